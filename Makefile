@@ -7,7 +7,7 @@ SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 STATIC := $(SYSTEMS:%=%-static)
 SMALL := $(SYSTEMS:%=%-small)
 
-.PHONY: demo install test test-coverage test-slow test-long test-browser lint format maps results figures benchmark ablation \
+.PHONY: demo install test test-coverage guard test-slow test-long test-browser lint format maps results figures benchmark ablation \
 	certificates agents environments speed sizes clients docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
@@ -21,6 +21,9 @@ test: $(VENV)/ready $(if $(AREA),,lint)  ## all that CI runs; AREA=training/maps
 
 test-coverage: $(VENV)/ready  ## the same tests, and which lines they run, in htmlcov; takes a quarter longer
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --cov --cov-report=html
+
+guard: $(VENV)/ready  ## what must not change: estimates, dynamics, names, held-out errors, short trainings; two minutes
+	OMP_NUM_THREADS=1 $(BIN)/python tests/guard/guard.py
 
 test-slow: $(VENV)/ready  ## the tests that train for minutes
 	$(BIN)/pytest -m slow
@@ -43,7 +46,7 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff format .
 
 # Into runs/; with error bars into runs/errorbars, which ship as NAME-static, and those that also track, which ship as
-# NAME and NAME-small, into runs/tracking. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
+# NAME and NAME-small, into runs/tracking. What ships lies in observers/maps.
 # One thread each, with which the same machine makes the same numbers to the last bit.
 maps: $(SYSTEMS:%=maps-%)  ## train the shipped maps again, two hours, or one with make -j 2 maps; resumable
 
@@ -58,7 +61,7 @@ maps-%: $(VENV)/ready
 
 results: $(VENV)/ready  ## the accuracy in the README and in docs/
 	$(BIN)/kkl-gym evaluate $(STATIC) $(SYSTEMS:%=%-spinn) --csv docs/results/accuracy.csv
-	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system-static $$system-spinn --noise 0.05 0.1 0.2 1 \
+	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system-static $$system-spinn --measurement-noise 0.05 0.1 0.2 1 \
 		--csv docs/results/noise_levels/$$system.csv || exit 1; done
 	for map in $(STATIC); do $(BIN)/kkl-gym evaluate $$map --calibration --ekf \
 		--csv runs/error_bars/$$map.csv || exit 1; done
@@ -66,7 +69,7 @@ results: $(VENV)/ready  ## the accuracy in the README and in docs/
 	cp $(STATIC:%=runs/error_bars/%.csv) docs/results/error_bars
 	$(BIN)/kkl-gym evaluate $(SMALL) --csv docs/results/accuracy-small.csv
 	mkdir -p docs/results/tracking
-	$(BIN)/kkl-gym evaluate $(SYSTEMS) --noise 0 0.1 0.5 1 --ekf --csv docs/results/tracking/accuracy.csv
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) --measurement-noise 0 0.1 0.5 1 --ekf --csv docs/results/tracking/accuracy.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --process-noise 0.05 --csv docs/results/tracking/process-noise.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/tracking/plant-error.csv
 	for map in $(SYSTEMS) $(SMALL); do $(BIN)/kkl-gym evaluate $$map --calibration \
@@ -125,7 +128,7 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 	$(BIN)/python -m examples.research agents $(HIDDEN)
 	mkdir -p docs/results/environments
 	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
-	$(BIN)/python -m examples.research agents CartPole-v1 Pendulum-v1 --noise 0.1 0.2 0.3 \
+	$(BIN)/python -m examples.research agents CartPole-v1 Pendulum-v1 --measurement-noise 0.1 0.2 0.3 \
 		--information state x_hat stacked_x_hat z stacked recurrent --aggregate 4 --seeds 5 --out runs/agents/noise
 	cp runs/agents/noise/results.csv docs/results/environments/noise.csv
 	$(BIN)/python -m examples.research agents InvertedDoublePendulum-v5 --information state x_hat --seeds 10 \

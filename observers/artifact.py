@@ -7,7 +7,7 @@ import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -22,46 +22,12 @@ from observers.flow import Flow
 from observers.forward import ForwardMap
 from observers.inverse import InverseMap
 from observers.monitor import Limits
+from observers.network import MLP
 from observers.spread import Spread
 
-# The second has maps that are told the process noise, the third maps that are told levels of measurement noise, one for
-# each of several outputs, the fourth maps that estimate parameters too, the fifth maps with error bars, the sixth maps
-# with a flow; the others are still written as the first.
-FORMATS = (1, 2, 3, 4, 5, 6)
-USUAL_NOISE = 0.5  # standard deviation of the measurement noise where a file does not say what is usual
-# Parameters that a system has been given since files for it were written that say none, and what they were then.
-_PARAMETERS_SINCE = {"reverse_duffing": {"a": 1.0, "b": 1.0}}
-_HOLDS = {"y": "first-order", "u": "zero-order"}  # what the filter takes signals for between samples
+FORMAT = 1
+USUAL_NOISE = 0.5  # standard deviation of the measurement noise where no other is given
 _KEY = "kkl-gym"
-_LIMITS = ("levels", "mean", "low", "high")
-_LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
-_FORWARD_ARRAYS = ("x_offset", "x_scale", "z_offset", "z_scale")
-_INVERSE_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
-_SPREAD_ARRAYS = ("levels", "ages", "factors")
-_FLOW_ARRAYS = (
-    "x_offset",
-    "x_scale",
-    "u_scale",
-    "gain",
-    "polynomial",
-    "low",
-    "high",
-    "error",
-    "process_noise",
-    "least_measurement_noise",
-)
-_FLOW_FACTORS = ("factors", "free_factors")  # of which the second need not be there
-_FLOW_OPTIONAL = "bend"
-_FLOW_SCALARS = ("least_process_noise", "window")
-# Scalars of an inverse map, and what the files call them.
-_SCALARS = {
-    "measurement_noise_unit": "noise_unit",
-    "measurement_noise_max": "noise_max",
-    "process_noise_unit": "process_unit",
-    "process_noise_max": "process_max",
-    "age_unit": "age_unit",
-    "age_max": "age_max",
-}
 
 
 @dataclass(frozen=True)
@@ -159,17 +125,8 @@ class Artifact:
         usual = noise_levels("measurement_noise", self.measurement_noise, self.ny)
         object.__setattr__(self, "measurement_noise", self.inverse.within(usual))
         free, nz = self.free_inverse, len(self.filter.A)
-        if free is not None and ("z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu):
-            raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
-        if free is not None and (
-            free.mlp.outputs != self.inverse.mlp.outputs
-            or free.measurement_noise_max != self.inverse.measurement_noise_max
-        ):
-            raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
-        if free is not None and _process(free) != _process(self.inverse):
-            raise ArtifactError("the maps of free and of driven motion differ in what they are told of process noise")
-        if free is not None and (free.spread is None) != (self.inverse.spread is None):
-            raise ArtifactError("of the maps of free and of driven motion one has error bars and the other has none")
+        if free is not None:
+            self._check_free(free)
         for spread in (self.inverse.spread, None if free is None else free.spread):
             if spread is not None and spread.nx != self.nx:
                 raise ArtifactError(f"error bars of {spread.nx} states do not fit {self.nx} states")
@@ -195,13 +152,7 @@ class Artifact:
             raise ArtifactError(f"limits of {self.limits.mean.shape[1]} residuals need a C or h with as many outputs")
 
     def require_system(self) -> None:
-        """See that there is a system behind the observer.
-
-        Raises
-        ------
-        ArtifactError
-            If it was learned from recorded states; the message says from which.
-        """
+        """Raise ArtifactError if the observer was learned from recorded states: there is no system behind it then."""
         if self.signals is not None:
             names = {role: ", ".join(of) for role, of in self.signals.items()}
             given = " and ".join(of for of in (names["measured"], names["inputs"]) if of)
@@ -210,6 +161,21 @@ class Artifact:
                 f"the observer {self.system!r} was learned from recorded states: {names['hidden']} from {given}, every "
                 f"{self.filter.dt:g} s. It has no equations, and {fits}; observers.load(path) runs it on samples"
             )
+
+    def _check_free(self, free: InverseMap) -> None:
+        driven, nz = self.inverse, len(self.filter.A)
+        if "z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu:
+            raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
+        if (free.mlp.outputs, free.measurement_noise_max) != (driven.mlp.outputs, driven.measurement_noise_max):
+            raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
+        process_noise = [
+            "process_noise" in each.features and (each.process_noise_unit, each.process_noise_max)
+            for each in (free, driven)
+        ]
+        if process_noise[0] != process_noise[1]:
+            raise ArtifactError("the maps of free and of driven motion differ in what they are told of process noise")
+        if (free.spread is None) != (driven.spread is None):
+            raise ArtifactError("of the maps of free and of driven motion one has error bars and the other has none")
 
     def _check_flow(self, flow: Flow) -> None:
         sizes, expected = (flow.nx, flow.nu, len(flow.least_measurement_noise)), (self.nx, self.nu, self.ny)
@@ -250,6 +216,8 @@ class Artifact:
                 raise ArtifactError(
                     f"the range {shown(tuple(ends))} of {name} must hold its value; parameters: {dict(self.parameters)}"
                 )
+        tuples = {name: tuple(ends) for name, ends in self.parameter_ranges.items()}  # of what may be JSON's lists
+        object.__setattr__(self, "parameter_ranges", tuples)
         if not {*self.estimated_parameters} <= {*self.parameter_ranges}:
             raise ArtifactError(
                 f"estimated_parameters = {self.estimated_parameters} must be among those with a range, "
@@ -329,18 +297,7 @@ class Artifact:
         return apart if self.C is not None else np.where(np.isfinite(apart), apart, 0.0)
 
     def require_forward(self) -> ForwardMap:
-        """Return T.
-
-        Returns
-        -------
-        ForwardMap
-            What :attr:`forward` holds.
-
-        Raises
-        ------
-        ArtifactError
-            If no T was learned; the message says which maps have one.
-        """
+        """Return T, or raise ArtifactError, which says which maps have one."""
         if self.forward is None:
             raise ArtifactError(
                 f"this map for {self.system!r} holds no forward map T; take one of the pipeline spinn, which does: "
@@ -350,13 +307,7 @@ class Artifact:
         return self.forward
 
     def require_known_start(self) -> None:
-        """See that an observer can begin at a state that is known: by T, or by tracking from there.
-
-        Raises
-        ------
-        ArtifactError
-            If there is neither; the message says which maps have one.
-        """
+        """Raise ArtifactError unless an observer can begin at a known state: by T, or by tracking from there."""
         if self.flow is None and self.signals is not None:
             self.require_flow()
         elif self.flow is None and self.forward is None:
@@ -367,18 +318,7 @@ class Artifact:
             )
 
     def require_spread(self) -> Spread:
-        """Return the error bars of T_inv.
-
-        Returns
-        -------
-        Spread
-            Those of :attr:`inverse`.
-
-        Raises
-        ------
-        ArtifactError
-            If none were learned; the message says how to.
-        """
+        """Return the error bars of T_inv, or raise ArtifactError, which says how to learn them."""
         if self.inverse.spread is None:
             data = "" if self.signals is None else " --data FILE"
             raise ArtifactError(
@@ -388,18 +328,7 @@ class Artifact:
         return self.inverse.spread
 
     def require_flow(self) -> Flow:
-        """Return the flow by which the observer tracks.
-
-        Returns
-        -------
-        Flow
-            What :attr:`flow` holds.
-
-        Raises
-        ------
-        ArtifactError
-            If none was learned; the message says how to.
-        """
+        """Return the flow by which the observer tracks, or raise ArtifactError, which says how to learn one."""
         if self.flow is None:
             data = "" if self.signals is None else " --data FILE"
             raise ArtifactError(
@@ -411,8 +340,7 @@ class Artifact:
     @property
     def process_noise_max(self) -> float | None:
         """The highest level of process noise that the map was trained for; None if it is not told the level."""
-        found = _process(self.inverse)
-        return None if found is None else found[1]
+        return self.inverse.process_noise_max if "process_noise" in self.inverse.features else None
 
     def check(self, system: str, parameters: Mapping[str, float], *, dt: float, ny: int, nu: int) -> None:
         """Raise an error unless the observer was made for this system.
@@ -474,51 +402,8 @@ class Artifact:
         TypeError, ValueError
             If JSON cannot hold ``training``, ``versions`` or a number.
         """
-        tensors = {"A": self.filter.A, "B": self.filter.B}
-        inverse = self.inverse
-        told = (
-            self.process_noise_max is not None,
-            inverse.noise_gain.ndim == 2,
-            bool(self.estimated_parameters),
-            inverse.spread is not None,
-            self.flow is not None,
-        )
-        level = max(number * there for number, there in enumerate(told, 1))
-        described: dict[str, Any] = {
-            "format": FORMATS[level],
-            "system": {"name": self.system, "parameters": dict(self.parameters)},
-            "dt": self.filter.dt,
-            "inputs": self.filter.nu,
-            "holds": _HOLDS,
-            "inverse": _put_inverse(tensors, "inverse", inverse),
-            "training": dict(self.training),
-            "versions": dict(self.versions),
-        }
-        if self.free_inverse is not None:
-            described["free"] = _put_inverse(tensors, "free", self.free_inverse)
-        if self.measurement_noise != self.inverse.within(USUAL_NOISE):
-            described["measurement_noise"] = self.measurement_noise
-        if self.signals is not None:
-            described["signals"] = {role: list(names) for role, names in self.signals.items()}
-        if self.environment is not None:
-            described["environment"] = dict(self.environment)
-        if self.parameter_ranges:
-            described["system"]["ranges"] = {name: list(ends) for name, ends in self.parameter_ranges.items()}
-        if self.estimated_parameters:
-            described["estimated_parameters"] = list(self.estimated_parameters)
-        if self.C is not None:
-            tensors["C"] = np.asarray(self.C, dtype=float)
-        if self.h is not None:
-            described["h"] = self.h.components
-        if self.forward is not None:
-            storage.put_mlp(tensors, "forward.", self.forward.mlp)
-            tensors |= {f"forward.{n}": np.asarray(getattr(self.forward, n), dtype=float) for n in _FORWARD_ARRAYS}
-            described["forward"] = {"activation": self.forward.mlp.activation}
-        if self.flow is not None:
-            described["flow"] = _put_flow(tensors, self.flow)
-        if self.limits is not None:
-            tensors |= {f"limits.{name}": np.asarray(getattr(self.limits, name), dtype=float) for name in _LIMITS}
-            described["limits"] = {name: getattr(self.limits, name) for name in _LIMIT_SCALARS}
+        tensors: dict[str, np.ndarray] = {}
+        described = {"format": FORMAT, **_put(tensors, "", self)}
         storage.save(path, tensors, key=_KEY, described=described)
 
     @classmethod
@@ -538,135 +423,77 @@ class Artifact:
         Raises
         ------
         ArtifactError
-            If the file is missing, not readable, damaged, foreign, of a newer format or too large (see
-            :func:`observers.storage.read`), or holds what makes no observer.
+            If the file is missing, not readable, damaged, foreign, of another format, without checksum or too large, or
+            holds what makes no observer.
         """
         tensors, described = storage.read(path, key=_KEY, error=ArtifactError, what="an observer")
         with storage.explained(path, ArtifactError):
-            return cls._assemble(tensors, described)
-
-    @classmethod
-    def _assemble(cls, tensors: Mapping[str, np.ndarray], described: Mapping[str, Any]) -> "Artifact":
-        if described["format"] not in FORMATS:
-            raise ArtifactError(f"it has format {described['format']!r}, this version of kkl-gym reads {FORMATS}")
-        if described.get("holds", _HOLDS) != _HOLDS:
-            raise ArtifactError(f"its filter holds signals as {described['holds']}, this version knows {_HOLDS}")
-        for name, tensor in tensors.items():
-            if not np.isfinite(tensor).all():
-                raise ArtifactError(f"its tensor {name} is not finite")
-        forward = limits = free_inverse = None
-        if "forward" in described:
-            forward = ForwardMap(
-                storage.get_mlp(tensors, "forward.", described["forward"]["activation"]),
-                **{name: tensors[f"forward.{name}"] for name in _FORWARD_ARRAYS},
-            )
-        if "limits" in described:
-            arrays: dict[str, Any] = {name: tensors[f"limits.{name}"] for name in _LIMITS}
-            limits = Limits(**arrays, **{name: described["limits"][name] for name in _LIMIT_SCALARS})
-        if "free" in described:
-            free_inverse = _get_inverse(tensors, "free", described["free"])
-        system, parameters = described["system"]["name"], described["system"]["parameters"]
-        if parameters == {}:
-            parameters = _PARAMETERS_SINCE.get(system, parameters)
-        return cls(
-            filter=LinearFilter(tensors["A"], tensors["B"], described["dt"], described["inputs"]),
-            inverse=_get_inverse(tensors, "inverse", described["inverse"]),
-            system=system,
-            parameters=parameters,
-            forward=forward,
-            C=tensors.get("C"),
-            h=Expression(described["h"]) if "h" in described else None,
-            limits=limits,
-            free_inverse=free_inverse,
-            flow=_get_flow(tensors, described["flow"]) if "flow" in described else None,
-            measurement_noise=described.get("measurement_noise", USUAL_NOISE),
-            parameter_ranges={name: tuple(ends) for name, ends in described["system"].get("ranges", {}).items()},
-            estimated_parameters=tuple(described.get("estimated_parameters", ())),
-            training=described["training"],
-            versions=described["versions"],
-            signals=described.get("signals"),
-            environment=described.get("environment"),
-        )
+            if (number := described.pop("format")) != FORMAT:
+                raise ArtifactError(f"it has format {number!r}, kkl-gym reads {FORMAT}: train the observer again")
+            for name, tensor in tensors.items():
+                if not np.isfinite(tensor).all():
+                    raise ArtifactError(f"its tensor {name} is not finite")
+            artifact: Artifact = _get(cls, tensors, "", described)
+        return artifact
 
 
-def _process(inverse: InverseMap) -> tuple[float, float] | None:
-    """Unit and end of the levels of process noise that a map is told, if it is."""
-    return (inverse.process_noise_unit, inverse.process_noise_max) if "process_noise" in inverse.features else None
+_PARTS: dict[str, type] = {  # what fields hold that are parts with fields of their own
+    "inverse": InverseMap,
+    "free_inverse": InverseMap,
+    "forward": ForwardMap,
+    "flow": Flow,
+    "limits": Limits,
+    "h": Expression,
+    "spread": Spread,
+    "factors": Factors,
+    "free_factors": Factors,
+}
 
 
-def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap) -> dict[str, Any]:
-    """Add an inverse map's arrays; returns what describes it."""
-    storage.put_mlp(tensors, f"{prefix}.", inverse.mlp)
-    for name in _INVERSE_ARRAYS:
-        tensors[f"{prefix}.{name}"] = np.asarray(getattr(inverse, name), dtype=float)
-    names = [name for name in _SCALARS if _process(inverse) or not name.startswith("process")]
-    scalars = {_SCALARS[name]: getattr(inverse, name) for name in names}
-    return {
-        "features": list(inverse.features),
-        "activation": inverse.mlp.activation,
-        **{name: value for name, value in scalars.items() if np.isfinite(value).all()},
-        **_put_spread(tensors, f"{prefix}.spread.", inverse.spread),
-    }
+def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, Any]:
+    """Add the arrays of a part under names that begin with ``prefix``; returns its other fields, parts nested."""
+    described: dict[str, Any] = {}
+    for entry in fields(part):
+        name, value = entry.name, getattr(part, entry.name)
+        if isinstance(value, LinearFilter):
+            tensors |= {"A": value.A, "B": value.B}
+            described |= {"dt": value.dt, "inputs": value.nu}
+        elif isinstance(value, MLP):
+            storage.put_mlp(tensors, prefix, value)
+            described["activation"] = value.activation
+        elif isinstance(value, np.ndarray):
+            tensors[f"{prefix}{name}"] = np.asarray(value, dtype=float)
+        elif is_dataclass(value):
+            described[name] = _put(tensors, f"{prefix}{name}.", value)
+        elif isinstance(value, Mapping):
+            described[name] = dict(value)
+        elif value is not None and math.inf not in (value if isinstance(value, tuple) else (value,)):
+            described[name] = value
+    return described
 
 
-def _put_spread(tensors: dict[str, np.ndarray], prefix: str, spread: Spread | None) -> dict[str, Any]:
-    """Add the arrays of error bars, where there are any; returns what describes them."""
-    if spread is None:
-        return {}
-    storage.put_mlp(tensors, prefix, spread.mlp)
-    tensors |= {f"{prefix}{name}": np.asarray(getattr(spread, name), dtype=float) for name in _SPREAD_ARRAYS}
-    return {"spread": {"activation": spread.mlp.activation}}
+def _get(kind: type, tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> Any:
+    """The part that :func:`_put` took apart; raises KeyError unless all is there that it writes."""
+    left = dict(described)
+    values: dict[str, Any] = {}
+    for entry in fields(kind):
+        name = entry.name
+        if name == "filter":
+            values[name] = LinearFilter(tensors["A"], tensors["B"], left.pop("dt"), left.pop("inputs"))
+        elif name == "mlp":
+            values[name] = storage.get_mlp(tensors, prefix, left.pop("activation"))
+        elif f"{prefix}{name}" in tensors:
+            values[name] = tensors[f"{prefix}{name}"]
+        elif name in left and name in _PARTS:
+            values[name] = _get(_PARTS[name], tensors, f"{prefix}{name}.", left.pop(name))
+        elif name in left:
+            value = left.pop(name)
+            values[name] = tuple(value) if isinstance(value, list) else value
+        elif entry.default not in (None, math.inf):  # which are not written
+            raise KeyError(f"{prefix}{name}")
+    if left:
+        raise ArtifactError(f"unknown metadata keys: {', '.join(f'{prefix}{name}' for name in sorted(left))}")
+    return kind(**values)
 
 
-def _put_flow(tensors: dict[str, np.ndarray], flow: Flow) -> dict[str, Any]:
-    """Add a flow's arrays; returns what describes it."""
-    storage.put_mlp(tensors, "flow.", flow.mlp)
-    names = (*_FLOW_ARRAYS, *(() if flow.bend is None else (_FLOW_OPTIONAL,)))
-    tensors |= {f"flow.{name}": np.asarray(getattr(flow, name), dtype=float) for name in names}
-    for kind in _FLOW_FACTORS:
-        factors = getattr(flow, kind)
-        if factors is not None:
-            names = (*_SPREAD_ARRAYS, *(() if factors.doubt is None else ("doubt",)))
-            tensors |= {f"flow.{kind}.{name}": np.asarray(getattr(factors, name), dtype=float) for name in names}
-    return {"activation": flow.mlp.activation, **{name: getattr(flow, name) for name in _FLOW_SCALARS}}
-
-
-def _get_flow(tensors: Mapping[str, np.ndarray], described: Mapping[str, Any]) -> Flow:
-    if "flow.polynomial" not in tensors and "flow.linear" in tensors:  # as it was before there were other degrees
-        bias, linear = tensors["flow.bias"], tensors["flow.linear"]
-        tensors = {**tensors, "flow.polynomial": np.concatenate([bias[:, None], linear], axis=1)}
-    arrays: dict[str, Any] = {name: tensors[f"flow.{name}"] for name in _FLOW_ARRAYS}
-    arrays[_FLOW_OPTIONAL] = tensors.get(f"flow.{_FLOW_OPTIONAL}")
-    factors: dict[str, Any] = {
-        kind: Factors(
-            **{name: tensors[f"flow.{kind}.{name}"] for name in _SPREAD_ARRAYS}, doubt=tensors.get(f"flow.{kind}.doubt")
-        )
-        for kind in _FLOW_FACTORS
-        if kind == _FLOW_FACTORS[0] or f"flow.{kind}.{_SPREAD_ARRAYS[0]}" in tensors
-    }
-    scalars = {name: described[name] for name in _FLOW_SCALARS}
-    return Flow(storage.get_mlp(tensors, "flow.", described["activation"]), **arrays, **scalars, **factors)
-
-
-def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> InverseMap:
-    unknown = set(described) - {"activation", "features", "spread", *_SCALARS.values()}
-    if unknown:
-        raise ArtifactError(f"its map {prefix} has settings that nobody knows: {', '.join(sorted(unknown))}")
-    features = tuple(described["features"])
-    for name, key in _SCALARS.items():
-        feature = name.rpartition("_")[0]
-        if feature in features and key not in described:
-            raise ArtifactError(f"its map {prefix} is told {feature}, but lacks {key!r}")
-    mlp = storage.get_mlp(tensors, f"{prefix}.", described["activation"])
-    arrays: dict[str, Any] = {name: tensors[f"{prefix}.{name}"] for name in _INVERSE_ARRAYS}
-    scalars = {name: described[key] for name, key in _SCALARS.items() if key in described}
-    scalars = {name: tuple(value) if isinstance(value, list) else value for name, value in scalars.items()}
-    spread = None
-    if "spread" in described:
-        own = f"{prefix}.spread."
-        network = storage.get_mlp(tensors, own, described["spread"]["activation"])
-        spread = Spread(network, *(tensors[f"{own}{name}"] for name in _SPREAD_ARRAYS))
-    return InverseMap(mlp, features, **arrays, **scalars, spread=spread)
-
-
-__all__ = ["FORMATS", "USUAL_NOISE", "Artifact"]
+__all__ = ["USUAL_NOISE", "Artifact"]

@@ -21,8 +21,7 @@ def load(
     Parameters
     ----------
     name_or_path : str or PathLike
-        A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file. A name without a version is
-        the newest; ``"van_der_pol-v2"`` is that version for good.
+        A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
     measurement_noise, process_noise, monitor, compiled
         As for :class:`KKLObserver`.
 

@@ -1,7 +1,6 @@
 """Names of the maps that ship, and the files behind them."""
 
 import os
-import re
 from importlib.resources import files
 from pathlib import Path
 
@@ -9,25 +8,15 @@ from observers.checks import shown
 from observers.errors import ArtifactError
 
 
-def shipped() -> dict[str, str]:
-    """Return the names of the maps that ship with the package: ``{"van_der_pol": "van_der_pol-v2", ...}``.
+def shipped() -> tuple[str, ...]:
+    """Return the names of the maps that ship with the package.
 
     Returns
     -------
-    dict of str to str
-        The name of a file, without its ending, by name. Every version that was released is there under its full name;
-        the name without a version is the newest.
+    tuple of str
+        What :func:`observers.load` takes, sorted.
     """
-    versions: dict[str, list[int]] = {}
-    for entry in files("observers").joinpath("maps").iterdir():
-        match = re.fullmatch(r"(.+)-v(\d+)\.safetensors", entry.name)
-        if match:
-            versions.setdefault(match[1], []).append(int(match[2]))
-    names = {}
-    for name, numbers in sorted(versions.items()):
-        names[name] = f"{name}-v{max(numbers)}"
-        names.update({f"{name}-v{number}": f"{name}-v{number}" for number in numbers})
-    return names
+    return tuple(sorted(path.stem for path in _maps().glob("*.safetensors")))
 
 
 def resolve(name_or_path: str | os.PathLike[str]) -> Path:
@@ -42,7 +31,11 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
         raise ArtifactError(
             f"unknown observer {shown(text)}; shipped: {', '.join(names) or 'none'}; a file's name ends in .safetensors"
         )
-    return Path(str(files("observers").joinpath("maps", f"{names[text]}.safetensors")))
+    return _maps() / f"{text}.safetensors"
+
+
+def _maps() -> Path:
+    return Path(str(files("observers").joinpath("maps")))
 
 
 __all__ = ["resolve", "shipped"]

@@ -2,16 +2,13 @@
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from observers.artifact import Artifact
 from observers.decoder import Decoders
 from observers.samples import checked_record, first_state, held_input
-
-if TYPE_CHECKING:
-    from observers.observer import KKLObserver
 
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
@@ -73,14 +70,14 @@ def along(
 
 
 def replayed(
-    observer: "KKLObserver",
+    observer: Any,
     y: np.ndarray,
     u: np.ndarray | None,
     x0: np.ndarray | None,
     *,
-    of: Callable[["KKLObserver"], np.ndarray],
+    of: Callable[[Any], np.ndarray],
 ) -> np.ndarray:
-    """A property of an observer at each sample of a record, through which it is run."""
+    """A property of a KKLObserver at each sample of a record, through which it is run."""
     y, u, gaps = checked_record(observer.artifact, y, u)
     observer.reset(y[0], x0)
     first = of(observer)

@@ -2,7 +2,7 @@
 
 A file of arrays is in the safetensors format; a JSON object that describes them lies in its metadata under a key of its
 kind, ``KEY``. Nothing in it can run. Beside it, under ``KEY-sha256``, lies a checksum: the SHA-256 of the file as it is
-without that entry. Files from before there were checksums have none.
+without that entry.
 """
 
 import hashlib
@@ -137,10 +137,15 @@ def read(
     metadata = header.get("__metadata__") or {}
     if key not in metadata:
         raise error(f"{path} is not {what} of kkl-gym: it carries no {key!r} metadata")
-    checksum = metadata.pop(f"{key}-sha256", None)
+    expected = metadata.pop(f"{key}-sha256", None)
+    if expected is None:
+        raise error(
+            f"{path} lacks its checksum, the metadata {key}-sha256, without which damage would stay unnoticed: "
+            "get the file again, or make it again with kkl-gym"
+        )
     if set(metadata) != {key}:
-        raise error(f"{path} is damaged: nobody knows its metadata {', '.join(sorted(set(metadata) - {key}))}")
-    if checksum is not None and checksum != hashlib.sha256(_whole(header, data)).hexdigest():
+        raise error(f"{path} is damaged: unknown metadata: {', '.join(sorted(set(metadata) - {key}))}")
+    if expected != hashlib.sha256(_whole(header, data)).hexdigest():
         raise error(f"{path} is damaged: it holds something else than its checksum says; get it again")
     try:
         described = json.loads(metadata[key])
@@ -172,17 +177,8 @@ def is_kind(path: str | os.PathLike[str], key: str) -> bool:
 
 
 def checksum(path: str | os.PathLike[str], error: type[Exception]) -> str:
-    """Compute the checksum of what a file of arrays holds, which stays the same when the file gets one."""
-    content = _content(path, error)
-    try:
-        header, data = _parts(content)
-        metadata = header.get("__metadata__") or {}
-        for name in [name for name in metadata if name.endswith("-sha256")]:
-            del metadata[name]
-            content = _whole(header, data)
-    except (ValueError, AttributeError, TypeError, RecursionError) as problem:
-        raise error(f"{path} is damaged or no safetensors file: {problem}") from problem
-    return hashlib.sha256(content).hexdigest()
+    """The SHA-256 of a file."""
+    return hashlib.sha256(_content(path, error)).hexdigest()
 
 
 def _content(path: str | os.PathLike[str], error: type[Exception]) -> bytes:

@@ -42,11 +42,13 @@ def test_following_the_page_adds_a_system(tmp_path):
     root = tmp_path
     for package in ("kkl_gym", "observers", "training"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "examples" / "research", root / "examples" / "research")
     shutil.copy(ROOT / "pyproject.toml", root)
-    command = root / "bin" / "kkl-gym"
-    command.parent.mkdir()
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m training "$@"\n')
-    command.chmod(0o755)
+    (root / "bin").mkdir()
+    for name, called in (("kkl-gym", f'"{sys.executable}" -m training'), ("python", f'"{sys.executable}"')):
+        command = root / "bin" / name
+        command.write_text(f'#!/bin/sh\nexec {called} "$@"\n')
+        command.chmod(0o755)
     path = os.pathsep.join([str(command.parent), os.environ["PATH"]])
     environment = os.environ | {"PATH": path, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
 
@@ -95,7 +97,7 @@ assert np.allclose(controller(system)(np.array([system.target])), 0.0)
 assert preset(system, "input-aware", "fast").eigenvalues[0] == -0.1
 assert observers.load("fitzhugh_nagumo", 0.5, monitor=True).artifact.system == "fitzhugh_nagumo"
 agent = Agent.read("runs/first-look/agent/agent.safetensors")
-assert agent.observer == "fitzhugh_nagumo-v1" and agent.task == PROFILES["fitzhugh_nagumo"].task
+assert agent.observer == "fitzhugh_nagumo" and agent.task == PROFILES["fitzhugh_nagumo"].task
 """
     do(sys.executable, "-c", checks)
 

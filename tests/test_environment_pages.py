@@ -15,28 +15,21 @@ DOCS = Path(__file__).parent.parent / "docs"
 CONDITIONS = [("X", 0.0), ("X", 0.5), ("2X \\ X", 0.0), ("2X \\ X", 0.5)]
 
 
-def page(name):
-    return (DOCS / "environments" / f"{name}.md").read_text()
-
-
 @cache
 def medians():
     files = DOCS / "results" / "accuracy.csv", DOCS / "results" / "tracking" / "accuracy.csv"
-    found = pd.concat(map(pd.read_csv, files))
-    return found[~found.driven].groupby(["observer", "starts", "measurement_noise"]).smape.median()
-
-
-def numbers(cell):
-    return [float(value) for value in re.findall(r"-?[\d.]+", cell.replace("−", "-"))]
+    rows = pd.concat(map(pd.read_csv, files))
+    return rows[~rows.driven].groupby(["observer", "starts", "measurement_noise"]).smape.median()
 
 
 @pytest.mark.parametrize("name", kkl_gym.ENV_IDS)
-def test_what_the_page_says_of_the_environment(name):
-    system, text = kkl_gym.get_system(name), page(name)
-    said = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE))
+def test_the_page_of_an_environment(name):
+    system, text = kkl_gym.get_system(name), (DOCS / "environments" / f"{name}.md").read_text()
+    cells = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE))
 
     def of(start):
-        return numbers(next(cell for title, cell in said.items() if title.startswith(start)))
+        (cell,) = (cell for title, cell in cells.items() if title.startswith(start))
+        return [float(value) for value in re.findall(r"-?[\d.]+", cell.replace("−", "-"))]
 
     assert of("training box X") == np.ravel(system.X).tolist()
     assert of("declared bounds") == np.ravel(system.bounds).tolist()
@@ -49,20 +42,13 @@ def test_what_the_page_says_of_the_environment(name):
     assert {key: eval(value) for key, value in defaults.items()} == system.parameters
     assert f'gym.make("{kkl_gym.ENV_IDS[name]}"' in text
 
+    rows = dict(re.findall(rf"^\| `({name}[\w-]*)`[^|]* \|(.*) \|$", text, re.MULTILINE))
+    assert set(rows) == {observer for observer, *_ in medians().index if re.fullmatch(rf"{name}(-.*)?", observer)}
+    for observer, row in rows.items():
+        assert row.strip().split(" | ") == [f"{medians()[observer, *case]:.2f}" for case in CONDITIONS], observer
 
-@pytest.mark.parametrize("name", kkl_gym.ENV_IDS)
-def test_accuracy_on_the_page_is_that_of_the_results(name):
-    rows = re.findall(rf"^\| `({name}[\w-]*)`[^|]* \|(.*) \|$", page(name), re.MULTILINE)
-    measured = {observer for observer, *_ in medians().index if re.fullmatch(rf"{name}(-.*)?", observer)}
-    assert {observer for observer, _ in rows} == measured
-    for observer, cells in rows:
-        assert cells.strip().split(" | ") == [f"{medians()[observer, *case]:.2f}" for case in CONDITIONS], observer
-
-
-@pytest.mark.parametrize("name", kkl_gym.ENV_IDS)
-def test_the_moving_picture_is_small(name):
-    path = DOCS / "figures" / f"{name}.gif"
-    assert path.stat().st_size < 400_000
-    with Image.open(path) as picture:
-        assert picture.n_frames > 100
-    assert f"../figures/{name}.gif" in page(name)
+    picture = DOCS / "figures" / f"{name}.gif"
+    assert f"../figures/{name}.gif" in text
+    assert picture.stat().st_size < 400_000
+    with Image.open(picture) as frames:
+        assert frames.n_frames > 100

@@ -1,35 +1,31 @@
-"""What the pages show works: code runs, commands and their options exist, links lead somewhere."""
+"""What the pages show works: code runs, commands, options and names exist, links lead somewhere."""
 
 import ast
 import importlib
 import inspect
 import re
+import runpy
 import shutil
 import tomllib
 import types
+from pkgutil import resolve_name
 
 import numpy as np
 import pytest
 from gymnasium.utils.play import PlayableGame, play
 from pages import PAGES, ROOT, Page, name
 
+from examples.research.__main__ import COMMANDS as OF_RESEARCH
 from training.cli import COMMANDS, EXTRAS, read
 
+RESEARCH = "python -m examples.research"
 # Commands of others, which are taken on trust.
 OF_OTHERS = {"cc", "cd", "cp", "dask", "printf", "ray", "sleep", "srun", "tensorboard", "./van_der_pol"}
-
-
-def with_blocks(language):
-    return [page for page in PAGES if any(block.language == language for block in Page(page).blocks)]
 
 
 def own(page):
     blocks = [] if Page(page).elsewhere else Page(page).blocks
     return [block for block in blocks if block.language == "python"]
-
-
-def ids(page):
-    return name(page)
 
 
 @pytest.fixture
@@ -84,7 +80,7 @@ def run(blocks, page):
                 raise
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if own(page)], ids=ids)
+@pytest.mark.parametrize("page", [page for page in PAGES if own(page)], ids=name)
 def test_code_runs(page, playground, capsys):
     """All blocks of a page in one namespace, but for those that train, of which the names are looked up."""
     run([block for block in own(page) if not block.needs_training], page)
@@ -101,7 +97,7 @@ def test_code_runs(page, playground, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if any(b.needs_training for b in own(page))], ids=ids)
+@pytest.mark.parametrize("page", [page for page in PAGES if any(b.needs_training for b in own(page))], ids=name)
 def test_code_that_trains_runs(page, playground):
     run(own(page), page)
 
@@ -136,18 +132,19 @@ def test_what_others_run_they_run():
             assert page.name in (ROOT / test).read_text(), f"{test} never names {name(page)}"
 
 
-@pytest.mark.parametrize("page", with_blocks("sh"), ids=ids)
-def test_commands_exist(page):
+def test_commands_exist():
     """Every line is one that the parsers take; nothing is run."""
+    lines = {tuple(words): page for page in PAGES for words in Page(page).commands}
     makefile = (ROOT / "Makefile").read_text()
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    for words in Page(page).commands:
-        line, (command, *rest) = " ".join(words), words
+    for words, page in lines.items():
+        line, (command, *rest) = f"{name(page)}: {' '.join(words)}", words
         for path in re.findall(r"(?<![\w/])examples/\w+\.py", line):
             assert (ROOT / path).exists(), line
-        if command == "kkl-gym":
+        research = line.partition(": ")[2].startswith(RESEARCH)
+        if command == "kkl-gym" or research:
             try:
-                read(rest)
+                read(rest[2:], prog=RESEARCH, commands=OF_RESEARCH) if research else read(rest)
             except SystemExit as end:
                 pytest.fail(f"{line}\n{end}")
         elif command == "make":
@@ -162,40 +159,105 @@ def test_commands_exist(page):
         elif command == "python":
             assert rest[0] == "-m" or (ROOT / rest[0]).exists(), line
         else:
-            assert command in OF_OTHERS, f"{name(page)}: nobody knows {line}"
+            assert command in OF_OTHERS, line
 
 
-@pytest.fixture(scope="module")
-def options():
-    """Options of each command, as its page of the reference says: that page is written from the parsers."""
-    page = Page(ROOT / "docs" / "reference" / "commands.md").text
-    sections = re.split(r"^##+ `kkl-gym (.*)`$", page, flags=re.MULTILINE)[1:]
-    found = {words: set(re.findall(r"`(--[\w-]+)`", text)) for words, text in zip(sections[::2], sections[1::2])}
-    assert set(found) >= set(COMMANDS)
-    return found
-
-
-@pytest.mark.parametrize("page", [page for page in PAGES if "`kkl-gym " in Page(page).prose], ids=ids)
-def test_commands_in_sentences_exist(page, options):
+def test_commands_in_sentences_exist():
     """There a command may lack what it needs, but has no option that there is not."""
-    for shown in re.findall(r"`kkl-gym ([^`]*)`", Page(page).prose):
-        command = re.match(r"agent [a-z]+|[a-z][\w-]*|", shown)[0]
-        if not command:  # an option of all, or a word in the place of any command
-            continue
-        assert command in options, f"{name(page)}: kkl-gym {shown}"
-        used = set(re.findall(r"(?<!\S)--[\w-]+", shown))
-        assert used - {"--help"} <= options[command], f"{name(page)}: kkl-gym {shown}"
+    sections = runpy.run_path(str(ROOT / "docs" / "site" / "commands.py"))["sections"]
+    written = "\n".join([*sections("kkl-gym", COMMANDS), *sections(RESEARCH, OF_RESEARCH)])
+    parts = re.split(r"^##+ `(.*)`$", written, flags=re.MULTILINE)[1:]
+    options = {words: set(re.findall(r"`(--[\w-]+)`", text)) for words, text in zip(parts[::2], parts[1::2])}
+    for page in PAGES:
+        for prog, shown in re.findall(rf"`(?:\w+=\w+ )?(kkl-gym|{RESEARCH})\s([^`]*)`", Page(page).prose):
+            words = re.match(r"agent [a-z]+|[a-z][\w-]*|", shown)[0]
+            if words:  # and not an option of all, or a word in the place of any command
+                where = f"{name(page)}: {prog} {shown}"
+                assert f"{prog} {words}" in options, where
+                assert set(re.findall(r"(?<!\S)--[\w-]+", shown)) - {"--help"} <= options[f"{prog} {words}"], where
 
 
-@pytest.mark.parametrize("page", PAGES, ids=ids)
-def test_links_lead_somewhere(page):
-    text = re.sub(r"`[^`\n]*`", "", Page(page).prose)
-    links = re.findall(r"\]\(([^)\s]+)\)|\b(?:href|src|srcset)=\"([^\"]+)\"", text)
-    for link in filter(None, (one for both in links for one in both)):
-        if re.match(r"[a-z]+:", link):
-            continue
-        target, _, anchor = link.partition("#")
-        found = page.parent / target if target else page
-        assert found.exists(), f"{name(page)}: {link}"
-        if anchor and found.suffix == ".md":
-            assert anchor in Page(found).anchors, f"{name(page)}: {link}"
+def stands_for_something(dotted):
+    """Whether a module, what it defines, or a field of a class has this name."""
+    owner, _, field = dotted.rpartition(".")
+    try:
+        resolve_name(dotted)
+    except ModuleNotFoundError:
+        return False
+    except AttributeError:
+        return field in getattr(resolve_name(owner), "__annotations__", ())
+    return True
+
+
+def test_names_in_sentences_exist():
+    """Of files and folders, ``training/kalman.py:ExtendedKalmanFilter``, and ``observers.Artifact.read``."""
+    ours = r"(?:examples|kkl_gym|observers|tests|training)"
+    for page in (page for page in PAGES if not Page(page).elsewhere):
+        shown = re.findall(r"`([^`\n]+)`", Page(page).prose)
+        for path, _, inside in (one.partition(":") for one in shown if re.match(rf"{ours}/[\w/]*(/|\.py)(:|$)", one)):
+            assert (ROOT / path).exists(), f"{name(page)}: {path}"
+            dotted = ".".join([*path.removesuffix(".py").split("/"), inside])
+            assert not inside or stands_for_something(dotted), f"{name(page)}: {path}:{inside}"
+        for one in filter(None, (re.match(rf"{ours}(\.[A-Za-z_]\w*)+(?=$|\()", one) for one in shown)):
+            assert stands_for_something(one[0]), f"{name(page)}: {one[0]}"
+
+
+def test_links_lead_somewhere():
+    for page in PAGES:
+        text = re.sub(r"`[^`\n]*`", "", Page(page).prose)
+        links = re.findall(r"\]\(([^)\s]+)\)|\b(?:href|src|srcset)=\"([^\"]+)\"", text)
+        for link in filter(None, (one for both in links for one in both)):
+            target, _, anchor = link.partition("#")
+            found = page.parent / target if target else page
+            if not re.match(r"[a-z]+:", link):
+                assert found.exists(), f"{name(page)}: {link}"
+                assert not anchor or found.suffix != ".md" or anchor in Page(found).anchors, f"{name(page)}: {link}"
+
+
+ABBREVIATIONS = re.compile(r"\b(?:e\.g|i\.e|et al|al|cf|vs|sec|Sec|eq|Eq|fig|Fig|ch|no|[C-SU-WYZ])\.$")
+ENDS = re.compile(r"(?<=[.!?])[)\"'*_”]*\s+")
+NO_PROSE = {
+    r"\A---\n.*?\n---\n|^( *)(```|~~~).*?^\1\2 *$|<!--.*?-->|\$\$.*?\$\$|\\\[.*?\\\]": "",
+    r"`[^`]+`": "code",
+    r"!\[[^\]]*\]\([^)]*\)(?:\{[^}]*\})?": "",
+    r"\[((?:[^\[\]]|\[[^\]]*\])*)\]\([^)]*\)": r"\1",
+    r"<[^>\n]+>|^ *(?:\||#)[^\n]*$|^ *[-=]{3,} *$": "",
+    r"^ *(?:[-*+]|\d+\.|!!!|\?\?\?) +": "\n\n",
+}
+
+
+def sentences(text):
+    """Those of paragraphs and list items."""
+    for pattern, instead in NO_PROSE.items():
+        text = re.sub(pattern, instead, text, flags=re.DOTALL | re.MULTILINE)
+    for block in re.split(r"\n\s*\n", text):
+        begun = ""
+        for part in ENDS.split(" ".join(block.split())):
+            begun = f"{begun} {part}".strip()
+            if not ABBREVIATIONS.search(begun):
+                yield begun
+                begun = ""
+        yield begun
+
+
+def test_no_sentence_has_more_than_35_words():
+    page = (
+        "# Title\n\nOne [link](a.b), by Wu et al. 2023, e.g. `x. y`! Two.\n\n| table. |\n\n- An *item.* And\n  more\n"
+    )
+    found = ["One link, by Wu et al. 2023, e.g. code!", "Two.", "An *item.", "And more"]
+    assert list(filter(None, sentences(page))) == found
+    for page in PAGES:
+        if page.name not in {"table.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"}:  # commands write tables
+            for sentence in sentences(Page(page).text):
+                words = [word for word in sentence.split() if any(map(str.isalnum, word))]
+                assert len(words) <= 35, f"{name(page)}: {sentence}"
+
+
+def test_the_page_on_the_paper_has_its_numbered_equations_theorems_and_assumptions():
+    rows = [line for line in Page(ROOT / "docs/background/paper.md").text.splitlines() if line.startswith("|")]
+    assert {len(re.split(r"(?<!\\)\|", row)) for row in rows} == {5}  # three columns
+    cells = " ".join(row.split("|")[1] for row in rows)
+    inside_proofs = {32, 33, 34, 35}
+    assert set(range(1, 41)) - inside_proofs == {int(number) for number in re.findall(r"(?<!T)\((\d+)\)", cells)}
+    for kind, last in (("theorem", 4), ("lemma", 6), ("assumption", 5), ("definition", 4)):
+        assert set(range(1, last + 1)) == {int(number) for number in re.findall(rf"{kind} (\d)", cells)}, kind

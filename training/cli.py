@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr
+from functools import cache
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -181,6 +182,7 @@ def load(module: str, name: str) -> Callable[..., Any]:
     return found
 
 
+@cache
 def _described(module: str, name: str) -> Callable[..., Any]:
     """In the place of a command that is not called: the summary of its class, read without importing the module."""
     import ast  # here, as is the next, so that an interruption soon finds somebody who notices it

@@ -28,21 +28,6 @@ Levels = Annotated[
 
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
-# What settings were called before; files and artifacts that say it so are still read.
-FORMER_NAMES = {
-    "method": "pipeline",
-    "features": "random_features",
-    "reach": "box_factor",
-    "free": "free_inverse",
-    "push": "lead_in_input",
-    "disturbed": "process_noise_share",
-    "noise_max": "measurement_noise_max",
-    "quiet": "noise_free_share",
-    "emphasis": "high_noise_emphasis",
-    "closed_loop": "closed_loop_trajectories",
-    "cap": "cpu_seconds",
-}
-
 
 @dataclass(frozen=True, config=STRICT)
 class Config:
@@ -201,15 +186,6 @@ def setting_types() -> dict[str, Any]:
     return {entry.name: entry.type for entry in dataclasses.fields(Config)}
 
 
-def current_names(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings under the names that they have now."""
-    found = {FORMER_NAMES.get(name, name): value for name, value in settings.items()}
-    if len(found) < len(settings):
-        twice = [f"{old} and {new}" for old, new in FORMER_NAMES.items() if old in settings and new in settings]
-        raise ValueError(f"two names of one setting: {', '.join(twice)}")
-    return found
-
-
 def read_changes(path: Path) -> dict[str, Any]:
     """Settings from a JSON file, as ``kkl-gym tune`` writes it, for :func:`override`."""
     try:
@@ -219,7 +195,6 @@ def read_changes(path: Path) -> dict[str, Any]:
     types = setting_types()
     # A file of settings must not name code to run: a policy is given on the command line.
     del types["pipeline"], types["closed_loop_trajectories"], types["policy"]
-    found = current_names(found) if isinstance(found, dict) else found
     if not isinstance(found, dict) or not set(found) <= set(types):
         unknown = sorted(set(found) - set(types)) if isinstance(found, dict) else type(found).__name__
         raise ValueError(f"{path} must be an object of settings among {', '.join(sorted(types))}; it has {unknown}")
@@ -229,7 +204,7 @@ def read_changes(path: Path) -> dict[str, Any]:
 def settings_of(training: Mapping[str, Any]) -> Config:
     """The configuration behind what an artifact says of its training."""
     known = setting_types()
-    found = {name: value for name, value in current_names(training).items() if name in known and value is not None}
+    found = {name: value for name, value in training.items() if name in known and value is not None}
     if not {"pipeline", "eigenvalues"} <= set(found):
         raise ValueError("the observer does not say how it was trained, so that it cannot be trained again")
     return Config(**_validated(found, "the observer's training"))

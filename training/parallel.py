@@ -1,106 +1,63 @@
-"""One engine for independent jobs, joblib: worker processes of this machine, or a cluster of Dask's or Ray's."""
+"""Independent jobs on joblib: worker processes of this machine, or a cluster of Dask's or Ray's."""
 
-import multiprocessing
+import logging
 import os
-import signal
 import threading
-import warnings
+import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import chdir, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Literal, TypeVar
 
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import get_reusable_executor
 
-from training.clusters import CLUSTERS
-
 Backend = Literal["loky", "dask", "ray"]
 
-WORKERS = 2  # of this machine, unless told otherwise
+DEFAULT_WORKERS = 2  # processes of this machine
 TRIES = 3  # of a job whose worker dies
+ADDRESSES = {"dask": "tcp://HOST:8786", "ray": "auto, or HOST:6379"}
 
-
-class Named(Protocol):
-    """What a job must have."""
-
-    @property
-    def name(self) -> str:
-        """For people."""
-        ...
-
-
-Job = TypeVar("Job", bound=Named)
+Job = TypeVar("Job")
 
 
 @dataclass(frozen=True)
 class Engine:
-    """What runs jobs."""
+    """Runs jobs, as many at a time as it has workers."""
 
     workers: int
-    settings: Mapping[str, Any]
-    around: Callable[[], AbstractContextManager[None]] = nullcontext
 
-    def run(self, run: Callable[[Job], None], jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None, list[str]]]:
-        """Run jobs, whatever goes wrong in one of them.
-
-        Where a worker dies, what it and those beside it were at is run again, ``TRIES`` times in all. An interruption
-        ends the workers, and so does the end of this process, even if it is killed.
-        """
+    def run(self, run: Callable[[Job], None], jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None]]:
+        """Yield each job when it ends, with the text of its error if it failed; jobs begin in their order."""
         todo, lost = dict(enumerate(jobs)), Counter[int]()
         workers = min(self.workers, len(todo))
+        attempt = delayed(partial(_attempt, run, Path.cwd()))
         while todo:
-            with parallel_config(**self.settings):
-                parallel = Parallel(
-                    n_jobs=workers,
-                    return_as="generator_unordered",
-                    batch_size=1,
-                    pre_dispatch=workers,  # no more, so that none begins after an interruption
-                )
-            calls = [delayed(_attempt)(run, job, index, self.around) for index, job in todo.items()]
-            ended = parallel(calls)
+            # As many as there are workers are handed out, so that those that a dead worker takes along are the first.
+            parallel = Parallel(workers, return_as="generator_unordered", batch_size=1, pre_dispatch=workers)
             try:
-                for index, failure in ended:
-                    yield todo.pop(index), failure, self._running(todo)
-            except Exception as error:  # not a job's, which comes as a result
+                for index, failure in parallel([attempt(*item) for item in todo.items()]):
+                    yield todo.pop(index), failure
+            except Exception as error:  # a worker died: what a job raises comes as its failure
                 for index in list(todo)[:workers]:
                     lost[index] += 1
                     if lost[index] == TRIES:
-                        yield todo.pop(index), f"was lost {TRIES} times with its worker: {error}", self._running(todo)
-            except BaseException:
-                with warnings.catch_warnings(action="ignore"):  # that not all jobs have run
-                    ended.close()
-                raise
-
-    def _running(self, todo: Mapping[int, Named]) -> list[str]:
-        """Names of those that run: jobs are begun in their order."""
-        return [job.name for job in list(todo.values())[: self.workers]]
+                        yield todo.pop(index), f"was lost {TRIES} times with its worker: {error}"
 
 
-def _attempt(
-    run: Callable[[Job], None], job: Job, index: int, around: Callable[[], AbstractContextManager[None]]
-) -> tuple[int, str | None]:
-    """Run a job, where it runs; whatever it does wrong, the others go on."""
+def _attempt(run: Callable[[Job], None], folder: Path, index: int, job: Job) -> tuple[int, str | None]:
+    """Run a job in a folder; its error becomes text, as not every error can be sent to another process."""
     try:
-        with around():
+        with chdir(folder):
             run(job)
-    except (Exception, SystemExit) as error:  # as text: not every error finds its way from process to process
-        return index, _text(error)
+    except SystemExit as error:
+        return index, f"left with sys.exit({error.code!r})"
+    except Exception as error:
+        return index, str(error) or type(error).__name__
     return index, None
-
-
-def _text(error: BaseException) -> str:
-    """Say what an error says; one that says nothing, or cannot, by its name."""
-    if isinstance(error, SystemExit):
-        return f"left with sys.exit({error.code!r})"
-    try:
-        return str(error) or type(error).__name__
-    except Exception:
-        return type(error).__name__
 
 
 @contextmanager
@@ -111,36 +68,61 @@ def engine(workers: int | None = None, *, backend: Backend = "loky", address: st
     if backend == "loky":
         if address is not None:
             raise ValueError(f"--address {address} is a cluster's: add --backend dask or --backend ray")
-        with _this_machine(workers or WORKERS) as found:
-            yield found
-        return
-    if address is None:
-        example = {"dask": "tcp://HOST:8786", "ray": "auto, or HOST:6379"}[backend]
-        raise ValueError(f"--backend {backend} needs the --address of its cluster, as in {example}")
-    with CLUSTERS[backend](address) as (cores, futures, around):
-        yield Engine(min(workers or cores, cores), {"backend": futures}, partial(around, Path.cwd()))
+        workers = workers or DEFAULT_WORKERS
+        with parallel_config("loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)):
+            try:
+                yield Engine(workers)
+            finally:
+                if workers > 1:
+                    get_reusable_executor(reuse=True).shutdown(kill_workers=True)
+    elif address is None:
+        raise ValueError(f"--backend {backend} needs the --address of its cluster, as in {ADDRESSES[backend]}")
+    else:
+        with _CLUSTERS[backend](address) as cores, parallel_config(backend):
+            yield Engine(min(workers or cores, cores))
+
+
+def _end_with(parent: int) -> None:
+    """End this worker soon after its parent, which may be killed: loky's go on to the end of their job."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager
-def _this_machine(workers: int) -> Iterator[Engine]:
-    lifeline, held = multiprocessing.Pipe(duplex=False)
-    with lifeline, held:
-        settings = {"inner_max_num_threads": 1, "initializer": _prepare, "initargs": (lifeline,)}
-        try:
-            yield Engine(workers, {"backend": "loky", **settings})
-        finally:
-            if workers > 1:  # it would keep them for the next jobs, with all that they have imported
-                get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)
+def _dask(address: str) -> Iterator[int]:
+    """Connect to a scheduler of Dask's; gives the number of its workers."""
+    from distributed import Client
+
+    with Client(address) as client:
+        threads = client.nthreads()
+        if set(threads.values()) != {1}:  # a job counts the CPU time of its process
+            raise ValueError(
+                f"--backend dask needs workers of one thread each, dask worker {address} --nthreads 1; got "
+                f"{threads or 'no worker'}"
+            )
+        yield len(threads)
 
 
-def _prepare(lifeline: Connection) -> None:
-    """Leave interruptions to the parent, and end when its end of the pipe is closed: by a kill, too."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+@contextmanager
+def _ray(address: str) -> Iterator[int]:
+    """Connect to Ray; gives the number of its cores."""
+    import ray
+    from ray.util.joblib import register_ray
+    from ray.util.joblib.ray_backend import RayBackend
 
-    def watch() -> None:
-        try:
-            lifeline.poll(None)  # nothing is ever sent
-        finally:
-            os._exit(1)
+    register_ray()
+    # RayBackend inherits False from the pool of multiprocessing; Ray's own pool hands results over as they come.
+    RayBackend.supports_return_generator = True
+    ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+    try:
+        yield int(ray.cluster_resources().get("CPU", 1))
+    finally:
+        ray.shutdown()
 
-    threading.Thread(target=watch, daemon=True).start()
+
+_CLUSTERS = {"dask": _dask, "ray": _ray}

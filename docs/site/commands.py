@@ -9,16 +9,19 @@ from pathlib import Path
 
 import tyro
 
-from training.cli import COMMANDS, load
+from training.cli import COMMANDS, Commands, load
 from training.markdown import table
 
 PAGE = Path(__file__).resolve().parents[1] / "reference" / "commands.md"
 BEGINNING = """\
 # Commands
 
-`kkl-gym COMMAND --help` says the same. Where `--preset` or `--pipeline` makes a difference, a default names each:
+`kkl-gym COMMAND --help` prints the same. Where `--preset` or `--pipeline` makes a difference, a default names each:
 "fast 128, paper 512" is 128 for `--preset fast` and 512 for `--preset paper`. In parentheses follow the systems that
 have a value of their own. What has no dashes is written in its place.
+
+Commands that compare observers and agents are no part of the package. In a clone, `python -m examples.research --help`
+lists them.
 
 <!-- Written by `make docs` from the parsers of the commands. -->
 """
@@ -26,25 +29,21 @@ DEFAULT = re.compile(r"\s*\((?:default: (.*)|(required|optional|sets: .*))\)\s*$
 
 
 def page() -> str:
-    """The whole page.
+    """The whole page, in Markdown."""
+    return "\n".join([BEGINNING, *sections("kkl-gym", COMMANDS)])
 
-    Returns
-    -------
-    str
-        In Markdown.
-    """
-    parts = [BEGINNING]
-    for name, behind in COMMANDS.items():
+
+def sections(prog: str, commands: Commands) -> Iterator[str]:
+    """A section for each command of a table, and for each of those below it."""
+    for name, behind in commands.items():
         command = load(*behind)
         with warnings.catch_warnings():  # nothing else in tyro says what the options are
             warnings.simplefilter("ignore", DeprecationWarning)
             parser = tyro.extras.get_parser(command, config=(tyro.conf.DisallowNone,))
-        parts.extend(_sections(f"kkl-gym {name}", parser, inspect.getdoc(command) or ""))
-    return "\n".join(parts)
+        yield from _sections(f"{prog} {name}", "##", parser, inspect.getdoc(command) or "")
 
 
-def _sections(name: str, parser: argparse.ArgumentParser, said: str) -> Iterator[str]:
-    """The section of a command, and of those below it."""
+def _sections(name: str, level: str, parser: argparse.ArgumentParser, said: str) -> Iterator[str]:
     below, rows = [], []
     for action in parser._actions:
         if isinstance(action.choices, dict):
@@ -54,9 +53,9 @@ def _sections(name: str, parser: argparse.ArgumentParser, said: str) -> Iterator
     if "\n\n" in said:  # numpydoc's sections are for those who read the code
         said = re.split(r"\n\n(?=\w+\n---)", said)[0]
     lines = table(["option and value", "meaning", "default"], rows) if rows else []
-    yield "\n".join([f"{'##' if name.count(' ') == 1 else '###'} `{name}`", "", _text(said, "\n\n"), "", *lines, ""])
+    yield "\n".join([f"{level} `{name}`", "", _text(said, "\n\n"), "", *lines, ""])
     for word, inner in below:
-        yield from _sections(f"{name} {word}", inner, inner.description or "")
+        yield from _sections(f"{name} {word}", f"{level}#", inner, inner.description or "")
 
 
 def _row(action: argparse.Action) -> list[str]:

@@ -26,6 +26,7 @@ SHOWN: Mapping[str, str] = {
 }
 WIDE = 1.5  # times as wide as high: such pictures scroll on phones
 ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>~?")  # of Sphinx, in docstrings
+FETCHED = re.compile(r'<(?:script|link|img)[^>]+(?:src|href)="?(https?://[^" >]+)')
 # Code of both kinds, in which nothing is a link; then the target of a link or an image.
 LINK = re.compile(r"^```.*?^```|`[^`\n]*`|\]\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
 # The same code, then an image and where it lies.
@@ -61,22 +62,17 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     return ROLE.sub("<code>", html)
 
 
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Warn where looking at a page would ask another host for something."""
+    for address in FETCHED.findall(output):
+        log.warning(f"{page.file.src_uri} asks another host for {address}")
+    return output
+
+
 def talk(notebook: Mapping[str, Any], name: str) -> tuple[str, dict[str, bytes]]:
-    """Make a page of a notebook.
+    """The page of a notebook, executed or not: its words and code, and what that printed and drew.
 
-    Parameters
-    ----------
-    notebook : mapping of str to object
-        What a file ``.ipynb`` holds, whose sources are lists of lines. It may have been executed or not.
-    name : str
-        What its pictures are called, with a number behind it.
-
-    Returns
-    -------
-    text : str
-        Markdown: its words, its code, and what that printed and drew.
-    pictures : dict of str to bytes
-        PNG files by name, which lie beside the page.
+    With the page come its pictures, PNG files named after the notebook, which lie beside it.
     """
     parts: list[str] = []
     pictures: dict[str, bytes] = {}
@@ -99,23 +95,9 @@ def talk(notebook: Mapping[str, Any], name: str) -> tuple[str, dict[str, bytes]]
 
 
 def relinked(markdown: str, source: str, page: str, *, repository: str) -> str:
-    """Rewrite the links of a page.
+    """A page whose links outside docs/ lead to the repository, unless the site shows their target.
 
-    Parameters
-    ----------
-    markdown : str
-        The page.
-    source : str
-        Where it lies in the repository.
-    page : str
-        Where it lies under docs/ for the site.
-    repository : str
-        Address for what is not in docs/.
-
-    Returns
-    -------
-    str
-        The page, in which a target outside docs/ is in the repository, unless the site shows it.
+    It lies at `source` in the repository, and at `page` under docs/ for the site.
     """
 
     def rewrite(found: re.Match[str]) -> str:
@@ -136,20 +118,9 @@ def relinked(markdown: str, source: str, page: str, *, repository: str) -> str:
 
 
 def themed(markdown: str, folder: Path) -> str:
-    """Show a picture twice where there is a dark one beside it, of which readers see the one that suits the ground.
+    """A page in which ``NAME.png`` is followed by ``NAME-dark.png``, if that lies beside it in the folder of the page.
 
-    Parameters
-    ----------
-    markdown : str
-        The page.
-    folder : Path
-        From where it names pictures.
-
-    Returns
-    -------
-    str
-        The page, in which ``NAME.png`` is followed by ``NAME-dark.png`` if there is one. The one that is not shown is
-        not loaded.
+    Readers see the one that suits the ground, and the other is not loaded.
     """
 
     def twice(found: re.Match[str]) -> str:

@@ -1,28 +1,27 @@
 """Draw the figures of the pages, on a light ground and on a dark one: ``make figures``.
 
-Each is drawn from the files in docs/results, or from what is simulated here in seconds, by the functions that the
-commands call. NAME-dark.png lies beside NAME.png, and moving pictures likewise; docs/site/hooks.py shows readers the
-one that suits them. ``python -m examples.research.figures figures/portraits.gif`` draws one alone.
+Each is drawn from the files in docs/results, or from simulations of seconds, by the functions that the commands call.
+NAME-dark.png lies beside NAME.png, and moving pictures likewise; docs/site/hooks.py shows readers the one of their
+theme. ``python -m examples.research.figures figures/portraits.gif`` draws one alone.
 
-What is not drawn here is light everywhere: docs/figures/qube.png needs records that are not part of this project, and a
-training (examples/qube.py). docs/figures/kkl.svg is drawn by hand; its colours alone are changed.
+docs/figures/qube.png is not drawn here, and is light everywhere: it needs a training (examples/qube.py) and records
+that are not part of this project. docs/figures/kkl.svg is drawn by hand; its colours alone are changed.
 """
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pandas as pd
 from PIL import Image
 
-from examples.research.agents.command import draw_results as draw_agents
+from examples.research.agents.tables import draw_curves, draw_environments, draw_systems
 from examples.research.benchmark.results import draw_results as draw_benchmark
 from examples.research.certificates import command as certify
 from examples.research.certificates.settled import record_settled
-from examples.research.environments.tables import draw_curves, draw_scores
 from examples.research.speed import sizes
 from kkl_gym import SYSTEMS
 from observers import Artifact, load
@@ -44,11 +43,16 @@ from training.maps.regions import chi_square
 from training.seeds import agent_evaluation_seed
 from training.systems import ControlTask
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 RESULTS = DOCS / "results"
 Draw = Callable[[Path], object]
 COLOURS = 256  # of a picture, which a third of the bytes then holds
 SEED = 7  # of the moving pictures
+DT = 0.01  # s, of the systems that ship
+EKF = "EKF with the exact equations"
 RIVALS = {"ekf": "tuned EKF", "ukf": "tuned UKF", "gru": "GRU"}  # of the benchmark, in the figure of noise
 BAND = 0.9  # of the errors lie in a band
 LEVELS = (0.0, 0.5)  # of measurement noise, in the figure of errors over time
@@ -56,7 +60,7 @@ SMALLEST = 0.01  # percent that is shown of errors under noise
 QUANTILES = (0.1, 0.5, 0.9)  # of the runs, in the same figure
 AGENTS = {"the agent sees the noisy output y": "van_der_pol-y", "the agent sees the estimate": "van_der_pol"}
 FIRST = 1.0  # s, in which bands may be wider than their panels
-# What the colours of docs/figures/kkl.svg are on a dark ground.
+# Colours of docs/figures/kkl.svg, and those on a dark ground.
 DARK = {
     "#fdfcf8": "#1e2129", "#ddd8c8": "#363b47", "#f1efe6": "#2a2f3a", "#e9f1fa": "#1f3044", "#fbecea": "#402523",
     "#333": "#c9ccd3", "#222": "#eceae4", "#555": "#b4b8c0", "#777": "#9aa0aa", "#888": "#8a909c",
@@ -112,30 +116,32 @@ def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
     episode = demo.play(environment, round(duration / environment.system.dt), None, seed=0)
     observer = load(name, environment.system.measurement_noise)
     width = chi_square(BAND, 1)[()] ** 0.5 * deviations(observer.estimate_covariance(episode.y))
-    return partial(draw_bands, episode=episode, width=width)
 
+    def draw(path: Path) -> None:
+        motion = episode.motion
+        t = np.arange(len(motion.x)) * motion.dt
+        with drawing(path, 9, 4.6) as figure:
+            axes = figure.subplots(2, motion.system.nx, sharex=True, height_ratios=[3, 2], squeeze=False)
+            for i, (above, below) in enumerate(axes.T):
+                if i == 0:  # the measured state
+                    above.plot(t, motion.y[:, 0], ".", ms=1.5, color=MEASURED, label="measured")
+                for ax, middle, label in (
+                    (above, motion.x_hat[:, i], f"{100 * BAND:.0f} % band"),
+                    (below, 0 * t, None),
+                ):
+                    ax.fill_between(
+                        t, middle - width[:, i], middle + width[:, i], color=ESTIMATE, alpha=0.3, lw=0, label=label
+                    )
+                above.plot(t, motion.x[:, i], color=TRUTH, label="true")
+                above.plot(t, motion.x_hat[:, i], "--", color=ESTIMATE, lw=1.0, label="estimate")
+                below.plot(t, motion.x[:, i] - motion.x_hat[:, i], color=TRUTH, lw=0.8)
+                margin, largest = 0.2 * np.ptp(motion.x[:, i]), 1.2 * width[t > FIRST, i].max()
+                name = motion.system.state_names[i]
+                above.set(ylabel=name, ylim=(motion.x[:, i].min() - margin, motion.x[:, i].max() + margin))
+                below.set(xlabel="t in s", ylabel=f"error of {name}", ylim=(-largest, largest))
+            axes[0, 0].legend(loc="lower right", ncols=2, markerscale=4)
 
-def draw_bands(path: Path, *, episode: demo.Episode, width: np.ndarray) -> None:
-    """Draw states, estimates with bands of a width, and outputs; and below them the errors in the same bands."""
-    motion = episode.motion
-    t = np.arange(len(motion.x)) * motion.dt
-    with drawing(path, 9, 4.6) as figure:
-        axes = figure.subplots(2, motion.system.nx, sharex=True, height_ratios=[3, 2], squeeze=False)
-        for i, (above, below) in enumerate(axes.T):
-            if i == 0:  # what is measured
-                above.plot(t, motion.y[:, 0], ".", ms=1.5, color=MEASURED, label="measured")
-            for ax, middle, label in ((above, motion.x_hat[:, i], f"{100 * BAND:.0f} % band"), (below, 0 * t, None)):
-                ax.fill_between(
-                    t, middle - width[:, i], middle + width[:, i], color=ESTIMATE, alpha=0.3, lw=0, label=label
-                )
-            above.plot(t, motion.x[:, i], color=TRUTH, label="true")
-            above.plot(t, motion.x_hat[:, i], "--", color=ESTIMATE, lw=1.0, label="estimate")
-            below.plot(t, motion.x[:, i] - motion.x_hat[:, i], color=TRUTH, lw=0.8)
-            margin, largest = 0.2 * np.ptp(motion.x[:, i]), 1.2 * width[t > FIRST, i].max()
-            name = motion.system.state_names[i]
-            above.set(ylabel=name, ylim=(motion.x[:, i].min() - margin, motion.x[:, i].max() + margin))
-            below.set(xlabel="t in s", ylabel=f"error of {name}", ylim=(-largest, largest))
-        axes[0, 0].legend(loc="lower right", ncols=2, markerscale=4)
+    return draw
 
 
 def noise_levels() -> Draw:
@@ -144,102 +150,101 @@ def noise_levels() -> Draw:
     files += [RESULTS / "noise_levels" / f"{name}.csv" for name in SYSTEMS]
     ours = pd.concat(map(pd.read_csv, files))
     rivals = pd.read_csv(RESULTS / "benchmark" / "results.csv")
-    return partial(draw_noise_levels, ours=ours, rivals=rivals)
 
-
-def draw_noise_levels(path: Path, *, ours: pd.DataFrame, rivals: pd.DataFrame) -> None:
-    """Draw median errors from starts in X by level of noise, a panel for each system."""
-    medians = ours[(ours.starts == "X") & ~ours.driven].groupby(["observer", "measurement_noise"]).smape.median()
-    others = rivals[rivals.starts == "X"].groupby(["system", "method", "noise"]).smape.median()
-    with drawing(path, 10, 3.2) as figure:
-        axes = figure.subplots(1, len(SYSTEMS), sharey=True)
-        for ax, name in zip(axes, SYSTEMS, strict=True):
-            for observer, line, color, label in (
-                (name, "o-", ESTIMATE, "default maps"),
-                (f"{name}-static", "o:", ESTIMATE, "T_inv alone"),
-                (f"{name}-spinn", "o-", TARGET, "SPINN"),
-            ):
-                ax.plot(medians[observer], line, color=color, label=label)
-            for (method, label), marker in zip(RIVALS.items(), ("x", "+", "^"), strict=True):
-                if (name, method) in others.index:
-                    ax.plot(others[name, method], marker, ms=6, mfc="none", color=RIVAL, label=label)
-            levels = medians[f"{name}-static"].index
-            ax.set_xscale("symlog", linthresh=levels[1], linscale=0.4)
-            ax.set_xticks(levels, [f"{level:g}" for level in levels], fontsize="small")
-            ax.minorticks_off()
-            ax.set(yscale="log", title=name.replace("_", " "), xlabel="noise on each sample of y")
-        axes[0].set_ylabel("median SMAPE in %")
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3 + len(RIVALS))
-
-
-def errors_over_time(trajectories: int = 100, duration: float | None = None) -> Draw:
-    """Errors at each step of the runs of ``kkl-gym evaluate SYSTEM --ekf`` from X, whose means the tables have."""
-    found = {}
-    for name, kind in SYSTEMS.items():
-        system, artifact = kind(), Artifact.read(resolve(name))
-        dt, seconds = artifact.filter.dt, duration or system.duration
-        runs = unseen_trajectories(system, dt, n=trajectories, duration=seconds, seed=0)
-        for level in LEVELS:
-            how: dict[str, Any] = {"measurement_noise": level, "seed": 0}
-            ours = estimates_of(artifact, system, runs, **how)
-            kalman = kalman_estimates(system, runs, dt, **how)
-            found[name, level] = percentage_error(runs.x, ours), percentage_error(runs.x, kalman)
-    return partial(draw_errors_over_time, found=found, dt=dt)
-
-
-def draw_errors_over_time(
-    path: Path, *, found: Mapping[tuple[str, float], tuple[np.ndarray, np.ndarray]], dt: float
-) -> None:
-    """Draw medians and bands of errors, (steps, n) of observer and Kalman filter: a column a system, a row a level."""
-    with drawing(path, 10, 4.6) as figure:
-        axes = figure.subplots(len(LEVELS), len(SYSTEMS), sharex=True, sharey="row")
-        for row, level in zip(axes, LEVELS, strict=True):
-            for ax, name in zip(row, SYSTEMS, strict=True):
-                for errors, color, label in zip(
-                    found[name, level], (ESTIMATE, RIVAL), ("observer", "EKF with the exact equations"), strict=True
+    def draw(path: Path) -> None:
+        medians = ours[(ours.starts == "X") & ~ours.driven].groupby(["observer", "measurement_noise"]).smape.median()
+        others = rivals[rivals.starts == "X"].groupby(["system", "method", "noise"]).smape.median()
+        with drawing(path, 10, 3.2) as figure:
+            axes = figure.subplots(1, len(SYSTEMS), sharey=True)
+            for ax, name in zip(axes, SYSTEMS, strict=True):
+                for observer, line, color, label in (
+                    (name, "o-", ESTIMATE, "default maps"),
+                    (f"{name}-static", "o:", ESTIMATE, "T_inv alone"),
+                    (f"{name}-spinn", "o-", TARGET, "SPINN"),
                 ):
-                    t = dt * np.arange(1, len(errors))
-                    low, middle, high = np.quantile(errors[1:], QUANTILES, axis=1)
-                    ax.fill_between(t, low, high, color=color, alpha=0.25, lw=0)
-                    ax.plot(t, middle, color=color, lw=0.9, label=label)
-                ax.set(xscale="log", yscale="log", ylim=(SMALLEST if level else SMALLEST / 100, 200.0))
-                ax.xaxis.set_major_formatter("{x:g}")
-                ax.yaxis.set_major_formatter("{x:g}")
-        for ax, name in zip(axes[0], SYSTEMS, strict=True):
-            ax.set_title(name.replace("_", " "))
-        for ax in axes[-1]:
-            ax.set_xlabel("t in s")
-        for ax, level in zip(axes[:, 0], LEVELS, strict=True):
-            ax.set_ylabel(f"error in %, noise {level:g}" if level else "error in %, no noise")
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+                    ax.plot(medians[observer], line, color=color, label=label)
+                for (method, label), marker in zip(RIVALS.items(), ("x", "+", "^"), strict=True):
+                    if (name, method) in others.index:
+                        ax.plot(others[name, method], marker, ms=6, mfc="none", color=RIVAL, label=label)
+                levels = medians[f"{name}-static"].index
+                ax.set_xscale("symlog", linthresh=levels[1], linscale=0.4)
+                ax.set_xticks(levels, [f"{level:g}" for level in levels], fontsize="small")
+                ax.minorticks_off()
+                ax.set(yscale="log", title=name.replace("_", " "), xlabel="noise on each sample of y")
+            axes[0].set_ylabel("median SMAPE in %")
+            figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3 + len(RIVALS))
+
+    return draw
 
 
-def tracking(trajectories: int = 100, duration: float | None = None) -> Draw:
-    """Errors at each step at noise 0.5, of observers that track beside those that do not."""
-    found = {}
+def errors_of_runs(
+    suffixes: Sequence[str], level: float, *, trajectories: int = 100, duration: float | None = None
+) -> dict[str, list[np.ndarray]]:
+    """Errors in % by system, (steps, n) for each map NAME + suffix and for an EKF, in the runs of ``kkl-gym evaluate``.
+
+    The runs start in X; the tables of the pages have their means.
+    """
+    errors = {}
     for name, kind in SYSTEMS.items():
-        system, dt = kind(), Artifact.read(resolve(name)).filter.dt
-        runs = unseen_trajectories(system, dt, n=trajectories, duration=duration or system.duration, seed=0)
-        how: dict[str, Any] = {"measurement_noise": LEVELS[-1], "seed": 0}
-        x_hats = [estimates_of(Artifact.read(resolve(one)), system, runs, **how) for one in (f"{name}-static", name)]
-        x_hats.append(kalman_estimates(system, runs, dt, **how))
-        found[name] = [np.median(percentage_error(runs.x, x_hat), axis=1) for x_hat in x_hats]
-    return partial(draw_tracking, found=found, dt=dt)
+        system, how = kind(), dict[str, Any](measurement_noise=level, seed=0)
+        runs = unseen_trajectories(system, DT, n=trajectories, duration=duration or system.duration, seed=0)
+        x_hats = [estimates_of(Artifact.read(resolve(name + suffix)), system, runs, **how) for suffix in suffixes]
+        x_hats.append(kalman_estimates(system, runs, DT, **how))
+        errors[name] = [percentage_error(runs.x, x_hat) for x_hat in x_hats]
+    return errors
 
 
-def draw_tracking(path: Path, *, found: Mapping[str, Sequence[np.ndarray]], dt: float) -> None:
-    """Draw median errors (steps,) of T_inv alone, of tracking and of a Kalman filter: a panel for each system."""
-    labels = "T_inv alone", "tracking", "EKF with the exact equations"
-    with drawing(path, 10, 3.2) as figure:
-        axes = figure.subplots(1, len(SYSTEMS), sharey=True)
-        for ax, name in zip(axes, SYSTEMS, strict=True):
-            for errors, color, label in zip(found[name], (TARGET, ESTIMATE, RIVAL), labels, strict=True):
-                ax.plot(dt * np.arange(1, len(errors)), errors[1:], color=color, lw=0.9, label=label)
-            ax.set(xscale="log", yscale="log", title=name.replace("_", " "), xlabel="t in s", ylim=(0.1, 200.0))
-            ax.xaxis.set_major_formatter("{x:g}")
-            ax.yaxis.set_major_formatter("{x:g}")
-        axes[0].set_ylabel("median error in %")
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(labels))
+def errors_over_time(**sizes: Any) -> Draw:
+    """Medians and bands of errors at each step, of observers and Kalman filters: a column a system, a row a level."""
+    errors = {level: errors_of_runs([""], level, **sizes) for level in LEVELS}
+
+    def draw(path: Path) -> None:
+        with drawing(path, 10, 4.6) as figure:
+            axes = figure.subplots(len(LEVELS), len(SYSTEMS), sharex=True, sharey="row")
+            for row, level in zip(axes, LEVELS, strict=True):
+                for ax, name in zip(row, SYSTEMS, strict=True):
+                    for own, color, label in zip(
+                        errors[level][name], (ESTIMATE, RIVAL), ("observer", EKF), strict=True
+                    ):
+                        t = DT * np.arange(1, len(own))
+                        low, middle, high = np.quantile(own[1:], QUANTILES, axis=1)
+                        ax.fill_between(t, low, high, color=color, alpha=0.25, lw=0)
+                        ax.plot(t, middle, color=color, lw=0.9, label=label)
+                    _set_logarithmic(ax, lowest=SMALLEST if level else SMALLEST / 100)
+                row[0].set_ylabel(f"error in %, noise {level:g}" if level else "error in %, no noise")
+            for ax, name in zip(axes[0], SYSTEMS, strict=True):
+                ax.set_title(name.replace("_", " "))
+            for ax in axes[-1]:
+                ax.set_xlabel("t in s")
+            figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+
+    return draw
+
+
+def tracking(**sizes: Any) -> Draw:
+    """Median errors at each step at noise 0.5, of T_inv alone, of tracking and of a Kalman filter."""
+    errors = errors_of_runs(["-static", ""], LEVELS[-1], **sizes)
+
+    def draw(path: Path) -> None:
+        labels = "T_inv alone", "tracking", EKF
+        with drawing(path, 10, 3.2) as figure:
+            axes = figure.subplots(1, len(SYSTEMS), sharey=True)
+            for ax, name in zip(axes, SYSTEMS, strict=True):
+                for own, color, label in zip(errors[name], (TARGET, ESTIMATE, RIVAL), labels, strict=True):
+                    median = np.median(own, axis=1)
+                    ax.plot(DT * np.arange(1, len(own)), median[1:], color=color, lw=0.9, label=label)
+                ax.set(title=name.replace("_", " "), xlabel="t in s")
+                _set_logarithmic(ax, lowest=0.1)
+            axes[0].set_ylabel("median error in %")
+            figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(labels))
+
+    return draw
+
+
+def _set_logarithmic(ax: "Axes", lowest: float) -> None:
+    ax.set(xscale="log", yscale="log", ylim=(lowest, 200.0))
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_major_formatter("{x:g}")
 
 
 FIGURES: Mapping[str, Callable[[], Draw]] = {
@@ -255,12 +260,12 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "results/certificates/rossler-spinn.png": partial(certificate, "rossler-spinn"),
     "results/benchmark/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "benchmark"),
     "results/ablation/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "ablation"),
-    "results/agents/scores.png": lambda: partial(draw_agents, RESULTS / "agents"),
+    "results/agents/scores.png": lambda: partial(draw_systems, RESULTS / "agents"),
     "results/environments/scores.png": lambda: partial(
-        draw_scores, results=pd.read_csv(RESULTS / "environments" / "results.csv")
+        draw_environments, results=pd.read_csv(RESULTS / "environments" / "results.csv")
     ),
     "results/environments/curves.png": lambda: partial(
-        draw_curves, found=pd.read_csv(RESULTS / "environments" / "curves.csv")
+        draw_curves, learned=pd.read_csv(RESULTS / "environments" / "curves.csv")
     ),
     "results/faults/scores.png": lambda: partial(faults.draw, found=pd.read_csv(RESULTS / "faults" / "faults.csv")),
     "results/sizes/sizes.png": lambda: (

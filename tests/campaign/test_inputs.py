@@ -10,7 +10,6 @@ import pytest
 from bad_values import Stranger, itself
 from entry_points import AREAS, ENTRIES
 
-FEW, MANY = 600, 30_000
 LONGEST = 1000  # characters of a clear error
 REFUSED, RIGHT, OBSCURE, SILENT = OUTCOMES = ("clear error", "accepted and right", "obscure", "silent")
 
@@ -29,7 +28,7 @@ def same(one, other):
 def finite(result):
     """Whether a result holds no NaN and no infinity."""
     if isinstance(result, dict):
-        return all(map(finite, result.values()))
+        return finite(list(result.values()))
     if isinstance(result, list | tuple) or (isinstance(result, np.ndarray) and result.dtype == object):
         return all(map(finite, result))
     return not isinstance(result, float | np.ndarray) or bool(np.isfinite(result).all())
@@ -57,27 +56,23 @@ class Pair:
         try:
             result = quietly(entry.call, self.tried, made())
         except Exception as error:
-            return self._judged(error)
+            return self.judged(error)
         if not right:
             return SILENT, f"accepted: {str(result)[:200]}"
         if not same(result, entry.call(self.other, clean)):
             return SILENT, f"accepted, and is not the same as {clean!r}"
-        if not (finite(result) and self._agree()):
+        if not (finite(result) and self.agree()):
             return SILENT, f"accepted, and led astray: {str(result)[:200]}"
         return RIGHT, ""
 
-    def _judged(self, error):
+    def judged(self, error):
         text = f"{type(error).__name__}: {error}"
-        if not self._agree():
+        if not self.agree():
             return SILENT, f"changed the state before {text}"
-        clear = (
-            isinstance(error, ValueError)
-            and re.search(rf"\b({self.entry.says})\b", str(error))
-            and len(text) <= LONGEST
-        )
-        return REFUSED if clear else OBSCURE, text
+        named = re.search(rf"\b({self.entry.says})\b", str(error))
+        return REFUSED if isinstance(error, ValueError) and named and len(text) <= LONGEST else OBSCURE, text
 
-    def _agree(self):
+    def agree(self):
         return same(self.entry.later(self.tried), self.entry.later(self.other))
 
 
@@ -107,79 +102,37 @@ def campaign(area, cases):
     return counts, wrong
 
 
+@pytest.mark.parametrize("cases", [200, pytest.param(10_000, marks=pytest.mark.long)])
 @pytest.mark.parametrize("area", AREAS)
-def test_bad_values_are_refused_or_as_good_as_plain_ones(area):
-    counts, wrong = campaign(area, FEW // len(AREAS))
+def test_bad_values_are_refused_or_as_good_as_plain_ones(area, cases):
+    counts, wrong = campaign(area, cases)
+    print(f"\n{area}: {', '.join(f'{outcome} {counts[outcome]}' for outcome in OUTCOMES)}")
     assert not wrong, "\n".join(wrong)
     assert counts[REFUSED] > counts[RIGHT] > 0
 
 
-@pytest.mark.long
-def test_thousands_of_bad_values(capsys):
-    found = {area: campaign(area, MANY // len(AREAS)) for area in AREAS}
-    with capsys.disabled():
-        print(f"\n{'bad inputs':17}", *(f"{outcome:>18}" for outcome in OUTCOMES))
-        for area, (counts, _) in found.items():
-            print(f"{area:17}", *(f"{counts[outcome]:18}" for outcome in OUTCOMES))
-    wrong = [line for _, lines in found.values() for line in lines]
-    assert not wrong, "\n".join(wrong)
-
-
-MASKED = np.ma.array([1e9], mask=[True])
-# Values that once gave another error or none, or an error after the state had changed.
+# Values that once gave another error or none, or an error after the state had changed, and that are rarely drawn.
 ONCE_WRONG = {
-    "KKLEnv(system)": ["x\0.py:B"],
-    "KKLEnv(dt)": [10**400, 10**5000],
-    "KKLEnv(process_noise)": [10**400],
-    "KKLEnv(measurement_noise)": [1.7e308],
+    "KKLEnv(dt)": [10**5000],
     "KKLEnv(start_box)": [[["0", "1"], ["0", "1"]]],
-    "KKLEnv(observe)": [np.array(["state"])],
     "KKLEnv(render_mode)": [np.array(["rgb_array", "x"])],
-    "KKLEnv(parameters)": [3, 0, {"mu": 10**400}],
-    "KKLEnv.reset(seed)": [True, 1.0],
-    "KKLEnv.reset(options)": [[1], 0, "", (), False, {"x0": ["0.5", "0.5"]}, {"x0": [50.0, 0.0]}],
-    "KKLEnv.reset(x0)": [None],
+    "KKLEnv(parameters)": [{"mu": 10**400}],
+    "KKLEnv.reset(options)": [[1], 0, "", {"x0": ["0.5", "0.5"]}, {"x0": [50.0, 0.0]}],
     "KKLEnv.step(action)": [
-        [True], np.array([True]), ["0.5"], [b"0.5"], np.array(["0.5"]), bytearray(b"a"), [1 + 0j], [10**400], MASKED,
-        np.array([1], "datetime64[s]"), np.array([1], "timedelta64[s]"), np.zeros(1, [("a", float)]),
-        np.array([0.5], object), Stranger(), itself(), {0.5: 0.5},
+        [True], np.array(["0.5"]), bytearray(b"a"), [10**400], np.ma.array([1e9], mask=[True]), Stranger(), itself(),
+        np.array([1], "timedelta64[s]"), np.zeros(1, [("a", float)]), np.array([0.5], object), {0.5: 0.5},
     ],
-    "KKLVectorEnv(num_envs)": [None, 10**12],
-    "KKLVectorEnv(autoreset_mode)": [[]],
+    "KKLVectorEnv(num_envs)": [10**12],
     "KKLVectorEnv.reset(seed)": [[True, 1, 2]],
-    "KKLVectorEnv.reset(options)": [[1], 0, "", (), False],
     "KKLVectorEnv.reset(reset_mask)": [np.ma.array([True] * 3, mask=[False, False, True])],
     "KKLVectorEnv.step(action)": [[[True], [0.5], [0.5]], [[0.5], [0.5, 1.0], [0.5]]],
-    "load(name)": [3, b"van_der_pol"],
-    "load(process_noise)": [np.timedelta64(1, "s"), 1e300],
-    "load(monitor)": ["no"],
-    "KKLObserver(artifact)": [None],
-    "observer(step y)": [[True], [[0.5], [0.5, 1.0]]],
-    "batch(restart rows)": [[[True], [True, False]]],
-    "with T(step u)": [np.zeros((7, 3))],
-    "LinearFilter(A)": [[["-1", "0"], ["0", "-2"]]],
-    "LinearFilter(nu)": [np.timedelta64(1, "s")],
-    "MLP(weight)": [None],
-    "MLP(weights)": [None],
-    "MLP(activation)": [[]],
-    "Limits(levels)": [[0.0, 1.0], 1.0],
-    "Limits(mean)": [[[1e200], [1e200]]],
-    "Monitor(limits)": [None],
-    "Monitor(level)": [np.nan, -1.0],
-    "Monitor(dt)": [0.0],
-    "KKLObservation(env)": [None],
-    "KKLObservation(observer)": [3],
-    "KKLObservation(ignore_input)": ["no"],
-    "KKLVectorObservation(env)": [None],
     "KKLVectorObservation(monitor)": [np.array([True, False])],
-    "ActionRepeat(env)": [None],
-    "VectorActionRepeat(env)": [None],
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ONCE_WRONG)
 def test_values_that_were_once_wrong(name):
-    [entry] = [entry for entry in ENTRIES if entry.name == name]
+    (entry,) = (entry for entry in ENTRIES if entry.name == name)
     for value in ONCE_WRONG[name]:
         outcome, what = Pair(entry).outcome(lambda value=value: value)
         assert outcome in (REFUSED, RIGHT), f"{value!r}: {what}"

@@ -6,12 +6,13 @@ KILLS says how many kills there are; without it a hundred. One in five is an int
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
 import time
-from abc import ABC, abstractmethod
 from collections import Counter
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +31,9 @@ pytestmark = pytest.mark.long
 KILLS = int(os.environ.get("KILLS", "100"))
 INTERRUPTIONS = 0.2  # of the kills
 ROOT = Path(__file__).parents[2]
-BATCHES = 1500  # of each stage
 
 # The command line with a checkpoint whenever there may be one, and a byte in a journal for each batch of a training of
-# maps, and for each step of the environments on which an agent learns.
+# maps, or for each step of the environments on which an agent learns.
 COMMAND = """
 import os, sys
 import training.cli
@@ -44,103 +44,38 @@ import_module = training.cli.import_module
 
 def import_and_watch(name):
     module = import_module(name)
-    import training.agents.cost, training.checkpoints, training.maps.optimise
+    import training.checkpoints
+    training.checkpoints.SECONDS = -1.0
+    if arguments[0] == "train":
+        from torch.optim.optimizer import register_optimizer_step_post_hook
+        register_optimizer_step_post_hook(lambda *_: os.write(journal, b"."))
+    else:
+        from training.agents.cost import Cost
 
-    def counted(function):
-        def counting(*arguments, **options):
-            result = function(*arguments, **options)
+        def step(self, *arguments, step=Cost.step, **options):
+            result = step(self, *arguments, **options)
             os.write(journal, b".")
             return result
-        return counting
 
-    def optimiser(*arguments):
-        made = make(*arguments)
-        made.step = counted(made.step)
-        return made
-
-    training.checkpoints.SECONDS = -1.0
-    training.agents.cost.Cost.step = counted(training.agents.cost.Cost.step)
-    make, training.maps.optimise._optimiser = training.maps.optimise._optimiser, optimiser
+        Cost.step = step
     return module
 
 training.cli.import_module = import_and_watch
 training.cli.main(arguments)
 """
 
-OWN = f"""
-import math
-from dataclasses import replace
 
-import torch
+class Train:
+    """A command, what of its work has been kept at any time, and what must be the same as without kills."""
 
-from examples.research.methods import Method
+    interval = LOG_EVERY  # batches between two checkpoints
 
-
-class Line(Method):
-    name = "line"
-    label = "line"
-
-    def train(self, task, configuration):
-        line = torch.nn.Linear(1, task.system.nx)
-        with torch.no_grad():
-            line.weight.zero_(), line.bias.zero_()
-
-        def loss(generator):
-            y = torch.randn(64, 1, generator=generator)
-            return {{"loss": ((line(y) - y) ** 2).mean()}}
-
-        budget = replace(task.budget, steps={2 * BATCHES}, cpu_seconds=math.inf)
-        replace(task, budget=budget).fit("line", line, loss, 1e-3)
-        return {{name: tensor.detach().numpy().copy() for name, tensor in line.state_dict().items()}}
-
-    def observer(self, trained, system, dt, noise):
-        return Proportional(trained)
-
-
-class Proportional:
-    def __init__(self, trained):
-        self.trained = trained
-
-    def reset(self, y0):
-        return self.step(y0)
-
-    def step(self, y):
-        return y @ self.trained["weight"].T + self.trained["bias"]
-"""
-
-
-class Scenario(ABC):
-    """A command, what of its work has been kept at any time, and what it must lead to."""
-
-    interval: int
-    """Units of work between two checkpoints."""
-
-    def __init__(self, folder):
-        self.folder = folder
-
-    @abstractmethod
     def arguments(self, out):
-        """What follows ``kkl-gym``."""
+        sizes = "--trajectories 20 --duration 5 --samples 30 --width 16 --depth 1 --batch 128 --inverse-steps 1500"
+        return ["train", "van_der_pol", *sizes.split(), "--no-monitor", "--resume", "--out", str(out)]
 
-    @abstractmethod
     def kept(self, out):
         """Units of work that need not be done again; raises ValueError if a file is damaged."""
-
-    @abstractmethod
-    def result(self, out):
-        """What must be the same as without kills."""
-
-
-class Train(Scenario):
-    name = "train"
-    interval = LOG_EVERY
-
-    def arguments(self, out):
-        sizes = "--trajectories 20 --duration 5 --samples 30 --width 16 --depth 1 --batch 128"
-        steps = ["--inverse-steps", str(BATCHES), "--no-monitor", "--resume", "--out", str(out)]
-        return ["train", "van_der_pol", *sizes.split(), *steps]
-
-    def kept(self, out):
         if (out / "van_der_pol.safetensors").exists():
             Artifact.read(out / "van_der_pol.safetensors")
         if (out / "config.json").exists():
@@ -155,13 +90,13 @@ class Train(Scenario):
         return history, weights, (out / "report.png").stat().st_size > 10_000
 
 
-class TrainAgent(Scenario):
-    name = "agent"
+class TrainAgent:
+    """The same of an agent; those that went on are others, of the same training."""
+
     interval = 32  # steps of its environments
-    rollouts = 4
 
     def arguments(self, out):
-        timesteps = str(self.rollouts * 256 * self.interval)
+        timesteps = str(4 * 256 * self.interval)
         options = ["--information", "y", "--timesteps", timesteps, "--resume", "--out", str(out)]
         return ["agent", "train", "lorenz", *options]
 
@@ -172,131 +107,64 @@ class TrainAgent(Scenario):
         return checkpoints.load(path)["counters"][0] // 256 if path.exists() else 0
 
     def result(self, out):
-        """Agents that went on are others, of the same training."""
         agent = Agent.read(out / "agent.safetensors")
         assert np.isfinite(play(agent.make(2), agent, steps=20, seed=0).x).all()
         seen = pd.read_csv(out / "progress.csv")["time/total_timesteps"].tolist()
         return {key: value for key, value in agent.training.items() if key != "resumed"}, seen
 
 
-class Benchmark(Scenario):
-    name = "benchmark"
-    interval = LOG_EVERY
-
-    def arguments(self, out):
-        script = self.folder / "line.py"
-        script.write_text(OWN)
-        options = ["--quick", "--systems", "van_der_pol", "--methods", f"{script}:Line", "--jobs", "1"]
-        return ["benchmark", *options, "--out", str(out)]
-
-    def kept(self, out):
-        folder = out / "jobs" / "van_der_pol" / "line"
-        for path in (*out.rglob("[!.]*.json"), *out.rglob("[!.]*.csv")):
-            (json.loads if path.suffix == ".json" else str)(path.read_text())
-        if (folder / "trained.safetensors").exists():
-            return 2 * BATCHES
-        path = folder / "trained" / f"line{checkpoints.SUFFIX}"
-        return checkpoints.load(path)["step"] if path.exists() else 0
-
-    def result(self, out):
-        """Temporary files of killed processes aside, which stay for an hour."""
-        names = {path.name for path in out.glob("*.*") if not path.name.startswith(UNFINISHED)}
-        return (out / "results.csv").read_text(), names
-
-
-class Campaign:
-    """Kills of one scenario, and what they did."""
-
-    def __init__(self, scenario, folder, rng):
-        self.scenario, self.folder, self.rng, self.counts = scenario, folder, rng, Counter()
-        self.problems, self.runs = [], 0
-        began = time.monotonic()
-        self.run(folder / "whole", None, None)
-        self.seconds = time.monotonic() - began
-        self.expected = scenario.result(folder / "whole")
-
-    def run(self, out, signal_number, after):
-        """Start the command and kill it; returns whether it was, and the work that it did."""
-        self.runs += 1
-        journal = self.folder / f"journal-{self.runs}"
-        with subprocess.Popen(
-            [sys.executable, "-c", COMMAND, str(journal), *self.scenario.arguments(out)],
-            cwd=self.folder,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        ) as process:
-            while signal_number == signal.SIGINT and process.poll() is None and not journal.exists():
-                time.sleep(0.01)  # what Python itself says of an interruption at its beginning is not ours
-            try:
-                _, said = process.communicate(timeout=after)
-            except subprocess.TimeoutExpired:
-                process.send_signal(signal_number)
-                _, said = process.communicate(timeout=120.0)
-        killed = process.returncode != 0
-        if killed and (signal_number is None or process.returncode not in (-signal_number, 128 + signal_number)):
-            raise AssertionError(f"{self.scenario.name} ended by itself with {process.returncode}: {said}")
-        if killed and signal_number == signal.SIGINT:
-            killed = said != ""  # else all is done, and Python was on its way out
-            if killed and not (said.startswith("kkl-gym: interrupted") and said.count("\n") == 1):
-                self.problems.append(said)
-        return killed, journal.stat().st_size if journal.exists() else 0
-
-    def chain(self, out, kills):
-        """Kill and resume in one folder until the command is done or was killed so often; returns how often it was."""
-        done, kept = 0, 0
-        while True:
-            number = signal.SIGINT if self.rng.random() < INTERRUPTIONS else signal.SIGKILL
-            after = self.rng.uniform(0.0, self.seconds)
-            halves, began = set(out.rglob(f"{UNFINISHED}*")), time.monotonic()
-            killed, work = self.run(out, number, after if done < kills else None)
-            if done:
-                self.counts["resumed"] += 1
-            if not killed:
-                if not done:  # kills are to be anywhere in a run, on a machine as busy as it is now
-                    self.seconds = time.monotonic() - began
-                break
-            done += 1
-            self.counts[number.name] += 1
-            if number == signal.SIGINT and set(out.rglob(f"{UNFINISHED}*")) - halves:
-                self.problems.append("an interruption left a temporary file")
-            try:
-                now = self.scenario.kept(out)
-            except ValueError as error:
-                self.counts["damaged"] += 1
-                self.problems.append(str(error))
-                break
-            lost = kept + work - now
-            self.counts["lost"] += lost
-            self.counts["lost more than one interval"] += lost > self.scenario.interval
-            kept = now
-        for got, wanted in zip(self.scenario.result(out), self.expected, strict=True):
-            if got != wanted:
-                self.counts["ended otherwise"] += 1
-                self.problems.append(f"{out}: {str(got)[:500]} in place of {str(wanted)[:500]}")
-        return done
+def run(scenario, out, journal, signal_number=None, after=None):
+    """Start the command and kill it; returns whether it was, the work that it did, and what it said."""
+    with subprocess.Popen(
+        [sys.executable, "-c", COMMAND, str(journal), *scenario.arguments(out)],
+        cwd=out.parent,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        while signal_number == signal.SIGINT and process.poll() is None and not journal.exists():
+            time.sleep(0.01)  # what Python itself says of an interruption at its beginning is not ours
+        try:
+            _, said = process.communicate(timeout=after)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal_number)
+            _, said = process.communicate(timeout=120.0)
+    killed = process.returncode != 0
+    assert not killed or (signal_number and process.returncode in (-signal_number, 128 + signal_number)), said
+    if signal_number == signal.SIGINT and not said:  # all is done, and Python was on its way out
+        killed = False
+    return killed, journal.stat().st_size if journal.exists() else 0, said
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends signals")
-def test_kills(tmp_path):
-    shares, total = {Train: 0.4, TrainAgent: 0.3, Benchmark: 0.3}, Counter()
-    told, problems = [], []
-    for number, (kind, share) in enumerate(shares.items()):
-        folder = tmp_path / kind.name
-        folder.mkdir()
-        campaign, left, chains = Campaign(kind(folder), folder, random.Random(number)), max(1, round(share * KILLS)), 0
-        told.append(f"{kind.name} {left}")
-        while left:
-            left -= campaign.chain(folder / f"run-{chains}", left)
-            chains += 1
-        total += campaign.counts
-        problems += campaign.problems
-    names = ("resumed", "lost more than one interval", "damaged", "ended otherwise")
-    print(
-        f"\n{total['SIGKILL'] + total['SIGINT']} kills, {total['SIGINT']} of them interruptions: {', '.join(told)}; "
-        + ", ".join(f"{name} {total[name]}" for name in names)
-    )
-    assert not problems
-    assert total["resumed"] == total["SIGKILL"] + total["SIGINT"]
-    assert not any(total[name] for name in names[1:])
+@pytest.mark.parametrize("scenario", [Train(), TrainAgent()], ids=["train", "agent train"])
+def test_kills(scenario, tmp_path):
+    """Kill and resume in one folder until the command is done, and begin again in another."""
+    rng, counts, journals = random.Random(0), Counter(), (tmp_path / f"journal-{i}" for i in count())
+    began = time.monotonic()
+    run(scenario, tmp_path / "whole", next(journals))
+    seconds, expected, out = time.monotonic() - began, scenario.result(tmp_path / "whole"), None
+    while counts["kills"] < KILLS // 2 or out:
+        if out is None:
+            out, kept = tmp_path / f"run-{counts['done']}", 0
+        last, began = counts["kills"] >= KILLS // 2, time.monotonic()
+        number = signal.SIGINT if rng.random() < INTERRUPTIONS else signal.SIGKILL
+        halves = set(out.rglob(f"{UNFINISHED}*"))
+        after = None if last else rng.uniform(0.0, seconds)
+        killed, work, said = run(scenario, out, next(journals), number, after)
+        if not killed:
+            assert scenario.result(out) == expected
+            if not kept:  # kills are to be anywhere in a run, on a machine as busy as it is now
+                seconds = time.monotonic() - began
+            counts["done"], out = counts["done"] + 1, None
+            continue
+        counts["kills"] += 1
+        if number == signal.SIGINT:
+            counts["interruptions"] += 1
+            assert re.fullmatch("kkl-gym: interrupted.*\n", said)
+            assert not set(out.rglob(f"{UNFINISHED}*")) - halves  # it leaves no temporary file
+        now = scenario.kept(out)
+        assert kept + work - now <= scenario.interval
+        kept = now
+    print(f"\n{scenario.arguments('')[0]}: {dict(counts)}")

@@ -62,29 +62,14 @@ def run(envs, steps, seed):
     return counts
 
 
-def vectors(rows, length):
-    """Every system under each of CASES."""
-    for name, (mode, levels, observe) in product(SYSTEMS, CASES):
-        yield (
-            name,
-            KKLVectorEnv(
-                name,
-                rows,
-                **levels,
-                observe=observe,
-                start_box=twice(name),
-                autoreset_mode=mode,
-                max_episode_steps=length,
-            ),
-        )
-
-
 def campaign(total, rows, length):
-    """At least that many steps, shared out among all of :func:`vectors`; returns counts by system."""
-    found = {name: Counter() for name in SYSTEMS}
+    """At least that many steps, shared out among all systems and CASES; returns counts by system."""
+    found, seeds = {name: Counter() for name in SYSTEMS}, count()
     share = total / len(SYSTEMS) / len(CASES)
-    seeds = count()
-    for name, envs in vectors(rows, length):
+    for name, (mode, levels, observe) in product(SYSTEMS, CASES):
+        envs = KKLVectorEnv(
+            name, rows, **levels, observe=observe, start_box=twice(name), autoreset_mode=mode, max_episode_steps=length
+        )
         counts = Counter()
         while counts["steps"] < share:  # more than once where rows waited
             counts += run(envs, int(np.ceil((share - counts["steps"]) / rows)), next(seeds))
@@ -106,53 +91,34 @@ def run_single(env, steps):
             obs, info = env.reset()
 
 
-def printed(found, capsys):
-    kinds = ("steps", "episodes", "escapes")
-    with capsys.disabled():
-        print(f"\n{'from 2X':17}", *(f"{kind:>14}" for kind in kinds))
-        for name, counts in found.items():
-            print(f"{name:17}", *(f"{counts[kind]:14,}" for kind in kinds))
+def long(*values):
+    return pytest.param(*values, marks=pytest.mark.long)
 
 
-def test_steps_stay_finite_and_within_their_spaces():
-    found = campaign(100_000, 64, length=12)
-    assert sum(counts["steps"] for counts in found.values()) >= 100_000
+@pytest.mark.parametrize(("total", "rows", "length"), [(100_000, 64, 12), long(100_000_000, 1024, 500)])
+def test_steps_stay_finite_and_within_their_spaces(total, rows, length):
+    found = campaign(total, rows, length)
+    print(f"\nfrom 2X: {', '.join(f'{name} {dict(counts)}' for name, counts in found.items())}")
+    assert sum(counts["steps"] for counts in found.values()) >= total
     assert all(counts["episodes"] > 0 for counts in found.values())
 
 
-@pytest.mark.parametrize("estimate", ["x", "z"])
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_estimates_stay_finite_and_within_their_spaces(name, estimate):
+@pytest.mark.parametrize(
+    ("name", "estimate", "rows", "steps", "length"),
+    [
+        ("lorenz", "x", 50, 40, 12),
+        ("reverse_duffing", "z", 50, 40, 12),
+        *(long(name, estimate, 1024, 170, 100) for name in SYSTEMS for estimate in ("x", "z")),
+    ],
+)
+def test_estimates_stay_finite_and_within_their_spaces(name, estimate, rows, steps, length):
     for mode in AutoresetMode:
-        envs = KKLVectorEnv(name, 50, start_box=twice(name), autoreset_mode=mode, max_episode_steps=12)
-        run(KKLVectorObservation(envs, estimate=estimate), 40, seed=0)
+        envs = KKLVectorEnv(name, rows, start_box=twice(name), autoreset_mode=mode, max_episode_steps=length)
+        run(KKLVectorObservation(envs, estimate=estimate), steps, seed=0)
 
 
+@pytest.mark.parametrize("steps", [300, long(100_000)])
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_single_steps_stay_finite_and_within_their_spaces(name):
-    run_single(KKLEnv(name, start_box=twice(name)), 300)
-    run_single(KKLObservation(KKLEnv(name, start_box=twice(name))), 100)
-
-
-@pytest.mark.long
-def test_a_hundred_million_steps(capsys):
-    found = campaign(100_000_000, 1024, length=500)
-    printed(found, capsys)
-    assert sum(counts["steps"] for counts in found.values()) >= 100_000_000
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_a_million_estimates(name, capsys):
-    counts = Counter()
-    for seed, (mode, estimate) in enumerate(product(AutoresetMode, ("x", "z"))):
-        envs = KKLVectorEnv(name, 1024, start_box=twice(name), autoreset_mode=mode, max_episode_steps=100)
-        counts += run(KKLVectorObservation(envs, estimate=estimate), 170, seed)
-    printed({name: counts}, capsys)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_a_hundred_thousand_single_steps(name):
-    run_single(KKLEnv(name, start_box=twice(name)), 100_000)
-    run_single(KKLObservation(KKLEnv(name, start_box=twice(name))), 20_000)
+def test_single_steps_stay_finite_and_within_their_spaces(name, steps):
+    run_single(KKLEnv(name, start_box=twice(name)), steps)
+    run_single(KKLObservation(KKLEnv(name, start_box=twice(name))), steps // 3)

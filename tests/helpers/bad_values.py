@@ -136,22 +136,11 @@ def _with_a_bad_entry(values, rng):
     return nested
 
 
-def _laid_out(values, rng):
-    doubled = np.repeat(values[..., None], 2, axis=-1)[..., 0]  # not contiguous
-    frozen = values.copy()
-    frozen.flags.writeable = False
-    return rng.choice([doubled, frozen, np.asfortranarray(values), np.flip(np.flip(values).copy())])
-
-
-def _scaled(values, rng):
-    return values * rng.choice([-1.0, 1e-30, 1e10, 1e200])
-
-
 def array_value(good, rng):
     """A value where an array like ``good`` is wanted."""
     if rng.random() < 0.25:
         return rng.choice(ATOMS)()
-    changes = (_retyped, _masked, _in_another_container, _reshaped, _with_a_bad_entry, _laid_out, _scaled)
+    changes = (_retyped, _masked, _in_another_container, _reshaped, _with_a_bad_entry)
     value = rng.choice(changes)(np.array(good), rng)
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and rng.random() < 0.3:
         value = rng.choice(changes)(np.asarray(value), rng)
@@ -175,9 +164,7 @@ def mapping_value(good, rng):
     if rng.random() < 0.5:
         return rng.choice(ATOMS)()
     return rng.choice([
-        lambda: list(good.items()), lambda: {**good, "unknown": 1.0}, lambda: {**good, 1: 2}, lambda: list(good),
-        lambda: {**good, None: None}, lambda: {**good, ("a",): 0},
-        lambda: {key.upper(): value for key, value in good.items()},
+        lambda: list(good.items()), lambda: {**good, "unknown": 1.0}, lambda: {**good, 1: 2},
         lambda: {key.encode(): value for key, value in good.items()}, lambda: str(good), lambda: pd.Series(good),
         lambda: {key: rng.choice(ATOMS)() for key in good}, lambda: dict.fromkeys(good), lambda: good.items(),
     ])()  # fmt: skip

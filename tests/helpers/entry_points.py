@@ -9,7 +9,6 @@ import gymnasium as gym
 import meanings as means
 import numpy as np
 from bad_values import array_value, mapping_value, scalar_value
-from random_artifacts import random_artifact
 
 import observers
 from kkl_gym import (
@@ -33,24 +32,9 @@ ENVIRONMENTS, OBSERVERS, WRAPPERS = AREAS = ("make, reset, step", "observers", "
 class Entry:
     """One argument of one call.
 
-    Attributes
-    ----------
-    area, name : str
-        What it belongs to and what it is called.
-    says : str
-        A regular expression for the words of an error that is clear about which argument it means.
-    good : object
-        A right value.
-    means : callable
-        What a value means, see :mod:`meanings`.
-    call : callable
-        ``call(target, value)`` returns what can be seen of the effect.
-    values : callable
-        ``values(good, rng)`` makes a value to try.
-    make : callable
-        Makes a target; None for constructors.
-    later : callable
-        ``later(target)`` returns what can be seen of the target's state.
+    ``says`` is a regular expression for the words of a clear error, ``good`` a right value, ``means`` one of the
+    functions of :mod:`meanings`; ``call(target, value)`` and ``later(target)`` return what can be seen of the effect
+    and of the target's state, ``values(good, rng)`` makes a value to try, and ``make()`` a target, if any is needed.
     """
 
     area: str
@@ -133,12 +117,6 @@ def observer(name="van_der_pol", rows=(), **options):
     return made
 
 
-def two_outputs():
-    made = KKLObserver(random_artifact(outputs=2), (0.2, 0.1))
-    made.reset([0.3, 0.2])
-    return made
-
-
 # Environments
 
 
@@ -176,6 +154,7 @@ def environments():
     box = np.array([[-1.0, 1.0], [-1.0, 2.0]])
     for kind, rows in ((KKLEnv, ()), (KKLVectorEnv, (N,))):
         for name, says, good, meaning, values in (
+            ("system", "[sS]ystem", "lorenz", means.system, scalar_value),
             ("dt", "dt", 0.02, means.real(lambda dt: 0 < dt < 10, optional=True), scalar_value),
             ("process_noise", "process_noise", 0.1, means.level, scalar_value),
             ("measurement_noise", "measurement_noise", 0.2, means.levels(), scalar_value),
@@ -184,11 +163,10 @@ def environments():
             ("start_box", "start_box", box, means.start_box, array_value),
             ("render_mode", "render_mode", "rgb_array", means.one_of(None, "rgb_array"), scalar_value),
         ):  # fmt: skip
-            yield Entry(ENVIRONMENTS, f"{kind.__name__}({name})", says, good, meaning,
-                        lambda _, v, kind=kind, rows=rows, name=name: driven(kind("van_der_pol", *rows, **{name: v})),
-                        values)  # fmt: skip
-        yield Entry(ENVIRONMENTS, f"{kind.__name__}(system)", "[sS]ystem", "lorenz", means.system,
-                    lambda _, v, kind=kind, rows=rows: driven(kind(v, *rows)))  # fmt: skip
+            made = lambda _, v, kind=kind, rows=rows, name=name: driven(  # noqa: E731
+                kind(v, *rows) if name == "system" else kind("van_der_pol", *rows, **{name: v})
+            )
+            yield Entry(ENVIRONMENTS, f"{kind.__name__}({name})", says, good, meaning, made, values)
     yield from constructors(ENVIRONMENTS, (
         ("KKLVectorEnv(num_envs)", "num_envs", 2, means.whole(1, 10**6),
          lambda v: driven(KKLVectorEnv("van_der_pol", v))),
@@ -196,27 +174,17 @@ def environments():
          lambda v: driven(KKLVectorEnv("van_der_pol", 2, max_episode_steps=v))),
         ("KKLVectorEnv(autoreset_mode)", "autoreset_mode", "SameStep", means.mode,
          lambda v: driven(KKLVectorEnv("van_der_pol", 2, autoreset_mode=v))),
-        ("get_system(system)", "[sS]ystem", "lorenz", means.system, get_system),
-        ("get_system(parameters)", "parameters?", {"mu": 2.0}, means.parameters,
-         lambda v: get_system("van_der_pol", v), mapping_value),
-        ("System.replace(parameters)", "parameters?", {"mu": 2.0}, means.parameters,
-         lambda v: get_system("van_der_pol").replace(v), mapping_value),
         ("System.replace(mu)", "mu", 2.0, means.real(np.isfinite),
          lambda v: get_system("van_der_pol").replace({"mu": v})),
     ))  # fmt: skip
-    for name, make, rows in (
-        ("KKLEnv", single, ()), ("gym.make", lambda: reset(limited()), ()), ("KKLVectorEnv", vector, (N,)),
-        ("SAME_STEP", lambda: vector(autoreset_mode="SameStep"), (N,)), ("DISABLED", disabled, (N,)),
-    ):  # fmt: skip
+    for name, make, rows in (("KKLEnv", single, ()), ("KKLVectorEnv", vector, (N,)), ("DISABLED", disabled, (N,))):
         yield from resets(ENVIRONMENTS, name, make, *rows)
         yield from steps(ENVIRONMENTS, name, make, *rows)
-    for name in ("lorenz", "rossler", "reverse_duffing"):
-        yield from steps(ENVIRONMENTS, name, lambda name=name: reset(KKLEnv(name, observe="output")))
 
 
 # Observers
 
-PATH = str(Path(observers.__file__).parent / "maps" / f"{observers.shipped()['van_der_pol']}.safetensors")
+PATH = str(Path(observers.__file__).parent / "maps" / "van_der_pol.safetensors")
 ARTIFACT = Artifact.read(PATH)
 Y, U = np.full((5, 1), 0.3), np.full((4, 1), 0.1)
 
@@ -272,29 +240,15 @@ def running():
         ("estimate x0", "x0", state, known, lambda o, v: o.estimate(Y, x0=v), array_value),
         ("step u", "u", np.zeros(1), zero, lambda o, v: o.step([0.3], v), array_value),
     ))  # fmt: skip
-    pair, gaps = (
-        np.array([0.3, 0.1]),
-        means.array(with_gaps((2,)), optional=True),
-    )
-    yield from calls(OBSERVERS, "two outputs", two_outputs, observed, (
-        ("reset y", "y", pair, means.array(lambda y: y.ndim and means.within((*y.shape[:-1], 2))(y)),
-         lambda o, v: o.reset(v), array_value),
-        ("step y", "y", pair, gaps, lambda o, v: o.step(v), array_value),
-        ("measurement_noise", "measurement_noise", pair, means.two_levels,
-         lambda o, v: setattr(o, "measurement_noise", v), array_value),
-    ))  # fmt: skip
     rows, two = np.array([True, False, True]), means.array(means.within((2, 1)))
-    for monitor in (False, True):
-        yield from calls(OBSERVERS, "watched batch" if monitor else "batch",
-                         lambda monitor=monitor: observer(rows=(N,), monitor=monitor), observed, (
-            ("restart y", "y", Y[:2], two, lambda o, v: o.restart(v, rows), array_value),
-            ("restart rows", "rows|y must have shape", rows, two_of_three, lambda o, v: o.restart(Y[:2], v),
-             array_value),
-            ("advance rows", "rows", rows, means.bools((N,), True), lambda o, v: o.advance(Y[:3], rows=v), array_value),
-            ("decode rows", "rows", rows, means.bools((N,), True), lambda o, v: o.decode(v), array_value),
-            ("step y", "y", Y[:3], means.array(with_gaps((N, 1)), optional=True), lambda o, v: o.step(v), array_value),
-            ("step u", "u", Y[:3], sample(N), lambda o, v: o.step(Y[:3], v), array_value),
-        ))  # fmt: skip
+    yield from calls(OBSERVERS, "batch", lambda: observer(rows=(N,), monitor=True), observed, (
+        ("restart y", "y", Y[:2], two, lambda o, v: o.restart(v, rows), array_value),
+        ("restart rows", "rows|y must have shape", rows, two_of_three, lambda o, v: o.restart(Y[:2], v), array_value),
+        ("advance rows", "rows", rows, means.bools((N,), True), lambda o, v: o.advance(Y[:3], rows=v), array_value),
+        ("decode rows", "rows", rows, means.bools((N,), True), lambda o, v: o.decode(v), array_value),
+        ("step y", "y", Y[:3], means.array(with_gaps((N, 1)), optional=True), lambda o, v: o.step(v), array_value),
+        ("step u", "u", Y[:3], sample(N), lambda o, v: o.step(Y[:3], v), array_value),
+    ))  # fmt: skip
 
 
 def with_gaps(shape):
@@ -313,31 +267,24 @@ LIMITS = {
     "levels": np.array([0.0, 1.0]), "mean": np.array([[0.3], [0.5]]), "low": np.array([[0.0], [0.4]]),
     "high": np.array([[0.1], [2.1]]), "window": 0.1, "warm_up": 0.05, "false_alarms": 0.01, "duration": 50.0,
 }  # fmt: skip
-RIGHT_LIMITS = {
-    "levels": means.array(lambda v: v.shape in ((2,), (2, 1)) and v.flat[0] == 0 < v.flat[1] <= 1e30),
-    "mean": means.array(lambda v: v.shape == (2, 1) and ((v > 0) & (v <= 1e30)).all()),
-    "low": means.array(lambda v: v.shape == (2, 1) and ((v >= 0) & (v < LIMITS["high"])).all()),
-    "high": means.array(lambda v: v.shape == (2, 1) and ((v > LIMITS["low"]) & (v <= 1e30)).all()),
-    "window": means.real(lambda v: 0 < v < np.inf),
-    "warm_up": means.real(lambda v: 0 <= v < 50),
-    "false_alarms": means.real(lambda v: 0 < v < 1),
-    "duration": means.real(lambda v: 0.05 < v < np.inf),
-}
 
 
 def filtered(linear):
     return [linear.transition, linear.early_y, linear.late_y, linear.held_u, linear.equilibrium]
 
 
-def bounds(limits):
-    return [limits.at(0.0), limits.at(0.2), limits.window, limits.warm_up, limits.false_alarms, limits.duration]
+def limits(**changes):
+    made = Limits(**{**LIMITS, **changes})
+    return [made.at(0.0), made.at(0.2)]
 
 
 def watched(limits, level, dt):
-    monitor = Monitor(limits, level, dt)
+    monitor, scores = Monitor(limits, level, dt), []
     monitor.reset(())
-    monitor.update(np.array([0.1]))
-    return [monitor.score, monitor._mean, monitor._square]
+    for residual in np.linspace(0.1, 0.3, 20):
+        monitor.update(np.array([residual]))
+        scores.append(monitor.score)
+    return scores
 
 
 def parts():
@@ -353,19 +300,18 @@ def parts():
         ("LinearFilter(nu)", "nu", 1, means.whole(0, 64), lambda v: filtered(LinearFilter(A, B, 0.1, v))),
         ("MLP(weight)", "weights", WEIGHTS[0], means.array(means.within((4, 2), 1e38)),
          lambda v: MLP([v, WEIGHTS[1]], BIASES, "tanh")(point), array_value),
-        ("MLP(bias)", "biases", BIASES[0], means.array(means.within((4,), 1e38)),
-         lambda v: MLP(WEIGHTS, [v, BIASES[1]], "tanh")(point), array_value),
         ("MLP(weights)", "weights", 1.0, means.nothing, lambda v: MLP(v, BIASES, "tanh")(point)),
-        ("MLP(biases)", "biases", 1.0, means.nothing, lambda v: MLP(WEIGHTS, v, "tanh")(point)),
         ("MLP(activation)", "activation", "tanh", means.one_of("tanh", "silu"),
          lambda v: MLP(WEIGHTS, BIASES, v)(point)),
         ("Monitor(limits)", "limits", known, means.instance(Limits), lambda v: watched(v, 0.2, 0.01)),
         ("Monitor(level)", "noise", 0.2, level, lambda v: watched(known, v, 0.01)),
         ("Monitor(dt)", "dt", 0.01, positive, lambda v: watched(known, 0.2, v)),
-        ("Limits.at(level)", "noise", 0.2, level, known.at),
-        *((f"Limits({name})", "limits|levels", good, RIGHT_LIMITS[name],
-           lambda v, name=name: bounds(Limits(**{**LIMITS, name: v})),
-           array_value if isinstance(good, np.ndarray) else scalar_value) for name, good in LIMITS.items()),
+        ("Limits(levels)", "limits|levels", LIMITS["levels"],
+         means.array(lambda v: v.shape in ((2,), (2, 1)) and v.flat[0] == 0 < v.flat[1] <= 1e30),
+         lambda v: limits(levels=v), array_value),
+        ("Limits(mean)", "limits|levels", LIMITS["mean"],
+         means.array(lambda v: v.shape == (2, 1) and ((v > 0) & (v <= 1e30)).all()),
+         lambda v: limits(mean=v), array_value),
     ))  # fmt: skip
 
 
@@ -382,42 +328,24 @@ def wrappers():
             ("measurement_noise", "measurement_noise", 0.2, means.levels(most)),
             ("ignore_input", "ignore_input", True, means.flag),
             ("monitor", "monitor", True, means.flag),
-            ("known_start", "known_start|forward map T", False, means.flag),
             ("uncertainty", "uncertainty|error bars", False, means.flag),
         ):
-            yield Entry(
-                WRAPPERS,
-                f"{kind.__name__}({name})",
-                says,
-                good,
-                meaning,
-                lambda _, v, kind=kind, inside=inside, name=name: driven(kind(inside(), **{name: v})),
-            )
-        yield Entry(WRAPPERS, f"{kind.__name__}(env)", "environments?|Env", None, means.nothing,
-                    lambda _, v, kind=kind: driven(kind(v)))  # fmt: skip
-    for kind, inside in ((KKLMemory, limited), (KKLVectorMemory, vector)):
-        yield from constructors(WRAPPERS, (
-            (f"{kind.__name__}(env)", "Env|VectorEnv", None, means.nothing, lambda v, kind=kind: driven(kind(v))),
-            (f"{kind.__name__}(measured)", "measured", [1], means.entries(2),
-             lambda v, kind=kind, inside=inside: driven(kind(inside(), v)), array_value),
-            (f"{kind.__name__}(time_constants)", "time_constants", [1.0, 4.0], means.array(means.time_constants),
-             lambda v, kind=kind, inside=inside: driven(kind(inside(), time_constants=v)), array_value),
-        ))  # fmt: skip
+            made = lambda _, v, kind=kind, inside=inside, name=name: driven(kind(inside(), **{name: v}))  # noqa: E731
+            yield Entry(WRAPPERS, f"{kind.__name__}({name})", says, good, meaning, made)
+    for kind in (KKLObservation, KKLVectorObservation, ActionRepeat, VectorActionRepeat, KKLMemory):
+        more = (2,) if kind in (ActionRepeat, VectorActionRepeat) else ()
+        made = lambda _, v, kind=kind, more=more: driven(kind(v, *more))  # noqa: E731
+        yield Entry(WRAPPERS, f"{kind.__name__}(env)", "environments?|Env", None, means.nothing, made)
     yield from constructors(WRAPPERS, (
+        ("KKLMemory(time_constants)", "time_constants", [1.0, 4.0], means.array(means.time_constants),
+         lambda v: driven(KKLMemory(limited(), time_constants=v)), array_value),
         ("ActionRepeat(repeat)", "repeat", 2, means.whole(1), lambda v: driven(ActionRepeat(limited(), v))),
-        ("ActionRepeat(env)", "Env|KKLVectorEnv", None, means.nothing, lambda v: driven(ActionRepeat(v, 2))),
         ("VectorActionRepeat(repeat)", "repeat", 2, means.whole(1),
          lambda v: driven(VectorActionRepeat(disabled(), v))),
-        ("VectorActionRepeat(env)", "KKLVectorEnv", None, means.nothing, lambda v: driven(VectorActionRepeat(v, 2))),
-        ("VectorActionRepeat(autoreset_mode)", "autoreset_mode", "SameStep", means.mode,
-         lambda v: driven(VectorActionRepeat(disabled(), 2, v))),
     ))  # fmt: skip
     for name, make, rows in (
         ("KKLObservation", lambda: KKLObservation(single()), ()),
-        ("ActionRepeat", lambda: ActionRepeat(KKLObservation(single()), 2), ()),
-        ("KKLMemory", lambda: KKLMemory(single()), ()),
         ("KKLVectorMemory", lambda: KKLVectorMemory(vector()), (N,)),
-        ("KKLVectorObservation", lambda: KKLVectorObservation(vector()), (N,)),
         ("z of SAME_STEP", lambda: KKLVectorObservation(vector(autoreset_mode="SameStep"), estimate="z"), (N,)),
         ("VectorActionRepeat", lambda: VectorActionRepeat(KKLVectorObservation(disabled()), 2), (N,)),
     ):

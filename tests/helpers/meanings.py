@@ -102,14 +102,6 @@ def levels(most=1e12, optional=True):
     return means
 
 
-def two_levels(value):
-    """Levels of measurement noise up to 1 and 2, one for each of two outputs or one for both."""
-    if isinstance(value, list | tuple | np.ndarray) and np.shape(value) == (2,):
-        both = [real(lambda sigma, most=most: 0 <= sigma <= most)(level) for level, most in zip(value, (1, 2))]
-        return all(right for right, _ in both), tuple(level for _, level in both)
-    return real(lambda sigma: 0 <= sigma <= 1)(value)
-
-
 def parameters(value):
     """Parameters of Van der Pol's oscillator."""
     finite = real(np.isfinite)
@@ -177,17 +169,6 @@ def mask(n):
     def means(value):
         right, found = bools((n,), optional=True)(value)
         return right and (found is None or found.any()), found
-
-    return means
-
-
-def entries(n):
-    """Some of n entries of an observation, each once; None is all."""
-
-    def means(value):
-        many = list(value) if isinstance(value, list | tuple | range | np.ndarray) and np.ndim(value) else []
-        right = bool(many) and len(set(many)) == len(many) and all(whole(0, n - 1)(one)[0] for one in many)
-        return value is None or right, many or None
 
     return means
 

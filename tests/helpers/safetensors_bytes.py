@@ -1,6 +1,9 @@
 """safetensors files by hand, with what the library would not write."""
 
+import hashlib
 import json
+
+from safetensors.numpy import save as serialise
 
 
 def content(tensors, metadata=None):
@@ -9,5 +12,24 @@ def content(tensors, metadata=None):
     for name, (dtype, shape, part) in tensors.items():
         header[name] = {"dtype": dtype, "shape": shape, "data_offsets": [len(data), len(data) + len(part)]}
         data += part
-    text = json.dumps(header).encode()
+    return _whole(header, data)
+
+
+def sealed(whole, key):
+    """The bytes of a file with the checksum that belongs to them, as of a file of the kind ``key``."""
+    end = 8 + int.from_bytes(whole[:8], "little")
+    header, data = json.loads(whole[8:end]), whole[end:]
+    header["__metadata__"][f"{key}-sha256"] = hashlib.sha256(_whole(header, data)).hexdigest()
+    return _whole(header, data)
+
+
+def with_arrays(arrays, key, described):
+    """The bytes of a file of arrays and what describes them, an object or a text."""
+    text = described if isinstance(described, str) else json.dumps(described)
+    return sealed(serialise(arrays, metadata={key: text}), key)
+
+
+def _whole(header, data):
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text + data

@@ -49,7 +49,8 @@ def open_loop(process_noise_share=0.0):
 def untrained(sampler, linear):
     """A network with weights that nobody trained, and the observer that it makes."""
     torch.manual_seed(0)
-    inputs = len(sampler.coordinates.noise_gain) + 2 + bool(sampler.process_noise_max)
+    told = np.size(sampler.measurement_noise_max) + 1 + bool(sampler.process_noise_max)
+    inputs = len(sampler.coordinates.whiten) + told
     network = Network(inputs, 2, width=8, depth=1, activation="tanh")
     return network, Artifact(linear, sampler.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
 

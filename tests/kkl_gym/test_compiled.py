@@ -1,5 +1,9 @@
+"""Sampling intervals in machine code, of single states and of batches, against those in Python and NumPy."""
+
+import copy
 import logging
 import math
+import pickle
 import sys
 import warnings
 from dataclasses import dataclass
@@ -7,62 +11,149 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from kinked_systems import SYSTEMS as KINKED
+from pushed_systems import Pendulum, TwoInputs
 
 import kkl_gym
-from kkl_gym import SYSTEMS, EquationError, System, get_system
-from kkl_gym.compiled import batch_step
-from kkl_gym.compiled.batch import compiled_step
-from kkl_gym.elementary import cos, sin, tanh
+from kkl_gym import SYSTEMS, EquationError, KKLEnv, KKLVectorEnv, System, get_system
+from kkl_gym.compiled import batch_step, single_step
+from kkl_gym.elementary import clip, exp, log, maximum, minimum, sign, sin, sqrt, tan, tanh, where
 from kkl_gym.simulate import advance, advance_batch
+from observers.thresholds import SOON
 
 DT = 0.01
-compiles = pytest.mark.usefixtures("compiler")
+GRAVITY = 9.81
+TABLE = {"k": 2.0}
+SHIPPED = [get_system(name) for name in SYSTEMS]
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def compiler():
     for library in ("numba", "sympy"):
         pytest.importorskip(library)
 
 
 @dataclass(frozen=True)
-class Unicycle(System):
-    """Inputs through a matrix that depends on the state, two outputs, a numerical rate."""
+class Elementary(System):
+    """All there is in kkl_gym.elementary, and branches, which single states allow."""
 
-    slip: float = 0.3
-
-    name = "unicycle"
-    X = ((-1, 1), (-1, 1), (-3, 3))
-    bounds = ((-10, 10), (-10, 10), (-30, 30))
-    u_max = (2.0, 3.0)
+    name = "elementary"
+    X = ((-2, 2), (0.5, 3), (-1, 1))
+    bounds = ((-5, 5), (-5, 5), (-5, 5))
 
     def f(self, x):
-        return self.slip * tanh(x[1]), -self.slip * x[0] ** 3, 0.0 * x[2]
-
-    def g(self, x):
-        return (cos(x[2]), 0.0), (sin(x[2]), 0.0), (0.0, 1.0)
+        a, b, c = x
+        if c > 0.2:
+            a = a + 0.1 * c
+        return (
+            tanh(b) * where(a > b, c, 1) - clip(a, -1, 1),
+            exp(-abs(b)) - log(1.0 + a * a) + maximum(a, c) / 3 - 0.3 * tan(0.1 * c),
+            sqrt(abs(a)) - sign(c) * minimum(b, 1.0),
+        )
 
     def h(self, x):
-        return x[0], x[1]
+        return (x[0],)
 
 
-class Branching(Unicycle):
-    """Equations that single states and symbols cannot share."""
+@dataclass(frozen=True, eq=False)
+class Decaying(System):
+    """A state that compiles in no time; two of these are never equal, nor are their parameters seen by ==."""
 
-    name = "branching"
+    a: float = 1.0
 
-    def f(self, x):
-        return np.where(x[1] > 0, x[1], 0.0), -x[0], 0.0 * x[2]
-
-
-@dataclass(frozen=True)
-class Autonomous(System):
-    name = "autonomous"
+    factor = 1.0
+    name = "decaying"
     X = ((0.5, 1),)
     bounds = ((-5, 5),)
 
     def f(self, x):
-        return (1.0 / (x[0] - 1.0),)
+        return (-self.a * self.factor * GRAVITY * x[0],)
+
+    def h(self, x):
+        return (x[0],)
+
+    def rate(self, x):
+        return 20.0
+
+
+def variant(f, name="variant", of=Decaying, **variables):
+    return type("Variant", (of,), {"name": name, "f": f, **variables})()
+
+
+def points(system, n=200, seed=0, factor=2.0):
+    """States, inputs and process noise."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(*system.box(factor), (n, system.nx)).T
+    u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None]
+    return x, u_max * rng.uniform(-1, 1, (system.nu, n)), scale * rng.uniform(-1, 1, x.shape)
+
+
+def rows(*arrays):
+    return zip(*(map(tuple, array.T.tolist()) for array in arrays), strict=True)
+
+
+def moved(step_of, system, dt=DT):
+    """The next states of a few, by one of both steps, and by Python or NumPy."""
+    x, u, w = points(system, 5)
+    if step_of is batch_step:
+        return batch_step(system)(x, u, w, dt), advance_batch(system, x, u, w, dt)
+    return [[step(*at, dt) for at in rows(x, u, w)] for step in (single_step(system), lambda *at: advance(system, *at))]
+
+
+@pytest.mark.parametrize("system", [*SHIPPED, Pendulum(), KINKED[1]], ids=lambda s: s.name)
+def test_a_batchs_step_is_numpys(system):
+    assert KKLVectorEnv(system, 2).compiled
+    step = batch_step(system)
+    x, u, w = points(system)
+    kinks = np.array([-1.5, -1.0, -0.5, 0.0, 0.3, 1.0, 1.5])
+    x[0, :7], x[1, 7:14] = kinks, kinks  # where the equations of KINKED[1] change
+    for dt in (DT, 0.2):
+        before, got = x.copy(), step(x, u, w, dt)
+        assert got.flags.c_contiguous
+        assert (x == before).all()
+        assert np.allclose(got, advance_batch(system, x, u, w, dt), rtol=1e-11, atol=1e-11, equal_nan=True)
+    for wild in (math.nan, math.inf, 1e200):  # which loses its row alone
+        lost = x.copy()
+        lost[:, 1] = wild
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            found = step(lost, u, w, dt)
+        assert not np.isfinite(found[:, 1]).all()
+        assert np.allclose(np.delete(found, 1, 1), np.delete(got, 1, 1), rtol=1e-13, atol=1e-13, equal_nan=True)
+    layout = step(*(np.asfortranarray(values)[:, ::2] for values in (x, u, w)), dt)
+    assert np.allclose(layout, got[:, ::2], rtol=1e-13, atol=1e-13, equal_nan=True)
+    assert step(x[:, :0], u[:, :0], w[:, :0], dt).shape == (system.nx, 0)
+
+
+@pytest.mark.parametrize("system", KINKED, ids=lambda s: s.name)
+def test_kinks_and_jumps_are_the_same_on_floats_and_arrays(system):
+    x, u, w = points(system, 50)
+    for dt in (DT, 0.2):
+        single = [advance(system, *at, dt) for at in rows(x, u, w)]
+        assert np.allclose(np.array(single).T, advance_batch(system, x, u, w, dt), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("system", [*SHIPPED, Pendulum(), TwoInputs(0.3), Elementary()], ids=lambda s: s.name)
+def test_a_single_step_is_pythons_to_the_last_bit(system):
+    assert single_step(system).obstacle is None
+    step = single_step(system).advance
+    for dt, n in ((DT, 300), (0.13, 100)):
+        for at in rows(*points(system, n, seed=7)):
+            assert np.array_equal(step(*at, dt), advance(system, *at, dt), equal_nan=True), at
+    for wild in (math.inf, math.nan, 1e200, -1e7):
+        at = (1.0,) * (system.nx - 1) + (wild,), [0.0] * system.nu, [0.0] * system.nx
+        assert np.array_equal(step(*at, DT), advance(system, *at, DT), equal_nan=True), wild
+
+
+@dataclass(frozen=True)
+class Poles(System):
+    """A division, and a negative power, at which Numba raises whatever the error model is."""
+
+    name = "poles"
+    X = ((0.5, 1), (0.5, 1))
+    bounds = ((-5, 5), (-5, 5))
+
+    def f(self, x):
+        return 1.0 / (x[0] - 1.0), 1e-3 * x[1] ** -2
 
     def h(self, x):
         return (x[0],)
@@ -71,208 +162,208 @@ class Autonomous(System):
         return 1.0
 
 
-systems = pytest.mark.parametrize("system", [*(get_system(name) for name in SYSTEMS), Unicycle()])
-
-
-def batch(system, n=200, seed=0):
-    rng = np.random.default_rng(seed)
-    x = rng.uniform(*system.box(2), (n, system.nx)).T
-    return x, rng.uniform(-1, 1, (system.nu, n)), rng.uniform(-1, 1, x.shape)
-
-
-@compiles
-@systems
-def test_the_systems_compile(system):
+@pytest.mark.parametrize("pole", [(1.0, 0.5), (0.5, 0.0)])
+def test_divisions_by_zero_lose_their_row_only(pole):
+    system, x = Poles(), np.array([pole, (0.5, 0.5)]).T
     assert batch_step(system).obstacle is None
-    assert kkl_gym.KKLVectorEnv(system, 2).compiled
+    got = batch_step(system)(x, np.zeros((0, 2)), np.zeros((2, 2)), DT)
+    assert not np.isfinite(got[:, 0]).all()
+    assert got[:, 1] == pytest.approx(advance(system, (0.5, 0.5), [], [0.0] * 2, DT))
 
 
-@compiles
-@systems
-@pytest.mark.parametrize("dt", [DT, 0.2])
-def test_compiled_is_numpys_step(system, dt):
-    x, u, w = batch(system)
-    before = x.copy()
-    expected = advance_batch(system, x, u, w, dt)
-    got = compiled_step(system)(x, u, w, dt)
-    assert got.flags.c_contiguous
-    assert (x == before).all()
-    assert np.allclose(got, expected, rtol=1e-11, atol=1e-11, equal_nan=True)
+class Singular(Elementary):
+    """Python raises where x1 = 0 and the motion ends there; an infinite number would go on as a finite one."""
 
-
-@compiles
-@pytest.mark.parametrize("system", KINKED, ids=str)
-def test_kinks_and_jumps_are_the_same_on_floats_arrays_and_compiled(system):
-    assert kkl_gym.KKLVectorEnv(system, 2).compiled
-    step = batch_step(system)
-    x, u, w = batch(system)
-    kinks = np.array([-1.5, -1.0, -0.5, 0.0, 0.3, 1.0, 1.5])
-    x[0, :7], x[1, 7:14] = kinks, kinks  # where the equations of either change
-    for dt in (DT, 0.2):
-        expected = advance_batch(system, x, u, w, dt)
-        single = [advance(system, tuple(xi), list(ui), list(wi), dt) for xi, ui, wi in zip(x.T, u.T, w.T, strict=True)]
-        assert np.isfinite(expected).all()
-        assert np.allclose(np.array(single).T, expected, rtol=1e-12, atol=1e-12)
-        assert np.allclose(step(x, u, w, dt), expected, rtol=1e-12, atol=1e-12)
-
-
-def test_any_memory_layout_and_no_rows():
-    system = Unicycle()
-    x, u, w = batch(system, 5)
-    expected = batch_step(system)(x, u, w, DT)
-    assert (batch_step(system)(*map(np.asfortranarray, (x, u, w)), DT) == expected).all()
-    some = batch_step(system)(x[:, ::2], u[:, ::2], w[:, ::2], DT)
-    assert np.allclose(some, expected[:, ::2], rtol=1e-13, atol=1e-13)
-    assert batch_step(system)(x[:, :0], u[:, :0], w[:, :0], DT).shape == (3, 0)
-
-
-@systems
-def test_lost_rows_are_nan_without_warning_and_leave_the_others(system):
-    x, u, w = batch(system, 4)
-    expected = batch_step(system)(x, u, w, DT)
-    for wild in (math.nan, math.inf, 1e200):
-        x[:, 1] = wild
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            got = batch_step(system)(x, u, w, DT)
-        assert not np.isfinite(got[:, 1]).all()
-        assert np.allclose(got[:, [0, 2, 3]], expected[:, [0, 2, 3]], rtol=1e-13, atol=1e-13)
-
-
-@compiles
-def test_division_by_zero_and_no_inputs():
-    got = compiled_step(Autonomous())(np.array([[1.0, 0.5]]), np.zeros((0, 2)), np.zeros((1, 2)), DT)
-    assert not np.isfinite(got[0, 0])
-    assert got[0, 1] == pytest.approx(advance_batch(Autonomous(), np.array([[0.5]]), [], np.zeros((1, 1)), DT)[0, 0])
-
-
-def test_parameters_are_the_systems_own():
-    x, u, w = batch(Unicycle(), 3)
-    fast, slow = (batch_step(Unicycle(slip))(x, u, w, DT) for slip in (3.0, 0.0))
-    assert not np.allclose(fast, slow)
-
-
-@compiles
-def test_numpy_where_equations_cannot_be_compiled(caplog):
-    """And somebody who asks is told so, and why."""
-    with pytest.raises(EquationError, match=r"use kkl_gym\.elementary\.where") as raised:
-        compiled_step(Branching())
-    with caplog.at_level(logging.INFO, "kkl_gym"):
-        step = batch_step(Branching(slip=0.31))
-    assert step.obstacle == f"EquationError: {raised.value}"
-    assert [record.getMessage() for record in caplog.records] == [
-        f"branching goes on with NumPy, not compiled: {step.obstacle}"
-    ]
-    assert not kkl_gym.KKLVectorEnv(Branching(slip=0.31), 2).compiled
-    assert len(caplog.records) == 1  # once for each system
-    x, u, w = batch(Branching(), 3)
-    assert (step(x, u, w, DT) == advance_batch(Branching(), x, u, w, DT)).all()
-
-
-@compiles
-@pytest.mark.parametrize(("unit", "second"), [(1.0, 1.0), (1e-12, 1.0), (1.0, 1e-9)])
-def test_equations_that_mean_something_else_to_symbols(unit, second):
-    class Comparing(Unicycle):
-        name = "comparing"
-        X = ((-unit, unit),) * 3
-        bounds = ((-9 * unit, 9 * unit),) * 3
-
-        def f(self, x):
-            still = x[0] == 1.0 * x[0]  # true for numbers; sympy compares how it is written
-            return ((0.0 if np.all(still) else unit) + x[1]) / second, x[0] / second, x[2] / second
-
-    with pytest.raises(ValueError, match="symbols"):
-        compiled_step(Comparing())
-    assert "symbols" in batch_step(Comparing()).obstacle
-
-
-class Filled(Unicycle):
-    """sin(x)/x with its limit at zero, where symbols see no special case."""
-
-    name = "filled"
+    name = "singular"
 
     def f(self, x):
-        return np.where(np.equal(x[0], 0), 1.0, sin(x[0]) / (x[0] + 1.0 * np.equal(x[0], 0))), x[0], x[2]
+        return x[1] - 1.0 / (1.0 + 1.0 / abs(x[0])), where(abs(x[0]) > 1e-9, sin(x[0]) / x[0], 1.0), -x[2]
 
 
-class Rooted(Unicycle):
-    """Not a number for negative states, unless somebody simplifies."""
+@pytest.mark.parametrize("x0", [(0.0, 0.0, 0.0), (1e-3, 1.0, 0.0)])
+def test_divisions_by_zero_of_a_single_state_end_as_in_python(x0):
+    at = x0, [], [0.0] * 3
+    assert single_step(Singular()).obstacle is None
+    assert np.array_equal(single_step(Singular())(*at, DT), advance(Singular(), *at, DT), equal_nan=True)
 
-    name = "rooted"
+
+@pytest.mark.parametrize("step_of", [single_step, batch_step])
+def test_parameters_are_the_systems_own(step_of):
+    slow, fast = (moved(step_of, Decaying(a)) for a in (1.0, 5.0))
+    np.testing.assert_allclose(*slow, rtol=1e-12)
+    np.testing.assert_allclose(*fast, rtol=1e-12)
+    assert not np.allclose(slow[0], fast[0])
+
+
+def compared(unit, second):
+    """Equations of which one comparison means something else to symbols."""
 
     def f(self, x):
-        return x[0] ** 0.5 * x[0] ** 0.5, x[1], x[2]
+        still = x[0] == 1.0 * x[0]  # true for numbers; sympy compares how it is written
+        return (((0.0 if np.all(still) else unit) + x[0]) / second,)
+
+    return variant(f, X=((-unit, unit),), bounds=((-9 * unit, 9 * unit),), rate=lambda self, x: 1.0 / second)
 
 
-class Random(Unicycle):
-    name = "random"
-
-    def f(self, x):
-        return np.random.default_rng().random() + x[0], x[1], x[2]
-
-
-class Long(Unicycle):
-    name = "long"
-
-    def f(self, x):
-        return sum(sin(i + x[0]) * x[1] for i in range(200)), x[1], x[2]
-
-
-@compiles
 @pytest.mark.parametrize(
-    ("kind", "obstacle"),
-    [(Filled, "elementary"), (Rooted, "symbols"), (Random, "not the same"), (Long, "too long")],
+    ("system", "obstacle"),
+    [
+        (compared(1e-12, 1.0), "symbols"),
+        (compared(1.0, 1e-9), "symbols"),
+        (variant(lambda self, x: (x[0] ** 0.5 * x[0] ** 0.5,), X=((-1, 1),)), "symbols"),  # which simplify it
+        (variant(lambda self, x: (np.where(x[0] > 0, x[0], 0.0),)), r"use kkl_gym.elementary.where"),
+        (variant(lambda self, x: (np.random.default_rng().random() + x[0],)), "not the same"),
+        (variant(lambda self, x: (sum(sin(i + x[0]) * x[0] for i in range(200)),)), "too long"),
+    ],
+    ids=["small", "quick", "rooted", "where", "random", "long"],
 )
-def test_equations_better_left_to_numpy(kind, obstacle):
-    assert obstacle in batch_step(kind()).obstacle
+def test_numpy_goes_on_where_equations_cannot_be_compiled_and_the_log_says_why(system, obstacle, caplog):
+    with caplog.at_level(logging.INFO, "kkl_gym"):
+        step = batch_step(system)
+        assert batch_step(system).obstacle == step.obstacle
+    assert obstacle in step.obstacle
+    (record,) = caplog.records  # once for each system
+    assert record.getMessage() == f"variant goes on with NumPy, not compiled: {step.obstacle}"
+    if "elementary" in obstacle:
+        assert not KKLVectorEnv(system, 2).compiled
+        np.testing.assert_array_equal(*moved(batch_step, system))
 
 
-@dataclass(frozen=True)
-class Pole(System):
-    """Negative powers, which Numba raises at zero whatever it is told."""
-
-    name = "pole"
-    X = ((0.5, 1),)
-    bounds = ((-5, 5),)
-
-    def f(self, x):
-        return (1e-3 * x[0] ** -2,)
-
-    def rate(self, x):
-        return 1.0 + 0.0 * x[0]
-
-    def h(self, x):
-        return (x[0],)
+def from_table(self, x):
+    return (-TABLE["k"] * x[0],)
 
 
-def test_negative_powers_at_zero_lose_their_row_only():
-    got = batch_step(Pole())(np.array([[0.0, 0.5]]), np.zeros((0, 2)), np.zeros((1, 2)), DT)
-    assert not np.isfinite(got[0, 0])
-    assert got[0, 1] == pytest.approx(0.5 + 1e-5 / 0.25, rel=1e-3)
+@pytest.mark.parametrize(
+    ("system", "why"),
+    [
+        (variant(lambda self, x: (x[0] ** 3,)), "f has a power; products"),
+        (variant(lambda self, x: tuple(-xi for xi in x)), "f makes functions"),
+        (variant(lambda self, x: (self.helper(x),), helper=lambda self, x: -x[0]), "f reads helper"),
+        (variant(from_table), "f uses TABLE"),
+        (variant(eval("lambda self, x: (" + " + ".join(["sin(x[0])"] * 200) + ",)")), "f is too long"),
+    ],
+)
+def test_what_cannot_be_compiled_stays_in_python_and_the_log_says_why(system, why, caplog):
+    with caplog.at_level(logging.INFO, "kkl_gym"):
+        assert why in single_step(system).obstacle
+        assert single_step(system).obstacle
+    (record,) = caplog.records
+    assert record.getMessage().startswith(f"single steps of {system.name} stay in Python: ")
 
 
-def test_systems_that_count_as_equal_are_told_apart():
-    @dataclass(frozen=True, eq=False)
-    class Decaying(System):
-        a: float
-
-        name = "decaying"
-        X = ((0.5, 1),)
-        bounds = ((-5, 5),)
-
-        def f(self, x):
-            return (-self.a * x[0],)
-
-        def h(self, x):
-            return (x[0],)
-
-    x = np.ones((1, 1))
-    steps = [batch_step(Decaying(a))(x, np.zeros((0, 1)), np.zeros((1, 1)), 0.1)[0, 0] for a in (1.0, 5.0)]
-    assert steps == pytest.approx([np.exp(-0.1), np.exp(-0.5)], rel=1e-5)
-
-
-@compiles
-@pytest.mark.parametrize(("missing", "slip"), [("numba", 0.123), ("sympy", 0.124)])
-def test_numpy_where_a_library_is_missing(monkeypatch, missing, slip):
+@pytest.mark.parametrize("missing", ["numba", "sympy"])
+def test_where_a_library_is_missing(missing, monkeypatch):
     monkeypatch.setitem(sys.modules, missing, None)
-    assert missing in batch_step(Unicycle(slip)).obstacle
+    system = variant(lambda self, x: (-x[0],), name=f"without_{missing}")
+    assert f"import of {missing}" in batch_step(system).obstacle
+    assert (missing == "numba") == (single_step(system).obstacle is not None)
+
+
+HERE = sys.modules[__name__]
+CHANGES = [
+    (Decaying, "factor", 3),
+    (Decaying, "f", lambda self, x: (-2.0 * x[0],)),
+    (HERE, "GRAVITY", 3.7),
+]
+
+
+@pytest.mark.parametrize(("where", "name", "value"), CHANGES)
+def test_what_the_equations_read_is_looked_up_anew(where, name, value, monkeypatch):
+    before, _ = moved(single_step, Decaying())
+    monkeypatch.setattr(where, name, value)
+    after, expected = moved(single_step, Decaying())
+    np.testing.assert_allclose(after, expected, rtol=1e-12)
+    assert not np.allclose(after, before)
+
+
+def test_what_a_batchs_equations_read_elsewhere_is_compared_anew(monkeypatch):
+    system = variant(from_table)
+    assert batch_step(system).obstacle is None
+    monkeypatch.setitem(TABLE, "k", 3.0)
+    np.testing.assert_allclose(*moved(batch_step, system), rtol=1e-12)
+
+
+def episode(env, seed, steps, gain=0.5):
+    obs, info = env.reset(seed=seed)
+    found = [(obs, info["x"], info["y"])]
+    for k in range(steps):
+        obs, reward, terminated, _, info = env.step(np.full(env.action_space.shape, gain * math.sin(0.01 * k)))
+        found.append((obs, info["x"], info["y"], info["u"], reward, terminated))
+        if terminated:
+            break
+    return found
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """The systems of which environments have asked for a compiled step."""
+    systems = []
+
+    def asking(system):
+        systems.append(system)
+        return single_step(system)
+
+    monkeypatch.setattr(kkl_gym.envs, "single_step", asking)
+    return systems
+
+
+@pytest.mark.parametrize("system", ["lorenz", Pendulum()], ids=str)
+def test_episodes_are_the_same_with_it_and_without(system, asked):
+    env = KKLEnv(system)
+    in_python = episode(env, 3, SOON + 300)
+    assert not asked
+    compiled = episode(env, 3, SOON + 300)
+    assert asked
+    for a, b in zip(in_python, compiled, strict=True):
+        assert all(np.array_equal(p, q) for p, q in zip(a, b, strict=True))
+    twins = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    action = np.full(env.action_space.shape, 0.3)
+    expected = env.step(action)
+    for twin in twins:
+        assert all(np.array_equal(a, b) for a, b in zip(twin.step(action)[:4], expected[:4], strict=True))
+
+
+def test_it_waits_for_a_reset_after_many_steps_of_one_system(asked):
+    env = KKLEnv("lorenz")
+    for steps in (SOON // 2, SOON // 2 - 1, 3):
+        episode(env, 0, steps)
+    assert not asked
+    env.reset(seed=0)
+    assert len(asked) == 1
+    env = KKLEnv("lorenz")
+    for rho in (26.0, 27.0):
+        env.system = env.system.replace({"rho": rho})
+        episode(env, 0, SOON)
+    assert len(asked) == 1
+    env.reset(seed=0)
+    assert asked[-1].rho == 27.0  # it has stayed
+
+
+def test_an_environment_that_is_given_another_system_takes_its_equations():
+    one, other = (KKLEnv("lorenz", parameters={"rho": rho}) for rho in (28.0, 20.0))
+    episode(one, 0, SOON)
+    for env in (one, other):
+        env.reset(seed=1, options={"x0": [1.0, 2.0, 20.0]})
+    one.system = other.system
+    (_, reward, *_, info), (_, expected, *_, there) = one.step([0.3]), other.step([0.3])
+    assert (info["x"] == there["x"]).all()
+    assert reward == expected  # at the other's target
+    with pytest.raises(ValueError, match="exchanged for another 'lorenz', got Rossler"):
+        one.system = get_system("rossler")
+    with pytest.raises(EquationError):  # which has no such target
+        one.system = get_system("lorenz").replace({"rho": 0.5})
+    assert one.system is other.system
+    for name in ("dt", "measurement_noise", "process_noise"):
+        with pytest.raises(AttributeError):
+            setattr(one, name, 0.1)
+
+
+def test_a_vector_that_is_given_another_system_takes_its_equations():
+    one, other = (KKLVectorEnv(Decaying(a), 200) for a in (1.0, 5.0))
+    for env in (one, other):
+        env.reset(seed=1, options={"x0": [0.7]})
+    assert one.compiled
+    one.system = other.system
+    (_, reward, *_, info), (_, expected, *_, there) = (env.step(np.zeros((200, 0))) for env in (one, other))
+    np.testing.assert_array_equal(info["x"], there["x"])
+    np.testing.assert_array_equal(reward, expected)

@@ -16,7 +16,6 @@ BOUNDS = "must be a tuple of positive numbers, one for each input, as in (1.0,)"
 MATRIX = "must be 2 rows of 1 numbers, for 2 states and 1 inputs, or override g(x)"
 POSITIVE = "must be 2 positive numbers, one for each state"
 NAME = "must be a text without slash and colon, for it names files"
-PORTRAIT = "must be two indices of its 2 states, as in (0, 1)"
 NAMES = "must be a tuple of 2 texts, one for each state"
 LEVEL = "must be a number, not below zero"
 DT = "must be a positive number of seconds"
@@ -50,25 +49,14 @@ def test_a_parameter_that_is_not_declared_anew_is_refused():
     assert dataclass(frozen=True)(Annotated)().mu == 1.0
 
 
-def test_what_a_constructor_sets_would_be_lost():
+def test_what_would_be_lost_is_refused_of_parents_too():
     with pytest.raises(TypeError, match="Tank defines __init__, and would be made anew without what that sets"):
         declared(__init__=lambda self: None)
-
-
-def test_what_parents_would_lose_is_refused_too():
-    class Hardware:
-        mu = 2.0
-
-        def __init__(self):
-            self.drag = 1.0
-
-    class Softer:
-        mu = 2.0
-
+    hardware = type("Hardware", (), {"__init__": lambda self: None})
     with pytest.raises(TypeError, match="Boat defines __init__, and would be made anew"):
-        type("Boat", (Hardware, VanDerPol), {"name": "boat"})
+        type("Boat", (hardware, VanDerPol), {"name": "boat"})
     with pytest.raises(TypeError, match=r"Mixed: mu = 2\.0 does not change the parameter mu"):
-        type("Mixed", (Softer, VanDerPol), {"name": "mixed"})
+        type("Mixed", (type("Softer", (), {"mu": 2.0}), VanDerPol), {"name": "mixed"})
 
 
 def test_slots_are_taken():
@@ -88,18 +76,14 @@ def test_lists_arrays_and_numbers_of_numpy_become_tuples_of_numbers():
         G=np.array([[0], [1]]),
         scale=[1, np.float64(2)],
         X_centre=np.zeros(2),
-        portrait=np.array([0, 1]),
-        process_noise=np.float32(0.5),
         measurement_noise=[0.5],
         dt=np.float64(0.5),
     )
-    assert cls.X == ((-1.0, 1.0), (-1.5, 1.0))
-    assert cls.bounds == ((-2, 2.0), (-2.0, 2))
-    assert (cls.u_max, cls.G, cls.scale, cls.X_centre) == ((3.0,), ((0.0,), (1.0,)), (1, 2.0), (0.0, 0.0))
-    assert (cls.process_noise, cls.measurement_noise, cls.dt) == (0.5, (0.5,), 0.5)
-    numbers = np.ravel([*cls.X, *cls.bounds, cls.u_max * 2, cls.scale, cls.X_centre, (cls.dt, cls.process_noise)])
-    assert all(type(number) in (int, float) for number in (*cls.X[0], *cls.bounds[0], *cls.bounds[1], cls.dt))
-    assert np.isfinite(numbers).all()
+    boxes = (cls.X, cls.bounds, cls.u_max, cls.G, cls.scale, cls.X_centre, cls.measurement_noise, cls.dt)
+    assert repr(boxes) == (
+        "(((-1.0, 1.0), (-1.5, 1.0)), ((-2, 2.0), (-2.0, 2)), (3.0,), ((0.0,), (1.0,)), (1, 2.0), (0.0, 0.0), (0.5,), "
+        "0.5)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,93 +91,36 @@ def test_lists_arrays_and_numbers_of_numpy_become_tuples_of_numbers():
     [
         # Names
         ({"name": LEFT_OUT}, "Tank must set the class variables name, X and bounds; it lacks name"),
-        ({"X": LEFT_OUT}, "Tank must set the class variables name, X and bounds; it lacks X"),
-        ({"bounds": LEFT_OUT}, "Tank must set the class variables name, X and bounds; it lacks bounds"),
-        ({"name": 5}, f"name = 5 {NAME}"),
-        ({"name": None}, f"name = None {NAME}"),
-        ({"name": " "}, f"name = ' ' {NAME}"),
         ({"name": "a/b"}, f"name = 'a/b' {NAME}"),
         # Boxes
-        ({"X": None}, f"X = None {PAIRS}"),
         ({"X": ()}, f"X = () {PAIRS}"),
-        ({"X": (-1, 1)}, f"X = (-1, 1) {PAIRS}"),
-        ({"X": "box"}, f"X = 'box' {PAIRS}"),
-        ({"X": 1.0}, f"X = 1.0 {PAIRS}"),
         ({"X": np.array(1.0)}, f"X = array(1.) {PAIRS}"),
         ({"X": {"angle": (-1, 1)}}, f"X = {{'angle': (-1, 1)}} {PAIRS}"),
         ({"X": ((-1, 1), (-1, "1"))}, f"X = ((-1, 1), (-1, '1')) {PAIRS}"),
-        ({"X": ((-1, 1), (-1, 1j))}, f"X = ((-1, 1), (-1, 1j)) {PAIRS}"),
-        ({"X": ((-1, 1), (-1, True))}, f"X = ((-1, 1), (-1, True)) {PAIRS}"),
-        ({"X": ((-1, 1), (-1, None))}, f"X = ((-1, 1), (-1, None)) {PAIRS}"),
-        ({"X": ((-1, 1), (-1, 0, 1))}, f"X = ((-1, 1), (-1, 0, 1)) {PAIRS}"),
         ({"X": ((math.nan, 1), (-1, 1))}, f"X = ((nan, 1), (-1, 1)) {PAIRS}"),
-        ({"X": ((1, -1), (-1, 1))}, "X[0] = (1, -1) must be (low, high), low before high"),
         ({"X": ((-1, 1), (1, 1))}, "X[1] = (1, 1) must be (low, high), low before high"),
         ({"X": ((-1, 1), (-3, 1))}, "X[1] = (-3, 1) must be within bounds[1] = (-2, 2)"),
-        ({"bounds": ((-2, 2), (-2, 0.5))}, "X[1] = (-1, 1) must be within bounds[1] = (-2, 0.5)"),
-        ({"bounds": ((2, -2), (-2, 2))}, "bounds[0] = (2, -2) must be (low, high), low before high"),
-        ({"bounds": ((-2, 2), (-2, math.inf))}, f"bounds = ((-2, 2), (-2, inf)) {PAIRS}"),
         ({"bounds": ((-2, 2),)}, "Tank: X has 2 states and bounds has 1"),
-        ({"bounds": [[-2, 2], [-2, 10**400]]}, f"{PAIRS}"),
         # Inputs
         ({"u_max": 1.0}, f"u_max = 1.0 {BOUNDS}"),
-        ({"u_max": "1"}, f"u_max = '1' {BOUNDS}"),
-        ({"u_max": None}, f"u_max = None {BOUNDS}"),
         ({"u_max": (0.0,)}, f"u_max = (0.0,) {BOUNDS}"),
-        ({"u_max": (-1.0,)}, f"u_max = (-1.0,) {BOUNDS}"),
-        ({"u_max": (math.inf,)}, f"u_max = (inf,) {BOUNDS}"),
-        ({"u_max": ((-1, 1),)}, f"u_max = ((-1, 1),) {BOUNDS}"),
-        (
-            {"u_max": LEFT_OUT},
-            "Tank: G = ((0.0,), (1.0,)) needs u_max, the bound of each input; without it",
-        ),
-        (
-            {"u_max": LEFT_OUT, "G": LEFT_OUT, "g": lambda self, x: ((0.0,), (1.0,))},
-            "Tank: g(x) needs u_max, the",
-        ),
+        ({"u_max": LEFT_OUT}, "Tank: G = ((0.0,), (1.0,)) needs u_max, the bound of each input; without it"),
+        ({"u_max": LEFT_OUT, "G": LEFT_OUT, "g": lambda self, x: ((0.0,),) * 2}, "Tank: g(x) needs u_max, the"),
         ({"u_max": (1.0, 1.0)}, "must be 2 rows of 2 numbers, for 2 states and 2 inputs, or override g(x)"),
-        ({"G": (0.0, 1.0)}, f"G = (0.0, 1.0) {MATRIX}"),
-        ({"G": ((1.0,),)}, f"G = ((1.0,),) {MATRIX}"),
-        ({"G": ((0.0,), (1.0, 2.0))}, f"G = ((0.0,), (1.0, 2.0)) {MATRIX}"),
-        ({"G": ((0.0,), ("1",))}, f"G = ((0.0,), ('1',)) {MATRIX}"),
-        ({"G": ()}, f"G = () {MATRIX}"),
-        ({"G": 1.0}, f"G = 1.0 {MATRIX}"),
         # What the states are like
-        ({"scale": 1.0}, f"scale = 1.0 {POSITIVE}"),
-        ({"scale": (1.0,)}, f"scale = (1.0,) {POSITIVE}"),
         ({"scale": (1.0, 0.0)}, f"scale = (1.0, 0.0) {POSITIVE}"),
-        ({"scale": (1.0, math.nan)}, f"scale = (1.0, nan) {POSITIVE}"),
-        ({"X_centre": (0.0, math.inf)}, "X_centre = (0.0, inf) must be 2 finite numbers, one for each state"),
-        ({"X_centre": 0.0}, "X_centre = 0.0 must be 2 finite numbers, one for each state"),
-        ({"state_names": "ab"}, f"state_names = 'ab' {NAMES}"),
+        ({"G": ((0.0,), (1.0, 2.0))}, f"G = ((0.0,), (1.0, 2.0)) {MATRIX}"),
+        ({"portrait": (0, 2)}, "portrait = (0, 2) must be two indices of its 2 states, as in (0, 1)"),
         ({"state_names": ("angle",)}, f"state_names = ('angle',) {NAMES}"),
-        ({"state_names": ("angle", 2)}, f"state_names = ('angle', 2) {NAMES}"),
-        ({"state_names": 2}, f"state_names = 2 {NAMES}"),
-        ({"portrait": (0, 2)}, f"portrait = (0, 2) {PORTRAIT}"),
-        ({"portrait": (0.0, 1.0)}, f"portrait = (0.0, 1.0) {PORTRAIT}"),
-        ({"portrait": (False, True)}, f"portrait = (False, True) {PORTRAIT}"),
-        ({"portrait": (0,)}, f"portrait = (0,) {PORTRAIT}"),
-        ({"portrait": 1}, f"portrait = 1 {PORTRAIT}"),
         # Noise and time
         ({"process_noise": -0.1}, f"process_noise = -0.1 {LEVEL}"),
-        ({"process_noise": math.nan}, f"process_noise = nan {LEVEL}"),
-        ({"process_noise": "0.1"}, f"process_noise = '0.1' {LEVEL}"),
-        ({"process_noise": (0.1, 0.1)}, f"process_noise = (0.1, 0.1) {LEVEL}"),
-        ({"process_noise": None}, f"process_noise = None {LEVEL}"),
-        ({"measurement_noise": -0.5}, f"measurement_noise = -0.5 {LEVEL}, or one for each output"),
         ({"measurement_noise": (0.5, -0.5)}, f"measurement_noise = (0.5, -0.5) {LEVEL}, or one for each output"),
-        ({"measurement_noise": None}, f"measurement_noise = None {LEVEL}, or one for each output"),
         ({"dt": 0}, f"dt = 0 {DT}"),
-        ({"dt": "0.01"}, f"dt = '0.01' {DT}"),
-        ({"dt": math.inf}, f"dt = inf {DT}"),
         ({"step": lambda self, x, u: x}, "Tank defines step and must set dt, the sampling interval in seconds"),
         # What is something else
         ({"g": 9.81}, "g = 9.81 must be a method; a parameter g needs another name"),
-        ({"f": None}, "f = None must be a method"),
-        ({"h": (0,)}, "h = (0,) must be a method"),
         ({"rate": 5.0}, "rate = 5.0 must be a method"),
         ({"nx": 2}, "nx = 2 follows from X: leave it out"),
-        ({"ny": 1}, "ny = 1 follows from h(x): leave it out"),
     ],
     ids=lambda value: ", ".join(value) if isinstance(value, dict) else "",
 )
@@ -232,11 +159,7 @@ def test_class_variables_may_be_annotated_as_such():
 
 
 def test_an_autonomous_variant_leaves_the_inputs_of_its_parent_out():
-    class Free(VanDerPol):
-        name = "free"
-        u_max = ()
-
-    assert Free().nu == 0
+    assert type("Free", (VanDerPol,), {"name": "free", "u_max": ()})().nu == 0
 
 
 def test_another_system_needs_a_name():

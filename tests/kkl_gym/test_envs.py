@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kkl_gym
-from kkl_gym import ENV_IDS, KKLEnv, Lorenz, Rossler, System, get_system
+from kkl_gym import ENV_IDS, KKLEnv, Lorenz, System, get_system
 from kkl_gym.elementary import sin
 from kkl_gym.plant import NOISE_BLOCK, output_bounds
 from kkl_gym.simulate import SubstepsError, advance
@@ -46,22 +46,14 @@ def play(env, steps, seed=None, actions=None, reset=True):
 def test_checkers_are_content(name, observe):
     env = gym.make(ENV_IDS[name], observe=observe)
     check_env(env.unwrapped, skip_render_check=True)
+    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
+    sb3.check_env(env)
 
 
-@everyone
-def test_checkers_are_content_with_rendering(name):
+def test_checkers_are_content_with_rendering():
     for needed in ("matplotlib", "pygame"):
         pytest.importorskip(needed)
-    check_env(gym.make(ENV_IDS[name]).unwrapped)
-
-
-@everyone
-@both
-def test_sb3s_checker_is_content(name, observe):
-    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
-    env = gym.make(ENV_IDS[name], observe=observe)
-    sb3.check_env(env)
-    sb3.check_env(env.unwrapped)
+    check_env(gym.make("KKLLorenz-v0").unwrapped)
 
 
 def test_ids():
@@ -72,11 +64,7 @@ def test_ids():
         "lorenz": "KKLLorenz-v0",
     }
     assert gym.make("kkl_gym:KKLLorenz-v0").unwrapped.system == Lorenz()
-
-
-def test_unknown_id():
-    with pytest.raises(gym.error.Error):
-        gym.make("KKLNonsense-v0")
+    assert {gym.spec(id_).max_episode_steps for id_ in ENV_IDS.values()} == {5000}
 
 
 @everyone
@@ -85,19 +73,11 @@ def test_equal_seeds_give_equal_episodes(name, observe):
     a, b = (gym.make(ENV_IDS[name], observe=observe) for _ in range(2))
     play(b, 10, seed=5)  # whatever came before
     first = play(a, 150, seed=3)  # longer than two blocks of noise
-    assert np.array_equal(first, play(b, 150, seed=3))
-    assert np.array_equal(first, play(a, 150, seed=3))
-    assert not np.array_equal(first, play(a, 150, seed=4))
-
-
-@everyone
-def test_a_second_reset_without_seed_differs_but_reproducibly(name):
-    a, b = (gym.make(ENV_IDS[name]) for _ in range(2))
-    first = play(a, 20, seed=3)
     second = play(a, 20)
-    assert (first[0, -2:] != second[0, -2:]).all()
-    play(b, 20, seed=3)
+    assert np.array_equal(first, play(b, 150, seed=3))
     assert np.array_equal(second, play(b, 20))
+    assert (first[0, -2:] != second[0, -2:]).all()
+    assert not np.array_equal(first, play(a, 150, seed=4))
 
 
 @everyone
@@ -112,36 +92,34 @@ def test_starts_are_uniform_in_the_training_box(name):
     assert np.allclose(u.std(0), 12**-0.5, atol=0.02)
 
 
-def test_spec_round_trip():
+@pytest.mark.parametrize("own", [False, True])
+def test_spec_round_trip(own, script):
+    system = {"system": f"{script}:Pendulum", "parameters": {"damping": 0.4}} if own else {"parameters": {"rho": 15.0}}
     env = gym.make(
         "KKLLorenz-v0",
-        parameters={"rho": 15.0, "sigma": 9.0},
+        **system,
         dt=0.02,
         observe="output",
         measurement_noise=0.1,
         process_noise=0.2,
         max_episode_steps=70,
     )
-    text = env.spec.to_json()
-    again = gym.make(EnvSpec.from_json(text))
-    assert again.unwrapped.system == Lorenz(rho=15, sigma=9)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.system == (get_system(*system.values()) if own else Lorenz(rho=15))
     assert again.spec.max_episode_steps == 70
     assert (again.unwrapped.dt, again.unwrapped.observe) == (0.02, "output")
     assert (again.unwrapped.measurement_noise, again.unwrapped.process_noise) == (0.1, 0.2)
     assert again.observation_space == env.observation_space
-    assert np.array_equal(play(env, 50, seed=1), play(again, 50, seed=1))
-    assert json.loads(again.spec.to_json()) == json.loads(text)
+    assert np.array_equal(play(env, 20, seed=1), play(again, 20, seed=1))
+    assert json.loads(again.spec.to_json()) == json.loads(env.spec.to_json())
 
 
-PROPERTY = {name: {o: KKLEnv(name, observe=o) for o in ("state", "output")} for name in ENV_IDS}
-
-
-@everyone
-@both
-@settings(deadline=None, max_examples=25, derandomize=True)
+@pytest.mark.parametrize(("name", "observe"), [("lorenz", "state"), ("rossler", "output"), ("van_der_pol", "state")])
+@settings(deadline=None, max_examples=10, derandomize=True)
 @given(data=st.data(), seed=st.integers(0, 2**31))
 def test_any_start_and_any_actions(name, observe, data, seed):
-    env = PROPERTY[name][observe]
+    env = KKLEnv(name, observe=observe)
+    sizes = {"y": env.system.ny, "x": env.system.nx, "u": env.system.nu}
     x0 = data.draw(st.tuples(*(st.floats(*bounds) for bounds in env.system.bounds)))
     actions = data.draw(st.lists(st.floats(allow_nan=False, allow_infinity=False, width=32), max_size=40))
     obs, info = env.reset(seed=seed, options={"x0": x0})
@@ -156,20 +134,19 @@ def test_any_start_and_any_actions(name, observe, data, seed):
         assert obs.dtype == np.float32
         assert np.isfinite(obs).all()
         assert obs in env.observation_space
+        assert np.array_equal(obs, info["x" if observe == "state" else "y"].astype(np.float32))
         assert type(reward) is float
         assert 0 <= reward <= 1
         assert type(terminated) is bool
         assert truncated is False
         assert info["escaped"] == terminated
-        assert info["escaped"].dtype == np.bool_
-        assert all(isinstance(value, np.ndarray) for value in info.values())
         assert list(info) == ["y", "x", "u", "sample", "escaped"]
-        assert info["sample"].shape == ()
-        assert info["sample"].dtype == np.int64
-        for key, size in (("y", env.system.ny), ("x", env.system.nx), ("u", env.system.nu)):
-            assert info[key].dtype == np.float64
-            assert info[key].shape == (size,)
-            assert np.isfinite(info[key]).all()
+        assert {key: (info[key].dtype, info[key].shape) for key in info} == {
+            **{key: (np.float64, (size,)) for key, size in sizes.items()},
+            "sample": (np.int64, ()),
+            "escaped": (np.bool_, ()),
+        }
+        assert all(np.isfinite(info[key]).all() for key in sizes)
         if terminated:
             break
 
@@ -189,52 +166,33 @@ def test_reward_is_one_at_the_target_and_follows_the_formula(name):
         assert reward < 1
 
 
-@everyone
 @both
-def test_observations_are_what_info_says(name, observe):
-    env = KKLEnv(name, observe=observe)
-    obs, info = env.reset(seed=2)
-    for _ in range(20):
-        shown = info["x" if observe == "state" else "y"]
-        assert np.array_equal(obs, shown.astype(np.float32))
-        obs, _, _, _, info = env.step(np.zeros(1))
-
-
-@both
-def test_observations_and_infos_are_copies(observe):
+def test_results_are_copies(observe):
     env, other = (KKLEnv("lorenz", observe=observe) for _ in range(2))
     obs, info = env.reset(seed=0)
     other.reset(seed=0)
     for _ in range(3):
         for array in (obs, *info.values()):
             array[...] = 7
-        obs, *_, info = env.step(np.ones(1))
-        expected = other.step(np.ones(1))
-        assert np.array_equal(obs, expected[0])
-        for key in info:
-            assert np.array_equal(info[key], expected[-1][key])
+        (obs, *_, info), (expected, *_, theirs) = env.step(np.ones(1)), other.step(np.ones(1))
+        assert np.array_equal(obs, expected)
+        assert all(np.array_equal(info[key], theirs[key]) for key in info)
 
 
-@both
-def test_escape_terminates_with_the_last_state(observe):
-    env = KKLEnv("rossler", observe=observe)
+def test_escape_terminates_with_the_last_state():
+    env = KKLEnv("rossler")
     obs, info = env.reset(seed=0, options={"x0": ESCAPING})
-    steps = 0
     terminated = False
     while not terminated:
-        steps += 1
-        before = obs, info
+        before, last = obs, info
         obs, reward, terminated, truncated, info = env.step(np.zeros(1))
-        assert steps < 300
-    assert steps > 100
-    assert terminated is True
-    assert info["escaped"]
-    assert truncated is False
-    assert np.array_equal(obs, before[0])
-    assert np.array_equal(info["x"], before[1]["x"])
-    assert np.array_equal(info["y"], before[1]["y"])
+    assert 100 < info["sample"] < 300
+    assert (terminated, truncated, info["escaped"].item()) == (True, False, True)
+    assert np.array_equal(obs, before)
+    assert np.array_equal(info["x"], last["x"])
+    assert np.array_equal(info["y"], last["y"])
     assert 0 < reward < 1
-    assert not env.reset(seed=0)[1].get("escaped")
+    assert not env.reset(seed=0)[1]["escaped"]
 
 
 def test_an_interval_too_long_to_simulate_is_an_error_of_its_own():
@@ -247,9 +205,8 @@ def test_an_interval_too_long_to_simulate_is_an_error_of_its_own():
         env.step(np.zeros(1))
 
 
-@everyone
-def test_measurement_noise_has_the_stated_deviation(name):
-    env = KKLEnv(name, measurement_noise=0.5)
+def test_measurement_noise_has_the_stated_deviation():
+    env = KKLEnv("van_der_pol", measurement_noise=0.5)
     v = []
     for _ in range(4):
         _, info = env.reset(seed=len(v))
@@ -259,6 +216,7 @@ def test_measurement_noise_has_the_stated_deviation(name):
     assert np.mean(v) == pytest.approx(0.0, abs=0.04)
     assert np.std(v) == pytest.approx(0.5, rel=0.05)
     assert np.mean(np.multiply(v[1:], v[:-1])) == pytest.approx(0.0, abs=0.025)  # white
+    assert len(np.unique(np.round(v, 9))) == len(v) > 4 * NOISE_BLOCK  # nor do blocks of it repeat
 
 
 @everyone
@@ -272,8 +230,7 @@ def test_no_noise(name):
         assert info["y"].tolist() == list(env.system.h(x))
 
 
-@pytest.mark.parametrize("level", [None, 0.3])
-@everyone
+@pytest.mark.parametrize(("name", "level"), [("lorenz", None), ("rossler", 0.3)])
 def test_process_noise_is_bounded_and_uniform(name, level):
     """w recovered from what the noise adds to a short interval; x' = f(x) + w makes x gain w dt + O(dt^2)."""
     dt = 1e-5
@@ -294,31 +251,20 @@ def test_process_noise_is_bounded_and_uniform(name, level):
     assert np.allclose(np.corrcoef(u.T), np.eye(system.nx), atol=0.08)
 
 
-def test_noise_is_not_repeated_between_blocks():
-    env = KKLEnv("lorenz")
-    _, info = env.reset(seed=0)
-    v = []
-    for _ in range(4 * NOISE_BLOCK):
-        v.append(info["y"][0] - info["x"][1])
-        *_, info = env.step(np.zeros(1))
-    assert len(np.unique(np.round(v, 9))) == len(v)
-
-
-@everyone
-def test_actions_are_scaled_and_clipped(name):
-    env = KKLEnv(name, process_noise=0)
+def test_actions_are_scaled_and_clipped():
+    env = KKLEnv("lorenz", process_noise=0)
     u_max = env.system.u_max[0]
     x0 = env.reset(seed=0)[1]["x"]
     for action, u in ((0.5, 0.5), (-1, -1), (0, 0), (3.0, 1), (-1e30, -1), (math.inf, 1)):
         env.reset(options={"x0": x0})
         *_, info = env.step(np.array([action]))
         assert info["u"] == pytest.approx([u * u_max], rel=1e-12)
-        expected = advance(env.system, x0.tolist(), [u * u_max], [0.0] * env.system.nx, env.dt)
+        expected = advance(env.system, x0.tolist(), [u * u_max], [0.0] * 3, env.dt)
         assert np.allclose(info["x"], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("action", [
-    [math.nan], np.float32(0.5), 0.5, [], [0.1, 0.2], [[0.1]], np.zeros((1, 1)), np.zeros((2, 1)), None, "a", ["a"],
+    [math.nan], 0.5, [], [0.1, 0.2], np.zeros((1, 1)), None, ["a"],
 ])  # fmt: skip
 def test_wrong_actions_raise_and_change_nothing(action):
     env, other = KKLEnv("lorenz"), KKLEnv("lorenz")
@@ -328,62 +274,40 @@ def test_wrong_actions_raise_and_change_nothing(action):
     assert np.array_equal(env.step([0.3])[0], other.step([0.3])[0])
 
 
-@pytest.mark.parametrize("options", [
-    {"x0": [1.0, 2.0]}, {"x0": 1.0}, {"x0": [[1.0, 2.0, 3.0]]}, {"x0": [1.0, 2.0, math.nan]},
-    {"x0": [math.inf, 0.0, 0.0]}, {"x0": [61.0, 0.0, 0.0]}, {"x0": [0.0, 0.0, -50.1]},
-])  # fmt: skip
-def test_wrong_starts_raise(options):
-    with pytest.raises(ValueError, match="x0 must be 3 numbers within"):
-        KKLEnv("lorenz").reset(options=options)
-
-
-def test_start_is_taken():
+@pytest.mark.parametrize("x0", [[1.0, 2.0], 1.0, [1.0, 2.0, math.nan], [61.0, 0.0, 0.0], [0.0, 0.0, -50.1]])
+def test_starts_within_the_bounds_alone_are_taken(x0):
     env = KKLEnv("lorenz")
-    _, info = env.reset(seed=0, options={"x0": (60, -120, 160)})
-    assert info["x"].tolist() == [60.0, -120.0, 160.0]
-    for empty in (None, {}):
-        env.reset(options=empty)
+    assert env.reset(options={"x0": (60, -120, 160)})[1]["x"].tolist() == [60.0, -120.0, 160.0]
+    with pytest.raises(ValueError, match="x0 must be 3 numbers within"):
+        env.reset(options={"x0": x0})
+    with pytest.raises(ValueError, match="unknown reset option 'x_0'"):
+        env.reset(options={"x_0": [0.0, 0.0, 0.0]})
 
 
 def test_start_box():
-    box = ((-3, 3), (-6.5, -6))
+    box = np.array([(-3.0, 3.0), (-6.5, -6.0)])
     env = gym.make("KKLVanDerPol-v0", start_box=box)
     starts = np.array([env.reset(seed=seed)[1]["x"] for seed in range(50)])
-    assert (starts >= [-3, -6.5]).all()
-    assert (starts <= [3, -6]).all()
+    assert ((starts >= box[:, 0]) & (starts <= box[:, 1])).all()
     assert np.ptp(starts[:, 0]) > 4
-    many = gym.make_vec("KKLVanDerPol-v0", num_envs=50, start_box=box).reset(seed=0)[1]["x"]
-    assert (many == starts).all()
-    mine = np.array(box, dtype=float)
-    env = KKLEnv("van_der_pol", start_box=mine)
-    mine[:] = 100.0  # it was copied
+    assert (gym.make_vec("KKLVanDerPol-v0", num_envs=50, start_box=box).reset(seed=0)[1]["x"] == starts).all()
+    env = KKLEnv("van_der_pol", start_box=box)
+    box[:] = 100.0  # it was copied
     assert env.reset(seed=0)[0] in env.observation_space
     point = gym.make("KKLVanDerPol-v0", start_box=((1, 1), (2, 2)))
     assert point.reset(seed=0)[1]["x"].tolist() == [1, 2]
 
 
-def test_unknown_option():
-    with pytest.raises(ValueError, match="unknown reset option 'x_0'"):
-        KKLEnv("lorenz").reset(options={"x_0": [0.0, 0.0, 0.0]})
-
-
 @pytest.mark.parametrize(
     ("wrong", "match"),
     [
-        ({"system": "nonsense"}, "unknown system 'nonsense'"),
         ({"dt": 0}, "dt must be"),
-        ({"dt": -0.01}, "dt must be"),
-        ({"dt": math.nan}, "dt must be"),
-        ({"dt": math.inf}, "dt must be"),
         ({"observe": "all"}, "observe must be .* 'all'"),
         ({"parameters": {"gamma": 1.0}}, "lorenz has no parameter 'gamma'"),
         ({"parameters": {"rho": math.nan}}, "parameter rho"),
         ({"process_noise": -0.1}, "process_noise must be"),
-        ({"process_noise": math.nan}, "process_noise must be"),
-        ({"measurement_noise": -0.1}, "measurement_noise must be"),
         ({"measurement_noise": math.inf}, "measurement_noise must be"),
         ({"start_box": ((0, 1), (0, 1))}, "start_box must be"),
-        ({"start_box": ((0, 1), (0, 1), (2, 1))}, "start_box must lie within"),
         ({"start_box": ((0, 1), (0, 1), (2, math.nan))}, "start_box must lie within"),
         ({"start_box": ((0, 1), (0, 1), (2, 1000))}, "start_box must lie within"),
         ({"render_mode": "ansi"}, "render_mode must be None or one of .* 'ansi'"),
@@ -401,9 +325,8 @@ def test_step_and_render_before_reset():
             call()
 
 
-@both
-def test_autonomous_user_system(script, observe):
-    env = KKLEnv(f"{script}:Pendulum", observe=observe)
+def test_autonomous_user_system(script):
+    env = KKLEnv(f"{script}:Pendulum")
     assert env.action_space.shape == (0,)
     check_env(env, skip_render_check=True)
     obs, _ = env.reset(seed=0)
@@ -412,18 +335,11 @@ def test_autonomous_user_system(script, observe):
     assert obs in env.observation_space
 
 
-def test_user_system_through_make_survives_json(script):
-    env = gym.make("KKLLorenz-v0", system=f"{script}:Pendulum", parameters={"damping": 0.4})
-    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.system == get_system(f"{script}:Pendulum", {"damping": 0.4})
-    assert np.array_equal(play(env, 10, seed=0), play(again, 10, seed=0))
-
-
-@pytest.mark.parametrize("name", ["van_der_pol", "rossler"])
-def test_render(name):
+def test_render():
     pytest.importorskip("matplotlib")
-    env = gym.make(ENV_IDS[name], render_mode="rgb_array")
-    env.reset(seed=0)
+    silent, env = (gym.make("KKLRossler-v0", render_mode=mode) for mode in (None, "rgb_array"))
+    silent.reset(seed=0), env.reset(seed=0)
+    assert silent.render() is None
     first = env.render()
     assert first.dtype == np.uint8
     assert first.shape == (480, 480, 3)
@@ -431,9 +347,7 @@ def test_render(name):
     assert np.array_equal(env.render(), first)
     for _ in range(50):
         env.step(np.zeros(1, np.float32))
-    later = env.render()
-    assert not np.array_equal(later, first)
-    assert not np.shares_memory(later, first)
+    assert not np.array_equal(env.render(), first)
     env.reset(seed=0)
     assert np.array_equal(env.render(), first)
     env.close()
@@ -441,28 +355,11 @@ def test_render(name):
 
 @pytest.mark.parametrize(("dt", "fps"), [(0.01, 100), (0.05, 20), (0.001, 100), (3.0, 1)])
 def test_a_video_shows_motions_as_they_are(dt, fps):
-    """As far as frames that one can see go."""
-    env = KKLEnv("lorenz", dt=dt)
+    env, batch = KKLEnv("lorenz", dt=dt), kkl_gym.KKLVectorEnv("lorenz", dt=dt, autoreset_mode="Disabled")
     assert env.metadata == {"render_modes": ["rgb_array", "human"], "render_fps": fps}
-    assert kkl_gym.KKLVectorEnv("lorenz", dt=dt).metadata["render_fps"] == fps
     assert kkl_gym.ActionRepeat(env, 5).metadata["render_fps"] == max(1, fps // 5)
-    assert env.metadata["render_fps"] == fps
-    many = kkl_gym.VectorActionRepeat(kkl_gym.KKLVectorEnv("lorenz", dt=dt, autoreset_mode="Disabled"), 5)
-    assert many.metadata["render_fps"] == max(1, fps // 5)
-
-
-def test_no_render_without_mode():
-    env = KKLEnv("lorenz")
-    env.reset(seed=0)
-    assert env.render() is None
-
-
-def test_output_bounds():
-    low, high = output_bounds(Rossler(), 3.0)
-    assert (low.tolist(), high.tolist()) == ([-73.0], [73.0])
-    env = KKLEnv("rossler", measurement_noise=0.5)
-    assert (env.plant.output_space.low, env.plant.output_space.high) == (-73.0, 73.0)
-    assert env.plant.state_space.low.tolist() == [-50.0, -70.0, -5.0]
+    assert kkl_gym.VectorActionRepeat(batch, 5).metadata["render_fps"] == max(1, fps // 5)
+    assert env.metadata["render_fps"] == batch.metadata["render_fps"] == fps
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
@@ -482,41 +379,19 @@ def test_a_copy_mid_episode_continues_identically(duplicate, render_mode):
 def test_under_gymnasiums_wrappers():
     env = gym.make("KKLVanDerPol-v0", observe="output", max_episode_steps=25)
     env = FrameStackObservation(RecordEpisodeStatistics(env), 4)
-    obs, _ = env.reset(seed=0)
-    assert obs.shape == (4, 1)
-    total = 0.0
-    for k in range(25):
-        obs, reward, terminated, truncated, info = env.step(np.zeros(1, np.float32))
-        total += reward
-        assert obs[-1] == np.float32(info["y"])
-        assert obs in env.observation_space
-        assert truncated is (k == 24)
-        assert terminated is False
-    assert info["episode"]["l"] == 25
-    assert info["episode"]["r"] == pytest.approx(total)
-
-
-def test_registered_ids_truncate_after_5000_steps():
-    assert {gym.spec(id_).max_episode_steps for id_ in ENV_IDS.values()} == {5000}
-
-
-def test_vector_env():
-    envs = gym.make_vec("KKLLorenz-v0", num_envs=3, vectorization_mode="sync")
-    obs, info = envs.reset(seed=5)
-    assert obs.shape == info["x"].shape == (3, 3)
-    single = gym.make("KKLLorenz-v0")
-    assert np.array_equal(single.reset(seed=6)[0], obs[1])
-    assert np.array_equal(envs.step(np.ones((3, 1), np.float32))[0][1], single.step(np.ones(1, np.float32))[0])
-    envs.close()
-
-
-def isolated(code):
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
+    assert env.reset(seed=0)[0].shape == (4, 1)
+    steps = [env.step(np.zeros(1, np.float32)) for _ in range(25)]
+    assert all(obs[-1] == np.float32(info["y"]) and obs in env.observation_space for obs, *_, info in steps)
+    assert [truncated for *_, truncated, _ in steps] == [False] * 24 + [True]
+    assert steps[-1][-1]["episode"]["l"] == 25
+    assert steps[-1][-1]["episode"]["r"] == pytest.approx(sum(reward for _, reward, *_ in steps))
 
 
 def test_import_is_light_and_registers_once():
-    isolated(
-        "import importlib, sys, kkl_gym, observers, gymnasium as gym\n"
+    code = (
+        "import importlib, sys, gymnasium as gym\n"
+        "gym.make('kkl_gym:KKLRossler-v0').reset(seed=0)\n"  # the prefixed id needs no import
+        "import kkl_gym, observers\n"
         "heavy = {'torch', 'scipy', 'matplotlib', 'sympy', 'stable_baselines3', 'training'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
         "before = dict(gym.registry)\n"
@@ -525,14 +400,7 @@ def test_import_is_light_and_registers_once():
         "env = gym.make('KKLLorenz-v0'); env.reset(seed=0); env.step(env.action_space.sample())\n"
         "assert not {'torch', 'scipy', 'matplotlib'} & set(sys.modules)\n"
     )
-
-
-def test_the_prefixed_id_needs_no_import():
-    isolated("import gymnasium as gym; gym.make('kkl_gym:KKLRossler-v0').reset(seed=0)")
-
-
-def test_public_names_exist():
-    assert all(hasattr(kkl_gym, name) for name in kkl_gym.__all__)
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
 
 
 @pytest.mark.parametrize("n", [3, 6, 7, 20])
@@ -550,3 +418,9 @@ def test_outputs_bounds_hold_all_corners_and_what_lies_between(n):
     low, high = output_bounds(Chain(), 0.0)
     assert high[0] == -low[0] == 2.0 * (n + 1)
     np.testing.assert_allclose((low[1], high[1]), (-1.0, 1.0), atol=1e-3)
+
+
+def test_spaces():
+    space, states = (KKLEnv("rossler", measurement_noise=0.5, observe=o).observation_space for o in ("output", "state"))
+    assert (space.low, space.high) == (-73.0, 73.0)  # the bounds, and six times the noise
+    assert states.low.tolist() == [-50.0, -70.0, -5.0]

@@ -8,14 +8,13 @@ import textwrap
 
 import numpy as np
 import pytest
-from wrong_systems import Branching, Late, Wide
+from wrong_systems import Late, Wide
 
 from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, System, elementary, get_system
 from kkl_gym.compiled import batch_step
 from kkl_gym.compiled.batch import compiled_step
 from kkl_gym.equations import components
-from kkl_gym.simulate import advance, advance_batch, simulate
-from kkl_gym.system import on_states
+from kkl_gym.simulate import advance, advance_batch
 
 HEAD = """
 import math
@@ -79,22 +78,14 @@ def test_scripts_without_mistake(tank):
 # What stands behind the return of f, and what is said of it.
 MOTIONS = [
     ("(x[1] if x[0] > 0 else 0.0), x[0]", ["ValueError", ARRAYS, NO_IF]),
-    ("x[1], (x[0] > 0 and x[1] > 0) * 1.0", ["ValueError", ARRAYS, NO_IF]),
-    ("x[1], (0 < x[0] < 1) * 1.0", ["ValueError", ARRAYS, NO_IF]),
     ("x[1], -math.sin(x[0])", ["TypeError", ARRAYS, f"use kkl_gym.elementary.sin, {SERVES}"]),
-    ("x[1], math.fabs(x[0])", [ARRAYS, f"use kkl_gym.elementary.abs, {SERVES}"]),
-    ("x[1], math.atan2(x[0], x[1])", [ARRAYS, f"use kkl_gym.elementary.atan2, {SERVES}"]),
     ("x[1], max(x[0], 0.0)", [ARRAYS, f"use kkl_gym.elementary.maximum, {SERVES}"]),
-    ("x[1], min(x[0], 0.0)", [ARRAYS, f"use kkl_gym.elementary.minimum, {SERVES}"]),
     ("x[1], float(x[0])", [ARRAYS, "equations take arithmetic and the functions of kkl_gym.elementary"]),
     ("x[1], math.sqrt(-x[0])", ["ValueError", "x = (", f"use kkl_gym.elementary.sqrt, {SERVES}"]),
     ("x[1], elementary.where(x[0], 1.0, 0.0)", ["where takes a comparison such as x[0] > 0"]),
-    ("x[1], elementary.sin('x')", ["sin takes floats, arrays, torch tensors and sympy expressions, not str"]),
     ("x[1], self.kk * x[0]", ["AttributeError: 'Tank' object has no attribute 'kk'; x = ("]),
-    ("x[1], kk * x[0]", ["NameError: name 'kk' is not defined; x = ("]),
     ("x[2], x[0]", ["IndexError", ", 2 of them"]),
     ("(lambda a, b, c: a)(*x), x[0]", ["TypeError", "missing 1 required positional argument"]),
-    ("x[1], 1 / 0", ["ZeroDivisionError"]),
 ]  # fmt: skip
 
 
@@ -115,32 +106,15 @@ RETURNED = [
     ({"f": "x[1]"}, FROM_F, "it returned -"),
     ({"f": "x[1], x[0], 0.0"}, FROM_F, "it returned 3 of them: ("),
     ({"f": "(x[1],)"}, FROM_F, "it returned 1 of them: ("),
-    ({"f": "None"}, FROM_F, "it returned None"),
-    ({"f": "'ab'"}, FROM_F, "it returned 'ab'"),
     ({"f": "{0: x[0], 1: x[1]}"}, FROM_F, "it returned {0: "),
-    ({"f": "{1.0, 2.0}"}, FROM_F, "it returned {1.0, 2.0}"),
-    ({"f": "(value for value in x)"}, FROM_F, "it returned <generator"),
     ({"f": "x[0], 'b'"}, FROM_F, "of which [1] is 'b', of type str"),
-    ({"f": "x[0], None"}, FROM_F, "of which [1] is None, of type NoneType"),
-    ({"f": "x[0], [x[1]]"}, FROM_F, ", of type list"),
-    ({"f": "x[0], 1j * x[1]"}, FROM_F, "which is complex: take fractional powers of negative numbers by"),
     ({"f": "x[0], (-x[0]) ** 0.5"}, FROM_F, "which is complex: take fractional powers of negative numbers by"),
-    ({"f": "x[0], np.zeros(3)"}, FROM_F, "of which [1] is of shape (3,), where the components of x have shape ()"),
-    ({"f": "np.zeros((2, 5))"}, FROM_F, "of which [0] is of shape (5,), where the components of x have shape ()"),
-    ({"f": "x[0], np.zeros(np.shape(x[0]), complex)"}, FROM_F, "which is complex"),
     ({"f": "np.array([x[1], x[0]]).T"}, FROM_F, "it returned 5 of them: an array of shape (5, 2)"),
-    ({"f": "x[1], x[0] * np.ones(np.shape(x[0]) + (1,))"}, FROM_F, "where the components of x have shape ("),
-    ({"f": "x[1], math.nan"}, FINITE, ", nan]; x = ("),
     ({"f": "x[1], 1e400 * x[0]"}, FINITE, ", inf]; x = ("),
     ({"f": "x[1], np.sum(x)"}, ALIKE, "sum, max and norm mix states"),
-    ({"f": "x[1], np.linalg.norm(x)"}, ALIKE, "sum, max and norm mix states"),
     ({"f": "x[1], np.random.default_rng().random()"}, ALIKE, "it returned ["),
     ({"h": "x[0]"}, FROM_H, "it returned 0."),
-    ({"h": "np.array(x[0])"}, FROM_H, "it returned 0."),
     ({"h": "()"}, FROM_H, "it returned 0 of them: ()"),
-    ({"h": "None"}, FROM_H, "it returned None"),
-    ({"h": "'y'"}, FROM_H, "it returned 'y'"),
-    ({"h": "[[x[0]]]"}, FROM_H, ", of type list"),
     ({"h": "(math.inf,)"}, FINITE, "it returned [inf]"),
 ]
 
@@ -160,32 +134,18 @@ DEFINITIONS = [
     ("def f(self, x, u):\n return x", ["must be defined as f(self, x): TypeError: Tank.f() missing 1"]),
     ("def f(self, x):\n a, b, c = x\n return a, b", ["(`a, b, c = x`): ValueError: not enough values", ", 2 of them"]),
     ("def f(self, x):\n x, y = x\n return y, math.sin(x)", ["(`return y, math.sin(x)`)", "use kkl_gym.elementary.sin"]),
-    ("def f(self, x):\n return (x[1],\n  math.exp(\n   x[0]))", ["(`math.exp(`)", ARRAYS, "kkl_gym.elementary.exp"]),
     ("def f(self, x):\n return x[1], -friction(x[1])", ["(`return math.tanh(v)`)", "kkl_gym.elementary.tanh"]),
     ("def g(self, x):\n return (0.0,),", [FROM_G, "it returned ((0.0,),)"]),
-    ("def g(self, x):\n return 0.0, 1.0", [FROM_G, "it returned 0.0"]),
-    ("def g(self, x):\n return (0.0, 1.0), (0.0, 1.0)", [FROM_G, "it returned 2 of them: (0.0, 1.0)"]),
-    ("def g(self, x):\n return np.eye(2)", [FROM_G, "it returned 2 of them: an array of shape (2,)"]),
-    ("def g(self, x):\n pass", [FROM_G, "it returned None"]),
     ("def g(self, x):\n return (0.0,), (math.cos(x[0]),)", ["g(x) of 'tank' failed in", "use kkl_gym.elementary.cos"]),
-    ("def g(self, x):\n return (0.0,), (np.max(x[0]),)", ["g(x) of 'tank' (", ALIKE]),
     ("def rate(self, x):\n return (1.0,)", [FROM_RATE, "it returned (1.0,), of type tuple"]),
-    ("def rate(self, x):\n pass", [FROM_RATE, "it returned None, of type NoneType"]),
     ("def rate(self, x):\n return -1.0", [FINITE, ", not below zero; it returned [-1.0]"]),
-    ("def rate(self, x):\n return math.nan * x[0]", [FINITE, "it returned [nan]"]),
     ("def rate(self, x):\n return max(1.0, x[0])", ["rate(x) of 'tank' failed in", "use kkl_gym.elementary.maximum"]),
-    ("def rate(self, x):\n return abs(x)", ["rate(x) of 'tank' failed in", "for abs(): 'tuple'; x = ("]),
     ("dt = 0.1\ndef step(self, x, u):\n return x[0], x[1], u[0]", ["step(x, u) of 'tank' (", FROM_F, "3 of them"]),
-    ("dt = 0.1\ndef step(self, x):\n return x", ["must be defined as step(self, x, u): "]),
     ("dt = 0.1\ndef step(self, x, u):\n return x[0], math.sin(x[1])", ["step(x, u) of 'tank' failed", "elementary"]),
     ("def target(self):\n return 0.0, 0.0", ["target of 'tank' is a method: write @property above its def"]),
     ("target = (0.0, 0.0, 0.0)", ["target of 'tank' must be 2 finite numbers, one for each state, got (0.0"]),
-    ("target = 0.0", ["target of 'tank' must be 2 finite numbers, one for each state, got 0.0"]),
-    ("target = (0.0, math.nan)", ["target of 'tank' must be 2 finite numbers, one for each state, got (0.0, nan)"]),
-    ("target = ('0', 0.0)", ["target of 'tank' must be 2 finite numbers, one for each state, got ('0', 0.0)"]),
     ("@property\ndef target(self):\n return self.kk, 0.0", ["target of 'tank' failed in", "(`return self.kk, 0.0`)"]),
     ("def draw_starts(self, rng, n, factor=1.0):\n return rng.random(2)", ["shape (n, 2), got an array of shape (2,)"]),
-    ("def draw_starts(self, rng, n, factor=1.0):\n return [['a', 'b']] * n", ["must return an array of numbers"]),
     ("def draw_starts(self, rng, n, factor=1.0):\n return 99 * np.ones((n, 2))", ["must stay within ((-9.0, 9.0), "]),
     ("def draw_starts(self, rng, n):\n return rng.unifrom(n)", ["draw_starts(rng, n) of 'tank' failed in", "unifrom"]),
 ]  # fmt: skip
@@ -203,15 +163,12 @@ def test_a_definition_that_is_wrong(tank, definition, said):
     [
         ("k: float = 2.0", "k: float", "Tank has no default for k: give one, or pass an instance"),
         ("k: float = 2.0", "k: float = None", "parameter k of tank must be a finite number, got None"),
-        ("k: float = 2.0", "k: str = 'a'", "parameter k of tank must be a finite number, got 'a'"),
         ("@dataclass(frozen=True)\n", "", "Tank has a parameter k, but lacks @dataclass(frozen=True)"),
         ("(frozen=True)", "", "line 10 (`@dataclass`): TypeError: cannot inherit non-frozen dataclass"),
         ("u_max = (1.0,)", "u_max = 1.0", "line 11 (`class Tank(System):`): TypeError: Tank: u_max = 1.0 must"),
         ("import numpy", "import nunpy", "line 3 (`import nunpy as np`): ModuleNotFoundError: No module named 'nunpy'"),
-        ("import math", "import math; 1 / 0", "line 2 (`import math; 1 / 0`): ZeroDivisionError: division by zero"),
         ("import math", "import math as (", "invalid syntax (tank0.py, line 2)"),
         ("class Tank", "class Barrel", "tank0.py defines no Tank; it defines Barrel"),
-        ("class Tank(System)", "class Barrel", "tank0.py defines no Tank; it defines none"),
     ],
 )  # fmt: skip
 def test_a_script_that_is_wrong(tank, old, new, message):
@@ -219,13 +176,12 @@ def test_a_script_that_is_wrong(tank, old, new, message):
         get_system(f"{tank(head=HEAD.replace(old, new))}:Tank")
 
 
-def test_missing_equations(tank):
-    for i, name in enumerate("fh"):
-        path = tank()
-        path.write_text(path.read_text().replace(f"def {name}(", "def another("))
-        with pytest.raises(EquationError, match=rf"^Tank defines no {name}\(self, x\)$"):
-            get_system(f"{path}:Tank")
-        assert path.name == f"tank{i}.py"
+@pytest.mark.parametrize("name", ["f", "h"])
+def test_missing_equations(tank, name):
+    path = tank()
+    path.write_text(path.read_text().replace(f"def {name}(", "def another("))
+    with pytest.raises(EquationError, match=rf"^Tank defines no {name}\(self, x\)$"):
+        get_system(f"{path}:Tank")
 
 
 HERE = r"failed in tests/helpers/wrong_systems\.py, line \d+ \(`return x\[1\], -math\.sin\(x\[0\]\)`\): TypeError: "
@@ -238,9 +194,7 @@ none = np.zeros((1, 7))
     "call",
     [
         lambda: Late().drift(many.T),
-        lambda: on_states(Late().f, many.T),
         lambda: advance_batch(Late(), many, none, 0.0 * many, 0.01),
-        lambda: simulate(Late(), many.T, 3, 0.01),
         lambda: batch_step(Late())(many, none, 0.0 * many, 0.01),
         lambda: KKLVectorEnv(Late(), 3),
     ],
@@ -248,13 +202,10 @@ none = np.zeros((1, 7))
 def test_every_way_to_evaluate_arrays_says_where(call):
     with pytest.raises(EquationError, match=rf"f\(x\) of 'late' {HERE}.* x held arrays of shape \(\d,\): {USE_SIN}"):
         call()
-
-
-def test_outputs_say_where_too():
-    place = r"h\(x\) of 'late' failed in tests/helpers/wrong_systems\.py, line \d+ .*: use kkl_gym\.elementary\.cos"
-    with pytest.raises(EquationError, match=place):
+    with pytest.raises(
+        EquationError, match=r"^h\(x\) of 'late' failed in tests/.*, line \d+ .*kkl_gym\.elementary\.cos"
+    ):
         Late().output(many.T)
-    assert Late().ny == 1
 
 
 def test_tracing_says_where():
@@ -273,25 +224,13 @@ class Long(Wide):
         return self.f(x)
 
 
-@pytest.mark.parametrize(
-    "step",
-    [
-        lambda: advance(Long(), (0.5, 0.5), (0.0,), (0.0, 0.0), 0.01),
-        lambda: advance_batch(Long(), many, none, 0.0 * many, 0.01),
-        lambda: advance(Wide(), (0.5, 0.5), (0.0,), (0.0, 0.0), 0.01),
-        lambda: advance_batch(Wide(), many, none, 0.0 * many, 0.01),
-        lambda: simulate(Wide(), many.T, 3, 0.01),
-    ],
-)
-def test_what_a_loop_cannot_take_is_looked_at_again(step):
-    with pytest.raises(
-        EquationError, match=r"^(f\(x\) of 'wide'|step\(x, u\) of 'long') \(.*\) must return 2 .* 3 of them"
-    ):
-        step()
-
-
-def test_one_state_may_decide():
-    assert np.isfinite(advance(Branching(), (0.5, 0.5), (0.0,), (0.0, 0.0), 0.01)).all()
+@pytest.mark.parametrize("system", [Long(), Wide()])
+def test_what_a_loop_cannot_take_is_looked_at_again(system):
+    message = r"^(f\(x\) of 'wide'|step\(x, u\) of 'long') \(.*\) must return 2 .* 3 of them"
+    with pytest.raises(EquationError, match=message):
+        advance(system, (0.5, 0.5), (0.0,), (0.0, 0.0), 0.01)
+    with pytest.raises(EquationError, match=message):
+        advance_batch(system, many, none, 0.0 * many, 0.01)
 
 
 def test_what_is_not_the_equations_fault_stays_as_it_is():
@@ -322,13 +261,6 @@ class Checked(Draining):
         return math.sqrt(level) if isinstance(level, float) else level**0.5
 
 
-class Sped(Draining):
-    name = "sped"
-
-    def rate(self, x):
-        return 1.0 + abs(x[0]) + 0.0 * abs(x[0] ** 0.5)
-
-
 class Stepping(Draining):
     """The same in discrete time."""
 
@@ -346,7 +278,6 @@ REAL = "must return real numbers; it returned complex ones on the way from x"
     ("system", "message"),
     [
         (Draining(), rf"f\(x\) of 'draining' \(.*\) {REAL}"),
-        (Sped(), rf"f\(x\) of 'sped' \(.*\) {REAL}"),
         (Stepping(), rf"step\(x, u\) of 'stepping' \(.*\) {REAL}"),
         (Checked(), r"f\(x\) of 'checked' failed in .*: ValueError: math domain error; x = \(-0.*elementary\.sqrt"),
     ],
@@ -355,22 +286,6 @@ def test_steps_that_leave_the_real_numbers(system, message):
     env = KKLEnv(system, measurement_noise=0.1, dt=0.1)
     env.reset(seed=0, options={"x0": [0.01, 0.0]})
     with pytest.raises(EquationError, match=message):
-        env.step(np.zeros(1))
-
-
-def test_outputs_that_leave_the_real_numbers():
-    class Rooted(Draining):
-        name = "rooted"
-
-        def f(self, x):
-            return -10.0 + 0.0 * x[0], 0.0 * x[1]
-
-        def h(self, x):
-            return (((x[0] + 4.0) ** 2 - 1.0) ** 0.5,)
-
-    env = KKLEnv(Rooted(), dt=0.1)
-    env.reset(seed=0, options={"x0": [-2.5, 0.0]})
-    with pytest.raises(EquationError, match=r"h\(x\) of 'rooted' .* must return its .*, which is complex: take"):
         env.step(np.zeros(1))
 
 
@@ -387,85 +302,59 @@ def test_constants_of_single_precision(tank):
 
 
 def test_where_leaves_out_what_is_divided_by_zero():
-    class Cardinal(System):
+    class Cardinal(Draining):
         name = "cardinal"
-        X = ((-3, 3), (-1, 1))
-        bounds = ((-20, 20), (-20, 20))
 
         def f(self, x):
             return x[1], -elementary.where(x[0] != 0.0, elementary.sin(x[0]) / x[0], 1.0) * x[0]
 
-        def rate(self, x):
-            return 1.5
-
-        def h(self, x):
-            return (x[0],)
-
-    system = Cardinal()
-    single = advance(system, (0.0, 1.0), [], [0.0, 0.0], 0.01)
-    batch = advance_batch(system, np.array([[0.0], [1.0]]), np.zeros((0, 1)), np.zeros((2, 1)), 0.01)
+    single = advance(Cardinal(), (0.0, 1.0), [0.0], [0.0, 0.0], 0.01)
+    batch = advance_batch(Cardinal(), np.array([[0.0], [1.0]]), np.zeros((1, 1)), np.zeros((2, 1)), 0.01)
     np.testing.assert_allclose(single, batch[:, 0], rtol=1e-14)
     assert single[0] == pytest.approx(math.sin(0.01), abs=1e-7)
 
 
 def test_symbols_are_not_equal_to_whole_numbers():
-    class Geared(System):
+    class Geared(Draining):
         """A state that is 0, 1 or 2 and stays so; of a symbol ``x == 1.0`` would be False."""
 
         name = "geared"
-        X = ((0, 10), (0, 2))
-        bounds = ((-50, 50), (0, 2))
 
         def f(self, x):
             return -elementary.where(x[1] == 1.0, 2.0, 0.1) * x[0], 0.0
 
-        def rate(self, x):
-            return 2.0
-
-        def h(self, x):
-            return (x[0],)
-
     step = batch_step(Geared())
-    found = step(np.array([[1.0, 1.0], [1.0, 2.0]]), np.zeros((0, 2)), np.zeros((2, 2)), 0.5)
-    np.testing.assert_allclose(found[0], np.exp([-1.0, -0.05]), rtol=1e-5)
+    found = step(np.array([[1.0, 1.0], [1.0, 2.0]]), np.zeros((1, 2)), np.zeros((2, 2)), 0.5)
+    np.testing.assert_allclose(found[0], np.exp([-1.0, -0.05]), rtol=1e-4)
 
 
-class Blinking(Draining):
+class Blinking(Stepping):
     """An output that is lost away from X, which a look at the bounds does not find."""
 
     name = "blinking"
 
-    def f(self, x):
-        return 1.0 + 0.0 * x[0], 0.0 * x[1]
+    def step(self, x, u):
+        return x[0] + 0.6, x[1]
 
     def h(self, x):
         return (None if np.all((np.asarray(x[0]) > 1.5) & (np.asarray(x[0]) < 2.0)) else x[0],)
 
 
-@pytest.mark.parametrize("make", [lambda: KKLEnv(Blinking(), dt=0.6), lambda: KKLVectorEnv(Blinking(), 2, dt=0.6)])
+@pytest.mark.parametrize("make", [lambda: KKLEnv(Blinking()), lambda: KKLVectorEnv(Blinking(), 2)])
 def test_outputs_that_fail_on_the_way(make):
     env = make()
     env.reset(seed=0, options={"x0": [1.0, 0.0]})
-    with pytest.raises(
-        EquationError, match=r"h\(x\) of 'blinking' \(.*\) must return its .* \(None,\), of which \[0\]"
-    ):
+    with pytest.raises(EquationError, match=r"h\(x\) of 'blinking' \(.*\) must return its .* \(None,\), of which"):
         env.step(np.zeros(env.action_space.shape))
 
 
-@pytest.mark.parametrize(
-    ("body", "message"),
-    [
-        ("raise ValueError('no equilibrium here')", "(`raise ValueError('no equilibrium here')`): ValueError: no equi"),
-        ("return math.sqrt(-1), 0.0", "(`return math.sqrt(-1), 0.0`): ValueError: math domain error"),
-    ],
-)
-def test_a_target_that_does_not_exist_is_for_environments_to_miss(tank, body, message):
-    path = tank(more=f"@property\ndef target(self):\n    {body}")
+@pytest.mark.parametrize("make", [KKLEnv, lambda system: KKLVectorEnv(system, 2)])
+def test_a_target_that_does_not_exist_is_for_environments_to_miss(tank, make):
+    path = tank(more="@property\ndef target(self):\n    raise ValueError('no equilibrium')")
     system = get_system(f"{path}:Tank")
-    for make in (lambda: KKLEnv(system), lambda: KKLVectorEnv(system, 2)):
-        with pytest.raises(EquationError, match=re.escape(message)) as raised:
-            make()
-        assert str(raised.value).startswith(f"target of 'tank' failed in {path}, line ")
+    with pytest.raises(EquationError, match=r"\(`raise ValueError\('no equilibrium'\)`\): ValueError: no eq") as raised:
+        make(system)
+    assert str(raised.value).startswith(f"target of 'tank' failed in {path}, line ")
 
 
 def test_equations_without_source():
@@ -480,8 +369,8 @@ def test_what_is_not_implemented_says_so_itself():
     kind = type("Partial", (System,), {"name": "partial", "X": ((0, 1),), "bounds": ((0, 1),)})
     with pytest.raises(NotImplementedError, match="Partial does not define f"):
         kind().drift(np.zeros((3, 1)))
-    with pytest.raises(NotImplementedError, match="Partial does not define f"):
-        advance(kind(), (0.5,), (), (0.0,), 0.1)
+    with pytest.raises(NotImplementedError, match="Partial does not define h"):
+        kind().h((0.5,))
 
 
 def test_bounds_within_which_an_output_is_lost():

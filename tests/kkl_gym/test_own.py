@@ -36,8 +36,7 @@ def test_a_system_must_be_named(make, options):
         make(kkl_gym.OWN_ID, **options)
 
 
-@pytest.mark.parametrize("instance", [False, True])
-@pytest.mark.parametrize("where", ["script", "module"])
+@pytest.mark.parametrize(("where", "instance"), [("script", True), ("module", False)])
 def test_worker_processes_find_the_class(where, instance, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copy(SCRIPT, tmp_path / "found_from_here.py")

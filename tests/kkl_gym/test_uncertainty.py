@@ -7,7 +7,7 @@ from error_bars import with_error_bars
 from gymnasium.utils.env_checker import check_env
 
 from kkl_gym import KKLObservation, KKLVectorObservation
-from observers import ArtifactError, KKLObserver
+from observers import ArtifactError
 
 
 @pytest.fixture(scope="module")
@@ -15,11 +15,6 @@ def path(make_artifact, tmp_path_factory):
     file = tmp_path_factory.mktemp("maps") / "map.safetensors"
     with_error_bars(make_artifact("van_der_pol", dt=0.01, free_inverse=True, process=True)).save(file)
     return str(file)
-
-
-@pytest.fixture(scope="module")
-def plain(saved):
-    return saved(system="van_der_pol", dt=0.01)
 
 
 @pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
@@ -47,22 +42,20 @@ def test_vector_is_single(path, mode):
     assert envs.observation_space.shape == (3, 4)
     obs, info = envs.reset(seed=0)
     alone = [single.reset(seed=i) for i, single in enumerate(singles)]
-    for k in range(4):
-        for i in range(3):
-            np.testing.assert_allclose(obs[i], alone[i][0], rtol=1e-3, atol=1e-4)
-            np.testing.assert_allclose(info["x_cov"][i], alone[i][-1]["x_cov"], rtol=1e-3, atol=1e-6)
-        obs, _, _, _, info = envs.step(np.full((3, 1), 0.2))
-        alone = [single.step([0.2]) for single in singles]
-        if mode == "SameStep" and k == 3:
-            last, info, obs = info, info["final_info"], np.stack(info["final_obs"])
-    for i in range(3):
-        np.testing.assert_allclose(obs[i], alone[i][0], rtol=1e-3, atol=1e-4)
-        np.testing.assert_allclose(info["x_cov"][i], alone[i][-1]["x_cov"], rtol=1e-3, atol=1e-6)
-    if mode == "SameStep":
-        np.testing.assert_allclose(last["x_cov"], envs.observer.covariance, rtol=1e-6)
+    for k in range(5):
+        for i, (expected, *_, its) in enumerate(alone):
+            np.testing.assert_allclose(obs[i], expected, rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(info["x_cov"][i], its["x_cov"], rtol=1e-3, atol=1e-6)
+        if k < 4:
+            obs, _, _, _, info = envs.step(np.full((3, 1), 0.2))
+            alone = [single.step([0.2]) for single in singles]
+            if mode == "SameStep" and k == 3:
+                np.testing.assert_allclose(info["x_cov"], envs.observer.covariance, rtol=1e-6)
+                info, obs = info["final_info"], np.stack(info["final_obs"])
 
 
-def test_where_there_is_none(path, plain):
+def test_where_there_is_none(path, saved):
+    plain = saved(system="van_der_pol", dt=0.01)
     env = gym.make("KKLVanDerPol-v0")
     with pytest.raises(ArtifactError, match="no error bars"):
         KKLObservation(env, plain, uncertainty=True)
@@ -73,11 +66,3 @@ def test_where_there_is_none(path, plain):
     with pytest.raises(ArtifactError, match="no error bars"):
         KKLObservation(env, path, uncertainty=True).replace_observer(plain)
     assert "x_cov" not in KKLObservation(env, path).reset(seed=0)[1]
-
-
-def test_monitor_and_missing_samples(path):
-    artifact = KKLObservation(gym.make("KKLVanDerPol-v0"), path).observer.artifact
-    observer = KKLObserver(artifact, 0.1)
-    observer.reset(np.zeros((3, 1)))
-    observer.step(None)
-    assert observer.covariance.shape == (3, 2, 2)

@@ -133,7 +133,7 @@ def test_known_starts_and_parameters():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(set(observers.shipped().values())))
+@pytest.mark.parametrize("name", observers.shipped())
 def test_100_000_samples_of_every_shipped_map(name):
     def compiled(exported, y, u):
         levels = {"measurement_noise": exported.measurement_noise, "process_noise": exported.process_noise}

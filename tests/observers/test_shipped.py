@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from safetensors import safe_open
 
 import observers
 from kkl_gym import SYSTEMS, get_system
@@ -19,15 +18,8 @@ def test_shipped_maps_say_what_they_are(name, suffix):
     assert artifact.nx == system.nx
     assert artifact.nu == (0 if suffix else system.nu)
     assert (artifact.forward is not None) == bool(suffix)
-    assert resolve(name + suffix) == resolve(f"{name}{suffix}-v2")
     assert (artifact.free_inverse is not None) == (not suffix)
     assert resolve(name + suffix).stat().st_size < 1_000_000
-
-
-@pytest.mark.parametrize("name", sorted(set(observers.shipped().values())))
-def test_every_map_has_a_checksum(name):
-    with safe_open(resolve(name), framework="numpy") as opened:
-        assert len(opened.metadata()["kkl-gym-sha256"]) == 64
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -39,7 +31,7 @@ def test_spinn_maps_recover_settled_states_from_their_own_forward_map(name):
     assert np.median(np.linalg.norm(x_hat - x, axis=1) / np.linalg.norm(x, axis=1)) < 0.002
 
 
-@pytest.mark.parametrize("name", sorted(set(observers.shipped().values())))
+@pytest.mark.parametrize("name", observers.shipped())
 def test_every_map_can_be_monitored(name):
     observer = observers.load(name, measurement_noise=0.5, monitor=True)
     assert observer.artifact.limits.false_alarms == 0.01

@@ -1,4 +1,4 @@
-"""Examples and research use what others may use: names of modules and in them that begin with no underscore."""
+"""Examples, research and its tests use public names: none that begins with an underscore, of modules or of objects."""
 
 import ast
 from pathlib import Path
@@ -7,15 +7,30 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 OURS = ("kkl_gym", "observers", "training", "examples")
+FILES = [*(ROOT / "examples").rglob("*.py"), *Path(__file__).parent.glob("*.py")]
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "examples").rglob("*.py")), ids=lambda path: path.name)
-def test_only_public_names_are_imported(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
-    ours = [node for node in imports if node.module.split(".")[0] in OURS]
-    names = [f"{node.module}.{each.name}" for node in ours for each in node.names]
-    assert not [name for name in names if any(part.startswith("_") for part in name.split("."))]
-    modules = {each.asname or each.name for node in imports for each in node.names if each.name.islower()}
-    used = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)]
-    assert not [node.attr for node in used if node.value.id in modules and node.attr.startswith("_")]
+def private(name):
+    return name.startswith("_") and not name.startswith("__")
+
+
+def used(source):
+    """Private names that a file imports from this project, or takes from objects other than self and cls."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in OURS:
+            yield from (part for name in node.names for part in (*node.module.split("."), name.name) if private(part))
+        if isinstance(node, ast.Import):
+            yield from (part for name in node.names for part in name.name.split(".") if private(part))
+        if isinstance(node, ast.Attribute) and private(node.attr) and ast.unparse(node.value) not in ("self", "cls"):
+            yield node.attr
+
+
+@pytest.mark.parametrize("path", sorted(FILES), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_public_names_are_enough(path):
+    assert not list(used(path.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("source", ["from training.a import _b", "from training._a import b", "import observers._a",
+                                    "x._y", "module._function(1)", "self.x._y"])  # fmt: skip
+def test_private_names_are_noticed(source):
+    assert list(used(source))

@@ -15,26 +15,15 @@ from training.config import override, read_changes
     [
         ({"dt": 0.0}, "dt"),
         ({"dt": 5.0, "duration": 3.0}, "shorter than one sample"),
-        ({"eigenvalues": (1.0,)}, "eigenvalues"),
-        ({"eigenvalues": (-1.0, -1.0)}, "distinct"),
-        ({"pairs": ((0.1, 1.0),)}, "pairs"),
         ({"pairs": ((-0.1, -1.0),)}, "pairs"),
         ({"pairs": ((-0.1, 1.0), (-0.1, 1.0))}, "distinct"),
         ({"eigenvalues": ()}, "needs eigenvalues"),
-        ({"forward_steps": 5}, "forward_steps"),
         ({"width": 0}, "width"),
-        ({"batch": 2}, "batch"),
         ({"batch": 100}, "batch"),
-        ({"samples": 1}, "samples"),
         ({"pipeline": "bogus"}, "pipeline"),
-        ({"activation": "relu"}, "activation"),
-        ({"trajectories": 2.5}, "trajectories"),
         ({"seed": -1}, "seed"),
         ({"measurement_noise_max": float("nan")}, "measurement_noise_max"),
-        ({"measurement_noise_max": ()}, "measurement_noise_max.each"),
         ({"measurement_noise_max": (0.1, 0.0)}, r"measurement_noise_max\.each\.1"),
-        ({"measurement_noise_max": (0.1, "0.3")}, r"measurement_noise_max\.each\.1"),
-        ({"process_noise_share": 1.5}, "share"),
         ({"noise_free_share": float("nan")}, "share"),
         ({"high_noise_emphasis": 0.0}, "high_noise_emphasis"),
         ({"closed_loop_trajectories": 5}, "closed_loop"),
@@ -64,7 +53,6 @@ def test_levels_of_noise_of_all_outputs_or_each(tmp_path):
         path.write_text(json.dumps({"measurement_noise_max": written}))
         changes = read_changes(path)
         assert override(preset(Oscillator(), "input-aware", "fast"), changes).measurement_noise_max == levels
-    for wrong, match in (([0.1, -1], "greater than 0"), ([], "at least 1 item"), ("0.1", "valid number")):
-        path.write_text(json.dumps({"measurement_noise_max": wrong}))
-        with pytest.raises(ValueError, match=match):
-            read_changes(path)
+    path.write_text(json.dumps({"measurement_noise_max": [0.1, -1]}))
+    with pytest.raises(ValueError, match="greater than 0"):
+        read_changes(path)

@@ -10,14 +10,14 @@ def test_noise_covariance_against_simulation_at_every_age():
     B = np.array([[1.0, 0.0], [1.0, 2.0], [0.0, 1.0]])
     linear = LinearFilter(np.diag([-0.5, -4.0, -20.0]), B, 0.05)
     ages = np.array([0, 1, 2, 5, 50])
-    n, levels = 200_000, np.array([1.0, 0.3])
+    n, levels = 50_000, np.array([1.0, 0.3])
     y = np.random.default_rng(0).normal(size=(51, n, 2)) * levels
     e = linear.run(y, np.zeros((50, n, 0)), ages)
     together = np.einsum("j,ajkl->akl", levels**2, noise_covariance(linear, ages))
     for predicted, sample in zip(together, e, strict=True):
         measured = sample.T @ sample / n
         size = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
-        assert np.abs(measured - predicted).max() / size.max() < 0.015
+        assert np.abs(measured - predicted).max() / size.max() < 0.03
 
 
 def test_noise_covariance_tends_to_the_lyapunov_solution():

@@ -10,7 +10,7 @@ import pytest
 
 from kkl_gym import get_system
 from observers.storage import UNFINISHED
-from training.jobs import check_identity, claimed_job, claimed_run, describe, locked
+from training.jobs import check_identity, claimed_job, claimed_run, describe
 
 HOLDER = """
 import sys
@@ -74,13 +74,6 @@ def test_a_job_keeps_its_folder(tmp_path):
         claimed_job(tmp_path / "job", {"levels": (0.0, 0.5), "width": 3}, "another job"),
     ):
         raise AssertionError
-
-
-def test_a_lock_ends_with_its_work(tmp_path):
-    with pytest.raises(RuntimeError, match="the work"), locked(tmp_path):
-        raise RuntimeError("the work")
-    with locked(tmp_path):
-        pass
 
 
 def test_who_locks_a_folder_clears_away_what_killed_processes_left(tmp_path):

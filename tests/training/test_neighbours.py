@@ -25,16 +25,6 @@ def test_what_is_left_is_the_part_of_x_that_does_not_follow_from_z():
     assert np.isnan(found.left[4])
 
 
-def test_with_more_samples_less_is_left_of_what_is_bent():
-    z, others = samples(300, 2, 0), samples(8000, 2, 1)
-
-    def left(step):
-        kept = others[::step]
-        return told(z, np.sin(3 * z[:, :1]), others_z=kept, others_x=np.sin(3 * kept[:, :1])).left[0]
-
-    assert left(1) < 0.3 * left(16) < 0.3
-
-
 def test_directions_below_the_resolution_tell_nothing():
     z, others = samples(300, 2, 0) * [1, 1e-6], samples(4000, 2, 1) * [1, 1e-6]
     bent = told(z, (1e6 * z[:, 1:]) ** 2, others_z=others, others_x=(1e6 * others[:, 1:]) ** 2)

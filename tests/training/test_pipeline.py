@@ -39,129 +39,115 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
 
     monkeypatch.setattr(training.pipeline, "record", note("record"))
     monkeypatch.setattr(training.pipeline, "TrajectorySampler", note("sampler"))
-    small = {
-        "trajectories": 5,
-        "duration": 1.0,
-        "samples": 10,
-        "process_noise_share": 0.5,
-        "noise_free_share": 0.3,
-        "high_noise_emphasis": 3.0,
-    }
-    config = replace(preset(VanDerPol(), "input-aware", "fast"), **small)
+    shares = {"process_noise_share": 0.5, "noise_free_share": 0.3, "high_noise_emphasis": 3.0}
+    config = toy(VanDerPol(), trajectories=5, duration=1.0, samples=10, **shares)
     with pytest.raises(ReachedError):
         train(VanDerPol(), config, tmp_path / "aware", device=CPU)
-    told = {
-        "measurement_noise_max": 1.0,
-        "batch": 1024,
-        "device": CPU,
-        "measurement_noise": 0.5,
-        "noise_free_share": 0.3,
-        "high_noise_emphasis": 3.0,
-        "error": None,
-        "scaling": "relative",
-        "parameters": 0,
-    }
-    assert seen == {"record": 0.5, "sampler": {**told, "process_noise_max": 0.05}}
+    assert seen["record"] == 0.5
+    told = {"measurement_noise_max": 1.0, "measurement_noise": 0.5, "noise_free_share": 0.3, "high_noise_emphasis": 3.0}
+    assert seen["sampler"].items() >= {**told, "process_noise_max": 0.05}.items()
     with pytest.raises(ReachedError):
         train(VanDerPol(), replace(config, process_noise_share=0.0), tmp_path / "undisturbed", device=CPU)
-    assert seen == {"record": 0.0, "sampler": {**told, "process_noise_max": 0.0}}
-    spinn = replace(
-        preset(VanDerPol(), "spinn", "fast"), process_noise_share=0.5, trajectories=5, duration=20.0, forward_steps=1
-    )
-    with pytest.raises(ReachedError):
-        train(VanDerPol(), replace(spinn, inverse_steps=1), tmp_path / "spinn", device=CPU)
     assert seen["record"] == 0.0
-    assert seen["sampler"]["process_noise_max"] == 0.0
+    assert seen["sampler"].items() >= {**told, "process_noise_max": 0.0}.items()
 
 
-def test_training_makes_the_error_fall(tmp_path):
-    system = Oscillator()
-    config = toy(system, trajectories=100, duration=20.0, inverse_steps=1500, width=32)
-    runs = unseen_trajectories(system, config.dt, n=20, duration=20.0, seed=0)
-    before = train(system, replace(config, inverse_steps=1), tmp_path / "a").artifact
-    after = train(system, config, tmp_path / "b").artifact
-    errors_before, errors_after = (
-        np.median(errors(a, system, runs, measurement_noise=0.0, seed=0).late) for a in (before, after)
-    )
-    assert errors_after < 0.1 * errors_before
-    assert errors_after < 5.0
-    driven = unseen_trajectories(system, config.dt, n=20, duration=20.0, seed=0, driven=True)
-    assert np.median(errors(after, system, driven, measurement_noise=0.0, seed=0).late) < 10.0
+OPTIONS = {"input-aware": {}, "spinn": {"adaptive": True, "lipschitz_penalty": 0.1}}
 
 
-@pytest.mark.parametrize(
-    ("method", "options"),
-    [("input-aware", {}), ("spinn", {}), ("spinn", {"adaptive": True, "lipschitz_penalty": 0.1})],
-)
-def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypatch, method, options):
-    system = Oscillator()
-    config = toy(system, method, duration=20.0, inverse_steps=400, **options)
-    whole = train(system, config, tmp_path / "whole", device=CPU).artifact
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Of each pipeline a configuration, the folder of an uninterrupted run, and its artifact."""
+    runs = {}
+    for method, options in OPTIONS.items():
+        config = toy(Oscillator(), method, duration=20.0, inverse_steps=200, **options)
+        folder = tmp_path_factory.mktemp(method)
+        runs[method] = config, folder, train(Oscillator(), config, folder, device=CPU).artifact
+    return runs
 
+
+def same_weights(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(one.mlp.weights, other.mlp.weights, strict=True))
+
+
+@pytest.mark.parametrize("method", OPTIONS)
+def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypatch, method, whole):
+    config, _, expected = whole[method]
     monkeypatch.setattr(checkpoints, "SECONDS", 0.0)
-    save, saved = training.maps.optimise._save, []
+    save = checkpoints.save
 
-    def save_and_stop(stage, parts, generator, course):
-        save(stage, parts, generator, course)
-        saved.append(course.step)
-        if stage.name == "inverse" and course.step == 200:
+    def save_and_stop(path, state, *, fingerprint):
+        save(path, state, fingerprint=fingerprint)
+        if path.name.startswith("inverse") and checkpoints.load(path)["step"] == 100:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(training.maps.optimise, "_save", save_and_stop)
-    with pytest.raises(KeyboardInterrupt):
-        train(system, config, tmp_path / "cut", device=CPU)
-    monkeypatch.setattr(training.maps.optimise, "_save", save)
-    resumed = train(system, config, tmp_path / "cut", resume=True, device=CPU)
-    for a, b in zip(whole.inverse.mlp.weights, resumed.artifact.inverse.mlp.weights, strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert resumed.losses["inverse"][-1][0] == 400
-    assert (whole.free_inverse is not None) == (method == "input-aware")
-    if whole.free_inverse:
-        for a, b in zip(whole.free_inverse.mlp.weights, resumed.artifact.free_inverse.mlp.weights, strict=True):
-            np.testing.assert_array_equal(a, b)
-    with pytest.raises(ValueError, match="seed = 0 there, 1 here"):
-        train(system, replace(config, seed=1), tmp_path / "cut", resume=True, device=CPU)
-    with pytest.raises(ValueError, match="--resume"):
-        train(system, config, tmp_path / "cut", device=CPU)
-    checkpoint = tmp_path / "cut" / "inverse.checkpoint.pt"
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "save", save_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            train(Oscillator(), config, tmp_path, device=CPU)
+    resumed = train(Oscillator(), config, tmp_path, resume=True, device=CPU)
+    assert resumed.losses["inverse"][-1][0] == 200
+    assert same_weights(expected.inverse, resumed.artifact.inverse)
+    if method == "input-aware":
+        assert same_weights(expected.free_inverse, resumed.artifact.free_inverse)
+    checkpoint = tmp_path / "inverse.checkpoint.pt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:100])
     with pytest.raises(ValueError, match="damaged"):
-        train(system, config, tmp_path / "cut", resume=True, device=CPU)
+        train(Oscillator(), config, tmp_path, resume=True, device=CPU)
 
 
-def test_a_run_is_not_resumed_for_another_process_noise(tmp_path):
-    config = toy(Oscillator(), duration=1.0)
-    train(Oscillator(), config, tmp_path, device=CPU)
-
+def test_another_run_is_not_resumed(whole):
     class Disturbed(Oscillator):
         process_noise = 0.5
 
-    with pytest.raises(ValueError, match=r"process_noise = 0\.05 there, 0\.5 here"):
-        train(Disturbed(), config, tmp_path, resume=True, device=CPU)
-
-
-def test_resuming_notices_a_changed_equation(tmp_path):
-    @dataclass(frozen=True)
     class Changed(Oscillator):
-        name: ClassVar[str] = "oscillator"
+        name = "oscillator"
 
         def f(self, x):
             return x[1], -2.0 * x[0]
 
-    train(Oscillator(), toy(Oscillator()), tmp_path)
-    with pytest.raises(ValueError, match="equations"):
-        train(Changed(), toy(Oscillator()), tmp_path, resume=True)
+    config, folder, _ = whole["input-aware"]
+    for system, other, message in (
+        (Oscillator(), replace(config, seed=1), "seed = 0 there, 1 here"),
+        (Disturbed(), config, r"process_noise = 0\.05 there, 0\.5 here"),
+        (Changed(), config, "equations"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            train(system, other, folder, resume=True, device=CPU)
+    with pytest.raises(ValueError, match="--resume"):
+        train(Oscillator(), config, folder, device=CPU)
+
+
+def test_artifact_of_a_run_records_what_made_it(whole, tmp_path):
+    _, folder, artifact = whole["spinn"]
+    artifact.save(tmp_path / "o.safetensors")
+    read = Artifact.read(tmp_path / "o.safetensors")
+    assert read.training["pipeline"] == "spinn"
+    assert read.training["seed"] == 0
+    assert read.versions["torch"] == torch.__version__
+    assert read.nu == 0
+    assert json.loads((folder / "config.json").read_text())["forward_steps"] == 200
+    x = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    np.testing.assert_allclose(read.forward(x), artifact.forward(x))
+
+
+def test_errors_of_a_trained_map_are_small(tmp_path):
+    system = Oscillator()
+    config = toy(system, trajectories=60, duration=20.0, inverse_steps=500, width=32)
+    artifact = train(system, config, tmp_path).artifact
+    for driven, most in ((False, 5.0), (True, 10.0)):
+        runs = unseen_trajectories(system, config.dt, n=20, duration=20.0, seed=0, driven=driven)
+        assert np.median(errors(artifact, system, runs, measurement_noise=0.0, seed=0).late) < most
 
 
 def test_closing_the_loop_is_a_second_stage(tmp_path):
     system = Oscillator()
-    config = toy(system, duration=5.0, closed_loop_trajectories=20)
+    config = toy(system, duration=1.0, closed_loop_trajectories=10, inverse_steps=5)
     result = train(system, config, tmp_path)
     assert list(result.losses) == ["free", "inverse", "closed-loop"]
-    assert result.artifact.training["closed_loop_trajectories"] == 20
+    assert result.artifact.training["closed_loop_trajectories"] == 10
     again = train(system, config, tmp_path, resume=True)
-    for a, b in zip(result.artifact.inverse.mlp.weights, again.artifact.inverse.mlp.weights, strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert same_weights(result.artifact.inverse, again.artifact.inverse)
     with pytest.raises(ValueError, match="no inputs"):
         train(Autonomous(), toy(Autonomous(), closed_loop_trajectories=20, inverse_steps=5), tmp_path / "b")
 
@@ -186,21 +172,12 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
     assert relative < 1e-3
 
 
-def test_a_pair_of_modes_can_be_trained(tmp_path):
-    system = Oscillator()
-    config = toy(system, eigenvalues=(-3.0,), pairs=((-0.5, 1.0),), inverse_steps=20)
-    train(system, config, tmp_path).artifact.save(tmp_path / "a.safetensors")
-    artifact = Artifact.read(tmp_path / "a.safetensors")
-    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(artifact.filter.A)), [-3, -0.5 - 1j, -0.5 + 1j])
-    assert artifact.filter.size == 3 * (1 + system.nu)
-
-
 def test_training_on_a_solved_map(tmp_path):
     sizes = {
         "random_features": 200,
         "forward_steps": 0,
         "box_factor": 1.5,
-        "inverse_steps": 2000,
+        "inverse_steps": 500,
         "duration": 15.0,
         "width": 32,
     }
@@ -215,26 +192,13 @@ def test_training_on_a_solved_map(tmp_path):
 
 def test_the_papers_own_way_is_told_neither_noise_nor_age(tmp_path):
     papers = {"collocation": "box", "box_factor": 1.0, "scaling": "range", "transients": False}
-    config = toy(Oscillator(), "spinn", duration=20.0, solved_output_layer=False, **papers)
+    config = toy(
+        Oscillator(), "spinn", duration=20.0, inverse_steps=5, forward_steps=5, solved_output_layer=False, **papers
+    )
     artifact = train(Oscillator(), config, tmp_path).artifact
     assert artifact.inverse.features == ("z_y",)
     np.testing.assert_allclose(artifact.forward.x_scale, 1.0, atol=0.01)  # the box, not the motions beyond it
     np.testing.assert_allclose(artifact.inverse.x_scale, 1.0, atol=0.01)
-
-
-def test_artifact_of_a_run_records_what_made_it(tmp_path):
-    system = Oscillator()
-    artifact = train(system, toy(system, "spinn", duration=20.0), tmp_path).artifact
-    artifact.save(tmp_path / "o.safetensors")
-    read = Artifact.read(tmp_path / "o.safetensors")
-    assert read.training["pipeline"] == "spinn"
-    assert read.training["seed"] == 0
-    assert read.versions["torch"] == torch.__version__
-    assert read.forward is not None
-    assert read.nu == 0
-    assert json.loads((tmp_path / "config.json").read_text())["forward_steps"] == 200
-    x = np.random.default_rng(0).uniform(-1, 1, (5, 2))
-    np.testing.assert_allclose(read.forward(x), artifact.forward(x))
 
 
 def test_two_outputs_train_and_run(tmp_path):

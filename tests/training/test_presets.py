@@ -75,8 +75,6 @@ def test_uncertain_parameters_add_what_the_systems_profile_says(name):
     assert found.eigenvalues == plain.eigenvalues
     assert found.pairs == PROFILES["rossler"].uncertain_settings["pairs"]
     assert found.width == (512 if name == "paper" else 192)
-    given = {"pairs": ((-0.5, 2.0),), "width": 40}
-    assert of(uncertain=uncertain, **given) == replace(found, **given)
     assert preset(VanDerPol(), "input-aware", name, changes={"uncertain": {"mu": 0.1}}) == replace(
         preset(VanDerPol(), "input-aware", name), uncertain={"mu": 0.1}
     )

@@ -21,10 +21,10 @@ def test_complex_modes_filter_a_linear_system_to_its_sylvester_solution():
     np.testing.assert_allclose(data.z, data.x @ sylvester(linear.A, linear.B).T, atol=1e-4)  # as holding y is exact
 
 
-@pytest.mark.parametrize("ny", [1, 2])
-@pytest.mark.parametrize("nu", [0, 1])
+@pytest.mark.parametrize(("ny", "nu"), [(1, 0), (2, 1)])
 def test_each_output_has_a_filter_with_the_poles(ny, nu):
     spectrum = Spectrum((-2.0, -5.0), ((-0.9, 1.7),))
+    assert spectrum == Spectrum((-2.0,)) + Spectrum((-5.0,), ((-0.9, 1.7),))
     assert spectrum.modes == len(spectrum.poles) == 4
     linear = spectrum.filter(ny, 0.02, nu)
     assert (linear.dt, linear.nu) == (0.02, nu)
@@ -35,13 +35,7 @@ def test_each_output_has_a_filter_with_the_poles(ny, nu):
     np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(spectrum.A)), np.sort_complex(spectrum.poles))
 
 
-def test_spectra_add_up():
-    both = Spectrum((-2.0,), ((-0.9, 1.7),)) + Spectrum((-3.0,), ((-1.0, 0.5),))
-    assert both == Spectrum((-2.0, -3.0), ((-0.9, 1.7), (-1.0, 0.5)))
-    assert both != Spectrum((-3.0, -2.0), ((-0.9, 1.7), (-1.0, 0.5)))
-
-
-@pytest.mark.parametrize("order", [2, 3, 6])
+@pytest.mark.parametrize("order", [2, 5])
 @pytest.mark.parametrize("norm", ["mag", "phase"])
 def test_bessel_spectra_are_scipys(order, norm):
     cutoff = 7.0
@@ -54,12 +48,7 @@ def test_bessel_spectra_are_scipys(order, norm):
         assert abs(response[0]) == pytest.approx(1 / np.sqrt(2), rel=1e-6)
     else:
         assert abs(np.prod(spectrum.poles)) == pytest.approx(cutoff**order)  # the asymptotes are a Butterworth filter's
-    twice = bessel_spectrum(order, 2 * cutoff, norm=norm)
-    np.testing.assert_allclose(twice.poles, 2 * spectrum.poles)
-
-
-def test_the_cutoff_is_by_magnitude_unless_said_otherwise():
-    assert bessel_spectrum(4, 2.0) == bessel_spectrum(4, 2.0, norm="mag") != bessel_spectrum(4, 2.0, norm="phase")
+    assert (spectrum == bessel_spectrum(order, cutoff)) == (norm == "mag")
 
 
 def test_evenly_spaced_eigenvalues():
@@ -67,14 +56,6 @@ def test_evenly_spaced_eigenvalues():
     assert all(isinstance(value, float) for value in found)
     np.testing.assert_allclose(found, [-1.0, -2.0, -4.0, -8.0, -16.0])
     assert papers_spectrum(get_system("van_der_pol")) == (-1.5, -1.875, -2.25, -2.625, -3.0)
-
-
-def test_the_papers_eigenvalues_follow_the_pace():
-    class Quick(Oscillator):
-        name = "quick"
-        dt = 1e-6
-
-    assert papers_spectrum(Quick()) == pytest.approx((-1.5e4, -1.875e4, -2.25e4, -2.625e4, -3e4))
 
 
 def test_typical_rate():

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 from kkl_gym import SYSTEMS, System, get_system
 from observers import MLP, storage
 from observers.errors import ArtifactError
-from observers.names import resolve, shipped
+from observers.names import resolve
 from training.agents.information import (
     EKF_PROCESS_NOISE,
     INFORMATION,
@@ -99,7 +99,9 @@ class Agent:
         if self.information in OBSERVED and self.observer is None:
             raise AgentError(f"an agent that knows {self.information} must name its observer")
         if self.observer is not None and fingerprint(self.observer) != self.fingerprint:
-            raise AgentError(f"the agent was trained on another version of the observer {self.observer!r}")
+            raise AgentError(
+                f"the observer {self.observer!r} is not the one that the agent was trained on: its file has changed"
+            )
         now = rules(task)
         for name in now:
             if self.rules.get(name) != now[name]:
@@ -135,7 +137,7 @@ class Agent:
         tensors, described = storage.read(path, key=_KEY, error=AgentError, what="an agent")
         with storage.explained(path, AgentError):
             if described.pop("format") != FORMAT:
-                raise AgentError(f"it has another format than {FORMAT}, which this version of kkl-gym reads")
+                raise AgentError(f"it has another format than {FORMAT}, which kkl-gym reads: train the agent again")
             network = storage.get_mlp(tensors, "", described.pop("activation"))
             task = described.pop("task")
             if task["start_box"] is not None:
@@ -159,13 +161,8 @@ def rules(task: ControlTask) -> dict[str, Any]:
     return dict(json.loads(json.dumps(described)))
 
 
-def versioned(observer: str) -> str:
-    """A shipped name with its version, so that it stays the same map for good; a path as it is."""
-    return observer if observer.endswith(".safetensors") else shipped().get(observer, observer)
-
-
 def fingerprint(observer: str) -> str:
-    """Return the checksum of what an observer's file holds."""
+    """Return the checksum of an observer's file."""
     try:
         return storage.checksum(resolve(observer), ArtifactError)
     except ArtifactError as error:

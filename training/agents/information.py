@@ -180,7 +180,7 @@ def make(
 
 
 def observer_of(system: System) -> str:
-    """Name of the map that agents get for a system: for a shipped one the version that the agents' results rest on."""
+    """Name of the map that agents get for a system: the one of its profile, or of its own name."""
     name = profile(system).agent_observer or system.name
     if name not in shipped():
         raise ValueError(f"no observer ships for {system.name!r}: name a .safetensors file (--observer FILE)")

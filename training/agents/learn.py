@@ -23,7 +23,7 @@ from torch import nn
 
 from kkl_gym import ENV_IDS, get_system
 from observers.storage import naming
-from training.agents.agent import Agent, fingerprint, rules, versioned
+from training.agents.agent import Agent, fingerprint, rules
 from training.agents.bridge import SB3VecEnv
 from training.agents.checkpoint import CURVE, Checkpoint
 from training.agents.cost import Cost
@@ -60,7 +60,7 @@ def learn(
     if observer is not None and information not in OBSERVED:
         raise ValueError(f"an agent that knows {information!r} has no use for the observer {observer!r}")
     name, settings = hyperparameters(task, algorithm)
-    named = versioned(observer or observer_of(get_system(task.system))) if information in OBSERVED else None
+    named = (observer or observer_of(get_system(task.system))) if information in OBSERVED else None
     env = make(task, information, settings["n_envs"], observer=named)
     timesteps = _positive(settings["n_timesteps"] if timesteps is None else timesteps)
     seen: dict[str, Any] = {

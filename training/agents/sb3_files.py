@@ -17,7 +17,7 @@ from torch import nn
 from kkl_gym import System, get_system
 from observers import MLP
 from observers.storage import explained
-from training.agents.agent import Agent, AgentError, fingerprint, rules, versioned
+from training.agents.agent import Agent, AgentError, fingerprint, rules
 from training.agents.bridge import SB3VecEnv
 from training.agents.information import observer_of
 from training.agents.policy import ACTIVATIONS, actor
@@ -77,7 +77,7 @@ def from_sb3(path: str | os.PathLike[str], system: str | System, observer: str |
             [weights[f"{name}.bias"].numpy() for name in layers],
             _activation(described, squashed),
         )
-    task, named = get_task(system), versioned(observer or observer_of(get_system(system)))
+    task, named = get_task(system), (observer or observer_of(get_system(system)))
     agent = Agent(
         network=network,
         squashed=squashed,

@@ -46,7 +46,7 @@ class Train:
             "takes it, such as Pendulum-v1.",
         ),
     ]
-    information: Annotated[Knows, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
+    information: Knows = "x_hat"
     """What the agent knows: docs/guides/agents.md explains each. In an environment: state, x_hat,
     z, stacked, recurrent or y (docs/results/partly_observed.md)."""
     seed: int = 0

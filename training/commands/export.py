@@ -40,7 +40,7 @@ class ExportCommand:
     case, as floats would not do: what the network is told of it are small differences. So is the covariance of maps
     that track."""
     measurement_noise: Annotated[
-        NoiseLevel, tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: what is usual for the map)")
+        NoiseLevel, tyro.conf.arg(help_behavior_hint="(default: what is usual for the map)")
     ] = None
     """For --format c and js: standard deviation of the noise on each sample that the estimate assumes, or one for each
     output as in 0.1,0.3. The compiler and the module may be told another."""

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Column, Table
 
@@ -46,7 +45,7 @@ class Faults:
     """Shipped maps, or .safetensors files, with limits for a monitor; by default the newest of each shipped system."""
     system: OwnSystem = None
     policy: OwnPolicy = None
-    trajectories: Annotated[int, tyro.conf.arg(aliases=["--runs"])] = 500
+    trajectories: int = 500
     """Number of trajectories for each observer."""
     duration: Seconds = None
     """Length of each trajectory in seconds; 50 for the systems that ship."""

@@ -8,42 +8,33 @@ from rich.table import Table
 
 from observers import Artifact, shipped
 from observers.names import resolve
-from training.config import current_names
 
-LEAST_WIDTH = 80  # of the table
+WIDTH = 80  # of the table; a narrower terminal breaks its lines, which cuts nothing
 
 
 @dataclass(frozen=True)
 class Maps:
-    """List the maps that ship with the package.
-
-    The name in brackets, without a version, is that of the newest.
-    """
+    """List the maps that ship with the package."""
 
     def run(self, console: Console) -> None:
-        """Print a row for each file."""
-        names = shipped()
-        table = Table(
-            box=SIMPLE_HEAD, show_edge=False, padding=0, caption="*: tracks; –: not told", caption_justify="left"
-        )
-        table.add_column("map", min_width=max(map(len, names)))  # which wraps between words only
+        """Print a row for each."""
+        caption = "*: tracks; –: not told"
+        table = Table(box=SIMPLE_HEAD, show_edge=False, padding=0, width=WIDTH, caption=caption, caption_justify="left")
+        table.add_column("map", no_wrap=True)
         table.add_column("pipeline", no_wrap=True)
         for column in ("inputs", "modes", "measurement\nnoise up to", "process\nnoise\nup to", "MB"):
             table.add_column(column, justify="right", no_wrap=True)
-        for file in dict.fromkeys(names.values()):
-            path = resolve(file)
+        for name in shipped():
+            path = resolve(name)
             artifact = Artifact.read(path)
-            newest = [name for name, meant in names.items() if meant == file != name]
             told = artifact.inverse.features
             table.add_row(
-                file + "".join(f" ({name})" for name in newest),
-                str(current_names(artifact.training).get("pipeline", "–")) + ("" if artifact.flow is None else "*"),
+                name,
+                str(artifact.training.get("pipeline", "–")) + ("" if artifact.flow is None else "*"),
                 str(artifact.nu),
                 str(len(artifact.filter.A)),
                 f"{artifact.inverse.measurement_noise_max:g}" if "measurement_noise" in told else "–",
                 f"{artifact.process_noise_max:g}" if artifact.process_noise_max is not None else "–",
                 f"{path.stat().st_size / 1e6:.2f}",
             )
-        if console.width < LEAST_WIDTH:  # the terminal breaks lines then, which cuts nothing
-            table.width = LEAST_WIDTH
         console.print(table, crop=False)

@@ -112,7 +112,7 @@ NoiseLevel = Annotated[
         is_instance=lambda value: True,
         str_from_instance=lambda level: [str(level)],
     ),
-    tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: the system's own)"),
+    tyro.conf.arg(help_behavior_hint="(default: the system's own)"),
 ]
 NoiseLevels = Annotated[
     tuple[Level, ...] | None,
@@ -123,7 +123,7 @@ NoiseLevels = Annotated[
         is_instance=lambda value: True,
         str_from_instance=lambda levels: [str(levels)],
     ),
-    tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: 0 and the system's own)"),
+    tyro.conf.arg(help_behavior_hint="(default: 0 and the system's own)"),
 ]
 Seconds = Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the system's own)")]
 OwnPolicy = Annotated[

@@ -51,14 +51,16 @@ def run_missing(
 ) -> list[str]:
     """Run the jobs that are not done."""
     todo, failures = [job for job in jobs if not job.done], list[str]()
+    names = [job.name for job in todo]  # the engine begins jobs in this order: the first ones run
     bar = progress.add_task(what, total=len(jobs), completed=len(jobs) - len(todo))
     with engine(workers.jobs, backend=workers.backend, address=workers.address) as here:
-        progress.update(bar, description=under_way(what, [job.name for job in todo[: here.workers]]))
-        for job, failure, running in here.run(run, todo):
+        progress.update(bar, description=under_way(what, names[: here.workers]))
+        for job, failure in here.run(run, todo):
+            names.remove(job.name)
             if failure:
                 failures.append(f"{job.name}: {failure}")
                 progress.say(f"failed {failures[-1]} (in {job.folder})")
             else:
                 progress.say(f"finished {job.name}")
-            progress.update(bar, advance=1, description=under_way(what, running))
+            progress.update(bar, advance=1, description=under_way(what, names[: here.workers]))
     return failures

@@ -1,6 +1,5 @@
 """``kkl-gym tracking``."""
 
-import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,8 +41,7 @@ class Tracking(Teaching):
         from training.recorded.tracking import learn_recorded_tracking
         from training.teaching.tracking import learn_tracking  # torch takes seconds that help need not wait for
 
-        name = re.sub(r"-v\d+$", "", resolve(self.observer).stem)
-        out = Path(f"runs/tracking/{name}.safetensors") if self.out is None else self.out
+        out = Path("runs/tracking") / resolve(self.observer).name if self.out is None else self.out
         found = self.taught(
             out,
             console,

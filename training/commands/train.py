@@ -49,7 +49,7 @@ class Train:
             help_behavior_hint="",
         ),
     ] = ""
-    pipeline: Annotated[Pipeline, tyro.conf.arg(aliases=["--method"])] = "input-aware"
+    pipeline: Pipeline = "input-aware"
     """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs."""
     preset: Preset = "fast"
     """fast: about ten minutes; it made the shipped maps. paper: the paper's sizes."""

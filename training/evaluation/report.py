@@ -7,7 +7,6 @@ import numpy as np
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from training.config import current_names
 from training.evaluation.errors import UnseenTrajectories, errors, unseen_trajectories
 from training.evaluation.levels import show_level
 from training.figures import ESTIMATE, TRUTH, drawing
@@ -36,7 +35,7 @@ def write_report(
         losses = figure.add_subplot(grid[0, 0])
         for name, history in result.losses.items():
             losses.semilogy(*np.array(history).T, label=name)
-        title = f"{system.name}, {current_names(artifact.training)['pipeline']}"
+        title = f"{system.name}, {artifact.training['pipeline']}"
         losses.set(xlabel="batch", ylabel="error", title=title)
         losses.legend()
         right = figure.add_subplot(grid[0, 1])

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
+from examples.research.resumable import check_failures, run_job
 from kkl_gym.systems import SYSTEMS, get_system
 from observers.checks import noise_levels
 from observers.storage import clear_unfinished
@@ -17,7 +18,7 @@ from training.progress import LOG, progress_bars
 from training.seeds import Stream, generator
 
 if TYPE_CHECKING:
-    from examples.research.benchmark.jobs import Job
+    from examples.research.benchmark.jobs import Training
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Benchmark:
     Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
     OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
     trained observer. A run that was interrupted goes on where it stopped. --systems and --methods do a part of the
-    work. What is missing from the full set is said in table and figure.
+    work; table and figure then name the missing observers.
     """
 
     budget: Literal["short", "cpu", "paper"] = "cpu"
@@ -57,9 +58,8 @@ class Benchmark:
     """Only write table and figure again from OUT/results.csv and OUT/methods.csv."""
 
     def run(self, console: Console) -> Path:
-        """Run what is missing, then report."""
-        from examples.research.benchmark.jobs import run_job, time_steps  # torch takes seconds to import
-        from examples.research.benchmark.results import check_results, collect, report
+        """Run the missing jobs, then report."""
+        from examples.research.benchmark.results import check_results, collect, report  # pandas takes a second
 
         name = "quick" if self.quick else self.budget
         out = self.out or Path("runs") / "benchmark" / name
@@ -67,15 +67,15 @@ class Benchmark:
             check_results(self.beside)
         clear_unfinished(out)
         with progress_bars(console, out / LOG) as progress:
-            failures = list[str]()
+            jobs, trained, failures = list["Training"](), list["Training"](), list[str]()
             if not self.report:
-                jobs = self._jobs(name, out)
+                jobs = self.jobs(name, out)
                 failures = run_missing(run_job, jobs, workers=self.workers, what="observers", progress=progress)
                 trained = [job for job in jobs if job.done]
                 for job in progress.track(trained, description="timing steps"):
                     try:
-                        time_steps(job)
-                    except Exception as error:  # as in a job: whatever a method does wrong, the others go on
+                        job.time_steps()
+                    except Exception as error:  # of one method; the others go on
                         failures.append(f"{job.name}, timing: {error}")
                 if trained:
                     collect(out, self.beside)
@@ -83,25 +83,16 @@ class Benchmark:
                 with progress.phase("drawing the table and the figure"):
                     note = report(out)
                 progress.say(f"wrote results.csv, methods.csv, table.md and heatmap.png in {out}. {note}")
-        if failures:
-            raise ValueError(f"{len(failures)} of {len(jobs)} jobs failed; the first: {failures[0]}")
+        check_failures(failures, jobs, "observers")
         return out
 
-    def _jobs(self, name: str, out: Path) -> "list[Job]":
-        """What is to be done; ValueError if an option makes no sense."""
-        import torch
+    def jobs(self, name: str, out: Path) -> "list[Training]":
+        """Make the jobs of a budget; raises ValueError if an option is invalid."""
+        import torch  # which, as the next ones, takes seconds that help need not wait for
 
-        from examples.research.benchmark.jobs import Job
+        from examples.research.benchmark import budgets
+        from examples.research.benchmark.jobs import Training
         from examples.research.methods import METHODS, WrongParameters, get_method
-        from examples.research.speed.size_errors import (
-            BUDGETS,
-            PROTOCOL,
-            QUICK_PROTOCOL,
-            SEARCH,
-            VALIDATION,
-            paced_budget,
-        )
-        from examples.research.speed.size_errors import paced_protocol as paced
 
         methods, levels = tuple(METHODS) if self.methods is None else self.methods, self.measurement_noise
         if not self.systems or not methods or levels == ():
@@ -111,9 +102,9 @@ class Benchmark:
         for names in (*named, [show_level(level) for level in levels or ()]):
             if len(set(names)) < len(names):
                 raise ValueError(f"{names} has one of them twice")
-        protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, seed=self.seed)
-        budget = BUDGETS[name]
-        search = None if self.quick else SEARCH * budget.cpu_seconds
+        protocol = replace(budgets.QUICK_PROTOCOL if self.quick else budgets.PROTOCOL, seed=self.seed)
+        budget = budgets.BUDGETS[name]
+        search = None if self.quick else budgets.SEARCH * budget.cpu_seconds
         device = "cuda" if name == "paper" and torch.cuda.is_available() else "cpu"
         jobs = []
         for given in self.systems:
@@ -121,18 +112,18 @@ class Benchmark:
             noise = tuple(noise_levels("measurement_noise", level, system.ny) for level in levels or ())
             noise = noise or tuple(dict.fromkeys([0.0, multiple(system, 1.0)]))
             for method in methods:
-                found = get_method(method)
-                if self.methods is None and isinstance(found, WrongParameters) and not system.parameters:
+                contender = get_method(method)
+                if self.methods is None and isinstance(contender, WrongParameters) and not system.parameters:
                     continue
-                found.believed(system)  # refuses some systems, now rather than when its turn comes
-                job = Job(
+                contender.believed(system)  # refuses some systems now rather than when their turn comes
+                job = Training(
                     system=given,
                     method=method,
-                    folder=out / "jobs" / system.name / found.name,
-                    budget=paced_budget(budget, system),
-                    protocol=replace(paced(protocol, system), measurement_noise=noise),
+                    folder=out / "jobs" / system.name / contender.name,
+                    budget=budgets.paced_budget(budget, system),
+                    protocol=replace(budgets.paced_protocol(protocol, system), measurement_noise=noise),
                     search=search,
-                    validation=replace(paced(VALIDATION, system), measurement_noise=noise),
+                    validation=replace(budgets.paced_protocol(budgets.VALIDATION, system), measurement_noise=noise),
                     device=device,
                 )
                 jobs.append(job)

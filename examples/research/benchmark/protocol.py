@@ -58,16 +58,13 @@ def with_shared_noise(
 
 def measure(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> pd.DataFrame:
     """Measure an observer on test trajectories."""
-    n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
-    frames = []
+    n, frames = protocol.trajectories, []
     for i, domain in enumerate(protocol.domains):
         seed = (Stream.EVALUATION, protocol.seed, 1, i)
-        runs = unseen_trajectories(
-            system, dt, n=protocol.trajectories, duration=protocol.duration, seed=protocol.seed, domain=domain
-        ).first(n)
+        runs = unseen_trajectories(system, dt, n=n, duration=protocol.duration, seed=protocol.seed, domain=domain)
         skip = round(TRANSIENT * len(runs.x))
         for noise in protocol.measurement_noise:
-            y = with_shared_noise(system, runs, measurement_noise=noise, n=protocol.trajectories, seed=seed)
+            y = with_shared_noise(system, runs, measurement_noise=noise, n=n, seed=seed)
             x_hat = run(method.observer(trained, system, dt, noise), y)
             late = smape(runs.x, x_hat, skip)
             errors = pd.DataFrame(
@@ -96,23 +93,22 @@ def tuned_for(method: Method[Any], system: System) -> tuple[Level, ...] | None:
 
 def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
     """Score a configuration on validation trajectories from X: smaller is better."""
-    n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
-    everyone = unseen_trajectories(
+    n = protocol.trajectories
+    runs = unseen_trajectories(
         system,
         dt,
-        n=protocol.trajectories,
+        n=n,
         duration=protocol.duration,
         seed=protocol.seed,
         domain="X",
         stream=Stream.VALIDATION,
     )
-    runs = everyone.first(n)
     if not runs.inside.any():
         raise ValueError(f"every validation trajectory of {system.name} left its bounds; widen them or shrink X")
     seed = (Stream.VALIDATION, protocol.seed, 1)
     medians = []
     for noise in tuned_for(method, system) or protocol.measurement_noise:
-        y = with_shared_noise(system, runs, measurement_noise=noise, n=protocol.trajectories, seed=seed)
+        y = with_shared_noise(system, runs, measurement_noise=noise, n=n, seed=seed)
         x_hat = run(method.observer(trained, system, dt, noise), y)
         medians.append(np.median(smape(runs.x, x_hat)))
     return float(np.exp(np.mean(np.log(np.maximum(medians, 1e-6)))))

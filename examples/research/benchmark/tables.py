@@ -20,32 +20,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INTERVAL = "{median} ± {half_iqr} [{low}, {high}]"
+PAPERS_MEASURE = "The paper's measure: median ± half the interquartile range [bootstrap 95 % interval of the median]."
+SETTLING = "Median time from which the error stays below a tenth of the trajectory's size."
 # Column of results.csv, title, form of a cell, explanation.
 MEASURES = (
-    (
-        "smape",
-        "SMAPE in %, all steps",
-        INTERVAL,
-        "The paper's measure: median ± half the interquartile range [bootstrap 95 % interval of the median].",
-    ),
-    (
-        "smape_late",
-        "SMAPE in % after the first 20 %",
-        INTERVAL,
-        "The same.",
-    ),
-    (
-        "rmse_late",
-        "RMSE after the first 20 %",
-        INTERVAL,
-        "The same, in units of the state.",
-    ),
-    (
-        "settling",
-        "Settling time in s",
-        "{median}",
-        "Median time from which the error stays below a tenth of the trajectory's size.",
-    ),
+    ("smape", "SMAPE in %, all steps", INTERVAL, PAPERS_MEASURE),
+    ("smape_late", "SMAPE in % after the first 20 %", INTERVAL, "The same."),
+    ("rmse_late", "RMSE after the first 20 %", INTERVAL, "The same, in units of the state."),
+    ("settling", "Settling time in s", "{median}", SETTLING),
 )
 NRMSE = re.compile(r"nrmse\d+")  # columns of results.csv
 NEVER = 1e12  # stands for an infinite time or error, of which no quantile can be taken
@@ -83,7 +65,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         for case in cases:
             lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", explanation, ""]
             lines += _by_method(methods, partial(_spread, summary, form, case))
-    states = [column for column in results if NRMSE.fullmatch(column)]  # none in results of earlier versions
+    states = [column for column in results if NRMSE.fullmatch(column)]  # none in the published results.csv
     if states:
         medians = results[results.escaped == 0].groupby(["starts", "noise", "system", "method"])[states].median()
         for case in cases:

@@ -1,8 +1,7 @@
 """How far to trust an observer: risks, sensitivities and the paper's bounds, from fresh samples."""
 
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,19 +18,16 @@ from examples.research.certificates.settled import TRUNCATED, SettledTrajectorie
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.checks import noise_levels
-from training.config import current_names
 from training.evaluation.levels import Level, level_for
 from training.evaluation.metrics import nrmse
 from training.maps.smooth import decoder
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
 
-WITHOUT_T, WITH_T = 3, 10  # parts of the work
-
 
 @dataclass(frozen=True)
 class Certificate:
-    """What :func:`certify` found. Errors are of the whole state in its own units; bounds are of their squares.
+    """The result of :func:`certify`. Errors are of the whole state in its own units; bounds are of their squares.
 
     Shapes: ``measurement_noise`` of length ny, ``noise_bound`` of length ny, ``nrmse``, ``noisy_nrmse`` of length nx,
     ``lipschitz_at`` of length of the filter's state.
@@ -66,7 +62,7 @@ class Certificate:
     forward: Forward | None
 
     def as_json(self) -> dict[str, Any]:
-        """For json.dumps; what is infinite becomes None."""
+        """For json.dumps; infinite values become None."""
         return {key: _plain(value) for key, value in asdict(self).items()}
 
 
@@ -83,18 +79,15 @@ def certify(
     name: str = "",
     policy: Controller | None = None,
     recorded: SettledTrajectories | None = None,
-    report: Callable[[float], object] = lambda done: None,
 ) -> Certificate:
-    """Say how far an observer is to be trusted, on samples that its training never saw.
+    """Bound how far an observer is to be trusted, on samples that its training never saw.
+
+    The bounds are those of T_inv(z): of an observer that tracks, its T_inv alone is certified.
 
     Shapes: ``measurement_noise`` of length ny.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
-    if artifact.flow is not None:
-        raise ValueError(
-            "the bounds are those of T_inv(z), and this observer tracks: certify the map that it was made from, of "
-            "those that ship NAME-static"
-        )
+    artifact = replace(artifact, flow=None)
     process_noise = system.process_noise if process_noise is None else process_noise
     for what, value in (("process_noise", process_noise), ("psi", 0.0 if psi is None else psi)):
         if not 0 <= value < math.inf:
@@ -108,16 +101,13 @@ def certify(
     noise: dict[str, Any] = {"measurement_noise": level, "process_noise": process_noise}
     if recorded is None:
         recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed, policy=policy)
-    report(1)
     measured, sample = recorded.halves()
     informed = decoder(artifact, **noise)
     lower, at = lipschitz_lower(informed, recorded.z)
-    report(2)
     upper = lipschitz_upper(informed)
-    report(WITHOUT_T)
     free = decoder(artifact, 0.0)
     if all(map(np.array_equal, (*informed.mlp.weights, *informed.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
-        free = informed  # a map that is not told the noise is bounded once
+        free = informed  # a map without noise among its inputs is bounded once
     linear = artifact.filter
     gain = theorem_gain(linear)
     l_h = output_lipschitz(system, system.draw_starts(generator(Stream.CERTIFICATE, seed, 1), 2_000))
@@ -132,7 +122,7 @@ def certify(
     samples = inverse_samples(artifact.training)
     inverse_dimension = pseudo_dimension_bound((artifact.free_inverse or artifact.inverse).mlp)
     return Certificate(
-        observer=name or f"{artifact.system} ({current_names(artifact.training).get('pipeline', 'unknown')})",
+        observer=name or f"{artifact.system} ({artifact.training.get('pipeline', 'unknown')})",
         system=system.name,
         measurement_noise=level,
         noise_bound=noise_levels("noise_bound", noise_bound, system.ny),
@@ -164,21 +154,15 @@ def certify(
             artifact,
             system,
             sample,
-            told=Inverse(informed, upper),
+            informed=Inverse(informed, upper),
             noise_free=Inverse(free, upper if free is informed or artifact.forward is None else lipschitz_upper(free)),
             noise_error=noise_error,
             psi=psi,
             error=float(losses.mean()),
             delta=delta,
             rng=generator(Stream.CERTIFICATE, seed, 2),
-            report=lambda share: report(WITHOUT_T + (WITH_T - WITHOUT_T) * share),
         ),
     )
-
-
-def parts(artifact: Artifact) -> int:
-    """Number of parts, of about the same length, that the work of :func:`certify` has."""
-    return WITHOUT_T if artifact.forward is None else WITH_T
 
 
 def _nrmse(x: np.ndarray, x_hat: np.ndarray) -> tuple[float, ...]:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,17 +53,17 @@ class Certify:
     seed: int = 0
     """Seed of starts and noise."""
     out: Path = Path("runs/certificates")
-    """Folder for what is written."""
+    """Folder of results."""
 
     def run(self, console: Console) -> "list[Certificate]":
         """Certify."""
-        from examples.research.certificates.certificate import certify, parts  # torch takes seconds to import
+        from examples.research.certificates.certificate import certify  # torch takes seconds to import
         from examples.research.certificates.settled import record_settled
 
         names = [Path(given).stem if given.endswith(".safetensors") else given for given in self.observers]
         if len(set(names)) < len(names):
             raise ValueError(f"each observer writes NAME.json, so names must differ; got {', '.join(names)}")
-        found = []
+        certificates = []
         observers = read_observers(self.observers, self.system)
         require_writable(self.out)
         for name, (_, artifact, system) in zip(names, observers, strict=True):
@@ -71,150 +71,137 @@ class Certify:
             if reason := beyond(artifact, level):
                 console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
                 continue
+            title = name
+            if artifact.flow is not None:
+                artifact, title = replace(artifact, flow=None), f"{name}, T_inv alone"
+                console.print(f"{name} tracks; this is the certificate of its T_inv alone", markup=False)
             process_noise = system.process_noise if self.process_noise is None else self.process_noise
             KKLObserver(artifact, level, process_noise=process_noise)  # refuses bad levels now
             noise: dict[str, Any] = {"measurement_noise": level, "process_noise": process_noise}
-            with progress_bars(console) as progress, progress.phase(f"certifying {name}", parts(artifact)) as report:
+            with progress_bars(console) as progress, progress.phase(f"certifying {name}"):
                 policy = read_policy(artifact, system, self.policy)
-                motion = record_settled(
-                    artifact,
-                    system,
-                    **noise,
-                    trajectories=self.trajectories,
-                    seed=self.seed,
-                    policy=policy,
-                )
+                how = {**noise, "trajectories": self.trajectories, "seed": self.seed}
+                motion = record_settled(artifact, system, **how, policy=policy)
                 certificate = certify(
-                    artifact,
-                    system,
-                    **noise,
-                    psi=self.psi,
-                    trajectories=self.trajectories,
-                    delta=self.delta,
-                    seed=self.seed,
-                    name=name,
-                    recorded=motion,
-                    report=report,
+                    artifact, system, **how, psi=self.psi, delta=self.delta, name=title, recorded=motion
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
-                draw(self.out / f"{name}.png", artifact, system, name=name, noise=noise, motion=motion)
-            found.append(certificate)
-        if not found:
+                draw(self.out / f"{name}.png", artifact, system, name=title, noise=noise, motion=motion)
+            certificates.append(certificate)
+        if not certificates:
             raise ValueError(f"nothing is left to certify of {', '.join(names)}: the lines above say why")
-        console.print(table(found))
-        write(self.out / "table.md", page(found))
+        console.print(table(certificates))
+        write(self.out / "table.md", page(certificates))
         console.print(f"wrote table.md, JSON and figures in {self.out}")
-        return found
+        return certificates
 
 
-def lines(found: "Certificate") -> list[dict[str, str]]:
-    """What a certificate says, in sections: label to value."""
-    from examples.research.certificates.forward import QUANTILES
-
-    forward = found.forward
-
-    def number(value: float | None) -> str:
-        return "–" if value is None or np.isnan(value) else "∞" if np.isinf(value) else f"{value:.3g}"
-
-    def of(name: str) -> str:
-        return number(getattr(forward, name, None))
-
-    def ratio(bound: float, error: float) -> str:
-        return number((bound / error) ** 0.5 if error > 0 else None)
-
-    def states(values: Sequence[float]) -> str:
-        return " / ".join(map(number, values))
-
-    residual = {f"\\|P\\|, {100 * level:g} % of X below": level for level in QUANTILES}
-    left = forward.envelope if forward else {}
+def lines(certificate: "Certificate") -> list[dict[str, str]]:
+    """The lines of a certificate in sections, by label; those that need T only where there is one."""
+    one, T = certificate, certificate.forward
+    learned, forgotten, bounds, noisy_bounds, samples = {}, {}, {}, {}, {}
+    if T is not None:
+        learned = {
+            "R_T, z - T(x) along the motion, mean square": _number(T.forward_risk),
+            "PDE residual P, mean square over X": _number(T.pde_risk),
+            **{f"\\|P\\|, {100 * level:g} % of X below": _number(value) for level, value in T.residual.items()},
+            "R_2, x - T_inv(T(x)) along the motion, mean square": _number(T.reconstruction_risk),
+            "the same over X": _number(T.reconstruction_risk_over_box),
+            "T_inv(T(x)) - T_inv(z) along the motion, mean square": _number(T.propagated_risk),
+        }
+        forgotten = {
+            **{f"start's \\|z - T(x)\\|, at most, at {age:g} s": _number(left) for age, left in T.envelope.items()},
+            "start forgotten after, s": _number(T.forgets_start),
+        }
+        share = 1 - (T.reconstruction_risk / T.sharp_bound) ** 0.5 if T.sharp_bound > 0 else np.nan
+        bounds = {
+            "bound of the rms error, no noise": _number(T.bound**0.5),
+            "bound / measured": _ratio(T.bound, one.error),
+            "share of T in the bound, %": _number(100 * T.forward_share),
+            "Lipschitz constant of T_inv from T(x) to z, at most": _number(T.lipschitz_between),
+            "sharp bound, no noise": _number(T.sharp_bound**0.5),
+            "share of T in it, %": _number(100 * share),
+            "sharp bound / measured": _ratio(T.sharp_bound, one.error),
+        }
+        noisy_bounds = {
+            "bound with noise / measured": _ratio(T.noisy_bound, one.noisy_error),
+            "sharp bound with noise / measured": _ratio(T.sharp_noisy_bound, one.noisy_error),
+        }
+        samples = {"N_1, samples of T": _number(T.forward_samples)}
     return [
         {
-            "rms error in the long run, no noise": number(found.error**0.5),
-            "the same, v and w bounded": number(found.noisy_error**0.5),
-            "rms error by state in % of its standard deviation, no noise": states(found.nrmse),
-            "the same by state, v and w bounded": states(found.noisy_nrmse),
-            "error due to v alone, predicted": number(found.predicted_noise_error),
-            "the same, measured": number(found.measured_noise_error),
+            "rms error in the long run, no noise": _number(one.error**0.5),
+            "the same, v and w bounded": _number(one.noisy_error**0.5),
+            "rms error by state in % of its standard deviation, no noise": " / ".join(map(_number, one.nrmse)),
+            "the same by state, v and w bounded": " / ".join(map(_number, one.noisy_nrmse)),
+            "error due to v alone, predicted": _number(one.predicted_noise_error),
+            "the same, measured": _number(one.measured_noise_error),
         },
         {
-            "Lipschitz constant of T_inv, at least": number(found.lipschitz_lower),
-            "the same, at most": number(found.lipschitz_upper),
-            "product of the layers' norms": number(found.norm_product),
-            "largest norm of dh/dx over X": number(found.output_lipschitz),
-            "least singular value of [A - s I, B]": number(found.controllability),
-            "gain from v to z, the theorem's": number(found.gain_theorem),
-            "H-infinity norm": number(found.gain_h_infinity),
-            "H2 norm": number(found.gain_h2),
+            "Lipschitz constant of T_inv, at least": _number(one.lipschitz_lower),
+            "the same, at most": _number(one.lipschitz_upper),
+            "product of the layers' norms": _number(one.norm_product),
+            "largest norm of dh/dx over X": _number(one.output_lipschitz),
+            "least singular value of [A - s I, B]": _number(one.controllability),
+            "gain from v to z, the theorem's": _number(one.gain_theorem),
+            "H-infinity norm": _number(one.gain_h_infinity),
+            "H2 norm": _number(one.gain_h2),
+        },
+        learned,
+        forgotten,
+        {
+            "psi": _number(one.psi),
+            **bounds,
+            "what the theorem adds for noise, as rms": _number(one.noise_term**0.5),
+            **noisy_bounds,
         },
         {
-            "R_T, z - T(x) along the motion, mean square": of("forward_risk"),
-            "PDE residual P, mean square over X": of("pde_risk"),
-            **{label: number(forward.residual[level] if forward else None) for label, level in residual.items()},
-            "R_2, x - T_inv(T(x)) along the motion, mean square": of("reconstruction_risk"),
-            "the same over X": of("reconstruction_risk_over_box"),
-            "T_inv(T(x)) - T_inv(z) along the motion, mean square": of("propagated_risk"),
-        },
-        {
-            **{f"start's \\|z - T(x)\\|, at most, at {age:g} s": number(value) for age, value in left.items()},
-            "start forgotten after, s": of("forgets_start"),
-        },
-        {
-            "psi": number(found.psi),
-            "bound of the rms error, no noise": number(forward.bound**0.5 if forward else None),
-            "bound / measured": number(None) if forward is None else ratio(forward.bound, found.error),
-            "share of T in the bound, %": number(100 * forward.forward_share if forward else None),
-            "Lipschitz constant of T_inv from T(x) to z, at most": of("lipschitz_between"),
-            "sharp bound, no noise": number(forward.sharp_bound**0.5 if forward else None),
-            "share of T in it, %": number(100 * (1 - (forward.reconstruction_risk / forward.sharp_bound) ** 0.5))
-            if forward and forward.sharp_bound > 0
-            else number(None),
-            "sharp bound / measured": number(None) if forward is None else ratio(forward.sharp_bound, found.error),
-            "what the theorem adds for noise, as rms": number(found.noise_term**0.5),
-            "bound with noise / measured": number(None)
-            if forward is None
-            else ratio(forward.noisy_bound, found.noisy_error),
-            "sharp bound with noise / measured": number(None)
-            if forward is None
-            else ratio(forward.sharp_noisy_bound, found.noisy_error),
-        },
-        {
-            "N_1, samples of T": of("forward_samples"),
-            "N_2, samples of T_inv": number(found.inverse_samples),
-            "pseudo-dimension of T_inv's losses, at most": number(found.inverse_dimension),
-            "generalisation term C of T_inv": number(found.inverse_term),
-            "generalisation term C of T": of("forward_term"),
+            **samples,
+            "N_2, samples of T_inv": _number(one.inverse_samples),
+            "pseudo-dimension of T_inv's losses, at most": _number(one.inverse_dimension),
+            "generalisation term C of T_inv": _number(one.inverse_term),
+            **({} if T is None else {"generalisation term C of T": _number(T.forward_term)}),
         },
     ]
 
 
-def table(found: "Sequence[Certificate]") -> Table:
+def _number(value: float) -> str:
+    return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.3g}"
+
+
+def _ratio(bound: float, error: float) -> str:
+    return _number((bound / error) ** 0.5 if error > 0 else np.nan)
+
+
+def table(certificates: "Sequence[Certificate]") -> Table:
     """Certificates side by side, one row for each label."""
-    out = Table("", *(certificate.observer for certificate in found))
-    for section in _sections(found):
+    out = Table("", *(one.observer for one in certificates))
+    for section in _sections(certificates):
         for label, *values in section:
             out.add_row(label.replace("\\", ""), *values)
         out.add_section()
     return out
 
 
-def page(found: "Sequence[Certificate]") -> str:
+def page(certificates: "Sequence[Certificate]") -> str:
     """Certificates side by side in Markdown, with the noise that they were made for."""
-    rows = [row for section in _sections(found) for row in section]
+    rows = [row for section in _sections(certificates) for row in section]
     noise = dict.fromkeys(
-        f"{show_level(one.measurement_noise)}, cut at {show_level(one.noise_bound)} for the bounds" for one in found
+        f"{show_level(one.measurement_noise)}, cut at {show_level(one.noise_bound)} for the bounds"
+        for one in certificates
     )
-    head = f"Measurement noise {'; '.join(noise)}; {found[0].samples} samples along the motion of the first.\n\n"
-    return head + "\n".join(markdown.table(["", *(certificate.observer for certificate in found)], rows)) + "\n"
+    head = f"Measurement noise {'; '.join(noise)}; {certificates[0].samples} samples along the motion of the first.\n\n"
+    return head + "\n".join(markdown.table(["", *(one.observer for one in certificates)], rows)) + "\n"
 
 
-def _sections(found: "Sequence[Certificate]") -> list[list[list[str]]]:
+def _sections(certificates: "Sequence[Certificate]") -> list[list[list[str]]]:
     """Rows of each section: a label, and what each certificate has under it."""
     out = []
-    for sections in zip(*map(lines, found), strict=True):
-        longest_first = sorted(sections, key=len, reverse=True)  # some lack lines that others have
+    for sections in zip(*map(lines, certificates), strict=True):
+        longest_first = sorted(sections, key=len, reverse=True)  # those without T lack lines that others have
         labels = dict.fromkeys(label for section in longest_first for label in section)
         out.append([[label, *(section.get(label, "–") for section in sections)] for label in labels])
-    return out
+    return [rows for rows in out if rows]
 
 
 def draw(

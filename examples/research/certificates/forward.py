@@ -1,7 +1,7 @@
-"""What a learned T allows to say: its risks, its residual, what stands in the way of T_inv, and the paper's bounds."""
+"""The part of a certificate that needs a learned T: its risks, its residual and the paper's bounds."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +26,7 @@ DRAWN = 20_000  # states in X
 
 @dataclass(frozen=True)
 class Forward:
-    """What is known where a forward map T was learned.
+    """The part of a certificate that needs a learned forward map T.
 
     Risks "along the motion" are means over recorded states that no training saw: over the measure of the theorems on
     the observer, not over the samples S_1 and S_2 of the training.
@@ -70,16 +70,15 @@ def certify_forward(
     system: System,
     recorded: SettledTrajectories,
     *,
-    told: Inverse,
+    informed: Inverse,
     noise_free: Inverse,
     noise_error: float,
     psi: float,
     error: float,
     delta: float,
     rng: np.random.Generator,
-    report: Callable[[float], object] = lambda share: None,
 ) -> Forward | None:
-    """Say what a learned T allows to say."""
+    """Certify what rests on T; None if the artifact has no T."""
     if artifact.forward is None:
         return None
     T, T_inv, linear = encoder(artifact.forward), noise_free.T_inv, artifact.filter
@@ -93,24 +92,22 @@ def certify_forward(
     dimension, samples = pseudo_dimension_bound(artifact.forward.mlp), forward_samples(artifact.training)
     largest = float(data_losses.max()) + weight * float(size.max()) ** 2
 
-    same = told.T_inv is noise_free.T_inv
+    same = informed.T_inv is noise_free.T_inv
 
     def sharp(used: Inverse) -> tuple[float, float, float, float]:
-        first = 0.0 if used is noise_free else 0.5
         some = np.linspace(0, len(z) - 1, min(SEGMENTS, len(z))).astype(int)
-        found = segment_lipschitz(
-            used.T_inv, images[some], z[some], lambda share: report(first + share / (1 if same else 2))
-        )
-        between = np.minimum(found, used.lipschitz)
+        between = np.minimum(segment_lipschitz(used.T_inv, images[some], z[some]), used.lipschitz)
         reconstruction = float(squared(recorded.x - used.T_inv(images)).mean())
         steep = float((between**2 * data_losses[some]).mean())
         return reconstruction, float(between.max()), steep, (math.sqrt(reconstruction) + math.sqrt(steep)) ** 2
 
     reconstruction_risk, lipschitz_between, steep_risk, sharp_bound = sharp(noise_free)
-    told_reconstruction, _, _, told_sharp = (reconstruction_risk, 0.0, 0.0, sharp_bound) if same else sharp(told)
+    informed_reconstruction, _, _, informed_sharp = (
+        (reconstruction_risk, 0.0, 0.0, sharp_bound) if same else sharp(informed)
+    )
     forward_part = 2 * noise_free.lipschitz**2 * physics_risk
     total = 2 * reconstruction_risk + forward_part
-    told_bound = 2 * (2 * told_reconstruction + 2 * told.lipschitz**2 * physics_risk)
+    informed_bound = 2 * (2 * informed_reconstruction + 2 * informed.lipschitz**2 * physics_risk)
     start_error = float(np.sqrt(squared(linear.start(system.output(x)) - T(x)).max()))
     ages = system.pace * np.array(AGES)
     left = envelope(linear, ages, start=start_error)
@@ -134,9 +131,9 @@ def certify_forward(
         forgets_start=max(0.0, math.log(added / math.sqrt(error)) / linear.slowest) if added * error > 0 else math.inf,
         bound=2 * total,
         forward_share=forward_part / total if total > 0 else math.nan,
-        noisy_bound=told_bound + 2 * noise_error**2,
+        noisy_bound=informed_bound + 2 * noise_error**2,
         sharp_bound=sharp_bound,
-        sharp_noisy_bound=(psi + math.sqrt(told_sharp) + noise_error) ** 2,
+        sharp_noisy_bound=(psi + math.sqrt(informed_sharp) + noise_error) ** 2,
     )
 
 

@@ -25,20 +25,11 @@ def generalisation_term(largest_loss: float, *, pseudo_dimension: float, samples
 
 
 def forward_samples(training: Mapping[str, Any]) -> int:
-    """N_1, the samples of S_1: what an artifact's training says of distinct pairs (x, z) and collocation points.
-
-    Files that do not say it count as many as they recorded, trajectories times samples, without collocation points.
-    """
-    return int(training.get("forward_samples", _recorded(training)))
+    """N_1, the samples of S_1: distinct pairs (x, z) and collocation points in an artifact's training."""
+    return int(training.get("forward_samples", 0))
 
 
 def inverse_samples(training: Mapping[str, Any]) -> int:
-    """N_2, the samples of S_2: what an artifact's training says of distinct x' that its T_inv could see.
-
-    Files that do not say it count as many as they recorded; so do maps that are fitted along trajectories.
-    """
-    return int(training.get("inverse_samples", _recorded(training)))
-
-
-def _recorded(training: Mapping[str, Any]) -> int:
-    return int(training.get("trajectories", 0)) * int(training.get("samples", 0))
+    """N_2, the samples of S_2: distinct x' in an artifact's training; along trajectories, all recorded states."""
+    recorded = int(training.get("trajectories", 0)) * int(training.get("samples", 0))
+    return int(training.get("inverse_samples", recorded))

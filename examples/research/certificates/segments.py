@@ -1,7 +1,5 @@
 """Lipschitz constants of a network along straight lines, from above: how steep T_inv is where T is wrong."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from examples.research.certificates.lipschitz import SLOPES
@@ -15,24 +13,21 @@ _STEEPEST = 2.39936  # where x sigmoid(x) is at its steepest, and its negative w
 _NEAR = 1e-5  # within which a place counts as the steepest
 
 
-def segment_lipschitz(
-    network: Smooth, start: np.ndarray, end: np.ndarray, report: Callable[[float], object] = lambda share: None
-) -> np.ndarray:
+def segment_lipschitz(network: Smooth, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Bound a network's Lipschitz constant from above along each of some line segments.
 
     Shapes: ``start``, ``end`` (n, inputs); returns (n,).
     """
-    constants, found = np.zeros(len(start)), np.zeros(len(start))
+    constants, middles = np.zeros(len(start)), np.zeros(len(start))
     owner = np.arange(len(start))
     for halving in range(HALVINGS + 1):
         upper, middle = _enclose(network, (start + end) / 2, (end - start) / 2)
-        np.maximum.at(found, owner, middle)
-        done = (upper <= (1.0 + SLACK) * found[owner]) | (halving == HALVINGS)
+        np.maximum.at(middles, owner, middle)
+        done = (upper <= (1.0 + SLACK) * middles[owner]) | (halving == HALVINGS)
         np.maximum.at(constants, owner[done], upper[done])
         left, right, owner = start[~done], end[~done], np.tile(owner[~done], 2)
         centre = (left + right) / 2
         start, end = np.concatenate([left, centre]), np.concatenate([centre, right])
-        report(1.0 - len(np.unique(owner)) / len(found))
         if not len(owner):
             break
     return constants * (1.0 + 1e-9)  # for the rounding of the arithmetic

@@ -3,23 +3,7 @@
 from inspect import isabstract
 from typing import Any
 
-from examples.research.methods.ablation import (
-    AdaptiveSPINN,
-    BySOAP,
-    LipschitzSPINN,
-    MoreModes,
-    MovingSPINN,
-    NoiseAware,
-    OwnFree,
-    PapersSPINN,
-    ScaledSPINN,
-    SmoothSPINN,
-    SolvedSPINN,
-    SPINNBySOAP,
-    SPINNOfAnyAge,
-    Transients,
-    Tuned,
-)
+from examples.research.methods.ablation import INVERSE_METHODS, SPINN_METHODS, TUNED
 from examples.research.methods.autoencoder import AE
 from examples.research.methods.base import Budget, CausalObserver, Configuration, Data, Method, Task, WrongParameters
 from examples.research.methods.dmf import DMF, DMFNoise
@@ -31,77 +15,61 @@ from examples.research.methods.node import NODE, NODENoise
 from examples.research.methods.rkn import RKN
 from kkl_gym.loading import load_class
 
-METHODS: dict[str, type[Method[Any]]] = {
-    cls.name: cls
-    for cls in (
-        Default,
-        SPINN,
-        AE,
-        DMF,
-        DMFNoise,
-        NODE,
-        NODENoise,
-        GRU,
-        KalmanNet,
-        RKN,
-        EKF,
-        UKF,
-        WrongEKF,
-        WrongDefault,
-        WrongSPINN,
-        UntunedEKF,
-    )
-}
-# Steps from the paper's pipeline to the package's and past it, which ``make ablation`` compares in this order.
-ABLATION: dict[str, type[Method[Any]]] = {
-    cls.name: cls
-    for cls in (
-        PapersSPINN,
-        SPINNBySOAP,
-        SmoothSPINN,
-        MovingSPINN,
-        ScaledSPINN,
-        SolvedSPINN,
-        SPINNOfAnyAge,
-        AdaptiveSPINN,
-        LipschitzSPINN,
-        Transients,
-        NoiseAware,
-        MoreModes,
-        BySOAP,
-        OwnFree,
-        Default,
-        Tuned,
-    )
-}
+Methods = dict[str, Method[Any]]
 
-# Those that need a map that ships for the system, and are in no table unless they are named.
-AS_SHIPPED: dict[str, type[Method[Any]]] = {cls.name: cls for cls in (Shipped, ShippedSPINN, ShippedStatic, Guided)}
+
+def _by_name(*methods: Method[Any]) -> Methods:
+    return {method.name: method for method in methods}
+
+
+METHODS = _by_name(
+    default := Default(),
+    SPINN(),
+    AE(),
+    DMF(),
+    DMFNoise(),
+    NODE(),
+    NODENoise(),
+    GRU(),
+    KalmanNet(),
+    RKN(),
+    EKF(),
+    UKF(),
+    WrongEKF(),
+    WrongDefault(),
+    WrongSPINN(),
+    UntunedEKF(),
+)
+# Steps from the paper's pipeline to the package's and past it, in the order of ``make ablation``.
+ABLATION = _by_name(*SPINN_METHODS, *INVERSE_METHODS, default, TUNED)
+# Those that need a map that ships for the system; they run only if they are named.
+AS_SHIPPED = _by_name(Shipped(), ShippedSPINN(), ShippedStatic(), Guided())
+SHIPPED = METHODS | ABLATION | AS_SHIPPED
 
 
 def get_method(name: str) -> Method[Any]:
     """Find a method of the benchmark."""
-    shipped = METHODS | ABLATION | AS_SHIPPED
-    if name in shipped:
-        return shipped[name]()
+    if name in SHIPPED:
+        return SHIPPED[name]
     if ":" not in name:
         raise ValueError(
-            f"unknown method {name!r}; there are {', '.join(shipped)}; your own: 'module:Class' or 'script.py:Class'"
+            f"unknown method {name!r}; there are {', '.join(SHIPPED)}; your own: 'module:Class' or 'script.py:Class'"
         )
-    found = load_class(name, Method)  # type: ignore[type-abstract]
-    if isabstract(found):
-        raise ValueError(f"the method {name!r} must define {', '.join(sorted(found.__abstractmethods__))}")
-    if not isinstance(vars(found).get("name"), str) or not isinstance(getattr(found, "label", None), str):
+    cls = load_class(name, Method)  # type: ignore[type-abstract]
+    if isabstract(cls):
+        raise ValueError(f"the method {name!r} must define {', '.join(sorted(cls.__abstractmethods__))}")
+    if not isinstance(vars(cls).get("name"), str) or not isinstance(getattr(cls, "label", None), str):
         raise ValueError(f"the method {name!r} must set the class variables name and label, its own")
-    if shipped.get(found.name, found) is not found:
-        raise ValueError(f"the method {name!r} takes the name {found.name!r} of another; give it one of its own")
-    return found()
+    if cls.name in SHIPPED and cls is not type(SHIPPED[cls.name]):
+        raise ValueError(f"the method {name!r} takes the name {cls.name!r} of another; give it one of its own")
+    return SHIPPED.get(cls.name) or cls()
 
 
 __all__ = [
     "ABLATION",
     "AS_SHIPPED",
     "METHODS",
+    "SHIPPED",
     "Budget",
     "CausalObserver",
     "Configuration",

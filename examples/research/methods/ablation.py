@@ -1,12 +1,12 @@
-"""What each idea earns, step by step, networks trained for equal times.
+"""What each idea earns: pipelines that differ from the next one in a few settings, trained for equal times.
 
-One staircase leads from the paper's SPINN to the package's, the other from inverses without T to the default.
+One series of steps leads from the paper's SPINN to the package's, the other from inverses without T to the default.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 from examples.research.methods.base import Configuration, Task
 from examples.research.methods.kkl import KKLMethod, within
@@ -19,26 +19,48 @@ from training.presets import preset
 from training.spectrum import papers_spectrum
 from training.tuning import Probe, Spectrum
 
+Settings = Mapping[str, Any]
+
 PENALTY = 0.03  # of the mean square error for a factor e in the Lipschitz constant
-NO_NOISE = 0.02  # of the system's own measurement noise: the largest in training of those that are to know none
-# How inverses were trained before there was one for free motion, samples drawn alike for all systems; and before SOAP.
-TOGETHER: dict[str, Any] = {
+NO_NOISE = 0.02  # of the system's own measurement noise: the largest in training of inverses for none
+# One inverse for free and driven motion, with samples drawn alike for all systems.
+TOGETHER: Settings = {
     "free_inverse": False,
     "process_noise_share": 0.0,
     "noise_free_share": 0.2,
     "high_noise_emphasis": 2.0,
 }
-EARLIER: dict[str, Any] = {**TOGETHER, "optimiser": "adam", "batch": 4096, "learning_rate": 8e-3}
+ADAM: Settings = {"optimiser": "adam", "batch": 4096, "learning_rate": 8e-3}
+# The paper's SPINN (its sec. 8.1), beside its spectrum: points uniform in X, and a small budget.
+PAPERS: Settings = {
+    "optimiser": "adam",
+    "learning_rate": 1e-3,
+    "batch": 2048,
+    "collocation": "box",
+    "box_factor": 1.0,
+    "scaling": "range",
+    "transients": False,
+    "solved_output_layer": False,
+    "adaptive": False,
+}
+# Name, label and the settings of the paper that are the preset's from this step on.
+SPINN_STEPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
+    ("ablation-spinn", "SPINN", ()),
+    ("ablation-spinn-soap", "SPINN by SOAP", ("optimiser", "learning_rate", "batch")),
+    ("ablation-spinn-spectrum", "... smooth T", ("eigenvalues", "pairs")),
+    ("ablation-spinn-motions", "... along motions", ("collocation", "box_factor")),
+    ("ablation-spinn-scaling", "... relative errors", ("scaling",)),
+    ("ablation-spinn-solved", "... output layer solved", ("solved_output_layer",)),
+    ("ablation-spinn-transients", "... transients and noise", ("transients",)),
+)
 
 
 class Ablation(KKLMethod):
     """A pipeline of the package with some settings changed."""
 
-    pipeline: ClassVar[Pipeline] = "input-aware"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """Settings that differ from the preset's: the paper's spectrum, unless another one is compared."""
-        return {"eigenvalues": papers_spectrum(task.system), "pairs": ()}
+    def __init__(self, name: str, label: str, changes: Callable[[Task], Settings], pipeline: Pipeline) -> None:
+        self.name, self.label = name, label  # type: ignore[misc]  # which other methods have of their class
+        self.changes, self.pipeline = changes, pipeline
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
@@ -47,173 +69,56 @@ class Ablation(KKLMethod):
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 
 
-class PapersSPINN(Ablation):
-    """The paper's SPINN as its sec. 8.1 describes it: points uniform in X, and its spectrum, all at a small budget."""
-
-    name: ClassVar[str] = "ablation-spinn"
-    label: ClassVar[str] = "SPINN"
-    pipeline: ClassVar[Pipeline] = "spinn"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """All that the package's SPINN has beyond the paper's; each class below gives some of it back."""
-        papers = {
-            **super().changes(task),
-            "optimiser": "adam",
-            "learning_rate": 1e-3,
-            "batch": 2048,
-            "collocation": "box",
-            "box_factor": 1.0,
-            "scaling": "range",
-            "transients": False,
-            "solved_output_layer": False,
-            "adaptive": False,
-        }
-        return {name: value for name, value in papers.items() if name not in self.given_back()}
-
-    @classmethod
-    def given_back(cls) -> set[str]:
-        """Settings that are the preset's, those of the classes before included."""
-        return {name for each in cls.__mro__ for name in vars(each).get("own", ())}
-
-
-class SPINNBySOAP(PapersSPINN):
-    """The same by SOAP."""
-
-    name: ClassVar[str] = "ablation-spinn-soap"
-    label: ClassVar[str] = "SPINN by SOAP"
-    own: ClassVar[tuple[str, ...]] = ("optimiser", "learning_rate", "batch")
-
-
-class SmoothSPINN(SPINNBySOAP):
-    """The same with a spectrum that makes T smooth."""
-
-    name: ClassVar[str] = "ablation-spinn-spectrum"
-    label: ClassVar[str] = "... smooth T"
-    own: ClassVar[tuple[str, ...]] = ("eigenvalues", "pairs")
-
-
-class MovingSPINN(SmoothSPINN):
-    """The same along motions, most of them from 2X, instead of uniform points in X."""
-
-    name: ClassVar[str] = "ablation-spinn-motions"
-    label: ClassVar[str] = "... along motions"
-    own: ClassVar[tuple[str, ...]] = ("collocation", "box_factor")
-
-
-class ScaledSPINN(MovingSPINN):
-    """The same with states in standard deviations, and relative errors."""
-
-    name: ClassVar[str] = "ablation-spinn-scaling"
-    label: ClassVar[str] = "... relative errors"
-    own: ClassVar[tuple[str, ...]] = ("scaling",)
-
-
-class SolvedSPINN(ScaledSPINN):
-    """The same, the output layer of T solved for in the end."""
-
-    name: ClassVar[str] = "ablation-spinn-solved"
-    label: ClassVar[str] = "... output layer solved"
-    own: ClassVar[tuple[str, ...]] = ("solved_output_layer",)
-
-
-class SPINNOfAnyAge(SolvedSPINN):
-    """The same at every age and level of noise."""
-
-    name: ClassVar[str] = "ablation-spinn-transients"
-    label: ClassVar[str] = "... transients and noise"
-    own: ClassVar[tuple[str, ...]] = ("transients",)
-
-
-class AdaptiveSPINN(SPINNOfAnyAge):
-    """The same with points where the residual is large drawn more often."""
-
-    name: ClassVar[str] = "ablation-spinn-adaptive"
-    label: ClassVar[str] = "... adaptive points"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """One setting more."""
-        return {**super().changes(task), "adaptive": True}
-
-
-class LipschitzSPINN(AdaptiveSPINN):
-    """The same with a penalty on the Lipschitz constant of T_inv."""
-
-    name: ClassVar[str] = "ablation-spinn-lipschitz"
-    label: ClassVar[str] = "... Lipschitz penalty"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """One setting more."""
-        return {**super().changes(task), "lipschitz_penalty": PENALTY}
-
-
-class Transients(Ablation):
-    """No T: one inverse fitted to what the filter shows along motions from X, half of them driven."""
-
-    name: ClassVar[str] = "ablation-transients"
-    label: ClassVar[str] = "inverse on transients"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """No noise."""
-        return {**super().changes(task), **EARLIER, "measurement_noise_max": multiple(task.system, NO_NOISE)}
-
-
-class NoiseAware(Ablation):
-    """The same, also under noise of every level, which it is told."""
-
-    name: ClassVar[str] = "ablation-noise"
-    label: ClassVar[str] = "... and noise"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """All that is not the default's."""
-        return {**super().changes(task), **EARLIER}
-
-
-class MoreModes(Ablation):
-    """The same with the default's spectrum."""
-
-    name: ClassVar[str] = "ablation-modes"
-    label: ClassVar[str] = "... more modes"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """Its modes are the preset's."""
-        return EARLIER
-
-
-class BySOAP(Ablation):
-    """The same by SOAP."""
-
-    name: ClassVar[str] = "ablation-soap"
-    label: ClassVar[str] = "... by SOAP"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """One map for free and driven motion."""
-        return TOGETHER
-
-
-class OwnFree(Ablation):
-    """The default, which has an inverse of its own for free motion, but no process noise in training."""
-
-    name: ClassVar[str] = "ablation-free"
-    label: ClassVar[str] = "... inverse of free motion"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """No process noise in training."""
-        return {"process_noise_share": 0.0}
-
-
-class Tuned(Ablation):
-    """The default with modes chosen anew for the system and its own level of noise."""
-
-    name: ClassVar[str] = "ablation-tuned"
-    label: ClassVar[str] = "... tuned spectrum"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """The last of the spectra that ``kkl-gym tune`` shows as chosen; what it writes begins with the default's."""
-        spectrum = tuned_spectrum(task.system, task.budget.dt, task.budget.duration)
-        return {"eigenvalues": spectrum.eigenvalues, "pairs": spectrum.pairs}
+def papers_modes(task: Task) -> Settings:
+    """The paper's spectrum."""
+    return {"eigenvalues": papers_spectrum(task.system), "pairs": ()}
 
 
 @cache
 def tuned_spectrum(system: System, dt: float, duration: float) -> Spectrum:
-    """Choose modes for a system's own level of noise; systems are tuned once."""
+    """Choose modes for a system's own level of noise, as ``kkl-gym tune`` does; each system is tuned once."""
     return Probe(system, dt, duration).choose(multiple(system, 1.0))[-1].spectrum
+
+
+def _tuned(task: Task) -> Settings:
+    spectrum = tuned_spectrum(task.system, task.budget.dt, task.budget.duration)
+    return {"eigenvalues": spectrum.eigenvalues, "pairs": spectrum.pairs}
+
+
+def _without(given_back: tuple[str, ...]) -> Callable[[Task], Settings]:
+    """The paper's settings, without some that are the preset's."""
+    return lambda task: {key: value for key, value in {**papers_modes(task), **PAPERS}.items() if key not in given_back}
+
+
+def _spinn() -> list[Ablation]:
+    methods, given_back = list[Ablation](), tuple[str, ...]()
+    for name, label, more in SPINN_STEPS:
+        given_back += more
+        methods.append(Ablation(name, label, _without(given_back), "spinn"))
+    adaptive: Settings = {"adaptive": True}
+    return [
+        *methods,
+        Ablation("ablation-spinn-adaptive", "... adaptive points", lambda task: adaptive, "spinn"),
+        Ablation(
+            "ablation-spinn-lipschitz",
+            "... Lipschitz penalty",
+            lambda task: {**adaptive, "lipschitz_penalty": PENALTY},
+            "spinn",
+        ),
+    ]
+
+
+def _without_noise(task: Task) -> Settings:
+    most = {"measurement_noise_max": multiple(task.system, NO_NOISE)}
+    return {**papers_modes(task), **TOGETHER, **ADAM, **most}
+
+
+SPINN_METHODS = _spinn()
+INVERSE_METHODS = [
+    Ablation("ablation-transients", "inverse on transients", _without_noise, "input-aware"),
+    Ablation("ablation-noise", "... and noise", lambda task: {**papers_modes(task), **TOGETHER, **ADAM}, "input-aware"),
+    Ablation("ablation-modes", "... more modes", lambda task: {**TOGETHER, **ADAM}, "input-aware"),
+    Ablation("ablation-soap", "... by SOAP", lambda task: TOGETHER, "input-aware"),
+    Ablation("ablation-free", "... inverse of free motion", lambda task: {"process_noise_share": 0.0}, "input-aware"),
+]
+TUNED = Ablation("ablation-tuned", "... tuned spectrum", _tuned, "input-aware")

@@ -41,11 +41,11 @@ class AE(KKLMethod):
     tuned_for: ClassVar[tuple[float, ...] | None] = (0.0,)
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """The cutoff that the criterion gives, and faster ones: it knows nothing of how well T can be learned."""
+        """The criterion's cutoff and faster ones, as it ignores how well T can be learned."""
         return tuple({"cutoff_factor": factor} for factor in (10.0, 3.0, 1.0))
 
     def settled(self, configuration: Configuration, trained: Artifact) -> Configuration:
-        """The cutoff that did well: what the criterion says moves with the time that the maps are learned for."""
+        """The cutoff of the best short training: the criterion depends on how long the maps are learned."""
         return {**configuration, "cutoff": trained.training["cutoff"]}
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
@@ -62,11 +62,11 @@ class AE(KKLMethod):
         task.fit("one-cutoff", problem, problem.loss, learning_rate=LEARNING_RATE, share=share)
         z_offset, z_scale = problem.z_offset.cpu().numpy().astype(float), problem.z_scale.cpu().numpy().astype(float)
         scaling = (problem.x_offset, problem.x_scale, z_offset, z_scale)
-        told = float(problem.feature(torch.tensor(chosen)))
+        feature = float(problem.feature(torch.tensor(chosen)))
         return Artifact(
             filter=LinearFilter(chosen * problem.D, chosen * problem.F, budget.dt),
             inverse=InverseMap(
-                mlp=_without_last_input(problem.decoder.export(), told),
+                mlp=_without_last_input(problem.decoder.export(), feature),
                 features=("z_y",),
                 z_offset=z_offset,
                 whiten=np.diag(1.0 / z_scale),
@@ -76,7 +76,7 @@ class AE(KKLMethod):
             ),
             system=system.name,
             parameters=system.parameters,
-            forward=ForwardMap(_without_last_input(problem.encoder.export(), told), *scaling),
+            forward=ForwardMap(_without_last_input(problem.encoder.export(), feature), *scaling),
             C=output_matrix(system),
             training={"method": self.name, **configuration, "cutoff": chosen, "seed": task.seed},
         )
@@ -116,7 +116,7 @@ class _Problem(nn.Module):
         self._starts = tensor(system.draw_starts(np.random.default_rng(0), STARTS), device) if own else None
 
     def feature(self, w: torch.Tensor) -> torch.Tensor:
-        """What the networks are told of the cutoff."""
+        """The networks' input for a cutoff."""
         return torch.log10(w)
 
     def encode(self, scaled: torch.Tensor, w: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""What a method of the benchmark is: trained from a system and a budget, it makes observers that step causally."""
+"""The interface of the benchmark's methods: trained from a system and a budget, they make causal observers."""
 
 import json
 from abc import ABC, abstractmethod
@@ -24,7 +24,7 @@ from training.trajectories.record import recording_ages, trajectories
 
 _KEY = "kkl-gym-method"
 
-WRONG = 0.1  # by what share every parameter is too large for methods that believe in wrong ones
+WRONG = 0.1  # share by which every parameter of a wrong model is too large
 
 Trained = TypeVar("Trained")
 Configuration = Mapping[str, Any]
@@ -51,7 +51,7 @@ class CausalObserver(Protocol):
 
 @dataclass(frozen=True)
 class Budget:
-    """What every method is given for a training."""
+    """The data, network size and CPU time of each training."""
 
     name: str
     trajectories: int
@@ -136,28 +136,27 @@ class Task:
 
 
 class Method(ABC, Generic[Trained]):
-    """A contender of the benchmark: a way to make observers. docs/results/benchmark.md says how to add one."""
+    """A way to make observers; docs/results/benchmark.md shows how to add one."""
 
     name: ClassVar[str]
     label: ClassVar[str]
-    trajectories: ClassVar[int | None] = None
     tuned_for: ClassVar[tuple[float, ...] | None] = None
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Propose at most three; the benchmark takes the one that does best on validation trajectories."""
+        """Propose at most three; the benchmark takes the one with the least error on validation trajectories."""
         return ({},)
 
     def believed(self, system: System) -> System:
-        """Say what it is trained on and takes for the truth: the system, unless a method is to be wrong about it."""
+        """The system on which it is trained: the true one, unless its model is to be wrong."""
         return system
 
     def settled(self, configuration: Configuration, trained: Trained) -> Configuration:
-        """Say what the full training is given, after a short one did best."""
+        """The configuration of the full training, after the short one with the least error."""
         return configuration
 
     @abstractmethod
     def train(self, task: Task, configuration: Configuration) -> Trained:
-        """Learn what the observer needs."""
+        """Train."""
 
     @abstractmethod
     def observer(self, trained: Trained, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
@@ -167,7 +166,7 @@ class Method(ABC, Generic[Trained]):
         """
 
     def save(self, trained: Trained, path: Path) -> None:
-        """Write what was trained, whole or not at all; by default a dictionary of arrays."""
+        """Write the result of a training, whole or not at all; by default a dictionary of arrays."""
         if not isinstance(trained, dict):
             raise TypeError(f"{type(self).__name__} trains a {type(trained).__name__}: override save and load")
         storage.save(path, trained, key=_KEY, described={"method": self.name})
@@ -177,18 +176,18 @@ class Method(ABC, Generic[Trained]):
         try:
             arrays, described = storage.read(path, key=_KEY, error=ValueError, what="a trained method")
         except ValueError as error:
-            raise ValueError(f"{error}; remove it to train anew") from error
+            raise ValueError(f"{error}; remove it to train again") from error
         if described.get("method") != self.name:
             raise ValueError(f"{path} was written by method {described.get('method')!r}, not {self.name!r}")
         return arrays  # type: ignore[return-value]
 
 
 class WrongParameters:
-    """First base of a method that is another one with every parameter too large; its second base is the other one.
+    """First of two bases of a method that is trained on wrong parameters; the second is the method itself.
 
     Its configurations are compared on trajectories of the true system.
     """
 
     def believed(self, system: System) -> System:
-        """The same equations with other parameters."""
+        """The same equations with every parameter too large."""
         return off_by(system, WRONG)

@@ -11,20 +11,20 @@ from kkl_gym.system import System
 from training.evaluation.levels import Level
 from training.maps.networks import tensor
 
-FAINT_NOISE = 0.01  # of the system's own level: below it observers are told noise by its size, above by its logarithm
-ROUNDING = 1e-3  # of a state's standard deviation: below it the length of an error is rounded off
+FAINT_NOISE = 0.01  # of the system's own level: the feature of noise is linear below it and logarithmic above
+ROUNDING = 1e-3  # of a state's standard deviation, below which the length of an error is rounded off
 
 
 class Chunk(NamedTuple):
     """The next samples of every row.
 
-    Shapes: ``fresh`` (rows,), ``y`` (samples, rows, ny), ``told`` (rows, ny), ``recorded`` (samples, rows), ``x``
-    (number recorded, nx).
+    Shapes: ``fresh`` (rows,), ``y`` (samples, rows, ny), ``noise`` (rows, ny), ``recorded`` (samples, rows),
+    ``x`` (number recorded, nx).
     """
 
     fresh: torch.Tensor
     y: torch.Tensor
-    told: torch.Tensor
+    noise: torch.Tensor
     recorded: torch.Tensor
     x: torch.Tensor
 
@@ -32,9 +32,8 @@ class Chunk(NamedTuple):
 class Chunks(nn.Module):
     """Rows that each follow a trajectory from its start, for a random part of it, and then begin another one.
 
-    Rows are of all ages at any time, so that every batch has transients and what comes after them. Half of the
-    trajectories carry no noise, the others a level up to the system's own. How far the rows have come is part of a
-    checkpoint.
+    Rows are of all ages at any time, so that every batch has transients and settled motion. Half of the trajectories
+    carry no noise, the others a level up to the system's own. The rows' places are buffers, part of a checkpoint.
 
     Shapes: ``measurement_noise`` of length ny, ``x_offset``, ``x_scale`` (nx,), ``y_offset``, ``y_scale`` (ny,).
     """
@@ -81,7 +80,7 @@ class Chunks(nn.Module):
         recorded = number >= 0
         x = self._x[number[recorded], self.trajectory.expand_as(number)[recorded]]
         self.age.add_(self._samples)
-        return Chunk(fresh, y, told(self.level.expand(-1, y.shape[-1])), recorded, x)
+        return Chunk(fresh, y, level_feature(self.level.expand(-1, y.shape[-1])), recorded, x)
 
 
 def varying(scale: np.ndarray) -> np.ndarray:
@@ -89,22 +88,22 @@ def varying(scale: np.ndarray) -> np.ndarray:
     return np.where(scale > 0, scale, 1.0)
 
 
-def told(level: torch.Tensor) -> torch.Tensor:
-    """What observers are told of levels of noise, in multiples of the system's own."""
+def level_feature(level: torch.Tensor) -> torch.Tensor:
+    """The networks' input for levels of noise, in multiples of the system's own."""
     return torch.asinh(level / FAINT_NOISE)
 
 
-def told_of(noise: Level, system: System) -> torch.Tensor:
-    """The same, (ny,), of standard deviations in the outputs' units, of all or each; cut at the highest in training."""
+def noise_feature(noise: Level, system: System) -> torch.Tensor:
+    """The same, (ny,), of standard deviations in the outputs' units, cut at the highest in training."""
     own = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
     level = np.minimum(np.divide(noise, own, out=np.zeros(system.ny), where=own > 0), 1.0)
-    return told(torch.as_tensor(level, dtype=torch.float32))
+    return level_feature(torch.as_tensor(level, dtype=torch.float32))
 
 
 def error(differences: torch.Tensor) -> torch.Tensor:
     """Mean length of the errors of scaled estimates, (n, nx), rounded off near zero; zero if there are none.
 
-    Squared, it would be ruled by the first samples, when nobody can know the state.
+    The first samples, when no observer can know the state, would dominate a mean of squares.
     """
     lengths = (differences.square().sum(-1) + ROUNDING**2).sqrt()
     return lengths.sum() / max(len(lengths), 1)

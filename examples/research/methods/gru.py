@@ -18,7 +18,7 @@ LEARNING_RATE = 3e-3
 class GRU(Method[Arrays]):
     """torch's GRU with a linear read-out, trained by truncated back-propagation along trajectories from their start.
 
-    Half of the trajectories carry no noise, the others a level up to the system's own that the network is not told.
+    Half of the trajectories carry no noise, the others a level up to the system's own, which is no input.
     """
 
     name: ClassVar[str] = "gru"

@@ -48,7 +48,7 @@ class EKF(Method[Arrays]):
         return {"diffusion": np.array([configuration["diffusion"]])}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
-        """The filter, told the noise level."""
+        """The filter for a noise level."""
         Q = diffusion_intensity(trained, system)
         R = measurement_covariance(system, noise)
         return self.filter(self.believed(system), dt, Q=Q, R=R)
@@ -69,7 +69,7 @@ class Guided(EKF):
     label: ClassVar[str] = "UKF, guided by the shipped map"
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
-        """The filter and the map, told the noise level."""
+        """The filter and the map for a noise level."""
         Q = diffusion_intensity(trained, system)
         return GuidedKalmanFilter(system, dt=dt, measurement_noise=noise, process_noise=0.0, Q=Q)
 
@@ -82,22 +82,18 @@ class WrongEKF(WrongParameters, EKF):
     diffusion: ClassVar[tuple[float, ...]] = WRONG_DIFFUSION
 
 
-class UntunedEKF(EKF):
+class UntunedEKF(Method[Arrays]):
     """The exact model with the covariances that filterpy starts from: P, Q (per sample) and R are the identity."""
 
     name: ClassVar[str] = "ekf-untuned"
     label: ClassVar[str] = "EKF, untuned"
-
-    def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """The one that nobody chose."""
-        return ({},)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
         """Nothing to learn."""
         return {}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
-        """The filter, told nothing."""
+        """The filter, whatever the noise."""
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)
         return ExtendedKalmanFilter(system, dt, Q=eye / dt, R=np.eye(system.ny), start=(x0, eye))

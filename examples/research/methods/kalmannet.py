@@ -1,4 +1,4 @@
-"""A Kalman filter whose gain a recurrent network says (Revach et al., 2022)."""
+"""KalmanNet: a Kalman filter whose gain is the output of a recurrent network (Revach et al., 2022)."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from examples.research.methods.base import Arrays, CausalObserver, Configuration, Data, Method, Task
-from examples.research.methods.chunks import Chunks, error, told_of, varying
+from examples.research.methods.chunks import Chunks, error, noise_feature, varying
 from kkl_gym.simulate import SubstepsError, advance_batch
 from kkl_gym.system import System
 from training.evaluation.levels import Level
@@ -16,7 +16,7 @@ from training.maps.pde import on_tensors
 
 ROWS = 64
 LEARNING_RATE = 5e-3
-FAINT = 1e-3  # of a standard deviation: innovations and corrections below it are told by their size, others by its log
+FAINT = 1e-3  # of a standard deviation: features of innovations are linear below it and logarithmic above
 TIMID = 0.1  # part of the usual first weights with which the gain begins
 MOVED = 500_000  # states of which the size of a sample's motion is taken, at most twice as many
 STEP = 1e-6  # of X's half-width, in numerical derivatives of the motion
@@ -41,19 +41,19 @@ class State(NamedTuple):
 
 
 class KalmanNet(Method[Arrays]):
-    """The exact model predicts, a recurrent network says the gain, and x_hat = prior + K (y - h(prior)).
+    """The exact model predicts, a recurrent network computes the gain K, and x_hat = prior + K (y - h(prior)).
 
     G. Revach, N. Shlezinger, X. Ni, A. Lopez Escoriza, R. J. G. van Sloun and Y. C. Eldar, "KalmanNet: neural network
     aided Kalman filtering for partially known dynamics", IEEE Transactions on Signal Processing, 2022. This is their
     first architecture, one GRU between fully connected layers. It sees the differences of two samples, the innovation,
-    the difference of two estimates, and the last correction. It is told f and h and no covariance. It is told the noise
-    level too, as the maps here are and the authors' is not: half of its training trajectories carry no noise, the
-    others a level up to the system's own.
+    the difference of two estimates, and the last correction. It knows f and h and no covariance. The noise level
+    is an input too, as for the maps here and not in the authors' version: half of its training trajectories carry no
+    noise, the others a level up to the system's own.
 
     The authors' code scales each of the four to unit length, which would leave the sign alone of a single output. Here
     they are scaled by their size in the data, and compressed by asinh. The loss is the mean length of the scaled error
-    in place of its square, which transients rule. It is taken at every sample, as the model tells the states between
-    the recorded ones.
+    in place of its square, which transients dominate, at every sample: the model gives the states between the recorded
+    ones.
     """
 
     name: ClassVar[str] = "kalmannet"
@@ -74,7 +74,7 @@ class KalmanNet(Method[Arrays]):
         return {key: value.detach().numpy() for key, value in problem.filter.state_dict().items()}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
-        """The filter, told the noise level."""
+        """The filter for a noise level."""
         return KalmanNetFilter(trained, system, dt, noise)
 
 
@@ -110,7 +110,7 @@ class Motion:
 
 
 class _Advance(torch.autograd.Function):
-    """A motion on tensors, of which torch is told the derivative."""
+    """A motion on tensors, with its derivative for torch."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, motion: Motion) -> torch.Tensor:
@@ -171,16 +171,16 @@ class Gain(nn.Module):
             return prior
         return torch.as_tensor(self.motion(state.x.numpy()))
 
-    def corrected(self, state: State, prior: torch.Tensor, y: torch.Tensor, told: torch.Tensor) -> State:
-        """Take in samples (n, ny), given their prior, and what is told of their noise, (n, ny)."""
+    def corrected(self, state: State, prior: torch.Tensor, y: torch.Tensor, noise: torch.Tensor) -> State:
+        """Take in samples (n, ny), given their prior and the feature of their noise, (n, ny)."""
         innovation = y - on_tensors(self._h, prior)
         seen = torch.cat([y - state.y, innovation, state.x - state.before, state.x - state.prior], -1)
-        features = torch.cat([torch.asinh(seen / self.units).float(), told], -1)
+        features = torch.cat([torch.asinh(seen / self.units).float(), noise], -1)
         hidden = self.gru(self.inlet(features).relu(), state.hidden)
         gain = self.gain(self.outlet(hidden).relu()).double()
         K = self.ratio * gain.reshape(-1, *self.ratio.shape)
         x = prior + (K @ innovation[..., None])[..., 0]
-        # Written so that what is not a number stays so: the row then begins anew.
+        # minimum and maximum keep NaN, by which the row is found and begins again.
         return State(torch.minimum(torch.maximum(x, self._low), self._high), prior, state.x, y, hidden)
 
     def begun(self, state: State, y: torch.Tensor, rows: torch.Tensor) -> tuple[State, torch.Tensor]:
@@ -222,7 +222,7 @@ class _Problem(nn.Module):
         for k, sample in enumerate(y):
             if k:
                 prior, truth = self.filter.predicted(state), self._motion(truth)
-            state = self.filter.corrected(state, prior, sample, chunk.told)
+            state = self.filter.corrected(state, prior, sample, chunk.noise)
             estimates.append(state.x)
             truths.append(torch.as_tensor(truth))
         self.state.copy_(torch.cat(state[:-1], -1).detach())
@@ -232,13 +232,13 @@ class _Problem(nn.Module):
 
 
 class KalmanNetFilter:
-    """The trained filter as an observer. Rows that are no longer finite begin anew with the next sample.
+    """The trained filter as an observer. Rows that are no longer finite begin again with the next sample.
 
     Shapes: ``noise`` of length ny.
     """
 
     def __init__(self, arrays: Arrays, system: System, dt: float, noise: Level) -> None:
-        self._told = told_of(noise, system)
+        self._noise = noise_feature(noise, system)
         self._filter = Gain(system, dt, hidden=len(arrays["hidden"]))
         self._filter.load_state_dict({key: torch.as_tensor(value) for key, value in arrays.items()})
 
@@ -247,14 +247,14 @@ class KalmanNetFilter:
         """From the centre of X, corrected by the first sample."""
         y = torch.as_tensor(y0, dtype=torch.float64)
         fresh = self._filter.fresh(y)
-        return self._taken(self._filter.corrected(fresh, fresh.x, y, self._told.expand(len(y), -1)))
+        return self._taken(self._filter.corrected(fresh, fresh.x, y, self._noise.expand(len(y), -1)))
 
     @torch.no_grad()
     def step(self, y: np.ndarray) -> np.ndarray:
         """One sample."""
         sample = torch.as_tensor(y, dtype=torch.float64)
         state, prior = self._filter.begun(self._state, sample, self._state.lost())
-        return self._taken(self._filter.corrected(state, prior, sample, self._told.expand(len(y), -1)))
+        return self._taken(self._filter.corrected(state, prior, sample, self._noise.expand(len(y), -1)))
 
     def _taken(self, state: State) -> np.ndarray:
         self._state = state

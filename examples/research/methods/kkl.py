@@ -27,10 +27,10 @@ def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...
 
 
 class KKLMethod(Method[Artifact]):
-    """Whatever trains an artifact."""
+    """A method that trains an artifact."""
 
     def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
-        """The observer of the package, told the noise level as far as it was trained for it, and no process noise."""
+        """The package's observer for a noise level, cut at the highest of its training, without process noise."""
         return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0)
 
     def save(self, trained: Artifact, path: Path) -> None:
@@ -86,7 +86,7 @@ class WrongDefault(WrongParameters, Default):
 
 
 class Shipped(KKLMethod):
-    """The maps that ship, whatever they cost: ``--methods shipped``."""
+    """The maps that ship, trained at a larger budget: ``--methods shipped``."""
 
     name: ClassVar[str] = "shipped"
     label: ClassVar[str] = "default maps, as shipped"

@@ -8,7 +8,7 @@ from torch import nn
 from torch.nn.functional import elu, pad
 
 from examples.research.methods.base import Arrays, CausalObserver, Configuration, Method, Task
-from examples.research.methods.chunks import Chunks, error, told_of
+from examples.research.methods.chunks import Chunks, error, noise_feature
 from kkl_gym.system import System
 from training.evaluation.levels import Level
 from training.maps.networks import Network
@@ -78,11 +78,11 @@ class RKN(Method[Arrays]):
     inference in high-dimensional deep feature spaces", ICML 2019. The encoder gives m latent observations and their
     variances. The latent state has 2m components, of which the upper half is observed, with a variance for each and a
     covariance for each pair. Its transition is a mixture of banded ones, with coefficients that a network makes of its
-    mean. It is told nothing of the model. The encoder is told the noise level, as the maps here are and the authors' is
-    not: half of its training trajectories carry no noise, the others a level up to the system's own.
+    mean. It knows nothing of the model. The noise level is an input of the encoder, as for the maps here and not in the
+    authors' version: half of its training trajectories carry no noise, the others a level up to the system's own.
 
-    The authors train the likelihood or squared errors; here the loss is the mean length of the scaled error, as the
-    measure is of the estimate alone, and squares are ruled by transients. Their transitions begin with one angle
+    The authors train the likelihood or squared errors; here the loss is the mean length of the scaled error, since
+    the estimate alone is measured, and transients dominate squares. Their transitions begin with one angle
     between the halves, here with one for each pair, since motions at 100 samples a second are slow.
     """
 
@@ -104,7 +104,7 @@ class RKN(Method[Arrays]):
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
         """The networks, one sample at a time."""
-        return RKNObserver(trained, told_of(noise, system))
+        return RKNObserver(trained, noise_feature(noise, system))
 
 
 class Cell(nn.Module):
@@ -129,9 +129,9 @@ class Cell(nn.Module):
         self.y_offset: torch.Tensor
         self.y_scale: torch.Tensor
 
-    def observe(self, y: torch.Tensor, told: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Latent observations (..., m) of outputs (..., ny) and what is told of their noise, and their variances."""
-        seen = torch.cat([(y - self.y_offset) / self.y_scale, told.expand_as(y)], -1)
+    def observe(self, y: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Latent observations (..., m) of outputs (..., ny) and the feature of their noise, and their variances."""
+        seen = torch.cat([(y - self.y_offset) / self.y_scale, noise.expand_as(y)], -1)
         w, raw = self.encoder(seen).chunk(2, -1)
         return w, elu(raw) + 1.0 + LEAST
 
@@ -185,7 +185,7 @@ class _Problem(nn.Module):
         chunk = self.chunks.draw(generator)
         belief = Belief(self.mean.clone(), self.variance.clone(), self.side.clone())
         means = []
-        for k, (w, variance) in enumerate(zip(*self.cell.observe(chunk.y, chunk.told), strict=True)):
+        for k, (w, variance) in enumerate(zip(*self.cell.observe(chunk.y, chunk.noise), strict=True)):
             prior = self.cell.predicted(belief)
             belief = update(prior if k else _begun(self.cell, prior, chunk.fresh), w, variance)
             means.append(belief.mean)
@@ -196,13 +196,13 @@ class _Problem(nn.Module):
 
 
 class RKNObserver:
-    """The trained networks as an observer. Rows that are no longer finite begin anew with the next sample.
+    """The trained networks as an observer. Rows that are no longer finite begin again with the next sample.
 
-    Shapes: ``told`` (ny,).
+    Shapes: ``noise`` (ny,), a feature.
     """
 
-    def __init__(self, arrays: Arrays, told: torch.Tensor) -> None:
-        self._told = told
+    def __init__(self, arrays: Arrays, noise: torch.Tensor) -> None:
+        self._noise = noise
         self._x_offset, self._x_scale = arrays["x_offset"], arrays["x_scale"]
         self._cell = Cell(len(arrays["y_scale"]), len(self._x_scale), arrays["log_noise"].shape[1])
         weights = {key: torch.as_tensor(value) for key, value in arrays.items() if not key.startswith("x_")}
@@ -220,6 +220,6 @@ class RKNObserver:
         return self._taken(_begun(self._cell, prior, torch.zeros(len(y), dtype=torch.bool)), y)
 
     def _taken(self, prior: Belief, y: np.ndarray) -> np.ndarray:
-        self._belief = update(prior, *self._cell.observe(torch.as_tensor(y, dtype=torch.float32), self._told))
+        self._belief = update(prior, *self._cell.observe(torch.as_tensor(y, dtype=torch.float32), self._noise))
         mean = torch.where(self._belief.mean.isfinite(), self._belief.mean, 0.0)
         return np.asarray(self._x_offset + self._x_scale * self._cell.decode(mean).numpy())

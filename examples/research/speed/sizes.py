@@ -1,6 +1,6 @@
 """``python -m examples.research sizes``."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,7 +34,7 @@ class Sizes:
 
     The widths are those of hidden layers; all else is as `kkl-gym train SYSTEM` has it. Errors are medians over unseen
     motions from X, over all steps. Times are CPU time of one thread: run it with OMP_NUM_THREADS=1, on an idle machine.
-    Observers that are there already are not trained again, so that times can be taken anew.
+    Observers that are there already are not trained again, so that times can be taken again.
 
     Writes OUT/NAME-WIDTH.safetensors, OUT/sizes.csv and OUT/sizes.png.
     """
@@ -46,14 +46,14 @@ class Sizes:
     """Settings that differ from the preset's, as `kkl-gym tune` writes them."""
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y, for errors under noise."""
-    trajectories: Annotated[int, tyro.conf.arg(aliases=["--runs"])] = 100
+    trajectories: int = 100
     """Number of motions for errors."""
     num_envs: int = 1024
     """Rows of the batch that is timed."""
     seed: int = 0
     """Seed of the motions and the noise."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/sizes/NAME)")] = None
-    """Folder for what is written."""
+    """Folder of results."""
 
     def run(self, console: Console) -> "pd.DataFrame":
         """Train, measure and draw."""
@@ -70,10 +70,11 @@ class Sizes:
         out = self.out or Path("runs/sizes") / system.name
         changes = read_changes(self.config) if self.config else {}
         with locked(out), progress_bars(console, out / LOG) as progress:
-            found = {width: self._trained(system, width, changes, out=out, progress=progress) for width in self.widths}
-            measured = self._errors(found, system, progress)
-            times = self._times(found, system, progress)
-        frame = pd.DataFrame([{"system": system.name, **measured[width], **times[width]} for width in self.widths])
+            artifacts = {
+                width: self._trained(system, {**changes, "width": width}, out, progress) for width in self.widths
+            }
+            rows = self._measured(artifacts, system, progress)
+        frame = pd.DataFrame(rows)
         write(out / "sizes.csv", frame.to_csv(index=False, float_format="%.6g"))
         draw(out / "sizes.png", frame)
         table = Table(title=system.name)
@@ -82,57 +83,47 @@ class Sizes:
         for row in frame.drop(columns="system").itertuples(index=False):
             table.add_row(*(f"{value:,}" if isinstance(value, int) else f"{value:.3g}" for value in row))
         console.print(table)
-        console.print(f"wrote sizes.csv, sizes.png and {len(found)} observers in {out}")
+        console.print(f"wrote sizes.csv, sizes.png and {len(artifacts)} observers in {out}")
         return frame
 
-    def _trained(
-        self, system: System, width: int, changes: Mapping[str, Any], *, out: Path, progress: ProgressBars
-    ) -> Artifact:
+    def _trained(self, system: System, changes: Mapping[str, Any], out: Path, progress: ProgressBars) -> Artifact:
+        """Train an observer, or read an earlier training of the same."""
         from training.pipeline import train
 
-        config = preset(system, "input-aware", "fast", changes={**changes, "width": width})
-        progress.say(f"an observer for {system.name} with hidden layers of {width}")
-        artifact = train(system, config, out / f"{width}", resume=True, console=progress).artifact
-        artifact.save(out / f"{system.name}-{width}.safetensors")
+        config = preset(system, "input-aware", "fast", changes=changes)
+        progress.say(f"an observer for {system.name} with hidden layers of {config.width}")
+        artifact = train(system, config, out / f"{config.width}", resume=True, console=progress).artifact
+        artifact.save(out / f"{system.name}-{config.width}.safetensors")
         return artifact
 
-    def _errors(
-        self, found: Mapping[int, Artifact], system: System, progress: ProgressBars
-    ) -> dict[int, dict[str, float]]:
+    def _measured(
+        self, artifacts: Mapping[int, Artifact], system: System, progress: ProgressBars
+    ) -> list[dict[str, Any]]:
+        """Median errors without and under noise and median times of a step, a row for each width."""
         from training.evaluation.errors import errors, unseen_trajectories
 
-        n, dt = self.trajectories, next(iter(found.values())).filter.dt
+        n, dt = self.trajectories, next(iter(artifacts.values())).filter.dt
         motions = unseen_trajectories(system, dt, n=n, duration=system.duration, seed=self.seed)
-        rows: dict[int, dict[str, float]] = {}
-        with progress.phase("estimating", len(found)) as report:
-            for done, (width, artifact) in enumerate(found.items(), 1):
-                given = level_for(artifact, system, self.measurement_noise)
-                of = {
-                    name: np.median(
-                        errors(artifact, system, motions, measurement_noise=level, seed=self.seed).full
-                    ).item()
-                    for name, level in {"smape_without_noise": 0.0, "smape_under_noise": given}.items()
-                }
+        rows, tasks = list[dict[str, Any]](), {}
+        with progress.phase("estimating", len(artifacts)) as report:
+            for done, (width, artifact) in enumerate(artifacts.items(), 1):
                 weights = sum(weight.size for weight in artifact.inverse.mlp.weights)
-                rows[width] = {"width": width, "weights": weights, **of}
+                row = {"system": system.name, "width": width, "weights": weights}
+                levels = {"without": 0.0, "under": level_for(artifact, system, self.measurement_noise)}
+                for name, level in levels.items():
+                    smape = errors(artifact, system, motions, measurement_noise=level, seed=self.seed).full
+                    row[f"smape_{name}_noise"] = float(np.median(smape))
+                rows.append(row)
+                tasks[width, "us_single"] = observer_tasks(artifact, system, rows=None, steps=STEPS)["KKL"]
+                batch = observer_tasks(artifact, system, rows=self.num_envs, steps=BATCH_STEPS)
+                tasks[width, "us_a_row"] = batch["KKL"]
                 report(done)
-        return rows
-
-    def _times(
-        self, found: Mapping[int, Artifact], system: System, progress: ProgressBars
-    ) -> dict[int, dict[str, float]]:
-        tasks: dict[tuple[int, str], Callable[[], float]] = {}
-        for width, artifact in found.items():
-            single = observer_tasks(artifact, system, rows=None, steps=STEPS)
-            batch = observer_tasks(artifact, system, rows=self.num_envs, steps=BATCH_STEPS)
-            tasks |= {(width, "us_single"): single["KKL"], (width, "us_a_row"): batch["KKL"]}
         with progress.phase("timing", len(tasks) * (TURNS + 1)) as report:
             seconds = in_turns(tasks, TURNS, report)
-        rows = {"us_single": 1, "us_a_row": self.num_envs}
-        return {
-            width: {what: 1e6 * float(np.median(seconds[width, what])) / n for what, n in rows.items()}
-            for width in found
-        }
+        for row, width in zip(rows, artifacts, strict=True):
+            for name, n in (("us_single", 1), ("us_a_row", self.num_envs)):
+                row[name] = 1e6 * float(np.median(seconds[width, name])) / n
+        return rows
 
 
 def draw(path: Path, *frames: "pd.DataFrame") -> None:

@@ -1,9 +1,8 @@
-"""How fast the environments step, as a ratio to well-known ones measured in the same run."""
+"""``python -m examples.research speed``."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -55,7 +54,7 @@ class Speed:
     """Steps of each vector environment in a turn, from starts in the training box on."""
 
     def run(self, console: Console) -> dict[str, float]:
-        """Measure and print."""
+        """Measure and print; returns the ratios."""
         for name in ("steps", "turns", "num_envs", "vector_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -68,21 +67,10 @@ class Speed:
         return ratios
 
     def _single(self, environments: Sequence[Shown], progress: ProgressBars) -> dict[str, float]:
-        envs = {REFERENCE: gym.make(REFERENCE)}
+        envs: dict[str, Any] = {REFERENCE: gym.make(REFERENCE)}
         for one in environments:
-            envs[one.label] = gym.make(one.env_id, **one.options)
-            if one.observed:
-                made = gym.make(one.env_id, **one.options)
-                envs[f"{one.label}, x_hat"] = kkl_gym.KKLObservation(made, one.observer)
-            if _has_error_bars(one):
-                made = gym.make(one.env_id, **one.options)
-                envs[f"{one.label}, x_hat, error bars"] = kkl_gym.KKLObservation(made, one.observer, uncertainty=True)
-            for kind, name in _others(one).items():
-                made = gym.make(one.env_id, **one.options)
-                envs[f"{one.label}, x_hat, {kind}"] = kkl_gym.KKLObservation(made, name)
-        actions = {name: _drawn(env.action_space, self.steps) for name, env in envs.items()}
-        tasks = {name: lambda name=name, env=env: timed(env, actions[name]) for name, env in envs.items()}
-        seconds = self._in_turns(tasks, progress.bar("timing single environments", self._runs(tasks)))
+            envs |= variants(one, partial(gym.make, one.env_id, **one.options), kkl_gym.KKLObservation)
+        seconds = self._timed("timing single environments", envs, self.steps, progress)
         ratios = _ratios(seconds, REFERENCE)
         table = Table(Column("environment", no_wrap=True), "µs per step", f"speed relative to {REFERENCE}")
         for name, ratio in ratios.items():
@@ -91,62 +79,39 @@ class Speed:
         return ratios
 
     def _vector(self, environments: Sequence[Shown], progress: ProgressBars) -> dict[str, float]:
-        """Whole steps, and how long their parts take by themselves on what the environment then holds."""
-
-        def make(env_id: str, **options: Any) -> gym.vector.VectorEnv:
-            return gym.make_vec(env_id, num_envs=self.num_envs, vectorization_mode="vector_entry_point", **options)
-
-        envs = {VECTOR_REFERENCE: make(VECTOR_REFERENCE)}
-        parts: dict[str, dict[str, str]] = {}
+        """Time whole steps, and their parts on the states after the last one."""
+        make = partial(gym.make_vec, num_envs=self.num_envs, vectorization_mode="vector_entry_point")
+        envs: dict[str, Any] = {VECTOR_REFERENCE: make(VECTOR_REFERENCE)}
         for one in environments:
-            envs[one.label] = make(one.env_id, **one.options)
-            if one.observed:
-                inner = [make(one.env_id, **one.options) for _ in range(2)]
-                envs[f"{one.label}, z"] = kkl_gym.KKLVectorObservation(inner[0], one.observer, estimate="z")
-                envs[f"{one.label}, x_hat"] = kkl_gym.KKLVectorObservation(inner[1], one.observer)
-            if _has_error_bars(one):
-                made = make(one.env_id, **one.options)
-                wrapped = kkl_gym.KKLVectorObservation(made, one.observer, uncertainty=True)
-                envs[f"{one.label}, x_hat, error bars"] = wrapped
-            for kind, name in _others(one).items():
-                made = make(one.env_id, **one.options)
-                envs[f"{one.label}, x_hat, {kind}"] = kkl_gym.KKLVectorObservation(made, name)
-        actions = {name: _drawn(env.action_space, self.vector_steps) for name, env in envs.items()}
-        tasks = {name: lambda name=name, env=env: timed_vector(env, actions[name]) for name, env in envs.items()}
-        report = progress.bar(f"timing {self.num_envs} environments at once", self._runs(tasks))
-        seconds = self._in_turns(tasks, report)
-        for name, env in envs.items():
-            info = env.step(actions[name][0])[-1]
-            parts[name] = _parts(env, info, np.median(seconds[name]) / self.vector_steps)
+            envs |= variants(one, partial(make, one.env_id, **one.options), kkl_gym.KKLVectorObservation, with_z=True)
+        seconds = self._timed(f"timing {self.num_envs} environments at once", envs, self.vector_steps, progress)
         ratios = _ratios(seconds, VECTOR_REFERENCE)
-        title = f"{self.num_envs} rows"
-        first = Column(title, no_wrap=True)
+        first = Column(f"{self.num_envs} rows", no_wrap=True)
         table = Table(first, "µs per step", "simulation", "network", f"speed relative to {VECTOR_REFERENCE}")
         for name, ratio in ratios.items():
-            whole = f"{1e6 * np.median(seconds[name]) / self.vector_steps:.0f}"
-            table.add_row(name, whole, parts[name]["simulation"], parts[name]["network"], f"{ratio:.2f}")
+            step = float(np.median(seconds[name])) / self.vector_steps
+            table.add_row(name, f"{1e6 * step:.0f}", *_parts(envs[name], step), f"{ratio:.2f}")
         progress.console.print(table)
         return {f"{name}, {self.num_envs} rows": ratio for name, ratio in ratios.items()}
 
     def _observers(self, environments: Sequence[Shown], progress: ProgressBars) -> None:
-        """Observers without environments, beside Kalman filters."""
+        """Time observers without environments, beside Kalman filters."""
         n, vector_steps = self.num_envs, -(-self.vector_steps // 10)
         title = Column("observers alone", no_wrap=True)
         table = Table(title, "µs per step", f"µs per step, {n} rows", "GFLOP/s", "GFLOP/s of its products", "share")
-        observed = [one for one in environments if one.observed]
-        for one in observed:
-            for name in (one.observer or one.system.name, *_others(one).values()):
+        for one in environments:
+            for name in (one.observer or one.system.name, *_others(one).values()) if one.observed else ():
                 artifact = Artifact.read(resolve(name))
                 tasks = observer_tasks(artifact, one.system, rows=None, steps=self.steps)
                 batch = observer_tasks(artifact, one.system, rows=n, steps=vector_steps)
-                many = KKLObserver(dataclasses.replace(artifact, flow=None))  # for its network, T_inv
+                many = KKLObserver(replace(artifact, flow=None))  # for its network, T_inv
                 many.reset(np.zeros((n, artifact.ny)))
                 many.step(np.zeros((n, artifact.ny)), np.full((n, artifact.nu), 1e-3))
                 products, operations = limit(artifact.inverse, n)
                 tasks |= {f"{n}, {key}": task for key, task in batch.items()}
-                tasks |= {"network": partial(_repeated, many.decode), "products": products}
-                report = progress.bar(f"timing {name} alone", self._runs(tasks))
-                seconds = {key: float(np.median(of)) for key, of in self._in_turns(tasks, report).items()}
+                tasks |= {"network": partial(_seconds, many.decode, 10), "products": products}
+                report = progress.bar(f"timing {name} alone", len(tasks) * (self.turns + 1))
+                seconds = {key: float(np.median(of)) for key, of in in_turns(tasks, self.turns, report).items()}
                 rows = table_rows(
                     {key: value for key, value in seconds.items() if key.startswith(("KKL", "EKF"))},
                     {key: seconds[f"{n}, {key}"] for key in batch},
@@ -156,38 +121,62 @@ class Speed:
                 )
                 for first, *others in rows:
                     table.add_row(f"{name}, {first}", *others)
-        if observed:
+        if table.row_count:
             progress.console.print(table)
 
     def _memory(self, progress: ProgressBars) -> None:
-        """What a memory takes, around environments that take next to nothing."""
-        envs = {"bare": Still(), "with memory": kkl_gym.KKLMemory(Still())}
-        actions = _drawn(envs["bare"].action_space, self.steps)
-        tasks = {f"1, {name}": lambda env=env: timed(env, actions) for name, env in envs.items()}
+        """Time a memory around environments that take next to no time themselves."""
         n = self.num_envs
-        vectors = {"bare": StillVector(n), "with memory": kkl_gym.KKLVectorMemory(StillVector(n))}
-        drawn = _drawn(vectors["bare"].action_space, self.vector_steps)
-        tasks |= {f"{n}, {name}": lambda env=env: timed_vector(env, drawn) for name, env in vectors.items()}
-        seconds = self._in_turns(tasks, progress.bar("timing the memory", self._runs(tasks)))
         title = Column("rows of 8 outputs and 2 inputs", no_wrap=True)
         table = Table(title, "bare, µs per step", "with memory, µs per step", "µs more per row")
-        for rows, steps in ((1, self.steps), (n, self.vector_steps)):
-            # Of the fastest turns, for what others took of the machine is no part of the difference.
-            bare, remembering = (1e6 / steps * min(seconds[f"{rows}, {name}"]) for name in envs)
-            table.add_row(f"{rows}", f"{bare:.1f}", f"{remembering:.1f}", f"{(remembering - bare) / rows:.2f}")
+        for rows, steps, envs in (
+            (1, self.steps, {"bare": Still(), "memory": kkl_gym.KKLMemory(Still())}),
+            (n, self.vector_steps, {"bare": StillVector(n), "memory": kkl_gym.KKLVectorMemory(StillVector(n))}),
+        ):
+            seconds = self._timed(f"timing the memory of {rows} rows", envs, steps, progress)
+            # The fastest turns: in a difference of medians other programs would count.
+            bare, memory = (1e6 / steps * min(seconds[name]) for name in envs)
+            table.add_row(f"{rows}", f"{bare:.1f}", f"{memory:.1f}", f"{(memory - bare) / rows:.2f}")
         progress.console.print(table)
 
-    def _runs(self, tasks: Mapping[str, Any]) -> int:
-        return len(tasks) * (self.turns + 1)
-
-    def _in_turns(
-        self, tasks: Mapping[str, Callable[[], float]], report: Callable[[int], object] = lambda done: None
+    def _timed(
+        self, description: str, envs: Mapping[str, Any], steps: int, progress: ProgressBars
     ) -> dict[str, list[float]]:
-        return in_turns(tasks, self.turns, report)
+        """CPU seconds of each environment in each turn."""
+        tasks = {}
+        for name, env in envs.items():
+            env.action_space.seed(0)
+            tasks[name] = partial(timed, env, [env.action_space.sample() for _ in range(steps)])
+        return in_turns(tasks, self.turns, progress.bar(description, len(tasks) * (self.turns + 1)))
+
+
+def variants(
+    one: Shown, make: Callable[[], Any], observe: Callable[..., Any], *, with_z: bool = False
+) -> dict[str, Any]:
+    """A system's environment by name: bare, and with each observer that there is."""
+    wrapped: dict[str, dict[str, Any]] = {}
+    if one.observed:
+        artifact = Artifact.read(resolve(one.observer or one.system.name))
+        default = {"observer": one.observer, "ignore_input": not artifact.nu}  # estimates are not judged here
+        if with_z:
+            wrapped["z"] = {**default, "estimate": "z"}
+        wrapped["x_hat"] = default
+        if artifact.inverse.spread is not None:
+            wrapped["x_hat, error bars"] = {**default, "uncertainty": True}
+        wrapped |= {f"x_hat, {kind}": {"observer": name} for kind, name in _others(one).items()}
+    envs = {f"{one.label}, {what}": observe(make(), **options) for what, options in wrapped.items()}
+    return {one.label: make(), **envs}
+
+
+def _others(one: Shown) -> dict[str, str]:
+    """Maps that ship for a system beside its default, by kind."""
+    names = {kind: f"{one.system.name}-{kind}" for kind in OTHERS}
+    there = shipped_maps() if one.observer is None and one.observed else {}
+    return {kind: name for kind, name in names.items() if name in there}
 
 
 class Still(gym.Env[np.ndarray, np.ndarray]):
-    """Eight outputs that rest and two inputs that do nothing."""
+    """Eight outputs that rest and two inputs without effect."""
 
     observation_space = gym.spaces.Box(-1.0, 1.0, (8,))
     action_space = gym.spaces.Box(-1.0, 1.0, (2,))
@@ -223,37 +212,29 @@ class StillVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return np.zeros((self.num_envs, 8), np.float32), never.astype(float), never, never, {}
 
 
-def timed(env: gym.Env, actions: list[np.ndarray]) -> float:
-    """Time an environment."""
+def timed(env: Any, actions: Sequence[np.ndarray]) -> float:
+    """CPU seconds of an environment's steps; vector environments reset by themselves."""
+    single = isinstance(env, gym.Env)
     env.reset(seed=0)
     started = time.process_time()
     for action in actions:
         _, _, terminated, truncated, _ = env.step(action)
-        if terminated or truncated:
+        if single and (terminated or truncated):
             env.reset()
     return time.process_time() - started
 
 
-def timed_vector(env: gym.vector.VectorEnv, actions: list[np.ndarray]) -> float:
-    """Time a vector environment that resets by itself."""
-    env.reset(seed=0)
-    started = time.process_time()
-    for action in actions:
-        env.step(action)
-    return time.process_time() - started
-
-
-def _parts(env: gym.vector.VectorEnv, info: Mapping[str, Any], step: float) -> dict[str, str]:
-    """Shares of a step's seconds, from the states that the last one reported."""
-    base = env.unwrapped
-    shares = {"simulation": "", "network": ""}
+def _parts(env: Any, step: float) -> tuple[str, str]:
+    """Shares of simulation and network in a step's seconds, empty where there is no such part."""
+    info = env.step(env.action_space.sample())[-1]
+    simulation, network, base = "", "", env.unwrapped
     if isinstance(base, kkl_gym.KKLVectorEnv):
         system, x = base.plant.system, info["x"].T.copy()
         u, w, advance = np.zeros((system.nu, x.shape[1])), np.zeros_like(x), batch_step(system)
-        shares["simulation"] = _share(lambda: advance(x, u, w, base.plant.dt), step)
+        simulation = _share(lambda: advance(x, u, w, base.plant.dt), step)
     if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x" and env.observer.artifact.flow is None:
-        shares["network"] = _share(lambda: _decoded(env.observer, error_bars="x_cov" in info), step)
-    return shares
+        network = _share(partial(_decoded, env.observer, error_bars="x_cov" in info), step)
+    return simulation, network
 
 
 def _decoded(observer: KKLObserver, *, error_bars: bool) -> None:
@@ -262,38 +243,16 @@ def _decoded(observer: KKLObserver, *, error_bars: bool) -> None:
         observer.decode_covariance()
 
 
-def _has_error_bars(one: Shown) -> bool:
-    """Whether there is a map for a system that says covariances."""
-    return one.observed and Artifact.read(resolve(one.observer or one.system.name)).inverse.spread is not None
-
-
-def _others(one: Shown) -> dict[str, str]:
-    """What ships for a system beside its default, by kind: the small map, and T_inv alone."""
-    names = {kind: f"{one.system.name}-{kind}" for kind in OTHERS}
-    there = shipped_maps() if one.observer is None and one.observed else {}
-    return {kind: name for kind, name in names.items() if name in there}
-
-
-def _repeated(task: Callable[[], object]) -> float:
-    """CPU seconds that a task takes, the mean of ten."""
-    began = time.process_time()
-    for _ in range(10):
-        task()
-    return (time.process_time() - began) / 10
-
-
 def _share(task: Callable[[], object], whole: float) -> str:
-    times = []
-    for _ in range(50):
-        started = time.process_time()
+    return f"{100 * np.median([_seconds(task, 1) for _ in range(50)]) / whole:.0f} %"
+
+
+def _seconds(task: Callable[[], object], repetitions: int) -> float:
+    """CPU seconds of a task, the mean of some repetitions."""
+    began = time.process_time()
+    for _ in range(repetitions):
         task()
-        times.append(time.process_time() - started)
-    return f"{100 * np.median(times) / whole:.0f} %"
-
-
-def _drawn(space: gym.Space[Any], steps: int) -> list[np.ndarray]:
-    space.seed(0)
-    return [space.sample() for _ in range(steps)]
+    return (time.process_time() - began) / repetitions
 
 
 def _ratios(seconds: Mapping[str, list[float]], reference: str) -> dict[str, float]:

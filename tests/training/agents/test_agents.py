@@ -1,7 +1,5 @@
 """Training, saving and playing agents, at toy size."""
 
-import hashlib
-import json
 import os
 import re
 import shutil
@@ -10,36 +8,33 @@ from dataclasses import replace
 import linear_system
 import numpy as np
 import pytest
-import torch
 from linear_system import Oscillator
 from PIL import Image
-from safetensors import safe_open
-from safetensors.numpy import save as serialise
-from safetensors.numpy import save_file
 from stable_baselines3 import PPO, SAC
 
-from kkl_gym import get_system
-from observers import MLP
+from kkl_gym import KKLVectorEnv, get_system
+from observers import MLP, storage
 from observers.names import resolve
 from training import figures
-from training.agents import SB3VecEnv, picture
-from training.agents.agent import Agent, AgentError, fingerprint, rules, versioned
-from training.agents.cost import WORST, Cost
+from training.agents import picture
+from training.agents.agent import Agent, AgentError, fingerprint, rules
+from training.agents.cost import WORST, paid
 from training.agents.information import observer_of
 from training.agents.learn import hyperparameters, learn, learn_recurrent
 from training.agents.play import play
 from training.agents.tasks import TASKS, ControlTask, get_task, scores
-from training.cli import main
 from training.commands.agent import find
 from training.seeds import AGENT_EVALUATION_SEED
 
 TASK = ControlTask("van_der_pol", measurement_noise=0.2, duration=0.5)
+KEY = "kkl-gym-agent"
+OBS = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory):
+def learned(saved, tmp_path_factory):
     folder = tmp_path_factory.mktemp("agent")
-    return learn(TASK, "x_hat", folder, timesteps=1, seed=1), folder
+    return learn(TASK, "x_hat", folder, observer=saved(), timesteps=1, seed=1), folder
 
 
 @pytest.mark.parametrize(("algorithm", "kind"), [("ppo", PPO), ("sac", SAC)])
@@ -52,28 +47,38 @@ def test_the_policy_is_that_of_stable_baselines3(algorithm, kind, tmp_path, monk
         return original(self, timesteps, **options)
 
     monkeypatch.setattr(kind, "learn", keep)
-    task = TASKS["van_der_pol" if algorithm == "ppo" else "reverse_duffing"]
-    agent = learn(task, "state", tmp_path, timesteps=1, algorithm=algorithm)
-    obs = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
-    expected, _ = models[0].predict(obs, deterministic=True)
-    assert np.allclose(agent(obs), expected, atol=1e-5)
-    assert np.abs(agent(100 * obs)).max() <= 1.0
+    agent = learn(TASK, "state", tmp_path, timesteps=1, algorithm=algorithm)
+    expected, _ = models[0].predict(OBS, deterministic=True)
+    assert np.allclose(agent(OBS), expected, atol=1e-5)
+    assert np.abs(agent(100 * OBS)).max() <= 1.0
 
 
-def test_equal_seeds_give_equal_agents(learned, tmp_path):
+def test_seeds_make_agents_and_never_the_episodes_of_the_evaluation(learned, tmp_path, monkeypatch):
+    """stable-baselines3 seeds environments when a model is made; each agent has seeds of its own all the same."""
+    seeds = []
+    reset = KKLVectorEnv.reset
+
+    def noted(self, *, seed=None, options=None):
+        seeds.append(seed)
+        return reset(self, seed=seed, options=options)
+
+    monkeypatch.setattr(KKLVectorEnv, "reset", noted)
     agent, _ = learned
-    again = learn(TASK, "x_hat", tmp_path / "a", timesteps=1, seed=1)
-    other = learn(TASK, "x_hat", tmp_path / "b", timesteps=1, seed=2)
-    obs = np.ones((1, 2), np.float32)
-    assert np.array_equal(again(obs), agent(obs))
-    assert not np.array_equal(other(obs), agent(obs))
+    again, other = (
+        learn(TASK, "x_hat", tmp_path / str(seed), observer=agent.observer, timesteps=1, seed=seed) for seed in (1, 2)
+    )
+    assert np.array_equal(again(OBS), agent(OBS))
+    assert not np.array_equal(other(OBS), agent(OBS))
+    first, second = (set(given) for given in seeds if isinstance(given, list))
+    assert not first & second
+    assert not (first | second) & set(range(AGENT_EVALUATION_SEED, AGENT_EVALUATION_SEED + 10_000))
 
 
 def test_a_saved_agent_plays_the_same(learned):
     agent, folder = learned
     read = Agent.read(folder / "agent.safetensors")
-    assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-v2")
-    assert read.fingerprint == fingerprint("van_der_pol")
+    assert (read.task, read.information, read.observer) == (TASK, "x_hat", agent.observer)
+    assert read.fingerprint == fingerprint(agent.observer)
     assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 256 * 32)
     assert "rollout/ep_rew_mean" in (folder / "progress.csv").read_text().splitlines()[0]
     episodes = [play(one.make(4), one, steps=TASK.steps, seed=0) for one in (agent, read)]
@@ -81,33 +86,30 @@ def test_a_saved_agent_plays_the_same(learned):
     assert episodes[0].x_hat.shape == episodes[0].x.shape == (TASK.steps + 1, 4, 2)
 
 
-def test_a_task_with_starts_of_its_own_survives_saving(learned, tmp_path):
+def test_starts_and_levels_of_noise_survive_saving(learned, tmp_path):
     agent, _ = learned
-    whole = replace(agent, task=TASKS["van_der_pol"], information="state")
-    whole.save(tmp_path / "a.safetensors")
-    assert Agent.read(tmp_path / "a.safetensors").task == TASKS["van_der_pol"]
-
-
-def test_levels_of_noise_of_each_output_survive_saving(learned, tmp_path):
-    agent, _ = learned
-    task = get_task(f"{linear_system.__file__}:TwoOutputs")
-    assert task.measurement_noise == (0.1, 0.3)
-    other = get_task(f"{linear_system.__file__}:TwoOutputs", (0.2, 0.4))
-    replace(agent, task=other, information="state", observer=None, rules=rules(other)).save(tmp_path / "a.safetensors")
-    assert Agent.read(tmp_path / "a.safetensors").task == replace(task, measurement_noise=(0.2, 0.4))
+    two = get_task(f"{linear_system.__file__}:TwoOutputs", (0.2, 0.4))
+    for task in (TASKS["van_der_pol"], two):
+        whole = replace(agent, task=task, information="state", observer=None, rules=rules(task))
+        whole.save(tmp_path / "a.safetensors")
+        assert Agent.read(tmp_path / "a.safetensors").task == task
+    assert get_task(two.system).measurement_noise == (0.1, 0.3)
 
 
 def test_mismatches_are_errors(learned, saved, tmp_path):
     agent, _ = learned
     path = tmp_path / "map.safetensors"
-    shutil.copy(saved(system="van_der_pol"), path)
+    shutil.copy(saved(), path)
     own = replace(agent, observer=str(path), fingerprint=fingerprint(str(path)))
     assert own.make(1)
-    shutil.copy(saved(system="van_der_pol", noise=False), path)
-    with pytest.raises(AgentError, match="another version of the observer"):
+    shutil.copy(saved(noise=False), path)
+    with pytest.raises(AgentError, match="trained on"):
         own.make(1)
     path.unlink()
     with pytest.raises(AgentError, match="observer cannot be read"):
+        own.make(1)
+    os.mkfifo(path)  # which is not waited for
+    with pytest.raises(AgentError, match=r"cannot be read: .*map\.safetensors is a folder, a pipe or a device"):
         own.make(1)
     with pytest.raises(AgentError, match="must name its observer"):
         replace(agent, observer=None).make(1)
@@ -118,25 +120,12 @@ def test_mismatches_are_errors(learned, saved, tmp_path):
         lorenz.make(1)
 
 
-def test_damaged_and_foreign_files(learned, saved, tmp_path):
-    _, folder = learned
-    with safe_open(folder / "agent.safetensors", framework="numpy") as opened:
-        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-        text = opened.metadata()["kkl-gym-agent"]
-    content = serialise(tensors, metadata={"kkl-gym-agent": text})  # whose checksum nobody has to mend
-    cases = {
-        "truncated": (content[:-7], "damaged"),
-        "empty": (b"", "damaged"),
-        "newer": (content.replace(b'\\"format\\": 1', b'\\"format\\": 9'), "another format"),
-        "incomplete": (content.replace(b'\\"squashed\\"', b'\\"squished\\"'), "incomplete"),
-        "unknown": (content.replace(b'\\"x_hat\\"', b'\\"x_hut\\"'), "knows one of state, .* got 'x_hut'"),
-    }
-    for name, (changed, match) in cases.items():
-        assert changed != content
-        path = tmp_path / f"{name}.safetensors"
-        path.write_bytes(changed)
-        with pytest.raises(AgentError, match=match):
-            Agent.read(path)
+def test_damaged_and_foreign_files(saved, tmp_path):
+    content = find("lorenz").read_bytes()
+    for changed in (content[:-7], b"", content[:-1] + bytes([content[-1] ^ 1])):
+        (tmp_path / "agent.safetensors").write_bytes(changed)
+        with pytest.raises(AgentError, match=r"agent\.safetensors.* damaged"):
+            Agent.read(tmp_path / "agent.safetensors")
     with pytest.raises(AgentError, match="is not an agent of kkl-gym"):
         Agent.read(saved())
     with pytest.raises(AgentError, match="there is no file"):
@@ -145,69 +134,29 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         find("nothing")
 
 
-@pytest.mark.parametrize("name", ["van_der_pol-static-v2", "lorenz-v2"])
-def test_agents_from_before_there_were_checksums_still_find_their_observers(name, tmp_path):
-    """Their fingerprint is the SHA-256 of the observer's file as it was without a checksum."""
-    with safe_open(resolve(name), framework="numpy") as opened:
-        tensors = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118
-        save_file(tensors, tmp_path / "old.safetensors", metadata={"kkl-gym": opened.metadata()["kkl-gym"]})
-    before = hashlib.sha256((tmp_path / "old.safetensors").read_bytes()).hexdigest()
-    assert fingerprint(str(tmp_path / "old.safetensors")) == before == fingerprint(name)
-
-
-@pytest.fixture
-def parts():
-    """Tensors and description of a shipped agent, to be written again changed."""
-    with safe_open(find("lorenz"), framework="numpy") as opened:
-        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-        return tensors, json.loads(opened.metadata()["kkl-gym-agent"])
-
-
-@pytest.mark.parametrize("change", [
-    lambda t, d: t.update({"0.weight": t["0.weight"].astype(np.int64)}),
-    lambda t, d: t.update({"0.bias": t["0.bias"] > 0}),
-    lambda t, d: t.update({"0.bias": np.full_like(t["0.bias"], np.nan)}),
-    lambda t, d: t.pop("1.bias"),
-    lambda t, d: t.clear(),
-    lambda t, d: d.update(activation=["tanh"]),
-    lambda t, d: d.update(squashed="false"),
-    lambda t, d: d.update(squashed=0),
-    lambda t, d: d.update(task=[]),
-    lambda t, d: d["task"].update(start_box=3),
-    lambda t, d: d["task"].update(period="0.05"),
-    lambda t, d: d.update(invented=1),
-    lambda t, d: d.update(information=["x_hat"]),
-    lambda t, d: d.update(format="1"),
-    lambda t, d: d.pop("activation"),
-    lambda t, d: d["task"].update(system=3),
-    lambda t, d: d["task"].update(duration=float("inf")),
-    lambda t, d: d.update(observer=3),
-    lambda t, d: d.update(observer=["lorenz-v2"]),
-    lambda t, d: d.update(fingerprint=3),
-    lambda t, d: d.update(rules=[]),
-    lambda t, d: d.update(training="sac"),
-    lambda t, d: d["training"].update(seed="x/../../out"),
-    lambda t, d: d["training"].update(seed=1.0),
-    lambda t, d: d["training"].update(seed=True),
-    lambda t, d: d["training"].update(seed=None),
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda t, d: t.update({"0.bias": np.full_like(t["0.bias"], np.nan)}), ""),
+    (lambda t, d: t.pop("1.bias"), ""),
+    (lambda t, d: d.update(format=9), "another format"),
+    (lambda t, d: d.pop("activation"), "incomplete"),
+    (lambda t, d: d.update(invented=1), ""),
+    (lambda t, d: d.update(squashed=0), "squashed must be a bool"),
+    (lambda t, d: d.update(information="x_hut"), "knows one of state, .* got 'x_hut'"),
+    (lambda t, d: d.update(observer=3), "observer must be a string"),
+    (lambda t, d: d.update(rules=[]), "rules must be a mapping"),
+    (lambda t, d: d["training"].update(seed="x/../../out"), "seed must be a whole number"),
+    (lambda t, d: d.update(task=[]), ""),
+    (lambda t, d: d["task"].update(start_box=3), ""),
+    (lambda t, d: d["task"].update(duration="0.05"), "duration must be a finite number"),
+    (lambda t, d: d["task"].update(system=3), "system must be a name"),
 ])  # fmt: skip
-def test_contents_that_make_no_agent(change, parts, tmp_path):
-    tensors, described = parts
-    change(tensors, described)
+def test_contents_that_make_no_agent(change, says, tmp_path):
+    tensors, described = storage.read(find("lorenz"), key=KEY, error=AgentError, what="an agent")
     path = tmp_path / "agent.safetensors"
-    save_file(tensors, path, metadata={"kkl-gym-agent": json.dumps(described)})
-    with pytest.raises(AgentError, match=re.escape(str(path))):
+    change(tensors, described)
+    storage.save(path, tensors, key=KEY, described=described)
+    with pytest.raises(AgentError, match=f"{re.escape(str(path))}.*{says}"):
         Agent.read(path)
-
-
-def test_a_pipe_for_an_observer_is_not_waited_for(learned, tmp_path):
-    agent, _ = learned
-    os.mkfifo(tmp_path / "map.safetensors")
-    stranger = replace(agent, observer=str(tmp_path / "map.safetensors"))
-    with pytest.raises(
-        AgentError, match=r"observer cannot be read: .*map\.safetensors is a folder, a pipe or a device"
-    ):
-        stranger.make(1)
 
 
 @pytest.fixture(scope="module")
@@ -220,33 +169,24 @@ def own():
 
 def test_a_system_that_does_not_ship_is_imported_only_if_the_caller_names_it(own, tmp_path):
     evil = tmp_path / "evil.py"
-    evil.write_text("open('ran', 'w')\nclass Evil: pass\n")
+    evil.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\nclass Evil: pass\n")
     named = f"{evil}:Evil"
     stranger = replace(own, task=replace(own.task, system=named))
     for trusted in (None, own.task.system, "van_der_pol", "evil.py:Evil"):
-        with pytest.raises(
-            AgentError, match=re.escape(f"the agent's system is {named!r}, and system={trusted!r}: give")
-        ):
+        says = f"the agent's system is {named!r}, and system={trusted!r}: give"
+        with pytest.raises(AgentError, match=re.escape(says)):
             stranger.make(1, system=trusted)
-    assert os.listdir(tmp_path) == ["evil.py"]
-    for trusted in (Oscillator, Oscillator()):  # what the file names is not asked
-        env = stranger.make(1, system=trusted)
-        assert env.unwrapped.system == Oscillator()
+    assert stranger.make(1, system=Oscillator()).unwrapped.system == Oscillator()  # what the file names is not asked
     assert os.listdir(tmp_path) == ["evil.py"]
 
 
-def test_a_system_may_be_given_by_name_as_a_class_or_itself(own, tmp_path):
-    own.save(tmp_path / "own.safetensors")
-    agent = Agent.read(tmp_path / "own.safetensors")
-    for trusted in (agent.task.system, linear_system.Oscillator, linear_system.Oscillator()):
-        assert play(agent.make(2, system=trusted), agent, steps=2, seed=0).x.shape == (3, 2, 2)
+def test_a_system_may_be_given_by_name_as_a_class_or_itself(own, learned):
+    for trusted in (own.task.system, Oscillator, Oscillator()):
+        assert own.make(2, system=trusted).reset(seed=0)[0].shape == (2, 2)
     with pytest.raises(AgentError, match="trained with equations = "):
-        agent.make(1, system=get_system("van_der_pol"))
+        own.make(1, system=get_system("van_der_pol"))
     with pytest.raises(ValueError, match="got 3"):
-        agent.make(1, system=3)
-
-
-def test_shipped_systems_need_no_trust_but_a_wrong_name_is_an_error(learned):
+        own.make(1, system=3)
     agent, _ = learned
     for system in (None, "van_der_pol", get_system("van_der_pol")):
         assert agent.make(1, system=system)
@@ -254,94 +194,36 @@ def test_shipped_systems_need_no_trust_but_a_wrong_name_is_an_error(learned):
         agent.make(1, system="lorenz")
 
 
-def test_metadata_nested_without_end(tmp_path):
-    path = tmp_path / "agent.safetensors"
-    save_file({"0.weight": np.ones((1, 1))}, path, metadata={"kkl-gym-agent": "[" * 100_000})
-    with pytest.raises(AgentError, match=re.escape(str(path))):
-        Agent.read(path)
-
-
-@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "van_der_pol-y", "rossler", "lorenz"])
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol-y"])
 def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
-    with safe_open(find(name), framework="numpy") as opened:
-        assert len(opened.metadata()["kkl-gym-agent-sha256"]) == 64
     Agent.read(find(name)).save(tmp_path / "new" / "agent.safetensors")
     assert (tmp_path / "new" / "agent.safetensors").read_bytes() == find(name).read_bytes()
     assert os.listdir(tmp_path / "new") == ["agent.safetensors"]
 
 
-def test_an_interrupted_save_leaves_nothing_behind(tmp_path, monkeypatch):
-    def fail(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(KeyboardInterrupt):
-        Agent.read(find("lorenz")).save(tmp_path / "agent.safetensors")
-    assert not os.listdir(tmp_path)
-
-
-@pytest.mark.parametrize("algorithm", ["ppo", "sac", "ppo_lstm"])
-def test_training_never_sees_the_episodes_of_the_evaluation(algorithm, tmp_path, monkeypatch):
-    """stable-baselines3 seeds environments when a model is made; each agent has seeds of its own all the same."""
-    seeds = []
-    reset = SB3VecEnv.reset
-
-    def keep(self):
-        seeds.append(list(self._seeds))
-        return reset(self)
-
-    monkeypatch.setattr(SB3VecEnv, "reset", keep)
-    task = TASKS["reverse_duffing"]
-    for seed in (0, 1):
-        if algorithm == "ppo_lstm":
-            learn_recurrent(task, "y", tmp_path / str(seed), seed=seed, timesteps=1)
-        else:
-            learn(task, "y", tmp_path / str(seed), seed=seed, timesteps=1, algorithm=algorithm)
-    first, second = seeds
-    evaluation = range(AGENT_EVALUATION_SEED, AGENT_EVALUATION_SEED + 10_000)
-    assert not set(first) & set(second)
-    assert not any(one in evaluation for one in (*first, *second))
+def test_pay_is_minus_the_cost_and_escaping_never_pays():
+    """An action has five samples, whose rewards are 1 / (1 + 4 c); the second one of the third action escapes."""
+    task, cost = ControlTask("rossler", period=0.05, duration=20.0), np.array([0.0, 0.3, 2 * WORST])
+    total = task.repeat / (1 + 4 * cost)
+    np.testing.assert_allclose(paid(task, total, 15, False), [0.0, -0.3, -WORST], atol=1e-12)
+    escaped = paid(task, 0.4 * total, 12, True)
+    np.testing.assert_allclose(escaped, np.array([0.0, -0.3, -WORST]) * (1 + task.steps - 3), atol=1e-9)
 
 
-def test_rewards_are_minus_the_cost_and_escaping_never_pays():
-    task = ControlTask("rossler", period=0.05, duration=20.0, start_box=((-44, -44), (-17, -17), (212, 212)))
-    ours, bare = Cost(task.make(1), task), task.make(1)
-    ours.reset(seed=0)
-    bare.reset(seed=0)
-    rewards = []
-    for _ in range(task.steps):
-        _, reward, terminated, _, info = ours.step(np.zeros((1, 1)))
-        _, total, *_ = bare.step(np.zeros((1, 1)))
-        rewards.append(reward[0])
-        if terminated[0]:
-            break
-        assert reward[0] == pytest.approx(-min((task.repeat / total[0] - 1) / 4, WORST))
-    assert terminated[0]
-    done = len(rewards)
-    assert done == np.ceil(info["final_info"]["sample"][0] / task.repeat)
-    assert rewards[-1] == -WORST * (task.steps - done + 1)  # as if it stayed there
-
-
-def test_hyperparameters():
-    assert hyperparameters(TASKS["reverse_duffing"])[0] == "sac"
-    assert hyperparameters(TASKS["lorenz"])[0] == "ppo"
-    assert hyperparameters(TASKS["reverse_duffing"], "ppo")[0] == "ppo"
+def test_hyperparameters(script):
+    own = ControlTask(f"{script}:Pendulum")  # which gets the defaults
+    duffing, lorenz = TASKS["reverse_duffing"], TASKS["lorenz"]
+    assert [hyperparameters(task)[0] for task in (duffing, lorenz, own)] == ["sac", "ppo", "ppo"]
+    assert hyperparameters(duffing, "ppo")[0] == "ppo"
+    assert hyperparameters(own, "sac") == hyperparameters(lorenz, "sac") == hyperparameters(duffing)
     for algorithm in ("ppo", "sac", "ppo_lstm"):  # any of them for any system
-        for task in TASKS.values():
-            assert hyperparameters(task, algorithm)[1]["n_timesteps"] >= 100_000
-    assert hyperparameters(TASKS["lorenz"], "sac") == hyperparameters(TASKS["reverse_duffing"])
+        assert all(hyperparameters(task, algorithm)[1]["n_timesteps"] >= 100_000 for task in TASKS.values())
     with pytest.raises(ValueError, match="unknown algorithm 'dqn'"):
-        hyperparameters(TASKS["lorenz"], "dqn")
+        hyperparameters(lorenz, "dqn")
     with pytest.raises(ValueError, match="algorithm must be one of ppo, sac"):
-        learn(TASKS["lorenz"], "y", None, algorithm="ppo_lstm")
+        learn(lorenz, "y", None, algorithm="ppo_lstm")
     with pytest.raises(ValueError, match="timesteps must be positive"):
-        learn(TASKS["lorenz"], "y", None, timesteps=0)
-
-
-def test_own_systems_get_the_defaults(script):
-    task = ControlTask(f"{script}:Pendulum")
-    assert hyperparameters(task)[0] == "ppo"
-    assert hyperparameters(task, "sac") == hyperparameters(TASKS["reverse_duffing"])
+        learn(lorenz, "y", None, timesteps=0)
 
 
 def test_a_recurrent_policy_remembers_and_begins_anew(tmp_path):
@@ -356,80 +238,47 @@ def test_a_recurrent_policy_remembers_and_begins_anew(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_agent_learns():
+def test_an_agent_learns(tmp_path):
     """Half a minute of PPO on the full state of Van der Pol."""
-    import tempfile
-    from pathlib import Path
-
-    torch.set_num_threads(2)
     task = TASKS["van_der_pol"]
-    with tempfile.TemporaryDirectory() as folder:
-        agent = learn(task, "state", Path(folder), timesteps=200_000)
+    agent = learn(task, "state", tmp_path, timesteps=200_000)
     x = play(agent.make(50), agent, steps=task.steps, seed=0).x
     assert scores(get_system(task.system), x).mean() > -0.25
 
 
-def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    main(["agent", "train", "lorenz", "--information", "y", "--timesteps", "1"])
-    folder = tmp_path / "runs" / "agents" / "lorenz-y-0"
-    assert Agent.read(folder / "agent.safetensors").information == "y"
-    with pytest.raises(SystemExit, match="holds an agent already"):
-        main(["agent", "train", "lorenz", "--information", "y", "--timesteps", "1"])
-    main(["agent", "evaluate", str(folder / "agent.safetensors"), "--episodes", "3", "--out", "pictures"])
-    assert "score" in capsys.readouterr().out
-    with Image.open(tmp_path / "pictures" / "lorenz-y-0.5-0.gif") as animation:
-        assert animation.n_frames > 20
-    with Image.open(tmp_path / "pictures" / "lorenz-y-0.5-0.png") as figure:
-        assert figure.size[0] > 200
-    with pytest.raises(SystemExit, match="episodes from 1 to 10000; got 0 and 0"):
-        main(["agent", "evaluate", str(folder / "agent.safetensors"), "--episodes", "0"])
-    own = replace(Agent.read(folder / "agent.safetensors"), task=ControlTask("some.py:Evil"))
-    own.save("own.safetensors")
-    with pytest.raises(SystemExit, match=r"if you trust that, give --system some\.py:Evil"):
-        main(["agent", "evaluate", "own.safetensors"])
-    with pytest.raises(SystemExit, match="unknown system"):
-        main(["agent", "train", "pendulum"])
-
-
-@pytest.mark.parametrize("columns", [1, 2])
-def test_figures_show_states_outputs_and_inputs(columns, learned, tmp_path, monkeypatch):
+def test_pictures_show_states_outputs_and_inputs(learned, tmp_path, monkeypatch):
     """Each in a row; nothing of the legend is cut off."""
     drawn = []
     monkeypatch.setattr(figures, "save", lambda path, figure: drawn.append(figure))
     agent, _ = learned
-    episodes = play(agent.make(columns), agent, steps=20, seed=0)
+    episodes = play(agent.make(1), agent, steps=TASK.steps, seed=0)
     picture.draw(TASK, episodes, tmp_path / "a.png")
     (figure,) = drawn
-    axes = np.reshape(figure.axes, (4, columns))
-    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["x1", "x2", "y", "u"]
-    for i in range(columns):
-        found = [{line.get_label(): line.get_ydata() for line in ax.lines} for ax in axes[:, i]]
-        for j in range(2):
-            np.testing.assert_array_equal(found[j]["state"], episodes.x[:, i, j])
-            np.testing.assert_array_equal(found[j]["estimate"], episodes.x_hat[:, i, j])
-        np.testing.assert_array_equal(found[2]["measured output"], episodes.y[:, i, 0])
-        np.testing.assert_array_equal(found[3]["input"], episodes.u[:, i, 0])
+    assert [ax.get_ylabel() for ax in figure.axes] == ["x1", "x2", "y", "u"]
+    found = [{line.get_label(): line.get_ydata() for line in ax.lines} for ax in figure.axes]
+    for row, label, values in (
+        (0, "state", episodes.x[:, 0, 0]),
+        (1, "estimate", episodes.x_hat[:, 0, 1]),
+        (2, "measured output", episodes.y[:, 0, 0]),
+        (3, "input", episodes.u[:, 0, 0]),
+    ):
+        np.testing.assert_array_equal(found[row][label], values)
     figure.draw_without_rendering()
     box = figure.legends[0].get_window_extent()
     assert -10 < box.x0 < box.x1 < figure.bbox.x1 + 10
-
-
-def test_metadata_is_json(learned):
-    _, folder = learned
-    with safe_open(folder / "agent.safetensors", framework="numpy") as opened:
-        described = json.loads(opened.metadata()["kkl-gym-agent"])
-    assert described["task"]["system"] == "van_der_pol"
+    picture.animate(TASK, {"": episodes}, tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as animation:
+        assert animation.n_frames == TASK.steps
 
 
 @pytest.mark.parametrize(
     ("name", "least"), [("reverse_duffing", -0.25), ("van_der_pol", -0.2), ("rossler", -0.12), ("lorenz", -0.35)]
 )
 def test_shipped_agents_act_on_estimates(name, least):
-    agent = Agent.read(find(name))
-    assert (agent.information, agent.observer) == ("x_hat", versioned(observer_of(get_system(name))))
-    assert agent.task == TASKS[name]
-    system, episodes = get_system(name), play(agent.make(20), agent, steps=agent.task.steps, seed=0)
+    agent, system = Agent.read(find(name)), get_system(name)
+    assert (agent.information, agent.task) == ("x_hat", TASKS[name])
+    assert resolve(agent.observer) == resolve(observer_of(system))
+    episodes = play(agent.make(20), agent, steps=agent.task.steps, seed=0)
     assert scores(system, episodes.x).mean() > least  # zero input: about -0.6
     assert not episodes.escaped.any()
     noise = episodes.y - system.output(episodes.x)

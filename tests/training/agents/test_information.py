@@ -1,13 +1,10 @@
 """What agents are shown."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from linear_system import Oscillator
 
-from examples.research.methods.kalman import EKF
-from kkl_gym import SYSTEMS, VanDerPol, get_system
+from kkl_gym import get_system
 from observers import load
 from training.agents.information import (
     INFORMATION,
@@ -30,24 +27,12 @@ def actions(steps):
     return np.random.default_rng(0).uniform(-1.5, 1.5, (steps, N, 1)).astype(np.float32)
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
-@pytest.mark.parametrize("information", INFORMATION)
-def test_observations_are_finite_and_of_the_size_of_one(name, information):
-    env = make(ControlTask(name, duration=0.5, measurement_noise=0.1), information, 20)
-    shown = [env.reset(seed=0)[0]]
-    for action in np.random.default_rng(0).uniform(-1, 1, (25, 20, 1)):
-        shown.append(env.step(action)[0])
-        assert shown[-1] in env.observation_space
-    late = np.array(shown[8:])
-    assert 0.05 < np.sqrt((late**2).mean()) < 5
-
-
 @pytest.mark.parametrize("information", INFORMATION)
 def test_last_observations_of_episodes_and_first_ones_of_the_next(information):
-    """Against the same environment that leaves resets to us."""
+    """Against the same environment that leaves resets to us; their size is about one."""
     ours, bare = make(TASK, information, N), make(TASK, information, N, autoreset_mode="Disabled")
     assert (ours.reset(seed=1)[0] == bare.reset(seed=1)[0]).all()
-    ends = 0
+    ends, shown = 0, []
     for action in actions(25):
         obs, reward, terminated, truncated, info = ours.step(action)
         expected, expected_reward, _, over, _ = bare.step(action)
@@ -60,16 +45,18 @@ def test_last_observations_of_episodes_and_first_ones_of_the_next(information):
             assert all(info["final_obs"][row].dtype == np.float32 for row in range(N))
             expected, _ = bare.reset(options={"reset_mask": over})
         assert (obs == expected).all()
+        assert obs in ours.observation_space
+        shown.append(obs)
     assert ends == 2
+    assert 0.05 < np.sqrt(np.square(shown).mean()) < 5
 
 
 def test_states_are_taken_from_the_target_over_the_scale():
     system = get_system("lorenz")
     task = ControlTask("lorenz", period=0.01, duration=1.0)
-    obs, info = make(task, "state", N).reset(seed=0)
-    assert np.allclose(obs, (info["x"] - system.target) / system.scale, atol=1e-6)
-    obs, info = make(task, "x_hat", N).reset(seed=0)
-    assert np.allclose(obs, (info["x_hat"] - system.target) / system.scale, atol=1e-6)
+    for information, key in (("state", "x"), ("x_hat", "x_hat")):
+        obs, info = make(task, information, N).reset(seed=0)
+        assert np.allclose(obs, (info[key] - system.target) / system.scale, atol=1e-6)
     obs, info = make(task, "y", N).reset(seed=0)
     assert np.allclose(obs, (info["y"] - system.target[1]) / system.scale[1], atol=1e-6)
     assert output_deviation(system)({"y": np.array([[system.target[1]]])}).tolist() == [[0.0]]
@@ -101,27 +88,6 @@ def test_z_is_what_the_network_sees_from_its_value_at_the_target():
     assert np.allclose(obs[:, -1], inverse.age_feature(np.full(N, 0.1)))
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_agents_act_on_the_default_maps(name):
-    assert observer_of(get_system(name)) == name
-
-
-def test_no_observer_ships_for_a_system_of_ones_own():
-    with pytest.raises(ValueError, match="no observer ships for 'oscillator'"):
-        observer_of(Oscillator())
-
-
-def test_an_output_that_is_flat_at_the_target():
-    @dataclass(frozen=True)
-    class Flat(VanDerPol):
-        name = "flat"
-
-        def h(self, x):
-            return (x[0] * x[0],)
-
-    assert np.isfinite(output_deviation(Flat())({"y": np.ones((2, 1))})).all()
-
-
 def test_stacked_outputs_and_actions_by_hand():
     env = make(TASK, "stacked", N)
     obs, info = env.reset(seed=0)
@@ -134,34 +100,22 @@ def test_stacked_outputs_and_actions_by_hand():
         assert np.allclose(obs, np.concatenate(pairs, 1), atol=1e-6)
 
 
-def test_kalman_filters_follow_a_driven_state():
-    """Told the input, they converge; and they are the benchmark's filters."""
-    task = ControlTask("van_der_pol", measurement_noise=0.1, period=0.01, duration=5.0)
-    env = make(task, "ekf", N)
+def test_kalman_filters_that_know_the_input_follow_a_driven_state():
+    env = make(ControlTask("van_der_pol", measurement_noise=0.1, period=0.01, duration=5.0), "ekf", N)
     env.reset(seed=0)
     errors = []
     for action in actions(400):
         *_, info = env.step(action)
         errors.append(np.abs(info["x_hat"] - info["x"]).max())
     assert max(errors[200:]) < 0.1 < errors[0]
-    system = get_system("van_der_pol")
-    ours = KalmanFilters(env.unwrapped)
-    theirs = EKF().observer({"diffusion": np.array([1e-2])}, system, 0.01, 0.1)
-    y = np.random.default_rng(0).normal(size=(20, N, 1))
-    x0 = np.full((N, 2), np.nan)  # which they are not to look at
-    ours.reset(y[0], x0)
-    theirs.reset(y[0])
-    for yk in y[1:]:
-        ours.advance(yk, np.zeros((N, 1)))
-        assert np.array_equal(ours.report()["x_hat"], theirs.step(yk))
-    kept = ours.report()["x_hat"]
-    rows = np.array([True, False, False])
-    ours.advance(y[0], None, ~rows)
-    assert np.array_equal(ours.report(rows)["x_hat"], kept[rows])
-    assert (ours.report(~rows)["x_hat"] != kept[~rows]).any(1).all()
-    ours.restart(y[0, :1], rows, x0[:1])
-    theirs.reset(y[0])
-    assert np.allclose(ours.report(rows)["x_hat"], theirs.decode(rows))
+    y, unknown = np.ones((N, 1)), np.full((N, 2), np.nan)  # states, at which they are not to look
+    filters, rows = KalmanFilters(env.unwrapped), np.array([True, False, False])
+    filters.reset(y, unknown)
+    first = filters.report()["x_hat"]
+    filters.advance(-y, np.zeros((N, 1)))
+    assert (filters.report()["x_hat"] != first).any(1).all()
+    filters.restart(y[:1], rows, unknown[:1])
+    assert ((filters.report()["x_hat"] == first).all(1) == rows).all()
 
 
 def test_rows_that_have_ended_stay_as_they_are():
@@ -180,6 +134,8 @@ def test_rows_that_have_ended_stay_as_they_are():
 
 
 def test_wrong_uses():
+    with pytest.raises(ValueError, match="no observer ships for 'oscillator'"):
+        observer_of(Oscillator())
     with pytest.raises(ValueError, match="unknown information 'everything'"):
         make(TASK, "everything", N)
     with pytest.raises(ValueError, match="resets in the same step"):

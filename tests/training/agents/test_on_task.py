@@ -16,7 +16,6 @@ from training.agents.information import make
 from training.agents.learn import hyperparameters
 from training.agents.tasks import TASKS
 from training.commands.agent import find
-from training.systems import ControlTask
 
 
 def settings(algorithm, name):
@@ -24,36 +23,40 @@ def settings(algorithm, name):
     return yaml.safe_load(text)[ENV_IDS[name]]
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_one_environment_is_a_row_of_the_task(name):
-    """Of what an agent sees and is paid, with the environment made as rl-zoo3 makes it, through an escape."""
+@pytest.mark.parametrize(("name", "x0"), [("van_der_pol", None), ("rossler", [-44.0, -17.0, 212.0])])
+def test_one_environment_is_a_row_of_the_task(name, x0):
+    """Of what an agent sees and is paid, with the environment made as rl-zoo3 makes it; from x0 it escapes."""
     one = OnTask(gym.make(ENV_IDS[name], **settings("ppo", name)["env_kwargs"]))
     rows = Cost(make(TASKS[name], "x_hat", 2), TASKS[name])
-    obs, _ = one.reset(seed=4)
-    expected, _ = rows.reset(seed=[4, 5])
+    options = None if x0 is None else {"x0": x0}
+    obs, _ = one.reset(seed=4, options=options)
+    expected, _ = rows.reset(seed=[4, 5], options=options)
     np.testing.assert_allclose(obs, expected[0], rtol=1e-5, atol=1e-6)
     assert obs in one.observation_space
-    rng, ended = np.random.default_rng(0), False
-    for _ in range(15):
+    rng, ended, done = np.random.default_rng(0), False, 0
+    while done < (15 if x0 is None else 100) and not ended:
+        done += 1
         action = rng.uniform(-1, 1, (2, *one.action_space.shape)).astype(np.float32)
         obs, reward, ended, truncated, _ = one.step(action[0])
-        expected, paid, terminated, truncated_rows, _ = rows.step(action)
-        np.testing.assert_allclose(obs, expected[0], rtol=1e-4, atol=1e-5)
+        expected, paid, terminated, truncated_rows, info = rows.step(action)
+        np.testing.assert_allclose(obs, (info["final_obs"] if ended else expected)[0], rtol=1e-4, atol=1e-5)
         assert reward == pytest.approx(paid[0], rel=1e-5)
         assert (ended, truncated) == (terminated[0], truncated_rows[0])
+    assert ended == (x0 is not None)
+    if ended:  # is paid for the rest of the episode
+        assert reward == -WORST * (TASKS[name].steps - done + 1)
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-@pytest.mark.parametrize("name", TASKS)
-def test_the_settings_for_rl_zoo3_make_our_task(algorithm, name):
-    found = settings(algorithm, name)
-    assert found["env_wrapper"] == "training.agents.OnTask"
-    env = gym.make(ENV_IDS[name], **found["env_kwargs"])
-    task, plant = TASKS[name], env.unwrapped.plant
-    assert env.spec.max_episode_steps == task.steps * task.repeat == task.options["max_episode_steps"]
-    assert (plant.dt, plant.measurement_noise) == (task.dt, task.measurement_noise)
-    box = task.start_box or plant.system.X
-    np.testing.assert_array_equal(plant.start_box, np.transpose(box))
+def test_the_settings_for_rl_zoo3_make_our_task():
+    for name, task in TASKS.items():
+        for algorithm in ("ppo", "sac"):
+            found = settings(algorithm, name)
+            assert found["env_wrapper"] == "training.agents.OnTask"
+            env = gym.make(ENV_IDS[name], **found["env_kwargs"])
+            plant = env.unwrapped.plant
+            assert env.spec.max_episode_steps == task.steps * task.repeat == task.options["max_episode_steps"]
+            assert (plant.dt, plant.measurement_noise) == (task.dt, task.measurement_noise)
+            np.testing.assert_array_equal(plant.start_box, np.transpose(task.start_box or plant.system.X))
 
 
 def test_the_settings_of_training_are_those_for_rl_zoo3():
@@ -63,19 +66,6 @@ def test_the_settings_of_training_are_those_for_rl_zoo3():
     assert "activation_fn=nn.Tanh" in written["policy_kwargs"]  # which learn gives to all
     assert written.keys() - found.keys() == {"env_kwargs", "env_wrapper"}
     assert all(found[key] == written[key] for key in found.keys() - {"policy_kwargs"})
-
-
-def test_an_escape_is_paid_for_the_rest_of_the_episode():
-    """At the second sample of the first action, seen from the reward of one sample at the worst cost."""
-    task = ControlTask("lorenz", period=0.05, duration=5.0)
-    env = OnTask(gym.make("KKLLorenz-v0", measurement_noise=0.0, process_noise=0.0))
-    env.reset(seed=0)
-    env.unwrapped._bounds = ((-1e-3, 1e-3),) * 3  # which any step leaves
-    _, reward, terminated, truncated, info = env.step([0.0])
-    assert (terminated, truncated) == (True, False)
-    assert info["sample"] == 1
-    total = env.unwrapped.step([0.0])[1]
-    assert reward == pytest.approx(-min((1 / total - 1) / 4, WORST) * task.steps)
 
 
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name != "lorenz"]
@@ -104,8 +94,8 @@ def test_refusals():
         OnTask(gym.make("KKLLorenz-v0", dt=0.02))
 
 
-def test_its_specification_makes_it_again():
-    env = OnTask(gym.make("KKLRossler-v0"), observer="rossler-v2")
+def test_its_specification_makes_it_again(saved):
+    env = OnTask(gym.make("KKLVanDerPol-v0"), observer=saved())
     again = gym.make(env.spec)
     assert isinstance(again, OnTask)
     assert (again.reset(seed=1)[0] == env.reset(seed=1)[0]).all()

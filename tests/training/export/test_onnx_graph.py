@@ -48,7 +48,7 @@ def test_maps_that_track(index, precision):
         ("lorenz", "double", {"steps": 600, "length": 200}),
         *(
             pytest.param(name, precision, {"steps": 34_000}, marks=pytest.mark.slow)
-            for name in sorted(set(shipped().values()))
+            for name in shipped()
             for precision in TOLERANCES
         ),
     ],

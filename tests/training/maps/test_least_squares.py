@@ -19,21 +19,22 @@ def test_solved_forward_map_of_reverse_duffing_against_backward_quadrature():
     system, linear = ReverseDuffing(), Spectrum((-1.5, -1.875, -2.25, -2.625, -3.0)).filter(1, 0.01)
     rng = np.random.default_rng(0)
     x0 = np.concatenate([rng.uniform(*system.box(), (40, 2)), rng.uniform(*system.box(2.0), (60, 2))])
-    points = simulate(system, x0, 400, 0.05).reshape(-1, 2)
-    T = solve_forward(system, linear, features=800, points=points, rng=rng)
+    points = simulate(system, x0, 400, 0.05)[::3].reshape(-1, 2)
+    T = solve_forward(system, linear, features=400, points=points, rng=rng)
     rng = np.random.default_rng(1)
-    inside = rng.uniform(*system.box(), (40, 2))
-    beyond = rng.uniform(*system.box(2), (80, 2))
+    inside = rng.uniform(*system.box(), (12, 2))
+    beyond = rng.uniform(*system.box(2), (24, 2))
     beyond = beyond[(np.abs(beyond) > 2).any(1)]
     for x in (inside, beyond):
         truth = np.array([backward_quadrature(point, linear.A.diagonal()) for point in x])
-        assert np.sqrt(np.square(T(x) - truth).sum() / np.square(truth).sum()) < 1e-3
+        assert np.sqrt(np.square(T(x) - truth).sum() / np.square(truth).sum()) < 2e-3
     on_tensors_too = on_torch(T, CPU)(torch.as_tensor(inside, dtype=torch.float32)).numpy()
     np.testing.assert_allclose(on_tensors_too, T(inside), atol=1e-4)
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-14])
-@pytest.mark.parametrize("spectrum", [Spectrum((-1.0, -2.0, -3.0)), Spectrum((-1.0,), ((-0.5, 2.0),))])
+@pytest.mark.parametrize(
+    ("spectrum", "unit"), [(Spectrum((-1.0, -2.0, -3.0)), 1.0), (Spectrum((-1.0,), ((-0.5, 2.0),)), 1e-14)]
+)
 def test_solved_forward_map_of_a_linear_system(spectrum, unit):
     linear, rng = spectrum.filter(1, 0.01), np.random.default_rng(0)
     T = solve_forward(Oscillator(), linear, features=100, points=unit * rng.uniform(-1, 1, (2000, 2)), rng=rng)

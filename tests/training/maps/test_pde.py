@@ -9,7 +9,7 @@ import torch
 from kinked_systems import SYSTEMS as KINKED
 from linear_system import C, F, Oscillator, sylvester
 from random_artifacts import random_artifact
-from wrong_systems import Branching, Flat, Late
+from wrong_systems import Branching, Late
 
 from kkl_gym import EquationError, get_system
 from kkl_gym.system import on_states
@@ -29,7 +29,7 @@ def points(system, n=20):
     return torch.as_tensor(np.random.default_rng(0).uniform(*system.box(), (n, system.nx)))
 
 
-@pytest.mark.parametrize("system", ["reverse_duffing", "van_der_pol", "rossler", "lorenz", *KINKED], ids=str)
+@pytest.mark.parametrize("system", ["lorenz", *KINKED], ids=str)
 def test_equations_on_tensors_are_those_on_arrays(system):
     system = get_system(system)
     x = points(system)
@@ -45,9 +45,7 @@ def test_equations_on_tensors_are_those_on_arrays(system):
     [
         (Late().f, "; x held tensors of shape (4,): use kkl_gym.elementary.sin, which serves"),
         (Branching().f, "; x held tensors of shape (4,), on which `if`, `and`, `or` and `not` cannot decide: use"),
-        (Flat().h, "; x held tensors of shape (4,): use kkl_gym.elementary.sin, which serves"),
         (lambda x: (x[0], x[1].reshape(2, 2)), "of which [1] is of shape (2, 2), where the components of x have shape"),
-        (lambda x: (x[0], np.zeros(4)), "of which [1] is an array of shape (4,), of type ndarray"),
         (lambda x: torch.complex(x[0], x[1])[None], "which is complex"),
     ],
 )
@@ -81,26 +79,6 @@ def test_the_solution_leaves_nothing_and_another_map_what_it_is_off_by():
     wrong = M + 0.1
     expected = x @ (wrong @ torch.as_tensor(F) - A @ wrong - B @ torch.as_tensor(C)).T - 0.2 * A.sum(1)
     np.testing.assert_allclose(residual(lambda x: x @ wrong.T + 0.2, x, **given), expected, atol=1e-14)
-
-
-def test_the_residual_can_be_trained():
-    system, x = Oscillator(), points(Oscillator())
-    M = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
-    f, h = on_tensors(system.f, x), on_tensors(system.h, x)
-
-    def risk():
-        return residual(lambda x: x @ M.T, x, f=f, h=h, A=A, B=B).square().mean()
-
-    optimiser = torch.optim.LBFGS([M], max_iter=200, tolerance_grad=1e-12, tolerance_change=1e-14)
-
-    def closure():
-        optimiser.zero_grad()
-        loss = risk()
-        loss.backward()
-        return loss
-
-    optimiser.step(closure)
-    np.testing.assert_allclose(M.detach(), sylvester(A.numpy(), B.numpy()), atol=1e-6)
 
 
 def test_the_residual_is_the_same_in_training_and_in_a_certificate():
@@ -141,12 +119,3 @@ def test_networks_come_back_from_numpy(activation):
     np.testing.assert_allclose(
         encoder(scaled)(x.numpy()), 5.0 + 3.0 * network((x - 1.0) / 2.0).detach().numpy(), atol=1e-5
     )
-
-
-def test_jacobians_in_chunks_are_those_at_once(monkeypatch):
-    network = Smooth(Network(3, 2, width=8, depth=2, activation="tanh").export())
-    x = np.random.default_rng(0).normal(size=(23, 3))
-    whole = network.jacobian(x)
-    assert whole.shape == (23, 2, 3)
-    monkeypatch.setattr("training.maps.smooth.CHUNK", 5)
-    np.testing.assert_allclose(network.jacobian(x), whole, rtol=1e-13)

@@ -25,7 +25,7 @@ def doubted(where, errors):
 def gaussian(where, scale=1.0, outliers=0.0, thin=1.0):
     """Errors whose covariance is said too small by a factor, some of them far off; all, along a diagonal and across."""
     rng = np.random.default_rng(0)
-    shape = (len(where.ages), 20_000)
+    shape = (len(where.ages), 8_000)
     root = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2) * np.sqrt([1.0, thin])
     error = np.sqrt(scale) * rng.standard_normal((*shape, 2)) @ root.T
     error[rng.random(shape) < outliers] *= np.sqrt(50.0)
@@ -33,17 +33,11 @@ def gaussian(where, scale=1.0, outliers=0.0, thin=1.0):
     return Errors(error, P, P * np.eye(2))
 
 
-def drawn(where, scale=1.0, outliers=0.0):
-    """Squared distances of Gaussian errors whose covariance is said too small by a factor, some of them far off."""
-    rng = np.random.default_rng(0)
-    distance = scale * rng.chisquare(where.nx, (len(where.ages), 20_000))
-    return np.where(rng.random(distance.shape) < outliers, 50.0 * distance, distance)
-
-
 def test_gaussian_errors_say_what_covariances_lack(one_level):
-    np.testing.assert_allclose(found(one_level, drawn(one_level, 3.0)), 3.0, rtol=0.02)
-    factors, doubts = doubted(one_level, gaussian(one_level, 3.0))
-    np.testing.assert_allclose(factors, 3.0, rtol=0.02)
+    errors = gaussian(one_level, 3.0)
+    factors, doubts = doubted(one_level, errors)
+    np.testing.assert_allclose(factors, 3.0, rtol=0.03)
+    np.testing.assert_allclose(found(one_level, squared_distance(errors.error, errors.covariance)), 3.0, rtol=0.03)
     assert not doubts.any()
 
 
@@ -54,14 +48,6 @@ def test_long_tails_may_widen_regions_to_91_percent(one_level):
     edge = chi2.ppf(0.9, one_level.nx)
     assert np.mean(distance / strict[0, -1] < edge) == pytest.approx(0.9, abs=0.005)
     assert np.mean(distance / lenient[0, -1] < edge) == pytest.approx(0.91, abs=0.005)
-
-
-def test_leniency_goes_no_farther_than_the_mean_asks(one_level):
-    errors = gaussian(one_level, outliers=0.0005)
-    distance = squared_distance(errors.error, errors.covariance)
-    lenient, _ = doubted(one_level, errors)
-    assert (found(one_level, distance) < lenient).all()
-    assert np.mean(distance) / lenient[0, -1] == pytest.approx(one_level.nx, rel=0.03)
 
 
 def test_a_few_motions_that_are_lost_count_for_little(one_level):
@@ -81,14 +67,6 @@ def test_the_usual_mean_is_the_median_over_hundreds_of_motions():
     assert usual_mean(value, 3 * motion) == 2.0  # whatever they are called
     few = motion < 199
     assert usual_mean(value[few], motion[few]) == pytest.approx(value[few].mean())
-
-
-def test_short_tails_leave_the_factor(one_level):
-    errors = gaussian(one_level)
-    distance = squared_distance(errors.error, errors.covariance)
-    errors.error[distance > chi2.ppf(0.95, one_level.nx)] = 0.0
-    distance = squared_distance(errors.error, errors.covariance)
-    np.testing.assert_array_equal(doubted(one_level, errors)[0], found(one_level, distance))
 
 
 def test_what_goes_together_less_than_is_said_is_doubted(one_level):

@@ -4,39 +4,19 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import gymnasium as gym
+import linear_system
 import numpy as np
+import pandas as pd
 import pytest
 import scipy
 from linear_system import Oscillator
+from recorded_runs import as_csv, swing
 
 import training
 from kkl_gym.systems import Lorenz
-from training.observable import of_records, of_system
-from training.observable.found import Observability
+from training.cli import main
+from training.observable import Observability, of_records, of_system
 from training.records import Record, Signals
-
-
-@dataclass(frozen=True)
-class ThroughThird(Lorenz):
-    """Seen through x3, which (x1, x2) -> (-x1, -x2) leaves as it is."""
-
-    name: ClassVar[str] = "lorenz_through_x3"
-
-    def h(self, x):
-        return (x[2],)
-
-
-@dataclass(frozen=True)
-class Blind(Oscillator):
-    """A state that y does not see."""
-
-    name: ClassVar[str] = "blind"
-    X: ClassVar = ((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0))
-    bounds: ClassVar = ((-50.0, 50.0),) * 3
-    G: ClassVar = ((0.0,), (1.0,), (0.0,))
-
-    def f(self, x):
-        return x[1], -x[0], -0.01 * x[2]
 
 
 def looked(env_id, measured, hidden, **changes):
@@ -69,12 +49,6 @@ def test_pendulums_angle_is_determined_by_its_rate_but_for_which_side_is_up():
     assert found["obs[0]"].verdict.startswith("partly")
 
 
-def test_cart_poles_velocities_are_determined_by_positions():
-    found = looked("CartPole-v1", [0, 2], [1, 3])
-    assert [one.verdict for one in found.judgements] == ["determined", "determined"]
-    assert max(one.linear for one in found.judgements) < 0.02
-
-
 def test_cart_poles_place_is_seen_up_to_a_constant_by_its_velocities():
     found = verdicts(looked("CartPole-v1", [1, 3], [0, 2]))
     assert found["obs[0]"].verdict == "up to a constant"
@@ -83,37 +57,33 @@ def test_cart_poles_place_is_seen_up_to_a_constant_by_its_velocities():
 
 
 class Noisy(gym.Wrapper):
-    """Beside Pendulum-v1: noise, what stays as it is in an episode, which nobody sees either, and a constant."""
+    """Beside Pendulum-v1: noise, an unseen constant of each episode, and a constant."""
 
     def reset(self, *, seed=None, options=None):
         observation, info = self.env.reset(seed=seed, options=options)
         self.weight = self.np_random.normal()
-        return observation, info | self._told()
+        return observation, info | self.more()
 
     def step(self, action):
         *rest, info = self.env.step(action)
-        return *rest, info | self._told()
+        return *rest, info | self.more()
 
-    def _told(self):
+    def more(self):
         return {"noise": self.np_random.normal(), "weight": self.weight, "one": 1.0}
 
 
-@pytest.fixture
-def noisy():
+def test_what_no_output_sees_is_not_determined():
     gym.register("Noisy-v0", entry_point=lambda: Noisy(gym.make("Pendulum-v1")), max_episode_steps=50)
-    yield "Noisy-v0"
-    gym.registry.pop("Noisy-v0")
-
-
-def test_what_nobody_sees_is_not_determined(noisy):
-    found = verdicts(looked(noisy, [0, 1], ["info[noise]", "info[weight]", "info[one]"], steps=4000))
+    try:
+        found = verdicts(looked("Noisy-v0", [0, 1], ["info[noise]", "info[weight]", "info[one]"]))
+    finally:
+        gym.registry.pop("Noisy-v0")
     for name in ("info[noise]", "info[weight]"):
-        assert found[name].verdict == "not determined"
-        assert found[name].window is None
+        assert (found[name].verdict, found[name].window) == ("not determined", None)
     assert found["info[one]"].verdict == "never moves"
 
 
-def wandering(records=40, n=150, a=0.95, name="x1"):
+def wandering(records=40, n=150, a=0.95):
     rng = np.random.default_rng(0)
     x = scipy.signal.lfilter([1.0], [1.0, -a], rng.normal(size=(records, n + 100)))[:, 100:, None]
     t = np.arange(n) + 0.0
@@ -124,122 +94,145 @@ def test_errors_under_noise_are_those_of_a_kalman_filter():
     a, levels = 0.95, [0.5, 2.0]
     found = of_records(wandering(a=a), measurement_noise=levels)
     assert found.noise == (0.0, 0.5, 2.0)
+    size = np.concatenate([record.y for record in wandering(20, 50)]).std()
+    assert of_records(wandering(20, 50)).noise == pytest.approx((0.0, 0.01 * size, 0.1 * size), rel=0.01)
     for level, error in zip(levels, found.judgements[0].errors[1:]):
         before = scipy.linalg.solve_discrete_are([[a]], [[1.0]], [[1.0]], [[level**2]])[0, 0]
         after = before * level**2 / (before + level**2)
         assert error == pytest.approx(np.sqrt(after * (1 - a**2)), rel=0.12)
 
 
-def test_levels_by_default_are_shares_of_the_output():
-    found = of_records(wandering())
-    size = np.concatenate([record.y for record in wandering()]).std()
-    assert found.noise == pytest.approx((0.0, 0.01 * size, 0.1 * size), rel=0.01)
-
-
-def test_windows_for_which_there_are_too_few_samples_are_left_out():
-    found = of_records(wandering(30, 16), measurement_noise=[])
-    assert found.windows == (0, 1, 2, 4)
-    assert found.warnings == (
+def test_too_little_data_is_warned_of():
+    short = of_records(wandering(30, 16), measurement_noise=[])
+    assert short.windows == (0, 1, 2, 4)
+    assert short.warnings == (
         "windows of 8 steps and more are left out, as too few samples have so many before them: record longer "
         "episodes, or more",
     )
-
-
-def test_few_records_are_warned_of():
-    records = [replace(record, t=0.1 * record.t, source="") for record in wandering(3, 2000)]
-    assert "fewer than 5 records" in of_records(records, measurement_noise=[]).warnings[0]
-
-
-def test_more_data_would_tell_more():
-    rng = np.random.default_rng(0)
-    records = [
+    few = [replace(record, t=0.1 * record.t, source="") for record in wandering(3, 2000)]
+    assert "fewer than 5 records" in of_records(few, measurement_noise=[]).warnings[0]
+    bent = [
         Record(f"{i}", np.arange(60.0), y, x=np.sin(9 * y).prod(1, keepdims=True), source="bent")
-        for i, y in enumerate(rng.uniform(0, 1, (20, 60, 2)))
+        for i, y in enumerate(np.random.default_rng(0).uniform(0, 1, (20, 60, 2)))
     ]
-    found = of_records(records, measurement_noise=[])
+    found = of_records(bent, measurement_noise=[])
     assert found.judgements[0].verdict.startswith("partly")
     assert any("with half of them" in text for text in found.warnings)
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
-        ({"measurement_noise": [-1.0]}, "measurement_noise must be a finite number, not negative"),
-        ({"measurement_noise": [float("nan")]}, "measurement_noise must be"),
         ({"measurement_noise": [(0.1, 0.2)]}, "one for each of 1 outputs"),
         ({"measurement_noise": 0.1}, r"must be a list of levels, as in \[0.1, 0.3\], got 0.1"),
-        ({"measurement_noise": "0.1"}, "must be a list of levels"),
-        ({"seed": -1}, "seed must be"),
         ({"records": []}, "there is no record"),
         ({"records": wandering(2, 8)}, "16 samples in 2 records are too few"),
         ({"records": [replace(wandering(1)[0], x=None, signals=Signals())]}, "no hidden states were recorded"),
     ],
 )
-def test_refused(changes, told):
-    wanted = {"records": wandering(6, 20)} | changes
-    with pytest.raises(ValueError, match=told):
-        of_records(wanted.pop("records"), **wanted)
-
-
-def test_environments_need_hidden_signals():
-    with pytest.raises(ValueError, match="which signals are hidden"):
-        looked("Pendulum-v1", [0], [])
+def test_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        of_records(**{"records": wandering(6, 20)} | changes)
     with pytest.raises(ValueError, match="cannot make 'None-v0'"):
         looked("None-v0", [0], [1])
-
-
-def test_a_symmetry_is_told_from_what_is_hard_to_see():
-    found = of_system(ThroughThird(), duration=6.0, measurement_noise=[0.5])
-    by_name = verdicts(found)
-    assert [by_name[name].verdict for name in ("x1", "x2", "x3")] == ["not determined", "not determined", "determined"]
-    assert "x1, x2: y tells them near each state" in found.warnings[0]
-    assert found.least[1, 0] < 0.05 < 0.9 < by_name["x1"].errors[1]
-
-
-def test_what_y_tells_nothing_of_is_said_of_systems():
-    found = of_system(Blind(), duration=10.0)
-    by_name = verdicts(found)
-    assert by_name[Blind().state_names[1]].verdict == "determined"
-    assert by_name[Blind().state_names[2]].verdict == "not determined"
-    assert any("y tells nothing of" in text for text in found.warnings)
-    assert found.noise == (0.0, Blind().measurement_noise)
-    assert not any("near each state" in text for text in found.warnings)
-
-
-def test_levels_of_systems_are_refused_before_any_work():
     with pytest.raises(ValueError, match="measurement_noise must"):
         of_system(Oscillator(), measurement_noise=[float("inf")])
 
 
-def judged(errors, changes):
-    errors, changes = np.array(errors).reshape(1, -1, 1), np.array(changes)[:, None]
-    windows = tuple(range(errors.shape[1]))
-    found = Observability(
-        ("y",),
-        (),
-        ("x",),
-        dt=0.1,
-        windows=windows,
-        noise=(0.0,),
-        errors=errors,
-        predicted=errors.min(1),
-        changes=changes,
-        linear=errors[0],
-    )
-    return found.judgements[0]
+@dataclass(frozen=True)
+class ThroughThird(Lorenz):
+    """Seen through x3, which (x1, x2) -> (-x1, -x2) leaves as it is."""
+
+    name: ClassVar[str] = "lorenz_through_x3"
+
+    def h(self, x):
+        return (x[2],)
+
+
+def test_a_symmetry_is_told_from_what_is_hard_to_see():
+    found = of_system(ThroughThird(), duration=6.0, measurement_noise=[0.5])
+    assert [each.verdict for each in found.judgements] == ["not determined", "not determined", "determined"]
+    assert "x1, x2: y tells them near each state" in found.warnings[0]
+    assert found.least[1, 0] < 0.05 < 0.9 < found.judgements[0].errors[1]
+
+
+@dataclass(frozen=True)
+class Blind(Oscillator):
+    """A state that y does not see."""
+
+    name: ClassVar[str] = "blind"
+    dt: ClassVar = 0.05
+    X: ClassVar = ((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0))
+    bounds: ClassVar = ((-50.0, 50.0),) * 3
+    G: ClassVar = ((0.0,), (1.0,), (0.0,))
+
+    def f(self, x):
+        return x[1], -x[0], -0.01 * x[2]
+
+
+def test_a_state_of_which_y_tells_nothing():
+    found = of_system(Blind(), duration=10.0)
+    assert [each.verdict for each in found.judgements][1:] == ["determined", "not determined"]
+    assert any("y tells nothing of" in text for text in found.warnings)
+    assert not any("near each state" in text for text in found.warnings)
+    assert found.noise == (0.0, Blind().measurement_noise)
+
+
+NONE = [np.nan] * 3
 
 
 @pytest.mark.parametrize(
     ("errors", "changes", "verdict", "window"),
     [
         ([0.9, 0.04, 0.01], [np.nan, 0.5, 0.5], "determined", 1),
-        ([0.9, 0.5, 0.3, 0.29], [np.nan, 0.5, 0.5, 0.5], "partly (29 % left)", 2),
+        ([0.5, 0.3, 0.29], [np.nan, 0.5, 0.5], "partly (29 % left)", 1),
         ([0.9, 0.5, 0.4], [np.nan, 0.3, 0.03], "up to a constant", 2),
         ([0.9, 0.07, 0.07], [np.nan, 0.02, 0.02], "partly (7 % left)", 1),  # its change is no better seen
-        ([0.99, 0.95, 1.0], [np.nan, np.nan, np.nan], "not determined", None),
-        ([np.nan, np.nan, np.nan], [np.nan, np.nan, np.nan], "never moves", None),
+        ([0.99, 0.95, 1.0], NONE, "not determined", None),
+        (NONE, NONE, "never moves", None),
     ],
 )
 def test_verdicts(errors, changes, verdict, window):
-    found = judged(errors, changes)
+    errors, changes = np.reshape(errors, (1, -1, 1)), np.reshape(changes, (-1, 1))
+    of = {"errors": errors, "predicted": errors.min(1), "changes": changes, "linear": errors[0]}
+    found = Observability(("y",), (), ("x",), dt=0.1, windows=(0, 1, 2), noise=(0.0,), **of).judgements[0]
     assert (found.verdict, found.window) == (verdict, window)
+
+
+def shown(arguments, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
+    main(["observability", *arguments])
+    return capsys.readouterr().out
+
+
+def test_the_command_on_an_environment(capsys, tmp_path, monkeypatch):
+    words = "Pendulum-v1 --measured 0,1 --hidden 2 --steps 2000 --measurement-noise 0.05,0.1 --out"
+    text = shown([*words.split(), str(tmp_path)], capsys, monkeypatch)
+    assert "what follows from obs[0], obs[1] and action[0]" in text
+    row = next(line for line in text.splitlines() if "obs[2]" in line)
+    assert "determined" in row
+    assert "0.05 s)" in row
+    assert "noise 0.05, 0.1" in text
+    assert (tmp_path / "observability.png").stat().st_size > 10_000
+    written = pd.read_csv(tmp_path / "observability.csv", dtype={"measurement_noise": str})
+    assert list(written) == ["signal", "measurement_noise", "steps", "seconds", "error", "linear", "change"]
+    assert set(written.measurement_noise) == {"0.0", "0.05, 0.1"}
+    np.testing.assert_allclose(written.seconds, 0.05 * written.steps)
+    exact = written[written.measurement_noise == "0.0"].set_index("steps")
+    assert exact.error[0] > 0.9 > 0.05 > exact.error[8]
+    assert written[written.steps == 8].error.is_monotonic_increasing
+
+
+def test_the_command_on_records_and_on_a_system(capsys, tmp_path, monkeypatch):
+    files = [as_csv(tmp_path / f"{i}.csv", swing(i, n=200)) for i in range(6)]
+    options = ["--measured", "position", "--inputs", "force", "--hidden", "speed", "--measurement-noise", "0.5"]
+    text = shown(["--data", *files, *options], capsys, monkeypatch)
+    assert "0.csv and 5 more" in text
+    assert "what follows from position and force" in " ".join(text.split())
+    assert "determined" in next(line for line in text.splitlines() if "│ speed" in line)
+    system = f"{linear_system.__file__}:Oscillator"
+    text = shown([system, "--dt", "0.05", "--duration", "10"], capsys, monkeypatch)
+    first, second = (line for line in text.splitlines() if "│ x" in line)
+    assert "y alone" in first
+    assert "determined" in second
+    assert "equations, noise" in text

@@ -15,17 +15,21 @@ from training.recorded.preparing import split
 from training.records import Record, resampled
 
 
+def trained(records, folder, **changes):
+    config = recorded_config(records, {**SMALL, **changes})
+    return train_recorded(records, config, folder, name="spring", device=torch.device("cpu"))
+
+
 def test_an_observer_from_recorded_states(tmp_path):
     records = [swing(seed, jitter=0.1) for seed in range(6)]
-    config = recorded_config(records, {**SMALL, "untold_noise": 0.01})
-    result = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu"))
+    result = trained(records, tmp_path, untold_noise=0.01)
     assert len(result.held_out) == 1
     assert result.errors.relative["speed"] < 0.2  # held out; the derivative of a driven position
     result.artifact.save(tmp_path / "spring.safetensors")
     artifact = Artifact.read(tmp_path / "spring.safetensors")
     assert artifact.signals == {"measured": ["position"], "inputs": ["force"], "hidden": ["speed"]}
     assert artifact.training["held_out_errors"] == pytest.approx(result.errors.relative)
-    new = resampled(swing(100), config.dt)
+    new = resampled(swing(100), artifact.filter.dt)
     x_hat = KKLObserver(artifact).estimate(new.y, new.u)
     late = slice(200, None)
     assert np.sqrt(np.mean((x_hat - new.x)[late] ** 2)) < 0.2 * new.x.std()
@@ -34,13 +38,13 @@ def test_an_observer_from_recorded_states(tmp_path):
 
 
 def test_resuming_makes_the_same_observer(tmp_path):
-    records = [swing(seed) for seed in range(3)]
-    config = recorded_config(records, {**SMALL, "members": 2, "inverse_steps": 20, "held_out": 0.0})
-    first = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu"))
+    records, options = [swing(seed) for seed in range(3)], {"members": 2, "inverse_steps": 20, "held_out": 0.0}
+    first = trained(records, tmp_path, **options)
     assert first.held_out == []
     (tmp_path / "inverse-2.checkpoint.pt").unlink()
     with pytest.raises(ValueError, match="holds the checkpoints of a run"):
-        train_recorded(records, config, tmp_path, name="spring")
+        trained(records, tmp_path, **options)
+    config = recorded_config(records, {**SMALL, **options})
     again = train_recorded(records, config, tmp_path, name="spring", resume=True, device=torch.device("cpu"))
     for a, b in zip(first.artifact.inverse.mlp.weights, again.artifact.inverse.mlp.weights):
         np.testing.assert_array_equal(a, b)
@@ -49,25 +53,20 @@ def test_resuming_makes_the_same_observer(tmp_path):
 
 
 def test_estimates_do_not_hang_on_an_arbitrary_zero(tmp_path):
-    records = [swing(seed) for seed in range(3)]
-    config = recorded_config(records, {**SMALL, "inverse_steps": 20, "arbitrary_zero": ("position",)})
-    artifact = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu")).artifact
-    new = resampled(swing(100), config.dt)
+    records, new = [swing(seed) for seed in range(3)], resampled(swing(100), 0.05)
+    artifact = trained(records, tmp_path / "a", inverse_steps=20, arbitrary_zero=("position",)).artifact
     here, there = (KKLObserver(artifact).estimate(new.y + offset, new.u) for offset in (0.0, 100.0))
     np.testing.assert_allclose(here, there, atol=1e-3 * new.x.std())
     assert here[-1] != pytest.approx(here[-50])  # it does move
-    unknown = replace(config, arbitrary_zero=("angle",))
     with pytest.raises(ValueError, match=r"arbitrary_zero names 'angle'; measured are position"):
-        train_recorded(records, unknown, tmp_path / "unknown", name="spring")
+        trained(records, tmp_path / "b", arbitrary_zero=("angle",))
 
 
 def test_without_states_or_with_short_records(tmp_path):
-    records = [replace(swing(0), x=None, signals=replace(SIGNALS, hidden=()))]
     with pytest.raises(ValueError, match=r"no hidden states were recorded; name their columns \(--hidden\)"):
-        train_recorded(records, recorded_config(records), tmp_path, name="spring")
-    records = [swing(0, n=40)]
+        trained([replace(swing(0), x=None, signals=replace(SIGNALS, hidden=()))], tmp_path)
     with pytest.raises(ValueError, match=r"run0.csv: column time, row 40: .* filter remembers .* faster eigenvalues"):
-        train_recorded(records, recorded_config(records), tmp_path, name="spring")
+        trained([swing(0, n=40)], tmp_path)
 
 
 def test_the_mean_of_networks_is_a_network():
@@ -113,7 +112,7 @@ def test_signals_that_stand_still_in_each_record(tmp_path):
     alone = recorded_config([swing(seed) for seed in range(6)], SMALL)
     config = recorded_config(records, SMALL)
     assert config.eigenvalues == alone.eigenvalues
-    errors = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu")).errors.relative
+    errors = trained(records, tmp_path).errors.relative
     assert errors["speed"] < 0.3
     assert np.isnan(errors["mass"])
     kept = replace(SIGNALS, measured=("target",), hidden=("mass",))
@@ -124,9 +123,8 @@ def test_signals_that_stand_still_in_each_record(tmp_path):
 
 def test_errors_are_relative_and_leave_the_transient_out(tmp_path):
     records = [swing(seed, n=300) for seed in range(2)]
-    config = recorded_config(records, {**SMALL, "inverse_steps": 20})
-    artifact = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu")).artifact
-    record = resampled(records[0], config.dt)
+    artifact = trained(records, tmp_path, inverse_steps=20).artifact
+    record = resampled(records[0], 0.05)
     x_hat = KKLObserver(artifact).estimate(record.y, record.u)
     expected = np.sqrt(np.mean((x_hat - record.x)[100:] ** 2)) / record.x[100:].std()
     found = recorded_errors(artifact, [record], after=5.0)

@@ -32,10 +32,7 @@ A = np.array([[np.cos(DT), np.sin(DT)], [-np.sin(DT), np.cos(DT)]])
 def both(seed, n=600):
     """A run of which the position is both measured and among what is to be estimated."""
     run = swing(seed, n=n)
-    assert run.x is not None
-    return replace(
-        run, x=np.hstack([run.y, run.x]), signals=replace(run.signals, hidden=("position", "speed")), t=run.t
-    )
+    return replace(run, x=np.hstack([run.y, run.x]), signals=replace(run.signals, hidden=("position", "speed")))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -83,15 +80,12 @@ def estimated(artifact, *, n=40, level=NOISE):
     return np.array(errors), np.array(covariances)
 
 
-def share_inside(artifact, level):
-    errors, covariances = estimated(artifact, level=level)
-    return np.mean(squared_distance(errors[:200], covariances[:200]) < chi_square(0.9, 2))
-
-
-@pytest.mark.parametrize("level", [NOISE, 2 * NOISE])
-def test_regions_hold_what_they_should_on_new_records(barred, tracking, level):
-    assert 0.85 < share_inside(barred, level) < 0.95
-    assert 0.85 < share_inside(tracking, level) < 0.97  # lenient: up to 91 % where errors have long tails
+def test_regions_hold_what_they_should_on_new_records(barred, tracking):
+    for level in (NOISE, 2 * NOISE):
+        for artifact, most in ((barred, 0.95), (tracking, 0.97)):  # lenient where errors have long tails
+            errors, covariances = estimated(artifact, level=level)
+            inside = squared_distance(errors[:200], covariances[:200]) < chi_square(0.9, 2)
+            assert 0.85 < np.mean(inside) < most
 
 
 def test_estimates_stay_as_they_are_with_error_bars(plain, barred):
@@ -125,15 +119,12 @@ def test_increments_are_between_samples_that_are_known(plain):
 
 def test_outputs_are_sums_of_states_or_an_error(records):
     rng, run = np.random.default_rng(0), records[0]
-    noisy = replace(run, y=run.y + 0.01 * rng.standard_normal(run.y.shape))
-    C, least = linear_output([noisy])
-    np.testing.assert_allclose(C, [[1.0, 0.0]], atol=2e-3)
-    assert least == pytest.approx(0.01, rel=0.1)
-    loud = replace(run, y=run.y + 0.3 * rng.standard_normal(run.y.shape))
-    loud.y[5] = 1e3  # and one sample is wrong
-    C, least = linear_output([loud])
-    np.testing.assert_allclose(C, [[1.0, 0.0]], atol=0.05)
-    assert least == pytest.approx(0.3, rel=0.1)
+    for noise, off in ((0.01, 2e-3), (0.3, 0.05)):
+        noisy = replace(run, y=run.y + noise * rng.standard_normal(run.y.shape))
+        noisy.y[5] = 1e3 if noise == 0.3 else noisy.y[5]  # one sample is wrong
+        C, least = linear_output([noisy])
+        np.testing.assert_allclose(C, [[1.0, 0.0]], atol=off)
+        assert least == pytest.approx(noise, rel=0.1)
     for other in (run.y**2, run.y + 3.0, rng.standard_normal(run.y.shape)):
         with pytest.raises(ValueError, match=r"position cannot be told as a sum of position, speed"):
             linear_output([replace(run, y=other)])
@@ -141,16 +132,6 @@ def test_outputs_are_sums_of_states_or_an_error(records):
     apart = replace(run, x=np.where(early, run.x, np.nan), y=np.where(early, np.nan, run.y))
     with pytest.raises(ValueError, match=r"no sample has all measured and all hidden signals"):
         linear_output([apart])
-
-
-def test_an_output_that_stands_still(records):
-    for size in (0.0, 2.0):
-        still = replace(
-            records[0], y=np.full((600, 1), size), x=np.hstack([records[0].x[:, :1], np.full((600, 1), size)])
-        )
-        C, least = linear_output([still])
-        assert least[0] > 0
-        np.testing.assert_allclose(still.x @ C.T, still.y, atol=1e-9)
 
 
 def test_records_are_those_of_the_training(plain, records):
@@ -164,8 +145,6 @@ def test_records_are_those_of_the_training(plain, records):
         parted(plain, [*records, both(11)], None)
     with pytest.raises(ValueError, match=r"run0.csv has changed"):
         parted(plain, [replace(records[0], y=2 * records[0].y), *records[1:]], None)
-    with pytest.raises(ValueError, match=r"run0.csv is of \{'id': 'Osc-v0'.*, the observer of None"):
-        parted(plain, [replace(record, environment={"id": "Osc-v0", "kwargs": {}}) for record in records], None)
     with pytest.raises(ValueError, match=r"steps of 50 s do not fit dt = 0.05 s; is the time in seconds"):
         parted(plain, [replace(record, t=1000 * record.t) for record in records], None)
 
@@ -179,30 +158,20 @@ def test_what_is_refused(plain, barred, tracking, records, tmp_path):
         learn_recorded_tracking(barred, [swing(0)])
     with pytest.raises(ValueError, match=r"no hidden states were recorded"):
         learn_recorded_tracking(barred, [Record("a.csv", np.arange(5.0), np.zeros((5, 1)))])
-    with pytest.raises(ValueError, match=r"there is no record"):
-        learn_recorded_tracking(barred, [])
     greedy = replace(plain, training={**plain.training, "held_out": 0.0})
     with pytest.raises(ValueError, match=r"no record was held out.*held-out 0.2"):
         learn_recorded_error_bars(greedy, records)
     with pytest.raises(ValueError, match=r"19 samples with states to begin at, too few"):
         learn_recorded_error_bars(plain, records[:1], [both(7, n=20)], steps=1)
     for teach, start in ((learn_recorded_error_bars, plain), (learn_recorded_tracking, barred)):
-        for wrong, said in (({"steps": 0}, "steps must be"), ({"seed": -1}, "seed must be"), ({"steps": 2.5}, "steps")):
-            with pytest.raises(ValueError, match=said):
-                teach(start, records, **wrong)
+        for name in ("steps", "seed"):
+            with pytest.raises(ValueError, match=f"{name} must be"):
+                teach(start, records, **{name: -1})
     zeroed = replace(barred, training={**barred.training, "arbitrary_zero": ("position",)})
     with pytest.raises(ValueError, match=r"compares position with what it expects.*without arbitrary_zero"):
         learn_recorded_tracking(zeroed, records)
     with pytest.raises(ValueError, match="was not learned from recorded states"):
         learn_recorded_error_bars(replace(plain, training={}), records)
-
-
-def test_the_file_holds_it(tracking, tmp_path):
-    tracking.save(tmp_path / "tracking.safetensors")
-    again = Artifact.read(tmp_path / "tracking.safetensors")
-    run = both(60)
-    x_hat, expected = (KKLObserver(each, NOISE).estimate(run.y, run.u) for each in (again, tracking))
-    np.testing.assert_allclose(x_hat, expected, atol=1e-12)  # arrays lie otherwise in memory
 
 
 def test_commands(plain, tmp_path, monkeypatch):

@@ -67,23 +67,18 @@ def test_missing_samples_are_nan(tmp_path):
 
 BAD_CSV = {
     "short row": (["0,1,2,a", "1,2,a"], "row 2 has 3 cells, the header 4"),
-    "long row": (["0,1,2,a", "1,2,a,3,4"], "row 2 has 5 cells, the header 4"),
     "no number": (["0,1,2,a", "1,x7,2,a"], "column theta, row 2: 'x7' is no number"),
     "empty row": (["0,1,2,a", "", "1,2,2,a"], "row 2 is empty"),
-    "back in time": (["0,1,2,a", "2,2,2,a", "1,3,2,a"], "column time, row 3: time must increase, but 1 comes after 2"),
     "time stands": (["0,1,2,a", "0,2,2,a"], "column time, row 2: time must increase"),
     "no time": (["0,1,2,a", ",2,2,a"], "column time, row 2: a number is missing"),
     "infinite": (["0,1,2,a", "1,inf,2,a"], "column theta, row 2: inf is no sample"),
-    "infinite angle": (["0,1,2,a", "1,2,-inf,a"], "column alpha, row 2: -inf is no sample"),
     "all missing": (["0,,2,a", "1,nan,2,a"], "column theta, row 1: no row holds a number"),
     "one row": (["0,1,2,a"], "t must be two samples at least"),
-    "never moves": (["0,3,2,a", "1,3,2,a"], "column theta: 3 in all rows"),
     "rounding moves": ([f"{k},0.1,2,a" for k in range(99)], "column theta: 0.1 in all rows"),
     "decimal comma": (
         ["0,1,2,a", '1,"2,5",2,a'],
         "column theta, row 2: '2,5' is no number; write decimals with a point",
     ),
-    "huge": (["0,1,2,a", "1,1e300,2,a"], "column theta, row 2: 1e\\+300 is no sample"),
     "hidden never moves": (["0,3,2,a", "1,4,2,a"], r"column cos\(alpha\): -0.416147 in all rows"),
 }
 
@@ -102,7 +97,6 @@ def test_bad_csv(tmp_path, case):
         ("time,theta,beta,note", r"no column alpha; there are time, theta, beta, note \(--hidden\)"),
         ("when,theta,alpha,note", r"no column t; there are .* \(--time\)"),
         ("time,theta,theta,alpha", "more than one column theta"),
-        ("0,1,2,3", "first row must hold the names"),
         ("", "first row must hold the names"),
     ],
 )
@@ -112,19 +106,11 @@ def test_bad_header(tmp_path, header, message):
         read_records([csv(tmp_path / "bad.csv", header)], signals=signals)
 
 
-def test_no_expression_but_cos_and_sin(tmp_path):
-    with pytest.raises(ValueError, match=r"no column exp\(alpha\)"):
-        read_records([csv(tmp_path / "a.csv")], signals=Signals(measured=("theta",), hidden=("exp(alpha)",)))
-
-
 BAD_NPZ = {
-    "short": ({"y": Y[:-1]}, "columns must be of one length; t has 200, y has 199 rows"),
-    "missing": ({"y": np.zeros((3, 4, 5))}, "no column y"),
     "objects": ({"y": np.array([None] * 200)}, "bad.npz: column y: .*allow_pickle=False"),
     "transposed": ({"y": np.stack([Y, Y])}, "columns must be of one length; t has 200, y1 has 2 rows$"),
     "rows for columns": ({"t": T[None]}, r"no column t; there are t1, t2, [t0-9, ]* \.\.\. \(--time\)$"),
     "text": ({"y": np.array(["a"] * 200)}, "bad.npz: column y must hold numbers, got <U1"),
-    "complex": ({"y": Y + 1j}, "bad.npz: column y must hold numbers, got complex128"),
     "missing input": ({"u": np.where(T < 5, T, np.nan)}, "bad.npz: column u, row 101: a number is missing"),
 }
 
@@ -139,17 +125,8 @@ def test_bad_npz(tmp_path, case):
 def test_what_is_not_asked_for_does_no_harm(tmp_path):
     (record,) = read_records([npz(tmp_path / "a.npz", notes=np.array({"made": "today"}, dtype=object))], warn=quiet)
     np.testing.assert_array_equal(record.t, T)
-
-
-def test_spaces_before_quotes(tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text('"t", "y"\n"0", "1"\n"1", "3"\n')
-    np.testing.assert_array_equal(read_records([path], warn=quiet)[0].y, [[1.0], [3.0]])
-
-
-def test_the_time_is_no_signal(tmp_path):
-    with pytest.raises(ValueError, match=r"a.npz: column t is the time, and cannot be a signal too"):
-        read_records([npz(tmp_path / "a.npz")], signals=Signals(measured=("y", "cos(t)")))
+    (tmp_path / "b.csv").write_text('"t", "y"\n"0", "1"\n"1", "3"\n')  # with spaces before quotes
+    np.testing.assert_array_equal(read_records([tmp_path / "b.csv"], warn=quiet)[0].y, [[1.0], [3.0]])
 
 
 def test_no_record(tmp_path):
@@ -172,6 +149,9 @@ def test_no_record(tmp_path):
         assert name in str(caught.value)
     with pytest.raises(ValueError, match="name a file"):
         read_records([])
+    for name, message in (("cos(t)", "column t is the time, and cannot be a signal too"), ("exp(y)", "no column exp")):
+        with pytest.raises(ValueError, match=message):
+            read_records([npz(tmp_path / "c.npz")], signals=Signals(measured=("y", name)))
 
 
 def test_files_that_differ(tmp_path):
@@ -229,14 +209,7 @@ def test_records_in_memory():
     with pytest.raises(ValueError, match=r"y must have shape \(200, n\)"):
         Record("a", T, Y)
     column = Y[:, None]
-    for y in (
-        np.ma.masked_array(column, column > 0.5),
-        column + 1j,
-        column.astype(str),
-        column > 0,
-        None,
-        [[1], [1, 2]],
-    ):
+    for y in (np.ma.masked_array(column, column > 0.5), column + 1j, column.astype(str), None, [[1], [1, 2]]):
         with pytest.raises(ValueError, match=r"a: y (must hold real numbers|holds masked entries)"):
             Record("a", T, y)
     with pytest.raises(ValueError, match=r"y has 1 columns, but measured"):

@@ -31,16 +31,6 @@ def test_inputs_are_the_policys_on_a_wrong_state_or_its_own():
     np.testing.assert_array_equal(x, simulate(SYSTEM, x0, 300, SYSTEM.dt, u=u))
 
 
-def test_a_policy_is_not_asked_about_states_that_are_no_numbers():
-    def letting_go(x):
-        assert np.isfinite(x).all()
-        return np.zeros((len(x), 1))
-
-    own, rng = np.ones(4, dtype=bool), np.random.default_rng(0)
-    x, _ = under_policy(SYSTEM, letting_go, np.full((4, 2), 0.3), steps=300, dt=SYSTEM.dt, rng=rng, own=own)
-    assert np.isnan(x[-1]).any()
-
-
 def test_actions_that_are_no_numbers_are_an_error():
     own, rng = np.ones(4, dtype=bool), np.random.default_rng(0)
     with pytest.raises(ValueError, match=r"the policy gives the action \[nan\] at x = \["):
@@ -98,9 +88,7 @@ def test_a_run_is_not_resumed_under_a_changed_policy(tmp_path):
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        ("return x", r"shape \(20, 1\)"),
         ("return 3.0 * (x[:, :1] > 0)", r"\[-1, 1\]"),
-        ("return x[:, :1] * float('nan')", r"\[-1, 1\]"),
         ("return x.nothing", "AttributeError"),
     ],
 )
@@ -110,7 +98,7 @@ def test_functions_that_are_no_policy(tmp_path, body, message):
         named_policy(SYSTEM, f"{tmp_path / 'bad.py'}:act")
 
 
-@pytest.mark.parametrize("name", ["nothing", "numpy:nothing", "nowhere.py:act", "math:pi"])
+@pytest.mark.parametrize("name", ["nothing", "nowhere.py:act", "math:pi"])
 def test_names_of_no_policy(name):
     with pytest.raises(ValueError, match=name.rpartition(":")[2]):
         named_policy(SYSTEM, name)

@@ -121,7 +121,7 @@ class Player:
         tensors, described = storage.read(path, key=KEY, error=AgentError, what="an agent for any environment")
         with storage.explained(path, AgentError):
             if described.pop("format") != FORMAT:
-                raise AgentError(f"it has another format than {FORMAT}, which this version of kkl-gym reads")
+                raise AgentError(f"it has another format than {FORMAT}, which kkl-gym reads: train the agent again")
             network = storage.get_mlp(tensors, "", described.pop("activation"))
             task: dict[str, Any] = described.pop("task")
             return cls(

@@ -1,1 +1,0 @@
-"""Agents in environments of others that are shown different things, compared."""

@@ -1,0 +1,80 @@
+"""Jobs that leave their results in folders, so that a comparison goes on where it stopped."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from rich.console import Console
+
+from training.commands.running import Workers, run_missing
+from training.jobs import check_identity, claimed_job
+from training.progress import LOG, ProgressBars, progress_bars
+
+
+class Job(ABC):
+    """One part of a comparison; derived dataclasses have its settings and the field ``folder``."""
+
+    folder: Path
+    result: ClassVar[str]
+    """File in the folder that is written last."""
+    other: ClassVar[str]
+    """What a folder holds where the identity in it differs, for the error's text."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """For progress and errors."""
+
+    @property
+    @abstractmethod
+    def identity(self) -> dict[str, Any]:
+        """All that the result depends on."""
+
+    @abstractmethod
+    def work(self) -> None:
+        """Compute the result and write it."""
+
+    @property
+    def done(self) -> bool:
+        """Whether the result is there; raises ValueError if it is that of another identity."""
+        if not (self.folder / self.result).exists():
+            return False
+        check_identity(self.folder / "job.json", self.identity, self.other)
+        return True
+
+
+def run_job(job: Job) -> None:
+    """Do a job in one thread, unless it is done."""
+    import torch  # which takes seconds that help need not wait for
+
+    torch.set_num_threads(1)
+    with claimed_job(job.folder, job.identity, job.other):
+        if not job.done:
+            job.work()
+
+
+def run_and_report(
+    jobs: Sequence[Job],
+    out: Path,
+    console: Console,
+    *,
+    workers: Workers,
+    what: str,
+    report: Callable[[ProgressBars], None],
+) -> None:
+    """Run the jobs that are not done and report on what is there, also after an interruption."""
+    failures = list[str]()
+    try:
+        with progress_bars(console, out / LOG) as progress:
+            failures = run_missing(run_job, jobs, workers=workers, what=what, progress=progress)
+    finally:
+        with progress_bars(console, out / LOG) as progress, progress.phase("collecting results"):
+            report(progress)
+    check_failures(failures, jobs, what)
+
+
+def check_failures(failures: Sequence[str], jobs: Sequence[Job], what: str) -> None:
+    """Raise ValueError with the first failure, if there are some."""
+    if failures:
+        raise ValueError(f"{len(failures)} of {len(jobs)} {what} failed; the first: {failures[0]}")

@@ -1,0 +1,276 @@
+"""The memory around Gymnasium's own environments, single and in vectors."""
+
+import copy
+import pickle
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from alike_vectors import compare
+from discrete_systems import Henon
+from gymnasium import spaces
+from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import FrameStackObservation
+
+from kkl_gym import OWN_ID, ActionRepeat, KKLMemory, KKLVectorEnv, KKLVectorMemory
+
+modes = pytest.mark.parametrize("mode", list(AutoresetMode))
+# What bare environments draw from the checkers, too: unbounded observations, actions that are not in [-1, 1].
+pytestmark = [
+    pytest.mark.filterwarnings(f"ignore:{message}")
+    for message in (
+        ".*A Box observation space (max|min)imum value is -?infinity",
+        ".*we recommend using a symmetric and normalized space",
+        "We recommend you to use a symmetric and normalized Box action space",
+        ".*is different from the unwrapped version",
+        "builtin type (Swig|swig).* has no __module__ attribute:DeprecationWarning",
+    )
+]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """MuJoCo writes its warnings into the folder in which it runs."""
+    monkeypatch.chdir(tmp_path)
+
+
+def pendulum(**arguments):
+    return KKLMemory(gym.make("Pendulum-v1"), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "package"),
+    [
+        ("CartPole-v1", "gymnasium"),
+        ("Pendulum-v1", "gymnasium"),
+        ("Blackjack-v1", "gymnasium"),
+        ("BipedalWalker-v3", "Box2D"),
+        ("Reacher-v5", "mujoco"),
+    ],
+)
+def test_checkers_are_content(env_id, package):
+    pytest.importorskip(package)
+    check_env(KKLMemory(gym.make(env_id)), skip_render_check=True)
+    if env_id != "BipedalWalker-v3":  # whose reward is no float, bare either
+        pytest.importorskip("stable_baselines3.common.env_checker").check_env(KKLMemory(gym.make(env_id)))
+
+
+@pytest.mark.parametrize(
+    ("env_id", "arguments"),
+    [
+        ("Blackjack-v1", {"measured": [0], "time_constants": [1, 3], "input_time_constants": np.array([2.0])}),
+        ("Pendulum-v1", {"angles": [0]}),
+        ("Pendulum-v1", {"angles": [[0, 1], 2]}),
+        ("Pendulum-v1", {"angles": np.array([[0, 1]])}),
+    ],
+    ids=str,
+)
+def test_specs_copies_and_pickles_go_on_alike(env_id, arguments):
+    env = KKLMemory(gym.make(env_id), **arguments)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert isinstance(again, KKLMemory)
+    assert again.spec.to_json() == env.spec.to_json()
+    assert again.observation_space == env.observation_space
+    env.action_space.seed(0)
+    action = env.action_space.sample()
+    first = [one.reset(seed=3)[0] for one in (env, again)]
+    steps = [one.step(action)[0] for one in (env, again)]
+    for twins in (first, steps):
+        assert np.array_equal(*twins)
+    assert not np.array_equal(first[0], steps[0])
+    if env_id == "Pendulum-v1":  # in the midst of an episode
+        for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+            assert np.array_equal(twin.step(action)[0], copy.deepcopy(env).step(action)[0])
+
+
+class Walk(gym.Env):
+    """A walk in a Dict of all kinds, of random length, that says so in its observation."""
+
+    observation_space = spaces.Dict(
+        place=spaces.Box(-np.inf, np.inf, (2,)),
+        mark=spaces.Discrete(3),
+        image=spaces.Box(0, 255, (2, 2), np.uint8),
+        way=spaces.Box(-np.inf, np.inf, (1,)),
+    )
+    action_space = spaces.Tuple([spaces.Box(-2.0, 2.0, (1,)), spaces.Discrete(2)])
+    poison: float | None = None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.left = self.np_random.normal(size=2).astype(np.float32), int(self.np_random.integers(2, 9))
+        return self._seen(), {}
+
+    def _seen(self):
+        place = self.place.copy()
+        return {"place": place, "mark": self.left % 3, "image": np.zeros((2, 2), np.uint8), "way": place[1:]}
+
+    def step(self, action):
+        self.left -= 1
+        self.place += self.np_random.normal(size=2).astype(np.float32) + action[0]
+        if self.poison is not None:
+            self.place[1] = self.poison
+        return self._seen(), 0.0, self.left == 0, False, {"left": self.left}
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind", "angles"),
+    [
+        *((mode, SyncVectorEnv, angles) for mode in AutoresetMode for angles in ((), ["way"])),
+        (AutoresetMode.SAME_STEP, AsyncVectorEnv, ["way"]),
+    ],
+)
+def test_rows_begin_anew_in_every_autoreset_mode(mode, kind, angles):
+    arguments = {"measured": ["place", "mark", "way"], "angles": angles, "time_constants": [1, 5]}
+    ours = KKLVectorMemory(kind([Walk] * 3, autoreset_mode=mode), **arguments)
+    theirs = kind([lambda: KKLMemory(Walk(), **arguments)] * 3, autoreset_mode=mode)
+    ours.action_space.seed(0)
+    assert ours.autoreset_mode is mode
+    assert len(compare(ours, theirs, [ours.action_space.sample() for _ in range(25)], mode, ())) > 5
+
+
+@modes
+def test_native_vectors_that_wait_for_their_reset(mode):
+    """In the package's own vectors rows that have ended stay as they are until they are reset."""
+    options = {"observe": "output", "max_episode_steps": 5}
+    envs = KKLVectorEnv(Henon(), 3, autoreset_mode=mode, **options)
+    single = partial(gym.make, OWN_ID, system=Henon(), **options)
+    rows = SyncVectorEnv([lambda: KKLMemory(single())] * 3, autoreset_mode=mode)
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, 3, 1)).astype(np.float32)
+    assert len(compare(KKLVectorMemory(envs), rows, actions, mode, (3,))) > 6
+
+
+def test_gymnasiums_native_vector():
+    envs = KKLVectorMemory(CartPoleVectorEnv(4, max_episode_steps=9), measured=[0, 2])
+    obs, _ = envs.reset(seed=0)
+    assert obs.shape == (4, 14)
+    ended, ends = np.zeros(4, dtype=bool), 0
+    for _ in range(25):
+        obs, _, terminated, truncated, _ = envs.step(np.ones(4, np.int64))
+        assert obs in envs.observation_space
+        assert np.array_equal(~obs[:, 2:].any(1), ended)  # the step after an end resets
+        ended = terminated | truncated
+        ends += ended.sum()
+    assert ends > 4
+
+
+def test_the_environment_is_left_as_it_was():
+    bare, env = gym.make("Pendulum-v1"), pendulum(measured=[1, 0])
+    assert np.array_equal(bare.reset(seed=2)[0][[1, 0]], env.reset(seed=2)[0][:2])
+    for action in np.random.default_rng(0).uniform(-3, 3, (20, 1)).astype(np.float32):
+        theirs, ours = bare.step(action), env.step(action)
+        assert np.array_equal(theirs[0][[1, 0]], ours[0][:2])
+        assert theirs[1:] == ours[1:]
+        assert ours[0] in env.observation_space
+
+
+def test_under_and_over_other_wrappers():
+    slow, fast = ActionRepeat(pendulum(), 3), pendulum()
+    slow.reset(seed=0), fast.reset(seed=0)
+    obs = slow.step(np.ones(1, np.float32))[0]
+    assert np.array_equal(obs, [fast.step(np.ones(1, np.float32))[0] for _ in range(3)][-1])  # it sees every step
+    stacked = KKLMemory(FrameStackObservation(gym.make("Pendulum-v1"), 2))
+    assert stacked.reset(seed=0)[0].shape == (6 * 5 + 2,)
+
+
+def test_stable_baselines3_takes_it_as_it_is():
+    env_util, env = pytest.importorskip("stable_baselines3.common.env_util"), pendulum(measured=[0, 1])
+    how = {"wrapper_class": KKLMemory, "wrapper_kwargs": {"measured": [0, 1]}}
+    envs = env_util.make_vec_env("Pendulum-v1", n_envs=2, seed=0, **how)
+    assert np.array_equal(envs.reset()[0], env.reset(seed=0)[0])
+    for k in range(200):
+        action = np.array([np.sin(k)], np.float32)
+        obs, _, done, infos = envs.step(np.array([action] * 2))
+        seen = infos[0]["terminal_observation"] if done[0] else obs[0]
+        assert np.allclose(seen, env.step(action)[0], rtol=1e-5, atol=1e-6)
+    assert done.all()
+    assert not obs[:, 2:].any()
+
+
+@pytest.mark.parametrize("poison", [np.nan, -1e20])
+def test_what_would_poison_the_memory_is_an_error_that_names_it(poison):
+    env = KKLMemory(Walk(), measured=["place"])
+    env.reset(seed=0)
+    env.unwrapped.poison = poison
+    with pytest.raises(ValueError, match=r"the observation of Walk holds .* in entry 1 of 'place': .*TransformObserv"):
+        env.step(env.action_space.sample())
+    env.unwrapped.poison = None
+    env.reset(seed=0)
+    assert np.isfinite(env.step(env.action_space.sample())[0]).all()
+    envs = KKLVectorMemory(SyncVectorEnv([Walk] * 3), measured=["place"])
+    envs.reset(seed=0)
+    envs.unwrapped.envs[2].poison = poison
+    with pytest.raises(ValueError, match="in entry 1 of 'place', row 2"):
+        envs.step(envs.action_space.sample())
+
+
+def test_a_wrong_action_changes_nothing():
+    env, twin = pendulum(), pendulum()
+    env.reset(seed=0), twin.reset(seed=0)
+    with pytest.raises(ValueError, match=r"the action of Pendulum-v1 must hold numbers .* got array\(\[nan\]\)"):
+        env.step(np.array([np.nan]))
+    assert np.array_equal(env.step(np.zeros(1, np.float32))[0], twin.step(np.zeros(1, np.float32))[0])
+
+
+def test_float64_without_bounds():
+    largest = np.finfo(float).max
+
+    class Wide(Walk):
+        observation_space = spaces.Box(-largest, largest, (2,), np.float64)
+
+        def _seen(self):
+            return self.place.astype(float)
+
+    env = KKLMemory(Wide())
+    assert np.isinf(env.observation_space.high[:10]).all()
+    assert env.reset(seed=0)[0] in env.observation_space
+
+
+def test_wrong_environments_say_what_to_do():
+    class Camera(Walk):
+        observation_space = spaces.Box(0, 255, (64, 64, 3), np.uint8)
+
+    envs = gym.make_vec("CartPole-v1", num_envs=2)
+    with pytest.raises(ValueError, match=r"KKLMemory needs a gymnasium.Env \(for vectors there is KKLVectorMemory"):
+        KKLMemory(envs)
+    with pytest.raises(ValueError, match=r"KKLVectorMemory needs .* \(for one environment there is KKLMemory\)"):
+        KKLVectorMemory(gym.make("CartPole-v1"))
+    with pytest.raises(ValueError, match="the observation of Camera is an image"):
+        KKLMemory(Camera())
+    envs.unwrapped.metadata = {}
+    with pytest.raises(ValueError, match="does not say its autoreset mode"):
+        KKLVectorMemory(envs)
+
+
+def test_other_actions_and_environments_that_take_no_seed():
+    class Buttons(gym.Env):
+        observation_space, action_space = spaces.Box(-1, 1, (2,)), spaces.MultiBinary(3)
+
+        def reset(self, *, seed=None, options=None):
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            return self.observation_space.sample(), 0.0, False, False, {}
+
+    env = KKLMemory(Buttons())
+    assert env.reset()[0].shape == (2 * 5 + 3 * 2,)
+    assert np.allclose(env.step(np.array([1, 0, 1], np.int8))[0][-6:-3], [1 - np.exp(-1), 0, 1 - np.exp(-1)])
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "match"),
+    [
+        ("time_constants", (), "time_constants must name at least one"),
+        ("time_constants", 4.0, "must be a sequence of numbers of steps"),
+        ("time_constants", (1, 1.2), r"each at least 1\.5 times the one before, got 1 and 1\.2"),
+        ("time_constants", (0.0,), r"from 0\.5 to 10,000 steps each, got 0$"),
+        ("input_time_constants", (1e9,), r"input_time_constants must be from 0\.5 to 10,000 steps each"),
+        ("input_time_constants", ("1",), r"input_time_constants must hold real numbers, got \('1',\)"),
+    ],
+)
+def test_wrong_arguments(argument, value, match):
+    with pytest.raises(ValueError, match=match):
+        pendulum(**{argument: value})

@@ -1,0 +1,58 @@
+"""Pieces of episodes that refits are made of."""
+
+import numpy as np
+from rollout_observers import observer_of
+
+from observers import Artifact
+from training.records import Record, Signals
+from training.rollouts.gathering import LONGEST, Gathering
+
+
+def sample(k):
+    return {"y": np.array([float(k)]), "u": np.array([0.1 * k]), "x": np.array([-float(k)]), "sample": k}
+
+
+def test_episodes_are_cut_and_the_oldest_are_forgotten(spy):
+    gathering = Gathering(Artifact.read(spy), keep=2 * LONGEST, held_out=0.0)
+    gathering.begin(0, {"y": np.zeros(1)})
+    for k in range(1, 3 * LONGEST + 3):
+        gathering.add(0, sample(k))
+    records, held_out = gathering.records()
+    assert gathering.steps == 3 * LONGEST + 2
+    assert not held_out
+    assert [len(record.t) - 1 for record in records] == [LONGEST, 2]  # a third would be more than are kept
+    assert records[0].y[0, 0] == 2 * LONGEST  # the next piece begins with the last sample
+    assert records[1].y[0, 0] == 3 * LONGEST == records[0].y[-1, 0]
+    np.testing.assert_allclose(records[0].u[:-1, 0], 0.1 * records[0].y[1:, 0])
+    gathering.add(0, sample(3 * LONGEST + 3))
+    assert len(gathering.records()[0][-1].t) == 2
+
+
+def test_pieces_have_their_role_for_good(spy):
+    gathering = Gathering(Artifact.read(spy), keep=10_000, held_out=0.2)
+    roles = {}
+    for episode in range(20):
+        gathering.begin(0, sample(0))
+        gathering.add(0, sample(1))
+        gathering.add(0, sample(2))
+        for held, records in enumerate(gathering.records()):
+            for record in records:
+                assert roles.setdefault(record.name, held) == held
+        assert len(roles) == episode + 1
+    assert sum(roles.values()) == 4
+    assert roles["Spy-v0, piece 1"] == 1
+
+
+def test_what_comes_from_before_is_brought_to_the_observers_form(spy):
+    artifact, count = Artifact.read(spy), np.arange(400.0)
+    signals = Signals("seconds", ("obs[0]",), ("action[0]",), ("obs[1]",))
+    column = count[:, None]
+    before = Record("slow", 2.0 * count, column, 0 * column, column, signals, environment=artifact.environment)
+    train, held_out = Gathering(artifact, keep=10**6, held_out=0.5, before=[before]).records()
+    assert not held_out
+    assert [len(piece.t) for piece in train] == [LONGEST + 1, LONGEST + 1, LONGEST + 1, 799 - 3 * LONGEST]
+    np.testing.assert_allclose(np.concatenate([piece.y[:-1, 0] for piece in train]), np.arange(0, 399, 0.5))
+    without = observer_of("Spy-v0", ["obs[0]"], ["obs[1]"], [])
+    (piece, *_), _ = Gathering(without, keep=10**6, held_out=0.5, before=[before]).records()
+    assert piece.u is None
+    assert piece.signals.inputs == ()
