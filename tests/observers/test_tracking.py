@@ -245,6 +245,8 @@ def test_a_known_start_is_begun_with(t_is_there):
     np.testing.assert_allclose(observer.estimate(y[:9], x0=x[0])[0], x[0])
     observer.step(y[1])
     assert (copy.copy(observer).std < 0.1).all()
+    observer.measurement_noise = 0.9 * LEVEL
+    assert (observer.std < 0.1).all()
     observer.restart(y[1][:1], first)
     assert (observer.std[0] > 0.2).all()
     assert (observer.std[1:] < 0.1).all()  # T_inv, which is less sure, does not take over
