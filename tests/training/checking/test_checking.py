@@ -345,30 +345,19 @@ def test_steps_that_take_long_and_samples_that_tell_nothing_new(monkeypatch):
     assert found.advice == "samples tell hardly anything new: take dt = 0.05 s"
 
 
-@dataclass(frozen=True)
-class Draining(Oscillator):
-    """Two tanks that run empty, where the outflow of Torricelli is infinitely steep. Metres and seconds."""
-
-    smooth: float = 0.0  # m
-
-    name, dt, duration = "draining", 0.5, 500.0
-    X = ((0.05, 0.6), (0.05, 0.6))
-    bounds = ((-0.1, 2.0), (-0.1, 2.0))
-    u_max = ()
-    G = ()
-
-    def f(self, x):
-        outflow = [0.0144 * level / sqrt(absolute(level) + self.smooth) for level in x]
-        return -outflow[0], outflow[0] - outflow[1]
-
-
 @pytest.mark.parametrize(("smooth", "verdict", "seconds"), [(1e-30, "note", 100), (1e-3, "ok", 500)])
 def test_motions_that_come_to_where_f_is_steep(smooth, verdict, seconds, monkeypatch):
-    """Of 1,000 intervals of 0.5 s those are followed that 1,000 substeps make, or 200."""
+    """Two tanks that run empty. Of 1,000 intervals those are followed that 1,000 substeps make, or 200."""
     monkeypatch.setattr("training.checking.subject.STEPS", 1000)
     monkeypatch.setattr("training.checking.subject.MOTIONS", 40)
     monkeypatch.setattr("training.checking.THEN", {name: THEN[name] for name in ("rate", "bounds")})
-    *_, rate, bounds = findings(Draining(smooth), duration=None)
+    tanks = NO_INPUT | {"X": ((0.05, 0.6), (0.05, 0.6)), "bounds": ((-0.1, 2), (-0.1, 2)), "dt": 0.5, "duration": 500.0}
+
+    def f(self, x):
+        outflow = [0.0144 * level / sqrt(absolute(level) + smooth) for level in x]
+        return -outflow[0], outflow[0] - outflow[1]
+
+    *_, rate, bounds = findings(made(**tanks, f=f), duration=None)
     assert bounds.found.startswith(f"all of 40 motions of {seconds} s stay within them")
     assert rate.verdict == verdict
     assert ("end where f is steep" in rate.found) == (verdict == "note")

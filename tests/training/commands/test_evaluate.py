@@ -11,18 +11,13 @@ import pytest
 from error_bars import with_error_bars
 from rich.console import Console
 
+import kkl_gym.elementary as e
 from training.cli import main
 from training.commands.evaluate import Evaluate
 
-SCRIPT = """
-from dataclasses import dataclass
 
-import kkl_gym.elementary as e
-from linear_system import Autonomous, Oscillator
-
-
-@dataclass(frozen=True)
-class Turning(Autonomous):
+@dataclasses.dataclass(frozen=True)
+class Turning(linear_system.Autonomous):
     omega: float = 1.0
 
     name, dt = "turning", 0.05
@@ -32,23 +27,19 @@ class Turning(Autonomous):
         return c * x[0] + s * x[1], c * x[1] - s * x[0]
 
 
-class Cornered(Oscillator):
+class Cornered(linear_system.Oscillator):
     name = "oscillator"
     bounds = ((-1, 1), (-1, 1))
 
 
-class Unstable(Oscillator):
+class Unstable(linear_system.Oscillator):
     name = "oscillator"
 
     def f(self, x):
         return 5 * x[0], 5 * x[1]
-"""
+
+
 COLUMNS = "observer,starts,driven,process_noise,measurement_noise,trajectory,smape,smape_late"
-
-
-@pytest.fixture(autouse=True)
-def _systems(tmp_path):
-    (tmp_path / "own.py").write_text(SCRIPT)
 
 
 def printed(*observers, **options):
@@ -103,7 +94,7 @@ def test_another_plant_moves_and_nothing_knows():
     """The oscillator turns at rate 1 in the exact observer's model, and twice as fast as a plant."""
     path = "map.safetensors"
     dataclasses.replace(linear_system.exact_observer(name="turning"), parameters={"omega": 1.0}).save(path)
-    options = {"system": "own.py:Turning", "trajectories": 4, "duration": 30.0, "measurement_noise": (0.0,)}
+    options = {"system": f"{__file__}:Turning", "trajectories": 4, "duration": 30.0, "measurement_noise": (0.0,)}
     (right, _), _ = printed(path, **options)
     (off, _), _ = printed(path, **options, plant=(("omega", 2.0),), ekf=True, csv=Path("errors.csv"))
     assert [row[0] for row in off[1:]] == ["map", "EKF, same model"] * 2
@@ -150,11 +141,11 @@ def test_levels_of_each_output(capsys):
 
 def test_why_there_are_no_runs():
     linear_system.exact_observer().save("map.safetensors")
-    (smape, _), below = printed("map.safetensors", system="own.py:Cornered", trajectories=10, duration=1.0)
+    (smape, _), below = printed("map.safetensors", system=f"{__file__}:Cornered", trajectories=10, duration=1.0)
     assert {row[0] for row in smape[1:]} == {"X"}
     assert int(smape[1][-1]) > 0
     assert any("left out: starts in 2X \\ X: no state of oscillator in 2X lies beyond X" in line for line in below)
-    unstable = Evaluate(("map.safetensors",), "own.py:Unstable", trajectories=5, duration=20.0)
+    unstable = Evaluate(("map.safetensors",), f"{__file__}:Unstable", trajectories=5, duration=20.0)
     with pytest.raises(ValueError, match=r"nothing is left to evaluate of map.safetensors"):
         unstable.run(console := Console(record=True))
     text = " ".join(console.export_text().split())
