@@ -4,6 +4,7 @@ import dataclasses
 import io
 from pathlib import Path
 
+import discrete_systems
 import linear_system
 import numpy as np
 import pandas as pd
@@ -11,20 +12,8 @@ import pytest
 from error_bars import with_error_bars
 from rich.console import Console
 
-import kkl_gym.elementary as e
 from training.cli import main
 from training.commands.evaluate import Evaluate
-
-
-@dataclasses.dataclass(frozen=True)
-class Turning(linear_system.Autonomous):
-    omega: float = 1.0
-
-    name, dt = "turning", 0.05
-
-    def step(self, x, u):
-        c, s = e.cos(self.omega * self.dt), e.sin(self.omega * self.dt)
-        return c * x[0] + s * x[1], c * x[1] - s * x[0]
 
 
 class Cornered(linear_system.Oscillator):
@@ -93,19 +82,19 @@ def test_every_column_of_the_printed_tables_holds_one_thing(saved):
 def test_another_plant_moves_and_nothing_knows():
     """The oscillator turns at rate 1 in the exact observer's model, and twice as fast as a plant."""
     path = "map.safetensors"
-    dataclasses.replace(linear_system.exact_observer(name="turning"), parameters={"omega": 1.0}).save(path)
-    options = {"system": f"{__file__}:Turning", "trajectories": 4, "duration": 30.0, "measurement_noise": (0.0,)}
+    dataclasses.replace(linear_system.exact_observer(name="turning"), parameters={"omega": 1.0, "gain": 1.0}).save(path)
+    options = {"trajectories": 4, "duration": 30.0, "measurement_noise": (0.0,)}
+    options["system"] = f"{discrete_systems.__file__}:Turning"
     (right, _), _ = printed(path, **options)
     (off, _), _ = printed(path, **options, plant=(("omega", 2.0),), ekf=True, csv=Path("errors.csv"))
     assert [row[0] for row in off[1:]] == ["map", "EKF, same model"] * 2
     found = pd.read_csv("errors.csv")
     assert found.columns[:2].tolist() == ["observer", "plant"]
-    assert set(found.plant) == {"omega=2"}
+    assert set(found.plant) == {"omega=2 gain=1"}
     assert float(right[1][-2].split()[0]) < 0.1  # from X
     assert min(float(row[-2].split()[0]) for row in off[1:]) > 20.0
-    (again, _), titles = printed(path, **options, plant_error=1.0)
-    assert again[1][-3] == off[1][-3]
-    assert " ".join(titles).count("plant omega=2, model omega=1") == 2
+    _, titles = printed(path, **options, plant_error=1.0)
+    assert " ".join(titles).count("plant omega=2 gain=2, model omega=1 gain=1") == 2  # in the title of each table
 
 
 def test_mixed_units_and_the_systems_own_duration_and_level():
