@@ -76,10 +76,10 @@ class Train:
 
     def kept(self, out):
         """Units of work that need not be done again; raises ValueError if a file is damaged."""
-        if (out / "van_der_pol.safetensors").exists():
-            Artifact.read(out / "van_der_pol.safetensors")
-        if (out / "config.json").exists():
-            json.loads((out / "config.json").read_text())
+        for path in out.glob("van_der_pol.safetensors"):
+            Artifact.read(path)
+        for path in out.glob("config.json"):
+            json.loads(path.read_text())
         return sum(checkpoints.load(path)["step"] for path in out.glob(f"[!.]*{checkpoints.SUFFIX}"))
 
     def result(self, out):
@@ -101,10 +101,9 @@ class TrainAgent:
         return ["agent", "train", "lorenz", *options]
 
     def kept(self, out):
-        path = out / f"agent{checkpoints.SUFFIX}"
-        if (out / "agent.safetensors").exists():
-            Agent.read(out / "agent.safetensors")
-        return checkpoints.load(path)["counters"][0] // 256 if path.exists() else 0
+        for path in out.glob("agent.safetensors"):
+            Agent.read(path)
+        return sum(checkpoints.load(path)["counters"][0] // 256 for path in out.glob(f"agent{checkpoints.SUFFIX}"))
 
     def result(self, out):
         agent = Agent.read(out / "agent.safetensors")

@@ -45,12 +45,9 @@ print(*sorted(slow & set(sys.modules)), file=sys.stderr)
 
 def test_help_names_every_command_and_imports_nothing_that_takes_seconds():
     done = subprocess.run([sys.executable, "-c", HELP], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0
-    assert done.stderr.strip() == ""
+    assert (done.returncode, done.stderr.strip()) == (0, "")
     first = done.stdout.partition("usage: kkl-gym check")[0]
-    for name in COMMANDS:
-        assert f" {name} " in first
-        assert f"usage: kkl-gym {name}" in done.stdout
+    assert all(f" {name} " in first and f"usage: kkl-gym {name}" in done.stdout for name in COMMANDS)
     assert "List the maps that ship with the package." in first
     assert "None" not in done.stdout
 

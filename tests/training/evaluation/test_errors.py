@@ -1,14 +1,12 @@
 """Errors on unseen trajectories, of the model and of other plants."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
+from discrete_systems import Turning
 from linear_system import Oscillator, Reactor, TwoOutputs, exact_observer, reactor_observer
 
-import kkl_gym.elementary as e
 import training.evaluation.errors
-from kkl_gym import System, VanDerPol, get_system
+from kkl_gym import VanDerPol, get_system
 from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
 from training import errors, unseen_trajectories
@@ -105,25 +103,6 @@ def test_an_exact_kalman_filter_follows_the_same_runs():
     assert np.median(found.late) < np.median(found.full)
     assert np.median(longer.nrmse) < np.median(found.nrmse)
     assert (louder.nrmse.mean(0) > 1.5 * found.nrmse.mean(0)).all()
-
-
-@dataclass(frozen=True)
-class Turning(System):
-    """Turns by omega dt in a sample; what is measured is in other units."""
-
-    omega: float = 1.0
-    gain: float = 1.0
-
-    name = "turning"
-    X, bounds = ((-1, 1), (-1, 1)), ((-9, 9), (-9, 9))
-    u_max, dt = (0.5,), 0.05
-
-    def step(self, x, u):
-        c, s = e.cos(self.omega * self.dt), e.sin(self.omega * self.dt)
-        return c * x[0] + s * x[1], c * x[1] - s * x[0] + self.dt * u[0]
-
-    def h(self, x):
-        return (self.gain * x[0],)
 
 
 def test_every_parameter_is_off_by_a_share():

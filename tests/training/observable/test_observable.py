@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import gymnasium as gym
 import linear_system
 import numpy as np
 import pandas as pd
@@ -56,38 +55,22 @@ def test_cart_poles_place_is_seen_up_to_a_constant_by_its_velocities():
     assert found["obs[2]"].verdict == "determined"
 
 
-class Noisy(gym.Wrapper):
-    """Beside Pendulum-v1: noise, an unseen constant of each episode, and a constant."""
-
-    def reset(self, *, seed=None, options=None):
-        observation, info = self.env.reset(seed=seed, options=options)
-        self.weight = self.np_random.normal()
-        return observation, info | self.more()
-
-    def step(self, action):
-        *rest, info = self.env.step(action)
-        return *rest, info | self.more()
-
-    def more(self):
-        return {"noise": self.np_random.normal(), "weight": self.weight, "one": 1.0}
-
-
-def test_what_no_output_sees_is_not_determined():
-    gym.register("Noisy-v0", entry_point=lambda: Noisy(gym.make("Pendulum-v1")), max_episode_steps=50)
-    try:
-        found = verdicts(looked("Noisy-v0", [0, 1], ["info[noise]", "info[weight]", "info[one]"]))
-    finally:
-        gym.registry.pop("Noisy-v0")
-    for name in ("info[noise]", "info[weight]"):
-        assert (found[name].verdict, found[name].window) == ("not determined", None)
-    assert found["info[one]"].verdict == "never moves"
-
-
 def wandering(records=40, n=150, a=0.95):
     rng = np.random.default_rng(0)
     x = scipy.signal.lfilter([1.0], [1.0, -a], rng.normal(size=(records, n + 100)))[:, 100:, None]
     t = np.arange(n) + 0.0
     return [Record(f"{i}", t, each, x=each, source="wandering") for i, each in enumerate(x)]
+
+
+def test_what_no_output_sees_is_not_determined():
+    rng, records = np.random.default_rng(0), wandering()
+    for i, record in enumerate(records):  # noise, a constant of each record, and one of all
+        x = np.stack([rng.normal(size=len(record.t)), np.full(len(record.t), rng.normal()), np.ones(len(record.t))], 1)
+        records[i] = replace(record, x=x, signals=Signals("t", ("y1",), (), ("noise", "weight", "one")))
+    found = verdicts(of_records(records, measurement_noise=[]))
+    for name in ("noise", "weight"):
+        assert (found[name].verdict, found[name].window) == ("not determined", None)
+    assert found["one"].verdict == "never moves"
 
 
 def test_errors_under_noise_are_those_of_a_kalman_filter():
