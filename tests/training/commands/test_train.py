@@ -87,7 +87,12 @@ def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(monk
     assert "no limits" not in capsys.readouterr().out
     path, system = "runs/falling/falling.safetensors", ["--system", FALLING]
     for command in (
-        ["evaluate", path, *system, *["--trajectories", "4", "--duration", "6", "--measurement-noise", "0", "--csv", "errors.csv"]],
+        [
+            "evaluate",
+            path,
+            *system,
+            *["--trajectories", "4", "--duration", "6", "--measurement-noise", "0", "--csv", "errors.csv"],
+        ],
         ["faults", path, *system, *["--trajectories", "4", "--duration", "6", "--measurement-noise", "0.01"]],
     ):
         with pytest.raises(SystemExit, match="--policy"):

@@ -1,6 +1,5 @@
 """Parameters and observers from records of outputs."""
 
-import json
 from typing import ClassVar
 
 import numpy as np
@@ -9,16 +8,13 @@ from spring import Spring
 
 from kkl_gym.simulate import simulate
 from kkl_gym.systems import Lorenz, ReverseDuffing, VanDerPol
-from observers import Artifact, KKLObserver
-from training.identification import adapt, estimate_parameters, identify
+from training.identification import estimate_parameters
 from training.identification.consistency import noise_level
 from training.identification.identifiability import combinations, hidden_directions, sign_symmetries, written
 from training.identification.identify import nearest
 from training.progress import progress_bars
 from training.records import Record
 from training.trajectories.signals import random_inputs
-
-SMALL = {"trajectories": 40, "samples": 40, "inverse_steps": 60, "width": 16, "depth": 1, "batch": 256}
 
 
 class HiddenSigns(Lorenz):
@@ -119,33 +115,6 @@ def test_the_nearest_parameters_keep_their_ratios():
 
 def test_the_noise_of_records():
     assert noise_level(records(VanDerPol(), 4, seconds=10, noise=0.2)) == pytest.approx(0.2, rel=0.1)
-
-
-@pytest.mark.slow
-def test_identified_and_adapted_observers(tmp_path):
-    plant = VanDerPol(3.3)
-    measured = records(plant, 6, seconds=12, noise=0.05)
-    learned = identify(
-        VanDerPol(2.2), {"mu": (1.0, 6.0)}, measured, tmp_path / "new", steps=60, settings=SMALL, resume=True
-    )
-    written_down = json.loads((tmp_path / "new" / "parameters.json").read_text())
-    assert abs(written_down["mu"]["value"] - 3.3) < 4 * written_down["mu"]["standard_error"] < 0.1
-    artifact = Artifact.read(tmp_path / "new" / "van_der_pol.safetensors")
-    assert artifact.parameters == learned.identified.system.parameters
-    assert artifact.nu == 0
-    assert artifact.measurement_noise == pytest.approx(0.05, rel=0.2)
-    assert (tmp_path / "new" / "identification.png").stat().st_size > 10_000
-    again = adapt(
-        artifact,
-        VanDerPol(3.0),
-        measured,
-        tmp_path / "adapted",
-        unknown={"mu": (1.0, 6.0)},
-        settings={"inverse_steps": 50},
-    )
-    assert again.identified.system.mu == pytest.approx(learned.identified.system.mu, rel=1e-3)
-    x_hat = KKLObserver(again.result.artifact).estimate(measured[0].y[:, None])
-    assert np.isfinite(x_hat).all()
 
 
 def test_what_makes_no_sense(tmp_path):

@@ -1,6 +1,6 @@
 """Windows of records: standard errors, and first guesses that explain nothing."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -104,23 +104,6 @@ def recorded_swings(process_noise, n, steps):
     records = [Record(str(i), SWING.dt * np.arange(steps + 1), y[:, i]) for i in range(n)]
     shooting = Shooting(SWING, SWING.dt, {"stiffness": (0.4, 40.0)}, np.array([4.0]))
     return shooting, records, lambda record, at: x[at, int(record.name)]
-
-
-@pytest.mark.parametrize(("exact", "taken"), [((), 40), ((40, 20), 20)])
-def test_where_no_first_fit_comes_to_rest_the_nearest_one_counts(exact, taken, monkeypatch):
-    """Not that of the shortest windows, which may not have moved, unless it explains them best, to rounding."""
-    left = {80: 1.5, 40: 1.2, 20: 5.0}
-    cost = {length: 1e-20 * length if length in exact else 1.0 for length in left}
-
-    def stuck(*arguments, **options):
-        fit = shoot(*arguments, **options)
-        return replace(fit, left=left[len(fit.windows.u)], cost=cost[len(fit.windows.u)])
-
-    monkeypatch.setattr(fitting, "FIRST_LENGTHS", tuple(left))
-    monkeypatch.setattr(fitting, "shoot", stuck)
-    shooting, records, guess = recorded_swings(0.0, 10, 80)
-    fit = fit_windows(shooting, [np.array([4.1])], records, guess, first=0)
-    assert (len(fit.windows.u), fit.left) == (taken, left[taken])
 
 
 @pytest.mark.parametrize(("process_noise", "length"), [(0.0, 64), (0.1, 16)])
