@@ -1,8 +1,8 @@
 import os
 
-os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # windows of pygame that nobody sees
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame opens no window
+os.environ.setdefault("MPLBACKEND", "agg")  # nor does Matplotlib, whatever order tests run in
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy and torch: more threads than cores get in each other's way
-
 
 import pytest
 from random_artifacts import random_artifact

@@ -6,11 +6,13 @@ KILLS says how many kills there are; without it a hundred. One in five is an int
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -74,10 +76,10 @@ class Train:
 
     def kept(self, out):
         """Units of work that need not be done again; raises ValueError if a file is damaged."""
-        if (out / "van_der_pol.safetensors").exists():
-            Artifact.read(out / "van_der_pol.safetensors")
-        if (out / "config.json").exists():
-            json.loads((out / "config.json").read_text())
+        for path in out.glob("van_der_pol.safetensors"):
+            Artifact.read(path)
+        for path in out.glob("config.json"):
+            json.loads(path.read_text())
         return sum(checkpoints.load(path)["step"] for path in out.glob(f"[!.]*{checkpoints.SUFFIX}"))
 
     def result(self, out):
@@ -99,10 +101,9 @@ class TrainAgent:
         return ["agent", "train", "lorenz", *options]
 
     def kept(self, out):
-        path = out / f"agent{checkpoints.SUFFIX}"
-        if (out / "agent.safetensors").exists():
-            Agent.read(out / "agent.safetensors")
-        return checkpoints.load(path)["counters"][0] // 256 if path.exists() else 0
+        for path in out.glob("agent.safetensors"):
+            Agent.read(path)
+        return sum(checkpoints.load(path)["counters"][0] // 256 for path in out.glob(f"agent{checkpoints.SUFFIX}"))
 
     def result(self, out):
         agent = Agent.read(out / "agent.safetensors")
@@ -111,88 +112,58 @@ class TrainAgent:
         return {key: value for key, value in agent.training.items() if key != "resumed"}, seen
 
 
-class Campaign:
-    """Kills of one scenario, and what they did."""
-
-    def __init__(self, scenario, folder, rng):
-        self.scenario, self.folder, self.rng, self.counts = scenario, folder, rng, Counter()
-        self.problems, self.runs = [], 0
-        began = time.monotonic()
-        self.run(folder / "whole", None, None)
-        self.seconds = time.monotonic() - began
-        self.expected = scenario.result(folder / "whole")
-
-    def run(self, out, signal_number, after):
-        """Start the command and kill it; returns whether it was, and the work that it did."""
-        self.runs += 1
-        journal = self.folder / f"journal-{self.runs}"
-        with subprocess.Popen(
-            [sys.executable, "-c", COMMAND, str(journal), *self.scenario.arguments(out)],
-            cwd=self.folder,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        ) as process:
-            while signal_number == signal.SIGINT and process.poll() is None and not journal.exists():
-                time.sleep(0.01)  # what Python itself says of an interruption at its beginning is not ours
-            try:
-                _, said = process.communicate(timeout=after)
-            except subprocess.TimeoutExpired:
-                process.send_signal(signal_number)
-                _, said = process.communicate(timeout=120.0)
-        killed = process.returncode != 0
-        if killed and (signal_number is None or process.returncode not in (-signal_number, 128 + signal_number)):
-            raise AssertionError(f"the command ended by itself with {process.returncode}: {said}")
-        if killed and signal_number == signal.SIGINT:
-            killed = said != ""  # else all is done, and Python was on its way out
-            if killed and not (said.startswith("kkl-gym: interrupted") and said.count("\n") == 1):
-                self.problems.append(said)
-        return killed, journal.stat().st_size if journal.exists() else 0
-
-    def chain(self, out, kills):
-        """Kill and resume in one folder until the command is done or was killed so often; returns how often it was."""
-        done, kept = 0, 0
-        while True:
-            number = signal.SIGINT if self.rng.random() < INTERRUPTIONS else signal.SIGKILL
-            after = self.rng.uniform(0.0, self.seconds)
-            halves, began = set(out.rglob(f"{UNFINISHED}*")), time.monotonic()
-            killed, work = self.run(out, number, after if done < kills else None)
-            if done:
-                self.counts["resumed"] += 1
-            if not killed:
-                if not done:  # kills are to be anywhere in a run, on a machine as busy as it is now
-                    self.seconds = time.monotonic() - began
-                break
-            done += 1
-            self.counts[number.name] += 1
-            if number == signal.SIGINT and set(out.rglob(f"{UNFINISHED}*")) - halves:
-                self.problems.append("an interruption left a temporary file")
-            try:
-                now = self.scenario.kept(out)
-            except ValueError as error:
-                self.counts["damaged"] += 1
-                self.problems.append(str(error))
-                break
-            self.counts["lost more than one interval"] += kept + work - now > self.scenario.interval
-            kept = now
-        for got, wanted in zip(self.scenario.result(out), self.expected, strict=True):
-            if got != wanted:
-                self.counts["ended otherwise"] += 1
-                self.problems.append(f"{out}: {str(got)[:500]} in place of {str(wanted)[:500]}")
-        return done
+def run(scenario, out, journal, signal_number=None, after=None):
+    """Start the command and kill it; returns whether it was, the work that it did, and what it said."""
+    with subprocess.Popen(
+        [sys.executable, "-c", COMMAND, str(journal), *scenario.arguments(out)],
+        cwd=out.parent,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        while signal_number == signal.SIGINT and process.poll() is None and not journal.exists():
+            time.sleep(0.01)  # what Python itself says of an interruption at its beginning is not ours
+        try:
+            _, said = process.communicate(timeout=after)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal_number)
+            _, said = process.communicate(timeout=120.0)
+    killed = process.returncode != 0
+    assert not killed or (signal_number and process.returncode in (-signal_number, 128 + signal_number)), said
+    if signal_number == signal.SIGINT and not said:  # all is done, and Python was on its way out
+        killed = False
+    return killed, journal.stat().st_size if journal.exists() else 0, said
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends signals")
-@pytest.mark.parametrize("scenario", [Train, TrainAgent])
+@pytest.mark.parametrize("scenario", [Train(), TrainAgent()], ids=["train", "agent train"])
 def test_kills(scenario, tmp_path):
-    campaign, left, chains = Campaign(scenario(), tmp_path, random.Random(0)), max(1, KILLS // 2), 0
-    while left:
-        left -= campaign.chain(tmp_path / f"run-{chains}", left)
-        chains += 1
-    counts, wrong = campaign.counts, ("lost more than one interval", "damaged", "ended otherwise")
-    print(f"\n{scenario.__name__}: {counts['SIGKILL']} killed, {counts['SIGINT']} interrupted, ", end="")
-    print(", ".join(f"{name} {counts[name]}" for name in ("resumed", *wrong)))
-    assert not campaign.problems
-    assert counts["resumed"] == counts["SIGKILL"] + counts["SIGINT"]
-    assert not any(counts[name] for name in wrong)
+    """Kill and resume in one folder until the command is done, and begin again in another."""
+    rng, counts, journals = random.Random(0), Counter(), (tmp_path / f"journal-{i}" for i in count())
+    began = time.monotonic()
+    run(scenario, tmp_path / "whole", next(journals))
+    seconds, expected, out = time.monotonic() - began, scenario.result(tmp_path / "whole"), None
+    while counts["kills"] < KILLS // 2 or out:
+        if out is None:
+            out, kept = tmp_path / f"run-{counts['done']}", 0
+        last, began = counts["kills"] >= KILLS // 2, time.monotonic()
+        number = signal.SIGINT if rng.random() < INTERRUPTIONS else signal.SIGKILL
+        halves = set(out.rglob(f"{UNFINISHED}*"))
+        after = None if last else rng.uniform(0.0, seconds)
+        killed, work, said = run(scenario, out, next(journals), number, after)
+        if not killed:
+            assert scenario.result(out) == expected
+            if not kept:  # kills are to be anywhere in a run, on a machine as busy as it is now
+                seconds = time.monotonic() - began
+            counts["done"], out = counts["done"] + 1, None
+            continue
+        counts["kills"] += 1
+        if number == signal.SIGINT:
+            counts["interruptions"] += 1
+            assert re.fullmatch("kkl-gym: interrupted.*\n", said)
+            assert not set(out.rglob(f"{UNFINISHED}*")) - halves  # it leaves no temporary file
+        now = scenario.kept(out)
+        assert kept + work - now <= scenario.interval
+        kept = now
+    print(f"\n{scenario.arguments('')[0]}: {dict(counts)}")

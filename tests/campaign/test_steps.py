@@ -25,38 +25,33 @@ def actions(rng, shape):
     return drawn if kind == 0 else np.sign(drawn) if kind == 1 else 3 * drawn
 
 
-def check(space, bounds, obs, info):
+def check(env, obs, info):
     """All rows of what is returned, in a few operations each."""
+    space = getattr(env, "single_observation_space", env.observation_space)
+    low, high = np.array(env.unwrapped.system.bounds).T
     assert obs.dtype == np.float32
     assert ((obs >= space.low) & (obs <= space.high)).all()  # false for NaN too
-    assert ((info["x"] >= bounds[0]) & (info["x"] <= bounds[1])).all()
-    for key in info:
-        if not key.startswith(("_", "final")):
-            assert np.isfinite(info[key]).all(), key
+    assert ((info["x"] >= low) & (info["x"] <= high)).all()
+    assert all(np.isfinite(info[key]).all() for key in info if not key.startswith(("_", "final")))
 
 
 def run(envs, steps, seed):
     """Make some steps of every row; returns how many of them moved, and how many episodes there were."""
-    rng, counts = np.random.default_rng(seed), Counter()
-    space, bounds = envs.single_observation_space, np.array(envs.unwrapped.system.bounds).T
-    mode = envs.metadata["autoreset_mode"]
-    obs, info = envs.reset(seed=seed)
-    check(space, bounds, obs, info)
+    rng, counts, mode = np.random.default_rng(seed), Counter(), envs.metadata["autoreset_mode"]
+    check(envs, *envs.reset(seed=seed))
     over = np.zeros(envs.num_envs, dtype=bool)
     for _ in range(steps):
         obs, reward, terminated, truncated, info = envs.step(actions(rng, envs.action_space.shape))
-        check(space, bounds, obs, info)
+        check(envs, obs, info)
         assert ((reward > 0) & (reward <= 1) | over & (reward == 0)).all()
-        counts["steps"] += int((~over).sum())
         ended = terminated | truncated
-        counts["episodes"] += int((ended & ~over).sum())
-        counts["escapes"] += int((terminated & ~over).sum())
+        moved = {"steps": ~over, "episodes": ended & ~over, "escapes": terminated & ~over}
+        counts.update({kind: int(rows.sum()) for kind, rows in moved.items()})
         if mode is AutoresetMode.SAME_STEP and ended.any():
             final = {key: values[ended] for key, values in info["final_info"].items()}
-            check(space, bounds, np.stack(info["final_obs"][ended]), final)
+            check(envs, np.stack(info["final_obs"][ended]), final)
         elif mode is AutoresetMode.DISABLED and ended.mean() > 0.1:
-            obs, info = envs.reset(options={"reset_mask": ended})
-            check(space, bounds, obs, info)
+            check(envs, *envs.reset(options={"reset_mask": ended}))
             ended = np.zeros_like(ended)
         over = ended if mode is not AutoresetMode.SAME_STEP else over
     return counts
@@ -80,15 +75,13 @@ def campaign(total, rows, length):
 def run_single(env, steps):
     """Steps of a single environment."""
     rng = np.random.default_rng(0)
-    bounds = np.array(env.unwrapped.system.bounds).T
-    obs, info = env.reset(seed=0)
+    check(env, *env.reset(seed=0))
     for _ in range(steps):
-        check(env.observation_space, bounds, obs, info)
         obs, reward, terminated, _, info = env.step(actions(rng, env.action_space.shape))
+        check(env, obs, info)
         assert 0 < reward <= 1
         if terminated:
-            check(env.observation_space, bounds, obs, info)
-            obs, info = env.reset()
+            check(env, *env.reset())
 
 
 def long(*values):

@@ -7,6 +7,7 @@ import numpy as np
 from linear_system import F, Oscillator
 from scipy.linalg import expm
 
+import kkl_gym.elementary as e
 from kkl_gym import System
 
 DT = 0.02
@@ -32,6 +33,27 @@ class Sampled(System):
 
     def h(self, x):
         return (x[0],)
+
+
+@dataclass(frozen=True)
+class Turning(System):
+    """Turns by omega dt in a sample; what is measured is in other units."""
+
+    omega: float = 1.0
+    gain: float = 1.0
+
+    name: ClassVar[str] = "turning"
+    X: ClassVar = ((-1, 1), (-1, 1))
+    bounds: ClassVar = ((-9, 9), (-9, 9))
+    u_max: ClassVar = (0.5,)
+    dt: ClassVar = 0.05
+
+    def step(self, x, u):
+        c, s = e.cos(self.omega * self.dt), e.sin(self.omega * self.dt)
+        return c * x[0] + s * x[1], c * x[1] - s * x[0] + self.dt * u[0]
+
+    def h(self, x):
+        return (self.gain * x[0],)
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,8 @@ def test_lists_arrays_and_numbers_of_numpy_become_tuples_of_numbers():
         ({"name": LEFT_OUT}, "Tank must set the class variables name, X and bounds; it lacks name"),
         ({"name": "a/b"}, f"name = 'a/b' {NAME}"),
         # Boxes
+        ({"X": ()}, f"X = () {PAIRS}"),
+        ({"X": np.array(1.0)}, f"X = array(1.) {PAIRS}"),
         ({"X": {"angle": (-1, 1)}}, f"X = {{'angle': (-1, 1)}} {PAIRS}"),
         ({"X": ((-1, 1), (-1, "1"))}, f"X = ((-1, 1), (-1, '1')) {PAIRS}"),
         ({"X": ((math.nan, 1), (-1, 1))}, f"X = ((nan, 1), (-1, 1)) {PAIRS}"),

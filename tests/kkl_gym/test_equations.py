@@ -8,7 +8,7 @@ import textwrap
 
 import numpy as np
 import pytest
-from wrong_systems import Branching, Late, Wide
+from wrong_systems import Late, Wide
 
 from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, System, elementary, get_system
 from kkl_gym.compiled import batch_step
@@ -233,10 +233,6 @@ def test_what_a_loop_cannot_take_is_looked_at_again(system):
         advance_batch(system, many, none, 0.0 * many, 0.01)
 
 
-def test_one_state_may_decide():
-    assert np.isfinite(advance(Branching(), (0.5, 0.5), (0.0,), (0.0, 0.0), 0.01)).all()
-
-
 def test_what_is_not_the_equations_fault_stays_as_it_is():
     with pytest.raises(ValueError, match="not enough values to unpack") as raised:
         advance(Late(), (0.5, 0.5), (0.0,), (0.0,), 0.01)
@@ -373,8 +369,8 @@ def test_what_is_not_implemented_says_so_itself():
     kind = type("Partial", (System,), {"name": "partial", "X": ((0, 1),), "bounds": ((0, 1),)})
     with pytest.raises(NotImplementedError, match="Partial does not define f"):
         kind().drift(np.zeros((3, 1)))
-    with pytest.raises(NotImplementedError, match="Partial does not define f"):
-        advance(kind(), (0.5,), (), (0.0,), 0.1)
+    with pytest.raises(NotImplementedError, match="Partial does not define h"):
+        kind().h((0.5,))
 
 
 def test_bounds_within_which_an_output_is_lost():

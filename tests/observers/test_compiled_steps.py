@@ -253,12 +253,6 @@ def test_what_is_compiled_goes_where_numba_is_not():
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("wrong", ["yes", 1, np.array([True])])
-def test_compiled_is_a_bool(wrong):
-    with pytest.raises(ValueError, match="compiled must be True or False"):
-        observers.load("lorenz", compiled=wrong)
-
-
 @pytest.mark.parametrize("batch", [(), (2000,)])
 def test_threads_do_not_share_memory(batch):
     """Trackers of one artifact, and records of one observer."""

@@ -178,11 +178,3 @@ def test_it_is_of_the_estimate_as_things_stand(make_artifact, batch):
         np.testing.assert_allclose(observer.covariance, fresh, rtol=1e-5)
         before = fresh
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(observer)).covariance, observer.covariance)
-
-
-def test_beside_estimated_parameters(make_artifact):
-    artifact = with_error_bars(make_artifact("van_der_pol", estimated=True))
-    observer = KKLObserver(artifact, 0.1)
-    observer.reset([0.2])
-    assert observer.covariance.shape == (2, 2)
-    assert observer.parameters_hat.shape == (1,)

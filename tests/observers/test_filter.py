@@ -78,14 +78,6 @@ def test_start_is_the_equilibrium_of_a_constant_output(A):
     assert np.allclose(linear.advance(z, y, np.zeros(1), y), z, rtol=1e-12, atol=1e-13)
 
 
-def test_early_and_late_outputs_add_up_to_a_held_one():
-    linear = random_filter(DIAGONAL)
-    held = (np.exp(DIAGONAL.diagonal() * DT) - 1) / DIAGONAL.diagonal()
-    assert np.allclose((linear.early_y + linear.late_y)[:3], held[:, None] * linear.B, rtol=1e-12)
-    assert (linear.early_y[3:] == 0).all()
-    assert (linear.late_y[3:] == 0).all()
-
-
 @pytest.mark.parametrize(("A", "ny", "nu"), [(DIAGONAL, 1, 0), (DIAGONAL, 2, 2), (PAIR, 2, 1), (FULL, 2, 1)])
 @pytest.mark.parametrize("batch", [(5,), (2, 3), (0,), (MANY_ROWS,)])
 def test_batches_equal_their_rows(A, ny, nu, batch):
@@ -114,6 +106,7 @@ def test_lists_are_taken():
     linear = LinearFilter([[-1, 0], [0, -2]], [[1], [1]], 1)
     assert linear.A.dtype == linear.B.dtype == float
     assert np.allclose(linear.transition, np.diag(np.exp([-1, -2])))
+    assert np.allclose(LinearFilter(-np.eye(2), np.ones((2, 1)), DT).transition, np.exp(-DT) * np.eye(2))
 
 
 @pytest.mark.parametrize(
@@ -149,11 +142,6 @@ def test_wrong_intervals_and_numbers_of_inputs_raise():
         with pytest.raises(ValueError, match=f"number of inputs must be an integer from 0 to 64, got {nu!r}"):
             LinearFilter(DIAGONAL, B, DT, nu)
     assert LinearFilter(DIAGONAL, B, DT, np.int64(64)).size == 65 * 3
-
-
-def test_repeated_poles_are_allowed_where_diagonal():
-    linear = LinearFilter(-np.eye(2), np.ones((2, 1)), DT)
-    assert np.allclose(linear.transition, np.exp(-DT) * np.eye(2))
 
 
 def test_a_filter_keeps_what_it_was_made_of():

@@ -64,29 +64,6 @@ def watched_artifact(**options):
     return dataclasses.replace(random_artifact(**options), C=np.array([[1.0, 0.0]]), limits=limits())
 
 
-def test_rows_of_a_batch_are_monitors_of_their_own():
-    artifact = watched_artifact()
-    rng = np.random.default_rng(1)
-    y, u = rng.normal(size=(30, 3, 1)), rng.uniform(-1, 1, (30, 3, 1))
-    together = KKLObserver(artifact, 1.0, monitor=True)
-    together.reset(y[0])
-    alone = [KKLObserver(artifact, 1.0, monitor=True) for _ in range(3)]
-    for i, observer in enumerate(alone):
-        observer.reset(y[0, i])
-    for k in range(1, 30):
-        active = np.array([True, k % 2 == 0, True])
-        together.advance(y[k], u[k], active)
-        for i in np.flatnonzero(active):
-            alone[i].step(y[k, i], u[k, i])
-        if k == 12:
-            restarted = np.array([False, False, True])
-            together.restart(y[k, 2:], restarted)
-            alone[2].reset(y[k, 2])
-        assert together.score == pytest.approx([float(observer.score) for observer in alone])
-        assert np.allclose(together.decode(), [observer.decode() for observer in alone], atol=1e-5)
-    assert (together.score > 0).all()
-
-
 def test_a_monitor_changes_no_estimate():
     artifact = watched_artifact()
     rng = np.random.default_rng(2)
@@ -102,6 +79,9 @@ def test_a_monitor_changes_no_estimate():
     assert (watched.score == before).all()  # nothing was measured
     watched.decode()[:] = np.nan  # a copy
     assert np.isfinite(watched.decode()).all()
+    for rows in (np.array([0, 2]), np.array([True, False])):
+        with pytest.raises(ValueError, match="rows must be boolean"):
+            watched.decode(rows)
 
 
 def test_no_score_without_a_monitor_or_limits():
@@ -140,15 +120,6 @@ def test_another_noise_level_is_another_monitor():
     with pytest.raises(ValueError, match="beyond"):
         observer.measurement_noise = 3.0
     assert observer.measurement_noise == 0.5
-
-
-def test_rows_are_checked_with_a_monitor_too():
-    observer = KKLObserver(watched_artifact(), 0.3, monitor=True)
-    observer.reset(np.zeros((3, 1)))
-    observer.step(np.zeros((3, 1)))
-    for rows in (np.array([0, 2]), np.array([True, False])):
-        with pytest.raises(ValueError, match="rows must be boolean"):
-            observer.decode(rows)
 
 
 def test_copies_have_monitors_of_their_own_and_files_keep_limits(tmp_path):

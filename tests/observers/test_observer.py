@@ -259,9 +259,12 @@ def test_wrong_levels_of_noise_raise(level, make_artifact):
     assert (observer.measurement_noise, observer.process_noise) == (0.2, 0.1)
 
 
-def test_there_are_as_many_noise_levels_as_outputs(make_artifact):
+def test_there_are_as_many_noise_levels_as_outputs_within_the_range_of_training(make_artifact):
     observer = KKLObserver(make_artifact(), [0.2])
     assert observer.measurement_noise == 0.2
+    with pytest.raises(ValueError, match=r"measurement_noise = 1\.01 is beyond the map's range, 0 to 1\.0"):
+        observer.measurement_noise = 1.01
+    assert KKLObserver(make_artifact(noise=False), 1.01).measurement_noise == 1.01  # is told none
     for wrong in ([], [0.1, 0.3]):
         with pytest.raises(ValueError, match="one for each of 1 outputs"):
             observer.measurement_noise = wrong
@@ -274,13 +277,6 @@ def test_every_kind_of_real_number_is_a_noise_level(level, make_artifact):
     observer = KKLObserver(make_artifact(process=True), level, process_noise=level)
     assert (observer.measurement_noise, observer.process_noise) == (float(level), float(level))
     assert type(observer.measurement_noise) is type(observer.process_noise) is float
-
-
-def test_noise_level_beyond_training_raises_only_where_it_is_a_feature(make_artifact):
-    with pytest.raises(ValueError, match=r"measurement_noise = 1\.01 is beyond the map's range, 0 to 1\.0"):
-        KKLObserver(make_artifact(), 1.01)
-    assert KKLObserver(make_artifact(), 1.0).measurement_noise == 1.0
-    assert KKLObserver(make_artifact(noise=False), 1.01).measurement_noise == 1.01
 
 
 def test_noise_level_told_changes_the_estimate(make_artifact):
@@ -333,6 +329,9 @@ def test_load_passes_its_settings_on(saved, make_artifact):
     direct.process_noise = 0.1
     y, u = record(direct, 5)
     assert np.array_equal(observer.estimate(y, u), direct.estimate(y, u))
+    for wrong in ("yes", 1, np.array([True])):
+        with pytest.raises(ValueError, match="compiled must be True or False"):
+            load(path, compiled=wrong)
     for call, first in ((load, path), (KKLObserver, make_artifact())):
         with pytest.raises(TypeError, match="positional"):
             call(first, 0.3, True)

@@ -245,6 +245,8 @@ def test_a_known_start_is_begun_with(t_is_there):
     np.testing.assert_allclose(observer.estimate(y[:9], x0=x[0])[0], x[0])
     observer.step(y[1])
     assert (copy.copy(observer).std < 0.1).all()
+    observer.measurement_noise = 0.9 * LEVEL
+    assert (observer.std < 0.1).all()
     observer.restart(y[1][:1], first)
     assert (observer.std[0] > 0.2).all()
     assert (observer.std[1:] < 0.1).all()  # T_inv, which is less sure, does not take over
@@ -400,23 +402,15 @@ def test_what_does_not_fit_is_refused(make_artifact):
     uncertain = with_error_bars(make_artifact("van_der_pol", estimated=True))
     with pytest.raises(ArtifactError):
         replace(uncertain, C=C, flow=replace(exact_flow()))
-    for name, value in (
-        ("x_scale", np.zeros(2)),
-        ("error", -np.ones(2)),
-        ("low", np.full(2, 50.0)),
-        ("window", 0.0),
-        ("window", np.nan),
-        ("window", 1e308),
-        ("least_process_noise", 1e200),
-        ("polynomial", np.zeros((2, 4))),  # two states have 1, 3, 6, 10 monomials, and so on
-        ("polynomial", np.zeros((2, 1))),
-        ("polynomial", np.zeros((2, 1081))),  # of degree 45, which is beyond all measure
-        ("polynomial", np.zeros((1, 4))),
-        ("gain", np.ones(3)),
-        ("least_measurement_noise", np.zeros(1)),
-    ):
-        with pytest.raises(ArtifactError):
-            replace(flow, **{name: value})
+    wrong = {
+        "x_scale": [np.zeros(2)], "error": [-np.ones(2)], "low": [np.full(2, 50.0)], "window": [0.0, np.nan, 1e308],
+        "least_process_noise": [1e200], "least_measurement_noise": [np.zeros(1)], "gain": [np.ones(3)],
+        "polynomial": [np.zeros((2, 4)), np.zeros((2, 1)), np.zeros((2, 1081))],  # no 1, 3, 6, 10
+    }  # fmt: skip
+    for name, values in wrong.items():
+        for value in values:
+            with pytest.raises(ArtifactError):
+                replace(flow, **{name: value})
     with pytest.raises(ArtifactError, match="kkl-gym tracking"):
         plain.require_flow()
     ages, ones = np.zeros(1), np.ones((1, 1))

@@ -40,9 +40,7 @@ def test_all_settings_are_ones_of_their_algorithm():
             found = hyperparameters(name, env_id)
             assert found["n_timesteps"] > 0
             assert set(found) <= set(algorithm.__init__.__annotations__) | of_the_run, (name, env_id)
-    for env_id in settings_of("ppo_lstm").keys() - {
-        "default"
-    }:  # which learns from as many steps as who is compared with it
+    for env_id in settings_of("ppo_lstm").keys() - {"default"}:  # as many steps as those compared with it
         other = "sac" if env_id in settings_of("sac") else "ppo"
         assert hyperparameters("ppo_lstm", env_id)["n_timesteps"] == hyperparameters(other, env_id)["n_timesteps"]
     hyperparameters("sac", "Pendulum-v1")["policy_kwargs"]["net_arch"] = None  # of a copy

@@ -1,6 +1,5 @@
 """``kkl-gym demo``."""
 
-import time
 from dataclasses import replace
 from itertools import pairwise
 
@@ -53,12 +52,6 @@ def push(x):
     return np.ones((len(x), 1))
 
 
-def slow_switch(x):
-    """On or off, after a while."""
-    time.sleep(0.02)
-    return x[:, :1] > 0
-
-
 def test_the_policy_of_its_training_acts(tmp_path):
     """An oscillator without damping comes to rest under its regulator, about u = 0.5 when pushed, alone nowhere."""
     artifact, pushed = random_artifact(system=OWN, dt=0.02), f"{__file__}:push"
@@ -73,14 +66,6 @@ def test_the_policy_of_its_training_acts(tmp_path):
     assert late[pushed].mean(0) == pytest.approx([0.5, 0.0], abs=0.1)
     with pytest.raises(ValueError, match=r"was trained under the policy .*, which acts"):
         play(environment, 2000, 0.1, seed=0)
-
-
-def test_what_a_policy_returns_and_how_long_it_takes(saved):
-    """Actions of any type count as numbers; the time of a step is not the policy's."""
-    (environment,) = shown(OWN, saved(system=OWN, dt=0.02))
-    episode = play(environment, 10, 0.1, seed=0, policy=f"{__file__}:slow_switch")
-    assert len(episode.x) == 11
-    assert episode.seconds < 0.1
 
 
 def test_spinn_is_shown_where_nothing_acts_as_it_knows_no_inputs():

@@ -4,6 +4,7 @@ import dataclasses
 import io
 from pathlib import Path
 
+import discrete_systems
 import linear_system
 import numpy as np
 import pandas as pd
@@ -14,41 +15,20 @@ from rich.console import Console
 from training.cli import main
 from training.commands.evaluate import Evaluate
 
-SCRIPT = """
-from dataclasses import dataclass
 
-import kkl_gym.elementary as e
-from linear_system import Autonomous, Oscillator
-
-
-@dataclass(frozen=True)
-class Turning(Autonomous):
-    omega: float = 1.0
-
-    name, dt = "turning", 0.05
-
-    def step(self, x, u):
-        c, s = e.cos(self.omega * self.dt), e.sin(self.omega * self.dt)
-        return c * x[0] + s * x[1], c * x[1] - s * x[0]
-
-
-class Cornered(Oscillator):
+class Cornered(linear_system.Oscillator):
     name = "oscillator"
     bounds = ((-1, 1), (-1, 1))
 
 
-class Unstable(Oscillator):
+class Unstable(linear_system.Oscillator):
     name = "oscillator"
 
     def f(self, x):
         return 5 * x[0], 5 * x[1]
-"""
+
+
 COLUMNS = "observer,starts,driven,process_noise,measurement_noise,trajectory,smape,smape_late"
-
-
-@pytest.fixture(autouse=True)
-def _systems(tmp_path):
-    (tmp_path / "own.py").write_text(SCRIPT)
 
 
 def printed(*observers, **options):
@@ -102,19 +82,19 @@ def test_every_column_of_the_printed_tables_holds_one_thing(saved):
 def test_another_plant_moves_and_nothing_knows():
     """The oscillator turns at rate 1 in the exact observer's model, and twice as fast as a plant."""
     path = "map.safetensors"
-    dataclasses.replace(linear_system.exact_observer(name="turning"), parameters={"omega": 1.0}).save(path)
-    options = {"system": "own.py:Turning", "trajectories": 4, "duration": 30.0, "measurement_noise": (0.0,)}
+    dataclasses.replace(linear_system.exact_observer(name="turning"), parameters={"omega": 1.0, "gain": 1.0}).save(path)
+    options = {"trajectories": 4, "duration": 30.0, "measurement_noise": (0.0,)}
+    options["system"] = f"{discrete_systems.__file__}:Turning"
     (right, _), _ = printed(path, **options)
     (off, _), _ = printed(path, **options, plant=(("omega", 2.0),), ekf=True, csv=Path("errors.csv"))
     assert [row[0] for row in off[1:]] == ["map", "EKF, same model"] * 2
     found = pd.read_csv("errors.csv")
     assert found.columns[:2].tolist() == ["observer", "plant"]
-    assert set(found.plant) == {"omega=2"}
+    assert set(found.plant) == {"omega=2 gain=1"}
     assert float(right[1][-2].split()[0]) < 0.1  # from X
     assert min(float(row[-2].split()[0]) for row in off[1:]) > 20.0
-    (again, _), titles = printed(path, **options, plant_error=1.0)
-    assert again[1][-3] == off[1][-3]
-    assert " ".join(titles).count("plant omega=2, model omega=1") == 2
+    _, titles = printed(path, **options, plant_error=1.0)
+    assert " ".join(titles).count("plant omega=2 gain=2, model omega=1 gain=1") == 2  # in the title of each table
 
 
 def test_mixed_units_and_the_systems_own_duration_and_level():
@@ -150,11 +130,11 @@ def test_levels_of_each_output(capsys):
 
 def test_why_there_are_no_runs():
     linear_system.exact_observer().save("map.safetensors")
-    (smape, _), below = printed("map.safetensors", system="own.py:Cornered", trajectories=10, duration=1.0)
+    (smape, _), below = printed("map.safetensors", system=f"{__file__}:Cornered", trajectories=10, duration=1.0)
     assert {row[0] for row in smape[1:]} == {"X"}
     assert int(smape[1][-1]) > 0
     assert any("left out: starts in 2X \\ X: no state of oscillator in 2X lies beyond X" in line for line in below)
-    unstable = Evaluate(("map.safetensors",), "own.py:Unstable", trajectories=5, duration=20.0)
+    unstable = Evaluate(("map.safetensors",), f"{__file__}:Unstable", trajectories=5, duration=20.0)
     with pytest.raises(ValueError, match=r"nothing is left to evaluate of map.safetensors"):
         unstable.run(console := Console(record=True))
     text = " ".join(console.export_text().split())

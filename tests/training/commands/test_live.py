@@ -7,6 +7,7 @@ import matplotlib.animation
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.animation import FuncAnimation
 from matplotlib.backend_bases import KeyEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -16,8 +17,6 @@ from training.commands import live as module
 from training.commands.live import Live
 from training.commands.options import shown
 
-OWN = f"{linear_system.__file__}:Oscillator"
-
 
 def live_of(system, observer=None, noise=None):
     figure = Figure(figsize=(12, 7.5))
@@ -25,26 +24,21 @@ def live_of(system, observer=None, noise=None):
     return Live(figure, shown(system, observer)[0], noise, seed=0), figure
 
 
-def texts(live):
-    """What is written where things move."""
-    return [artist.get_text() for artist in live.draw() if hasattr(artist, "get_text")]
-
-
-def pixels(live, figure):
-    """The figure with what moves on it."""
+def drawn(live, figure):
+    """The pixels of the figure with what moves on it, and what is written of the score."""
     figure.draw_without_rendering()
-    live.draw()
+    score = live.draw()[-1].get_text()
     for artist in live.artists:
         artist.set_animated(False)
     figure.canvas.draw()
-    return np.asarray(figure.canvas.buffer_rgba()).copy()
+    return np.asarray(figure.canvas.buffer_rgba()).copy(), score
 
 
 def test_frames_follow_the_motion():
     live, figure = live_of("lorenz", noise=0.1)
-    first = pixels(live, figure)
+    first, _ = drawn(live, figure)
     live.advance(700)
-    assert (pixels(live, figure) != first).any()
+    assert (drawn(live, figure)[0] != first).any()
     x, x_hat, y, score = live.history[-1]
     assert np.abs(x_hat - x).max() < 1
     assert 0 < score < 1
@@ -53,7 +47,7 @@ def test_frames_follow_the_motion():
     live.press("f")
     live.advance(200)
     assert live.history[-1][3] > 1
-    assert texts(live)[-1].endswith("a fault?")
+    assert drawn(live, figure)[1].endswith("a fault?")
     live.advance(400)
     assert len(live.history) == 1201  # twelve seconds
 
@@ -88,8 +82,7 @@ def test_keys_and_sliders():
 
 
 class Slow(linear_system.Oscillator):
-    name = "slow"
-    dt = 1.0
+    name, dt = "slow", 1.0
 
 
 def test_slow_systems_of_ones_own_move_at_the_pace_of_those_that_ship(saved):
@@ -97,46 +90,41 @@ def test_slow_systems_of_ones_own_move_at_the_pace_of_those_that_ship(saved):
     live, figure = live_of(own, saved(system=own, dt=1.0))
     assert (live.clock, live.seconds) == (0.01, 1200.0)
     live.advance(1300)
-    pixels(live, figure)
     assert len(live.history) == 1201
     assert np.isnan(live.history[-1][3])  # its map has no limits
-    assert texts(live)[-1] == ""
+    assert drawn(live, figure)[1] == ""
 
 
 def test_the_command(monkeypatch):
     asked = []
-    monkeypatch.setattr(module, "show", lambda environment, level, *, seed: asked.append((environment, level, seed)))
+    monkeypatch.setattr(module, "show", lambda one, level, *, seed: asked.append((one.system.name, level, seed)))
     main(["demo", "--live"])
     main(["demo", "lorenz", "--live", "--measurement-noise", "0.2", "--seed", "3"])
-    assert [(environment.system.name, *rest) for environment, *rest in asked] == [
-        ("van_der_pol", None, 0),
-        ("lorenz", 0.2, 3),
-    ]
+    assert asked == [("van_der_pol", None, 0), ("lorenz", 0.2, 3)]
 
 
 def test_time_passes_in_a_window_unless_it_is_paused(monkeypatch):
     opened, frames = [], []
 
-    class Animation(matplotlib.animation.FuncAnimation):
-        def __init__(self, figure, frame, **options):
-            super().__init__(figure, frame, **options)
-            frames.append(frame)
+    def animated(figure, frame, **options):
+        frames.append(frame)
+        return FuncAnimation(figure, frame, **options)
 
     monkeypatch.setattr(module, "Live", lambda *args, **options: opened.append(Live(*args, **options)) or opened[-1])
-    monkeypatch.setattr(matplotlib.animation, "FuncAnimation", Animation)
+    monkeypatch.setattr(matplotlib.animation, "FuncAnimation", animated)
     plt.switch_backend("agg")
-    monkeypatch.setattr(plt, "get_backend", lambda: "TkAgg")  # a window that none opens
+    monkeypatch.setattr(plt, "get_backend", lambda: "TkAgg")  # which would open a window
     animation = module.show(shown("rossler", None)[0], None, seed=0)
-    (live,), (frame,), figure = opened, frames, plt.gcf()
-    figure.canvas.draw()  # starts it
+    (live,), (frame,), canvas = opened, frames, plt.gcf().canvas
+    canvas.draw()  # starts it
     before = len(live.history)
     while len(live.history) < before + 5:
         frame(0)
-    figure.canvas.callbacks.process("key_press_event", KeyEvent("key_press_event", figure.canvas, " "))
-    assert live.paused
+    canvas.callbacks.process("key_press_event", KeyEvent("key_press_event", canvas, " "))
     before = len(live.history)
     time.sleep(0.05)
     frame(0)
+    assert live.paused
     assert len(live.history) == before
     plt.close("all")
     del animation

@@ -1,27 +1,18 @@
 """Errors on unseen trajectories, of the model and of other plants."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
+from discrete_systems import Turning
 from linear_system import Oscillator, Reactor, TwoOutputs, exact_observer, reactor_observer
 
-import kkl_gym.elementary as e
 import training.evaluation.errors
-from kkl_gym import System, VanDerPol, get_system
+from kkl_gym import VanDerPol, get_system
 from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
 from training import errors, unseen_trajectories
-from training.evaluation.errors import kalman_errors, measured, starts
+from training.evaluation.errors import kalman_errors, measured
 from training.evaluation.plants import off_by, show_parameters
 from training.filter_noise import stationary_covariance
-
-
-def test_starts_outside_lie_outside():
-    low, high = VanDerPol().box()
-    x0 = starts(VanDerPol(), "2X", 50, np.random.default_rng(0))
-    assert ((x0 < low) | (x0 > high)).any(-1).all()
-    assert (np.abs(x0) <= 2 * high).all()
 
 
 def test_process_noise_disturbs_the_motion_and_is_passed_to_the_observer(make_artifact, monkeypatch):
@@ -64,8 +55,12 @@ def test_impossible_evaluations(wrong, message):
         unseen_trajectories(**{"system": VanDerPol(), "dt": 0.01, "n": 1, "duration": 1.0, "seed": 0} | wrong)
 
 
-def test_escapes_are_counted():
-    runs = unseen_trajectories(get_system("rossler"), 0.01, n=200, duration=20.0, seed=0, domain="2X")
+def test_starts_outside_lie_outside_and_escapes_are_counted():
+    system = get_system("rossler")
+    runs = unseen_trajectories(system, 0.01, n=200, duration=20.0, seed=0, domain="2X")
+    low, high = system.box()
+    assert ((runs.x[0] < low) | (runs.x[0] > high)).any(-1).all()
+    assert ((runs.x[0] >= system.box(2)[0]) & (runs.x[0] <= system.box(2)[1])).all()
     assert runs.escaped > 0
     assert runs.x.shape[1] == 200 - runs.escaped
     assert np.isfinite(runs.x).all()
@@ -98,35 +93,16 @@ def test_each_output_has_noise_of_its_level():
 
 
 def test_an_exact_kalman_filter_follows_the_same_runs():
-    system, dt = Oscillator(), 0.05
-    runs = unseen_trajectories(system, dt, n=20, duration=20.0, seed=0, driven=True)
-    found = kalman_errors(system, runs, dt, measurement_noise=0.1, seed=0)
+    runs = unseen_trajectories(Oscillator(), 0.05, n=20, duration=20.0, seed=0, driven=True)
+    found, longer, louder = (
+        kalman_errors(Oscillator(), runs, 0.05, measurement_noise=noise, seed=0, skip=skip)
+        for noise, skip in ((0.1, None), (0.1, 15.0), (0.4, None))
+    )
     assert found.nrmse.shape == (20, 2)
     assert 0.5 < np.median(found.nrmse) < 10  # noise of some 15 % of the output, averaged
     assert np.median(found.late) < np.median(found.full)
-    longer = kalman_errors(system, runs, dt, measurement_noise=0.1, seed=0, skip=15.0)
     assert np.median(longer.nrmse) < np.median(found.nrmse)
-    louder = kalman_errors(system, runs, dt, measurement_noise=0.4, seed=0)
     assert (louder.nrmse.mean(0) > 1.5 * found.nrmse.mean(0)).all()
-
-
-@dataclass(frozen=True)
-class Turning(System):
-    """Turns by omega dt in a sample; what is measured is in other units."""
-
-    omega: float = 1.0
-    gain: float = 1.0
-
-    name = "turning"
-    X, bounds = ((-1, 1), (-1, 1)), ((-9, 9), (-9, 9))
-    u_max, dt = (0.5,), 0.05
-
-    def step(self, x, u):
-        c, s = e.cos(self.omega * self.dt), e.sin(self.omega * self.dt)
-        return c * x[0] + s * x[1], c * x[1] - s * x[0] + self.dt * u[0]
-
-    def h(self, x):
-        return (self.gain * x[0],)
 
 
 def test_every_parameter_is_off_by_a_share():

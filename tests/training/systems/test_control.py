@@ -1,18 +1,38 @@
-"""Control tasks, their scores and the classical controllers."""
+"""Profiles of the shipped systems, their control tasks and scores, and the classical controllers."""
 
 import numpy as np
 import pytest
 
 from kkl_gym import SYSTEMS, get_system
+from observers import shipped
 from training.agents.play import play
 from training.agents.tasks import TASKS, ControlTask, get_task, scores, successes
-from training.systems import controller
+from training.presets import preset
+from training.systems import PROFILES, Profile, controller, profile
 from training.trajectories.controllers import linear_quadratic
 from training.trajectories.derivatives import linearised
 
 
 def nothing(obs):
     return np.zeros((len(obs), 1))
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_profile_fits_its_system(name):
+    found, system = PROFILES[name], get_system(name)
+    assert profile(system) is found
+    assert found.task is None or found.task.system == name
+    assert found.agent_observer in {None, *shipped()}
+    config = preset(system, "input-aware", "fast")
+    assert {key: getattr(config, key) for key in found.settings} == dict(found.settings)
+    assert found.eigenvalues is None or config.eigenvalues == pytest.approx(found.eigenvalues, abs=1e-6)
+
+
+def test_a_system_of_ones_own_has_the_defaults_and_no_controller_without_input(script):
+    own = get_system(f"{script}:Pendulum")
+    assert profile(own) == Profile()
+    with pytest.raises(ValueError, match="pendulum has no inputs"):
+        controller(own)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -79,35 +99,19 @@ def test_scores_and_successes_by_hand():
     assert successes(task, x).tolist() == [True, True]
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"tolerance": float("nan")}, {"dt": True}, {"period": 0.015}, {"duration": 19.97}, {"duration": 1e9}]
-)
-def test_impossible_tasks(wrong):
-    with pytest.raises(ValueError, match=r"task needs|whole multiple|must be a finite number|at most 100000 samples"):
-        ControlTask("lorenz", **wrong)
-
-
-def test_play_refuses_environments_that_reset_by_themselves():
+def test_what_is_refused():
+    for wrong in ({"tolerance": np.nan}, {"dt": True}, {"period": 0.015}, {"duration": 19.97}, {"duration": 1e9}):
+        with pytest.raises(ValueError, match=r"task needs|whole multiple|must be a finite number|at most 100000"):
+            ControlTask("lorenz", **wrong)
     with pytest.raises(ValueError, match='autoreset_mode="Disabled"'):
         play(TASKS["lorenz"].make(2), nothing, steps=3, seed=0)
-
-
-def test_finding_tasks():
-    assert get_task("lorenz", 2.0).measurement_noise == 2.0
-    assert get_task("lorenz").measurement_noise == 0.5
     with pytest.raises(ValueError, match="unknown system 'lorentz'"):
         get_task("lorentz")
+    assert [get_task("lorenz", *level).measurement_noise for level in ((), (2.0,))] == [0.5, 2.0]
 
 
 def test_the_law_of_reverse_duffing_follows_its_parameters():
     """Where x2 is on its way, -cbrt(a x1), the input replaces the drift by one that stays there."""
-    system = get_system("reverse_duffing", {"a": 8.0, "b": 0.5})
-    x = np.array([[1e-3, -0.2], [-0.5, 0.3]])
-    assert controller(system)(x) == pytest.approx(
-        np.array([[0.5e-3], [-0.25 - 2.0 * (0.3 - 4.0 ** (1 / 3))]]).clip(-1, 1)
-    )
-
-
-def test_no_controller_without_input(script):
-    with pytest.raises(ValueError, match="pendulum has no inputs"):
-        controller(get_system(f"{script}:Pendulum"))
+    act = controller(get_system("reverse_duffing", {"a": 8.0, "b": 0.5}))
+    assert act(np.array([[1e-3, -0.2]])) == pytest.approx(0.5e-3)
+    assert act(np.array([[-0.5, 0.3]])) == pytest.approx(np.clip(-0.25 - 2.0 * (0.3 - 4.0 ** (1 / 3)), -1, 1))

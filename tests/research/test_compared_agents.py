@@ -13,7 +13,7 @@ from commands import research
 
 from examples.research.agents import environment_agents, system_agents
 from examples.research.agents.statistics import interval, middle, normalised
-from examples.research.agents.tables import cells, report_systems, write_environments
+from examples.research.agents.tables import report_systems, write_environments
 from examples.research.agents.window import Stacks, WindowEstimator, learn_window, show_window
 from training.agents.any_environment.information import Stacked, part_of
 from training.agents.any_environment.observing import SETTINGS, wander
@@ -78,18 +78,8 @@ def test_agents_in_an_environment_are_compared_beside_earlier_ones(tmp_path, mon
         research(*common)
 
 
-@pytest.mark.research
-def test_recurrent_agents_and_agents_on_estimates_are_compared_on_a_system(tmp_path):
-    common = ("agents", "--systems", "lorenz", "--seeds", "1", "--timesteps", "1", "--episodes", "2", "--jobs", "1")
-    research(*common, "--information", "state", "ekf", "x_hat_std", "recurrent", "--out", str(tmp_path))
-    results = pd.read_csv(tmp_path / "results.csv")
-    assert list(results.knows) == ["state", "ekf", "x_hat_std", "recurrent"] * 2
-    assert "x̂ and its standard deviations" in (tmp_path / "table.md").read_text()
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
+def test_impossible_comparisons(tmp_path):
+    for wrong, message in (
         ("--seeds 0", "must be positive"),
         ("--systems lorenz lorenz", "give some systems, each once"),
         ("--information stacked_x_hat", "compared by state"),
@@ -99,11 +89,9 @@ def test_recurrent_agents_and_agents_on_estimates_are_compared_on_a_system(tmp_p
         ("--systems lorenz --observers rossler", "the observer rossler is for rossler"),
         ("--systems lorenz --observers lorenz-spinn", "takes in no inputs"),
         ("--systems mine.py:Mine", "no file mine.py"),
-    ],
-)
-def test_impossible_comparisons(wrong, message, tmp_path):
-    with pytest.raises(SystemExit, match=message):
-        research("agents", *wrong.split(), "--out", str(tmp_path))
+    ):
+        with pytest.raises(SystemExit, match=message):
+            research("agents", *wrong.split(), "--out", str(tmp_path))
     assert not (tmp_path / "jobs").exists()
 
 
@@ -134,16 +122,6 @@ def test_the_published_tables_follow_from_the_published_results(tmp_path):
     assert (tmp_path / "table.md").read_text() == (PUBLISHED / "agents" / "table.md").read_text()
     write_environments(tmp_path / "table.md", pd.read_csv(PUBLISHED / "environments" / "results.csv"))
     assert (tmp_path / "table.md").read_text() == (PUBLISHED / "environments" / "table.md").read_text()
-
-
-def test_cells_of_known_results():
-    rows = [("state", 110.0 + i) for i in range(-2, 3)] + [("y", 60.0 + 2 * i) for i in range(-2, 3)]
-    frame = pd.DataFrame(rows, columns=["kind", "value"]).assign(task="a", idle=10.0, success=1.0, seconds=7.0)
-    found = cells(frame)
-    assert found["a", "state"].interval[0] == pytest.approx(1.0)
-    assert found["a", "y"].interval[0] == pytest.approx(0.5)
-    assert 0.46 < found["a", "y"].interval[1] < 0.5 < found["a", "y"].interval[2] < 0.54
-    assert np.isnan(cells(frame[5:])["a", "y"].interval).all()  # without agents on the state
 
 
 def test_statistics_by_hand():
