@@ -314,20 +314,6 @@ def test_where_leaves_out_what_is_divided_by_zero():
     assert single[0] == pytest.approx(math.sin(0.01), abs=1e-7)
 
 
-def test_symbols_are_not_equal_to_whole_numbers():
-    class Geared(Draining):
-        """A state that is 0, 1 or 2 and stays so; of a symbol ``x == 1.0`` would be False."""
-
-        name = "geared"
-
-        def f(self, x):
-            return -elementary.where(x[1] == 1.0, 2.0, 0.1) * x[0], 0.0
-
-    step = batch_step(Geared())
-    found = step(np.array([[1.0, 1.0], [1.0, 2.0]]), np.zeros((1, 2)), np.zeros((2, 2)), 0.5)
-    np.testing.assert_allclose(found[0], np.exp([-1.0, -0.05]), rtol=1e-4)
-
-
 class Blinking(Stepping):
     """An output that is lost away from X, which a look at the bounds does not find."""
 
