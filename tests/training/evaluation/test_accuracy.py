@@ -33,7 +33,6 @@ def test_shipped_maps_are_what_the_preset_makes(name):
         if entry.name not in made
     }  # they change nothing
     assert {key: made.get(key, later.get(key)) for key in config} == config
-    assert made["optimiser"] == "soap"
 
 
 def test_coasting_runs_as_a_model_of_the_system():
