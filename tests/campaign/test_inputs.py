@@ -7,7 +7,6 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from bad_values import Stranger, itself
 from entry_points import AREAS, ENTRIES
 
 LONGEST = 1000  # characters of a clear error
@@ -109,30 +108,3 @@ def test_bad_values_are_refused_or_as_good_as_plain_ones(area, cases):
     print(f"\n{area}: {', '.join(f'{outcome} {counts[outcome]}' for outcome in OUTCOMES)}")
     assert not wrong, "\n".join(wrong)
     assert counts[REFUSED] > counts[RIGHT] > 0
-
-
-# Values that once gave another error or none, or an error after the state had changed, and that are rarely drawn.
-ONCE_WRONG = {
-    "KKLEnv(dt)": [10**5000],
-    "KKLEnv(start_box)": [[["0", "1"], ["0", "1"]]],
-    "KKLEnv(render_mode)": [np.array(["rgb_array", "x"])],
-    "KKLEnv(parameters)": [{"mu": 10**400}],
-    "KKLEnv.reset(options)": [[1], 0, "", {"x0": ["0.5", "0.5"]}, {"x0": [50.0, 0.0]}],
-    "KKLEnv.step(action)": [
-        [True], np.array(["0.5"]), bytearray(b"a"), [10**400], np.ma.array([1e9], mask=[True]), Stranger(), itself(),
-        np.array([1], "timedelta64[s]"), np.zeros(1, [("a", float)]), np.array([0.5], object), {0.5: 0.5},
-    ],
-    "KKLVectorEnv(num_envs)": [10**12],
-    "KKLVectorEnv.reset(seed)": [[True, 1, 2]],
-    "KKLVectorEnv.reset(reset_mask)": [np.ma.array([True] * 3, mask=[False, False, True])],
-    "KKLVectorEnv.step(action)": [[[True], [0.5], [0.5]], [[0.5], [0.5, 1.0], [0.5]]],
-    "KKLVectorObservation(monitor)": [np.array([True, False])],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", ONCE_WRONG)
-def test_values_that_were_once_wrong(name):
-    (entry,) = (entry for entry in ENTRIES if entry.name == name)
-    for value in ONCE_WRONG[name]:
-        outcome, what = Pair(entry).outcome(lambda value=value: value)
-        assert outcome in (REFUSED, RIGHT), f"{value!r}: {what}"

@@ -59,9 +59,6 @@ def problems(system, **options):
     return [one for one in findings(system, **options) if one.verdict == "problem"]
 
 
-# Systems without problems.
-
-
 def test_a_system_that_ships():
     found = findings(get_system("van_der_pol"))
     assert "problem" not in {one.verdict for one in found}
@@ -136,9 +133,6 @@ def test_discrete_time_and_starts_of_its_own():
         findings(system, dt=0.2)
 
 
-# Equations.
-
-
 @dataclass(frozen=True)
 class Branching(Oscillator):
     gain: float = 1.0
@@ -199,9 +193,6 @@ def test_compiled_or_not(monkeypatch):
     assert "several times slower: " in one(of_numpy, "compiled", "note").found
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert one(Oscillator(), "compiled", "note").advice == 'pip install "kkl-gym[fast]"'
-
-
-# Whatever one check says of one wrong attribute.
 
 
 def drawn(*shape):
@@ -291,9 +282,6 @@ def test_a_system_without_a_rate():
     integrator = made(f=lambda self, x: (0.0 * x[0], 0.0 * x[1]))
     (found,) = (one for one in problems(integrator, duration=0.1) if one.check == "rate")
     assert "override it to say how fast f changes" in found.found
-
-
-# Motions.
 
 
 def test_bounds_that_are_too_narrow():

@@ -183,12 +183,10 @@ def test_interruptions_while_modules_are_imported(arguments, instead, hint, monk
 
 @pytest.mark.filterwarnings("error")
 def test_an_interruption_that_a_callback_swallows_comes_again(monkeypatch, capsys):
-    class Callback:
-        def __del__(self):
-            signal.raise_signal(signal.SIGINT)
+    callback = type("Callback", (), {"__del__": lambda self: signal.raise_signal(signal.SIGINT)})
 
     def interrupted(name):
-        Callback()
+        callback()
         for _ in range(600):  # Python looks for interruptions between steps, not within one
             time.sleep(0.1)
 

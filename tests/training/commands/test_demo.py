@@ -32,7 +32,6 @@ def test_a_system_of_ones_own(saved, tmp_path, capsys):
     main(["demo", system, "--observer", observer, "--out", ".", "--duration", "1", "--measurement-noise", "0.2"])
     out = capsys.readouterr().out
     assert " autonomous " in out
-    assert "observer" in out
     assert "SPINN" not in out
     assert (tmp_path / "estimates-autonomous.png").stat().st_size > 10_000
 

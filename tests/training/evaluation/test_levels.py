@@ -1,6 +1,6 @@
 """Levels of measurement noise."""
 
-from dataclasses import replace
+import dataclasses
 
 import linear_system
 import numpy as np
@@ -31,24 +31,21 @@ def test_levels_as_people_write_them():
 
 
 def trained_up_to(artifact, largest):
-    return replace(artifact, inverse=replace(artifact.inverse, measurement_noise_max=largest))
+    return dataclasses.replace(artifact, inverse=dataclasses.replace(artifact.inverse, measurement_noise_max=largest))
 
 
 def test_the_systems_own_level_as_far_as_the_map_knows_it(make_artifact):
-    one = make_artifact()  # trained up to 1
-    two = make_artifact(system=f"{linear_system.__file__}:TwoOutputs", outputs=2)  # up to 1 and 2
-    for artifact, system, level in (
-        (one, VanDerPol(), 0.5),
-        (trained_up_to(one, 0.1), VanDerPol(), 0.1),
-        (make_artifact(noise=False), VanDerPol(), 0.5),
-        (one, TwoOutputs(), 0.3),  # the larger one: this map takes one for all outputs
-        (two, TwoOutputs(), (0.1, 0.3)),
-        (trained_up_to(two, (1.0, 0.2)), TwoOutputs(), (0.1, 0.2)),
-    ):
-        assert level_for(artifact, system) == level
-    assert not beyond(one, 1.0)
+    artifact = make_artifact()  # trained up to 1
+    assert level_for(artifact, VanDerPol()) == 0.5
+    assert level_for(trained_up_to(artifact, 0.1), VanDerPol()) == 0.1
+    assert level_for(make_artifact(noise=False), VanDerPol()) == 0.5
+    assert level_for(artifact, TwoOutputs()) == 0.3  # the larger one: this map takes one for all outputs
+    two = make_artifact(system=f"{linear_system.__file__}:TwoOutputs", outputs=2)  # trained up to 1 and 2
+    assert level_for(two, TwoOutputs()) == (0.1, 0.3)
+    assert level_for(trained_up_to(two, (1.0, 0.2)), TwoOutputs()) == (0.1, 0.2)
+    assert not beyond(artifact, 1.0)
     assert not beyond(two, (0.1, 2.0))
     assert not beyond(make_artifact(noise=False), np.inf)
-    assert beyond(one, 1.5) == "measurement noise 1.5 is beyond the map's range, 0 to 1"
+    assert beyond(artifact, 1.5) == "measurement noise 1.5 is beyond the map's range, 0 to 1"
     assert beyond(two, (0.1, 2.5)) == "measurement noise 0.1, 2.5 is beyond the map's range, 0 to 1, 0 to 2"
-    assert "told one level of measurement noise for all outputs" in beyond(one, (0.1, 0.3))
+    assert "told one level of measurement noise for all outputs" in beyond(artifact, (0.1, 0.3))

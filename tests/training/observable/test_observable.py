@@ -43,7 +43,6 @@ def test_pendulums_rate_is_determined_by_its_angle():
 def test_pendulums_angle_is_determined_by_its_rate_but_for_which_side_is_up():
     found = verdicts(looked("Pendulum-v1", [2], [0, 1], steps=5000))
     assert found["obs[1]"].verdict == "determined"  # gravity turns it
-    assert found["obs[1]"].window > 0
     assert found["obs[0]"].errors[0] > 2 * found["obs[1]"].errors[0]  # a cosine is flat where the sine is steep
     assert found["obs[0]"].verdict.startswith("partly")
 
