@@ -28,7 +28,7 @@ guard: $(VENV)/ready  ## what must not change: estimates, dynamics, names, held-
 test-slow: $(VENV)/ready  ## the tests that train for minutes
 	$(BIN)/pytest -m slow
 
-test-research: $(VENV)/ready  ## the longer tests of examples/research, ten minutes
+test-research: $(VENV)/ready  ## the longer tests of examples/research, five minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m research
 
 test-long: $(VENV)/ready  ## campaigns of kills, flipped bits and bad input, half an hour; they print counts
