@@ -25,19 +25,8 @@ def test_shipped_maps_are_what_the_preset_makes(name):
     kind = name.removeprefix(artifact.system)
     pipeline, changes = "spinn" if kind == "-spinn" else "input-aware", {"-small": SMALL_SETTINGS}
     settings = preset(get_system(artifact.system), pipeline, "fast", changes=changes.get(kind))
-<<<<<<< HEAD
     made, config = artifact.training, json.loads(json.dumps(asdict(settings)))
     assert {key: made[key] for key in config} == config
-    assert made["optimiser"] == "soap"
-=======
-    made, config = current_names(artifact.training), json.loads(json.dumps(asdict(settings)))
-    later = {
-        entry.name: {} if entry.name == "uncertain" else entry.default
-        for entry in fields(Config)
-        if entry.name not in made
-    }  # they change nothing
-    assert {key: made.get(key, later.get(key)) for key in config} == config
->>>>>>> tcmd
 
 
 def test_coasting_runs_as_a_model_of_the_system():
