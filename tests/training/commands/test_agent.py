@@ -1,17 +1,26 @@
 """``kkl-gym agent``: episodes, intervals, and systems of one's own; tests/training/agents has the rest."""
 
+from functools import partial
+
 import linear_system
 import numpy as np
 import pytest
 
 import training.agents.learn
 import training.agents.picture
+from kkl_gym.compiled import SamplingStep
+from kkl_gym.simulate import advance_batch
 from training.agents.agent import Agent
 from training.cli import main
 from training.commands.agent import Evaluate, interval
 from training.seeds import AGENT_EVALUATION_SEED, agent_evaluation_seed
 
 OWN = f"{linear_system.__file__}:Oscillator"
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_compiled(monkeypatch):
+    monkeypatch.setattr("kkl_gym.vector.batch_step", lambda system: SamplingStep(partial(advance_batch, system)))
 
 
 def test_seeds_of_the_evaluation_share_no_episode():
