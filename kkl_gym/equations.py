@@ -44,10 +44,7 @@ def components(equations: Equations, *args: Any) -> Any:
 
 
 def input_matrix(system: Any, x: Any) -> Any:
-    """Call a system's g, and check what comes back.
-
-    Shapes: ``x`` of length nx; returns (nx, nu).
-    """
+    """Call a system's g, and check what comes back. Shapes: ``x`` of length nx; returns (nx, nu)."""
     rows, nx, nu = _called(system.g, x), len(x), system.nu
     wanted = f"{nx} rows, one for each state, of {nu} components, one for each input"
     if not _is_sequence(rows) or len(rows) != nx:
@@ -58,10 +55,7 @@ def input_matrix(system: Any, x: Any) -> Any:
 
 
 def rate_at(system: Any, x: Any) -> Any:
-    """Call a system's rate, and check what comes back.
-
-    Shapes: ``x`` of length nx.
-    """
+    """Call a system's rate, and check what comes back. Shapes: ``x`` of length nx."""
     value = _called(system.rate, x)
     if not _fits(value, x[0]):
         raise returned(system.rate, "one number in 1/s for each state x", _misfit(value, x[0]))
@@ -133,10 +127,7 @@ def _checked_starts(system: Any) -> np.ndarray:
 
 
 def target_of(system: Any) -> Any:
-    """A system's target, checked.
-
-    Shapes: returns of length nx.
-    """
+    """A system's target, checked. Shapes: returns of length nx."""
     found, nx = f"target of {system.name!r}", system.nx
     try:
         target = system.target

@@ -83,10 +83,7 @@ class Plant:
         return rng.uniform(low, high)
 
     def start(self, x0: Any) -> np.ndarray:
-        """The start that a user asks for.
-
-        Shapes: ``x0`` (nx,); returns (nx,).
-        """
+        """The start that a user asks for. Shapes: ``x0`` (nx,); returns (nx,)."""
         start = real_array("x0", x0)
         low, high = np.array(self.system.bounds).T
         if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():

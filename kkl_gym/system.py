@@ -432,10 +432,7 @@ def _starts(system: System) -> np.ndarray:
 
 
 def dot(row: Iterable[Any], u: Components) -> Any:
-    """A row of the input matrix times u.
-
-    Shapes: ``row`` of length nu, ``u`` of length nu.
-    """
+    """A row of the input matrix times u. Shapes: ``row`` of length nu, ``u`` of length nu."""
     total = 0.0  # and not sum(), which from Python 3.12 on rounds in another way
     for gij, uj in zip(row, u, strict=True):
         total = total + gij * uj
@@ -466,10 +463,7 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box, side: int =
 
 
 def typical_rate(system: System, starts: np.ndarray) -> float:
-    """Median over some starts of how fast f changes.
-
-    Shapes: ``starts`` (n, nx).
-    """
+    """Median over some starts of how fast f changes. Shapes: ``starts`` (n, nx)."""
     rate_at(system, starts.T)  # or say what is wrong with it
     rate = float(np.median(np.broadcast_to(system.rate_under(starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:

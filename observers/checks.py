@@ -151,10 +151,7 @@ def _of_numbers(values: Any) -> bool:
 
 
 def bool_array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array of bools.
-
-    Shapes: ``shape`` : tuple of int.
-    """
+    """Return an array of bools. Shapes: ``shape`` : tuple of int."""
     try:
         array = values if type(values) is np.ndarray else np.asarray(values)
     except Exception as error:  # as in real_array

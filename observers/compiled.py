@@ -24,10 +24,7 @@ Layers = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
 class CompiledNetwork:
-    """A multilayer perceptron.
-
-    Shapes: ``bias`` (outputs,).
-    """
+    """A multilayer perceptron. Shapes: ``bias`` (outputs,)."""
 
     def __init__(self, layers: Layers, activation: str) -> None:
         network_kernels(activation)  # or say now that there is no Numba
@@ -43,19 +40,13 @@ class CompiledNetwork:
         self._spare: list[np.ndarray] = []  # what batches take, and put back: BLAS does let others in
 
     def single(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate for one sample.
-
-        Shapes: ``x`` (inputs,); returns (outputs,).
-        """
+        """Evaluate for one sample. Shapes: ``x`` (inputs,); returns (outputs,)."""
         out = np.empty(self.outputs, np.float32)
         network_kernels(self.activation).single(x, self.packed, self.widths, self.between, out)
         return out
 
     def batch(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate for many samples.
-
-        Shapes: ``x`` (n, inputs); returns (n, outputs).
-        """
+        """Evaluate for many samples. Shapes: ``x`` (n, inputs); returns (n, outputs)."""
         out = np.empty((len(x), self.outputs), np.float32)
         with self.memory() as memory:
             for here in self.pieces(len(x)):
@@ -136,19 +127,13 @@ class CompiledDecoder:
         )
 
     def single(self, z: np.ndarray, age: float) -> np.ndarray:
-        """Estimate for one sample.
-
-        Shapes: ``z`` (size,); returns (nx,).
-        """
+        """Estimate for one sample. Shapes: ``z`` (size,); returns (nx,)."""
         x_hat = np.empty(self._network.outputs)
         self._one(z, age, x_hat)
         return x_hat
 
     def batch(self, z: np.ndarray, age: float | np.ndarray) -> np.ndarray:
-        """Estimate for many samples.
-
-        Shapes: ``z`` (n, size), ``age`` (n,); returns (n, nx).
-        """
+        """Estimate for many samples. Shapes: ``z`` (n, size), ``age`` (n,); returns (n, nx)."""
         network, n, width = self._network, len(z), len(self._sums)
         kernels = batch_kernels(network.activation)
         ages = np.full(n, np.log1p(np.minimum(age, self._age_max) / self._age_unit))  # to Numba, of one type
@@ -185,10 +170,7 @@ def first_layer(
     conditions: Sequence[float],
     age: tuple[float, float] | None,
 ) -> np.ndarray:
-    """A network's first layer on the filter's state, in float64.
-
-    Shapes: returns (2 + size, outputs).
-    """
+    """A network's first layer on the filter's state, in float64. Shapes: returns (2 + size, outputs)."""
     weight, bias = (part.astype(float) for part in layer)
     modes, given = len(offset), len(offset) + len(conditions)
     first = np.vstack([bias, np.zeros_like(bias) if age is None else weight[given], whiten @ weight[:modes]])

@@ -26,10 +26,7 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None) ->
 def check_output(
     artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], *, first: bool = False
 ) -> np.ndarray | None:
-    """Find what is missing of samples.
-
-    Shapes: returns (..., ny), or None.
-    """
+    """Find what is missing of samples. Shapes: returns (..., ny), or None."""
     if y.shape != (*batch, artifact.ny):
         raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
     if all_finite(y):
@@ -49,10 +46,7 @@ def check_output(
 
 
 def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
-    """Return inputs as floats, zeros where there are none.
-
-    Shapes: ``u`` (..., nu), or None; returns (..., nu).
-    """
+    """Return inputs as floats, zeros where there are none. Shapes: ``u`` (..., nu), or None; returns (..., nu)."""
     nu = artifact.nu
     if u is None:
         return np.zeros((*batch, nu))

@@ -28,10 +28,7 @@ class SparseUpdate:
         self._batch, self._one = partial(_kernel(), *parts), partial(_single_kernel(), *parts)
 
     def __call__(self, z: np.ndarray, *terms: np.ndarray) -> np.ndarray:
-        """Return the next z.
-
-        Shapes: ``z`` (n, size), ``*terms`` (n, ...); returns (n, size).
-        """
+        """Return the next z. Shapes: ``z`` (n, size), ``*terms`` (n, ...); returns (n, size)."""
         rows, size = self._shape
         if z.shape[1:] != (size,):
             raise ValueError(f"expected z of shape (n, {size}), got {z.shape}")

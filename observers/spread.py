@@ -82,10 +82,7 @@ class Covariance:
         self._log_factors = Factors(spread.levels, spread.ages, spread.factors).log_roots(*levels).tolist()
 
     def __call__(self, inputs: np.ndarray, age: Any) -> np.ndarray:
-        """Evaluate.
-
-        Shapes: ``inputs`` (..., inputs); returns (..., nx, nx).
-        """
+        """Evaluate. Shapes: ``inputs`` (..., inputs); returns (..., nx, nx)."""
         nx, out = self._nx, self._mlp(inputs)
         if out.ndim == 1:  # a single sample: every call would be felt
             entries = _entries(out.tolist(), nx, self._log_factor(float(age)))

@@ -62,10 +62,7 @@ CUBATURE = Points()
 def predicted(
     x: np.ndarray, P: np.ndarray, *, move: Callable[[np.ndarray], np.ndarray], Q: np.ndarray, points: Points = CUBATURE
 ) -> Gaussian:
-    """Move a batch of Gaussians.
-
-    Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``Q`` (nx, nx).
-    """
+    """Move a batch of Gaussians. Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``Q`` (nx, nx)."""
     nx = x.shape[-1]
     mean, spread = points.moments(move(points.of(x, P)), nx)
     return mean, points.products(spread, spread, nx) + Q

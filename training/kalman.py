@@ -70,26 +70,17 @@ class KalmanFilter(ABC):
         self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Begin with the start, corrected by the first sample.
-
-        Shapes: ``y0`` (n, ny); returns (n, nx).
-        """
+        """Begin with the start, corrected by the first sample. Shapes: ``y0`` (n, ny); returns (n, nx)."""
         self.x, self.P, self.nis = self._corrected(*self._starts(len(y0)), y0)
         return self.decode()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
-        """Begin anew in some rows.
-
-        Shapes: ``y0`` (number of rows, ny), ``rows`` (n,).
-        """
+        """Begin anew in some rows. Shapes: ``y0`` (number of rows, ny), ``rows`` (n,)."""
         self.x, self.P, self.nis = self.x.copy(), self.P.copy(), self.nis.copy()
         self.x[rows], self.P[rows], self.nis[rows] = self._corrected(*self._starts(len(y0)), y0)
 
     def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Predict over one sample and correct.
-
-        Shapes: ``y`` (n, ny), ``u`` (n, nu); returns (n, nx).
-        """
+        """Predict over one sample and correct. Shapes: ``y`` (n, ny), ``u`` (n, nu); returns (n, nx)."""
         self.advance(y, u)
         return self.decode()
 

@@ -82,10 +82,7 @@ def _reason(error: Exception) -> str:
 
 
 def trial_states(system: System, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """States at which compiled equations are compared with the others.
-
-    Shapes: returns (2 n, nx), (3 n, nx).
-    """
+    """States at which compiled equations are compared with the others. Shapes: returns (2 n, nx), (3 n, nx)."""
     low, high = np.array(system.bounds, dtype=float).T
     random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])
     ends = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])

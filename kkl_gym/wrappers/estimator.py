@@ -23,10 +23,7 @@ class Estimator(Protocol):
     space: gym.spaces.Box
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> object:
-        """Forget the past and take in the first samples.
-
-        Shapes: ``y0`` (n, ny), ``x0`` (n, nx).
-        """
+        """Forget the past and take in the first samples. Shapes: ``y0`` (n, ny), ``x0`` (n, nx)."""
         ...
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
@@ -44,17 +41,11 @@ class Estimator(Protocol):
         ...
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains.
-
-        Shapes: ``rows`` (n,); returns (number of rows, ...).
-        """
+        """What ``info`` gains. Shapes: ``rows`` (n,); returns (number of rows, ...)."""
         ...
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What of a report is the observation.
-
-        Shapes: returns (number of rows, width).
-        """
+        """What of a report is the observation. Shapes: returns (number of rows, width)."""
         ...
 
 
@@ -143,10 +134,7 @@ class KKLEstimator:
         return dataclasses.replace(artifact, flow=None)
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
-        """The input as far as the map knows it.
-
-        Shapes: ``u`` (..., nu); returns (..., nu), or None.
-        """
+        """The input as far as the map knows it. Shapes: ``u`` (..., nu); returns (..., nu), or None."""
         if not self._blind:
             return u
         if not self._ignore_input and u.any():
@@ -157,10 +145,7 @@ class KKLEstimator:
         return None
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past and take in the first samples.
-
-        Shapes: ``y0`` (..., ny), ``x0`` (..., nx).
-        """
+        """Forget the past and take in the first samples. Shapes: ``y0`` (..., ny), ``x0`` (..., nx)."""
         self.observer.reset(y0, x0 if self._known_start else None)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
@@ -178,10 +163,7 @@ class KKLEstimator:
         self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains.
-
-        Shapes: ``rows`` (...,).
-        """
+        """What ``info`` gains. Shapes: ``rows`` (...,)."""
         found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
         if self.estimate == "x":
             found["x_hat"] = self.observer.decode(rows)
@@ -194,10 +176,7 @@ class KKLEstimator:
         return found
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What of a report is the observation.
-
-        Shapes: returns (..., width).
-        """
+        """What of a report is the observation. Shapes: returns (..., width)."""
         if self._uncertainty:
             return np.concatenate([report["x_hat"], deviations(report["x_cov"])], axis=-1)
         return report["x_hat" if self.estimate == "x" else "z"]

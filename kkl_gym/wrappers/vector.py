@@ -483,10 +483,7 @@ def _merged(old: Infos, new: Infos) -> Infos:
 
 
 def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Shape a mask over rows to go with values.
-
-    Shapes: ``mask`` (n,), ``values`` (n, ...); returns (n, 1, ...).
-    """
+    """Shape a mask over rows to go with values. Shapes: ``mask`` (n,), ``values`` (n, ...); returns (n, 1, ...)."""
     return mask.reshape(-1, *(1,) * (values.ndim - 1))
 
 

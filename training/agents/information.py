@@ -72,10 +72,7 @@ class Features(VectorWrapper):
         return self._shown(), info
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
-        """Step the environments.
-
-        Shapes: ``actions`` (n, nu).
-        """
+        """Step the environments. Shapes: ``actions`` (n, nu)."""
         _, reward, terminated, truncated, info = self.env.step(actions)
         values = {key: info[key] for key in self._keys}
         ended = info.get("_final_info", np.zeros(self.num_envs, dtype=bool))

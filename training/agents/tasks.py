@@ -13,10 +13,7 @@ TASKS: dict[str, ControlTask] = {name: found.task for name, found in PROFILES.it
 
 
 def get_task(name: str | System, measurement_noise: Level | None = None) -> ControlTask:
-    """The task of a system, with another noise level if one is given.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """The task of a system, with another noise level if one is given. Shapes: ``measurement_noise`` of length ny."""
     system = get_system(name)
     if not system.nu:
         raise ValueError(f"{name} has no inputs for an agent to act on")
@@ -27,10 +24,7 @@ def get_task(name: str | System, measurement_noise: Level | None = None) -> Cont
 
 
 def deviation(system: System, x: np.ndarray) -> np.ndarray:
-    """(x - target) / scale.
-
-    Shapes: ``x`` (..., nx); returns (..., nx).
-    """
+    """(x - target) / scale. Shapes: ``x`` (..., nx); returns (..., nx)."""
     out: np.ndarray = (x - np.array(system.target)) / np.array(system.scale)
     return out
 

@@ -35,10 +35,7 @@ def of_bounds(system: System, n: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Motions:
-    """Motions of several kinds.
-
-    Shapes: ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
-    """
+    """Motions of several kinds. Shapes: ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu)."""
 
     kinds: tuple[str, ...]
     x: np.ndarray
@@ -116,10 +113,7 @@ class Subject:
             return out
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """df/dx by central differences, with states in half-widths of X.
-
-        Shapes: ``x`` (n, nx); returns (m, nx, nx).
-        """
+        """df/dx by central differences, with states in half-widths of X. Shapes: ``x`` (n, nx); returns (m, nx, nx)."""
         columns = []
         with np.errstate(all="ignore"):
             for j, half in enumerate(self.half):

@@ -279,10 +279,7 @@ def kalman_filter(system: System, dt: float, process_noise: float, measurement_n
 
 
 def measured(system: System, trajectories: UnseenTrajectories, level: Level, seed: int) -> np.ndarray:
-    """Measure trajectories.
-
-    Shapes: ``level`` of length ny; returns (steps + 1, n, ny).
-    """
+    """Measure trajectories. Shapes: ``level`` of length ny; returns (steps + 1, n, ny)."""
     rng = generator(Stream.EVALUATION, seed, 1)
     return noisy_output(trajectories.plant or system, trajectories.x, measurement_noise=level, rng=rng)
 

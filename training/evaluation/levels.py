@@ -38,10 +38,7 @@ def as_cell(level: Level) -> float | str:
 
 
 def multiple(system: System, factor: float) -> Level:
-    """Return a multiple of a system's own level of measurement noise.
-
-    Shapes: returns of length ny.
-    """
+    """Return a multiple of a system's own level of measurement noise. Shapes: returns of length ny."""
     return noise_levels("measurement_noise", np.multiply(factor, system.measurement_noise), system.ny)
 
 
@@ -62,10 +59,7 @@ def level_for(artifact: Artifact, system: System, given: Level | None = None) ->
 
 
 def beyond(artifact: Artifact, level: Level) -> str:
-    """Say why a map cannot be told a level of measurement noise.
-
-    Shapes: ``level`` of length ny.
-    """
+    """Say why a map cannot be told a level of measurement noise. Shapes: ``level`` of length ny."""
     try:
         if artifact.inverse.within(level) == level:
             return ""

@@ -56,10 +56,7 @@ def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarr
 
 
 def rmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Root of the mean over the steps of |x - x_hat|^2.
-
-    Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,).
-    """
+    """Root of the mean over the steps of |x - x_hat|^2. Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,)."""
     x, x_hat = _compared(x, x_hat, skip)
     return np.asarray(np.sqrt(((x - x_hat) ** 2).sum(-1).mean(0)))
 

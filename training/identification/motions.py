@@ -30,10 +30,7 @@ class Windows:
 
 
 class Shooting:
-    """The least squares of one set of windows.
-
-    Shapes: ``unit`` (p,).
-    """
+    """The least squares of one set of windows. Shapes: ``unit`` (p,)."""
 
     def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
         self.system, self.dt, self.unit, self.names = system, dt, unit, tuple(limits)

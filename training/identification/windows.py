@@ -151,10 +151,7 @@ def _unsettled(fit: Fit) -> tuple[bool, float]:
 
 
 def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarray], length: int) -> Windows:
-    """Cut windows of one length out of records.
-
-    Shapes: ``length`` of length : int.
-    """
+    """Cut windows of one length out of records. Shapes: ``length`` of length : int."""
 
     def cut(values: Sequence[np.ndarray], samples: int) -> np.ndarray:
         return np.stack([values[index][k : k + samples] for index, k in starts], 1)

@@ -37,10 +37,7 @@ class Courses:
 
 
 def draw_courses(system: System, x: np.ndarray, u: np.ndarray, dt: float, *, samples: int = SAMPLES) -> Courses:
-    """Simulate motions.
-
-    Shapes: ``x`` (n, nx), ``u`` (n, nu).
-    """
+    """Simulate motions. Shapes: ``x`` (n, nx), ``u`` (n, nu)."""
     x, u, samples = x[:COURSES], u[:COURSES], min(samples, SAMPLES)
     try:
         later = simulate(system, x, samples, dt, u=np.broadcast_to(u, (samples, *u.shape)) if u.shape[1] else None)

@@ -208,10 +208,7 @@ def fit_flow(
     device: torch.device | None = None,
     **of_plant: Any,
 ) -> Flow:
-    """Fit a flow.
-
-    Shapes: ``u_scale`` (nu,).
-    """
+    """Fit a flow. Shapes: ``u_scale`` (nu,)."""
     device = device or torch.device("cpu")
     problem = FlowProblem(increments, u_scale, degrees=degrees, small=small, device=device)
     optimise_at_once(
@@ -231,10 +228,7 @@ def fit_flow(
 
 
 def usual_error(flow: Flow, increments: Increments) -> np.ndarray:
-    """Find what a flow is usually off by after a sample.
-
-    Shapes: returns (nx,).
-    """
+    """Find what a flow is usually off by after a sample. Shapes: returns (nx,)."""
     return np.asarray(OF_MEDIAN * np.median(_missed(flow, increments), axis=0))
 
 
@@ -244,10 +238,7 @@ def _missed(flow: Flow, increments: Increments) -> np.ndarray:
 
 
 def usual_bend(flow: Flow, increments: Increments) -> np.ndarray | None:
-    """Find what a flow is usually off by where states move far within a sample.
-
-    Shapes: returns (nx,), or None.
-    """
+    """Find what a flow is usually off by where states move far within a sample. Shapes: returns (nx,), or None."""
     moved = ((increments.change / flow.x_scale) ** 2).sum(-1)
     far = moved >= np.quantile(moved, 1 - FARTHEST)
     shares = _missed(flow, increments)[far] / np.maximum(moved[far, None], TINY)

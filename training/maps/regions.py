@@ -36,10 +36,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Regions:
-    """Where along runs errors are looked at.
-
-    Shapes: ``knots`` (m,).
-    """
+    """Where along runs errors are looked at. Shapes: ``knots`` (m,)."""
 
     knots: np.ndarray
     steps: int

@@ -32,10 +32,7 @@ class Smooth:
 
 
 def decoder(artifact: Artifact, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0) -> Smooth:
-    """T_inv of free motion long after reset, in physical units.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """T_inv of free motion long after reset, in physical units. Shapes: ``measurement_noise`` of length ny."""
     inverse = (artifact.free_inverse or artifact.inverse).part(slice(artifact.nx))
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
     told = inverse.noise_features(measurement_noise, process_noise)

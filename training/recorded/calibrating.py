@@ -126,10 +126,7 @@ def factors_along(
     rng: np.random.Generator,
     report: Callable[[float], object] | None = None,
 ) -> np.ndarray:
-    """Find factors for an observer's covariances.
-
-    Shapes: returns (levels, knots).
-    """
+    """Find factors for an observer's covariances. Shapes: returns (levels, knots)."""
     return regions.factors(_along(distances_along, artifact, runs, regions, rng, report), _known(runs, regions))
 
 

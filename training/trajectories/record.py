@@ -75,10 +75,7 @@ def record(
     motions: Motions | None = None,
     report: Callable[[float], object] = lambda done: None,
 ) -> Trajectories:
-    """Simulate trajectories and run the filter beside them.
-
-    Shapes: ``ages`` (m,).
-    """
+    """Simulate trajectories and run the filter beside them. Shapes: ``ages`` (m,)."""
     motions = motions or Motions(kinds=KINDS)
     if not linear.nu:
         motions = dataclasses.replace(motions, kinds=(), policy=None)

@@ -49,10 +49,7 @@ def settings(system: System, spectrum: Spectrum, measurement_noise: Level) -> di
 
 @dataclass(frozen=True)
 class Trial:
-    """An observer of free motion, trained for a spectrum: a job.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """An observer of free motion, trained for a spectrum: a job. Shapes: ``measurement_noise`` of length ny."""
 
     system: str
     parameters: Mapping[str, float]

@@ -149,10 +149,7 @@ class Probe:
         return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages).sum(1)
 
     def error(self, spectrum: Spectrum, measurement_noise: Level) -> float:
-        """Predict the error of the best decoder.
-
-        Shapes: ``measurement_noise`` of length ny.
-        """
+        """Predict the error of the best decoder. Shapes: ``measurement_noise`` of length ny."""
         return self._relative(self._information(*self.response(spectrum), measurement_noise))
 
     def least(self, measurement_noise: Level) -> float:
@@ -255,10 +252,7 @@ class Probe:
             found.append(Choice(chosen, error))
 
     def bessel(self, measurement_noise: Level, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
-        """Find Bessel filters to compare with.
-
-        Shapes: ``measurement_noise`` of length ny.
-        """
+        """Find Bessel filters to compare with. Shapes: ``measurement_noise`` of length ny."""
         found, cutoffs = [], list(cutoffs)
         for order in orders:
             options = []

@@ -83,10 +83,7 @@ class Player:
         return env
 
     def act(self, observation: np.ndarray, action_space: gym.Space[Any]) -> Any:
-        """Act.
-
-        Shapes: ``observation`` (width,) or (n, width).
-        """
+        """Act. Shapes: ``observation`` (width,) or (n, width)."""
         if self.mean is not None:
             observation = np.clip((observation - self.mean) / self.scale, -LARGEST_SCALED, LARGEST_SCALED)
         out = self.network(np.asarray(observation, dtype=np.float32))
