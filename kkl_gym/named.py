@@ -146,10 +146,7 @@ class InputReader:
         self.largest = np.maximum(abs(self._inputs.low), abs(self._inputs.high))[self._take]
 
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The inputs: bounded boxes scaled to [-1, 1] and cut there, discrete actions one-hot.
-
-        Shapes: returns (*batch, n).
-        """
+        """The inputs, (*batch, n): bounded boxes scaled to [-1, 1] and cut there, discrete actions one-hot."""
         return self._inputs(action, batch)[..., self._take]
 
 

@@ -98,10 +98,7 @@ class Outputs:
 
 
 class Inputs:
-    """What of an environment's actions acts, at equal size: bounded boxes in [-1, 1], one-hot where Discrete.
-
-    Shapes: ``low``, ``high`` (nu,).
-    """
+    """What of an environment's actions acts, at equal size: bounded boxes in [-1, 1], one-hot where Discrete."""
 
     def __init__(self, space: Space, *, source: str) -> None:
         self._space, self._source = space, f"the action of {source}"

@@ -60,10 +60,7 @@ class CompiledNetwork:
         return [slice(n * i // count, n * (i + 1) // count) for i in range(count)]
 
     def piece(self, h: np.ndarray, memory: np.ndarray, out: np.ndarray) -> None:
-        """Evaluate for the rows of a piece, all but the last biases.
-
-        Shapes: ``h`` (rows, inputs), ``out`` (rows, outputs).
-        """
+        """Evaluate for the rows of a piece, (rows, inputs), all but the last biases, into ``out`` (rows, outputs)."""
         *hidden, (last, _) = self._layers
         activate, rows = network_kernels(self.activation).activate, len(h)
         for i, ((weight, bias), tile) in enumerate(zip(hidden, self._tiles)):

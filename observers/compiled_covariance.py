@@ -11,10 +11,7 @@ from observers.machine import fast_kernel, fast_part
 
 
 class CompiledCovariance:
-    """From the filter's state to the covariance of the estimate's error, by one call for a single sample.
-
-    Shapes: ``largest`` (nx,).
-    """
+    """From the filter's state to the covariance of the estimate's error, by one call for a single sample."""
 
     def __init__(
         self,

@@ -70,10 +70,7 @@ class Spread:
 
 
 class Covariance:
-    """A spread at given levels of noise: what T_inv's network is given, and the age, to covariances.
-
-    Shapes: ``scale`` (nx,).
-    """
+    """A spread at given levels of noise: what T_inv's network is given, and the age, to covariances."""
 
     def __init__(self, spread: Spread, levels: tuple[float, float], scale: np.ndarray) -> None:
         self._nx, self._mlp = spread.nx, spread.in_units(scale)

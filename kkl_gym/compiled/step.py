@@ -30,11 +30,7 @@ class SamplingStep(Generic[Values]):
     obstacle: str | None = None
 
     def __call__(self, x: Values, u: Values, w: Values, dt: float) -> Values:
-        """Take the step.
-
-        Shapes: ``x`` (nx, n), or sequence of float, ``u`` (nu, n), or sequence of float, ``w`` (nx, n), or sequence of
-        float; returns (nx, n), or sequence of float.
-        """
+        """Take the step, for arrays of a batch (nx, n) and (nu, n), or for sequences of floats."""
         return self.advance(x, u, w, dt)
 
 

@@ -27,17 +27,11 @@ class Estimator(Protocol):
         ...
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in some rows and take in their first samples.
-
-        Shapes: ``y0`` (number of True in rows, ny), ``rows`` (n,), ``x0`` (number of True in rows, nx).
-        """
+        """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
         ...
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in one sample and the input that led to it.
-
-        Shapes: ``y`` (n, ny), ``u`` (n, nu), or None, ``rows`` (n,).
-        """
+        """Take in samples (..., ny) and the inputs (..., nu) that led to them."""
         ...
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -149,17 +143,11 @@ class KKLEstimator:
         self.observer.reset(y0, x0 if self._known_start else None)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in some rows and take in their first samples.
-
-        Shapes: ``y0`` (number of True in rows, ny), ``rows`` (n,), ``x0`` (number of True in rows, nx).
-        """
+        """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
         self.observer.restart(y0, rows, x0 if self._known_start else None)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in samples and the inputs that led to them.
-
-        Shapes: ``y`` (..., ny), ``u`` (..., nu), or None, ``rows`` (...,).
-        """
+        """Take in samples (..., ny) and the inputs (..., nu) that led to them."""
         self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -191,18 +179,12 @@ class KKLEstimator:
 
 
 def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
-    """Values as observations: float32, within the bounds of their space.
-
-    Shapes: ``values`` (..., width), ``space`` (width,); returns (..., width).
-    """
+    """Values (..., width) as observations: float32, within the bounds of their space."""
     return clipped(values, space.low, space.high)
 
 
 def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of states and of their standard deviations behind them, which are no larger than the bounds are wide.
-
-    Shapes: ``low``, ``high`` (nx,); returns ``low, high`` (2 nx,).
-    """
+    """Bounds (2 nx,) of states and of their standard deviations, which are no larger than the bounds are wide."""
     with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
         return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
 

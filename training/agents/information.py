@@ -60,10 +60,7 @@ class Features(VectorWrapper):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Reset the environments and what is remembered of them.
-
-        Shapes: returns ``obs`` (n, stacked * (width + actions)).
-        """
+        """Reset the environments and what is remembered of them; returns (n, stacked * (width + actions))."""
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         first = self._first(info)

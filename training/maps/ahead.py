@@ -27,10 +27,7 @@ JUDGED = 1000  # courses that are not learned from
 
 @dataclass(frozen=True)
 class Courses:
-    """Motions from many states, over up to ``SAMPLES`` samples, each under an input that is held.
-
-    Shapes: ``x`` (samples + 1, n, nx), ``u`` (n, nu).
-    """
+    """Motions (samples + 1, n, nx) from many states, over up to ``SAMPLES`` samples, under inputs that are held."""
 
     x: np.ndarray
     u: np.ndarray

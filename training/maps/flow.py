@@ -50,10 +50,7 @@ LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of 
 
 @dataclass(frozen=True)
 class Increments:
-    """States, inputs, and how states change over a sample.
-
-    Shapes: ``x``, ``u``, ``change`` (n, nx), (n, nu) and (n, nx), ``x_offset``, ``x_scale`` (nx,).
-    """
+    """States (n, nx), inputs (n, nu), and how states change over a sample."""
 
     x: np.ndarray
     u: np.ndarray
@@ -108,10 +105,7 @@ def _log_uniform(rng: np.random.Generator, ends: tuple[float, float]) -> np.ndar
 
 
 class FlowProblem(nn.Module):
-    """The network of :class:`observers.Flow`, on what a polynomial leaves of the increments.
-
-    Shapes: ``u_scale`` (nu,), ``polynomial`` (nx, terms), ``gain`` (nx,).
-    """
+    """The network of :class:`observers.Flow`, on what a polynomial (nx, terms) leaves of the increments."""
 
     def __init__(
         self,

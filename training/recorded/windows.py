@@ -56,10 +56,7 @@ def restarted(
     sample: np.ndarray,
     age: int,
 ) -> np.ndarray:
-    """What the filter holds at some samples if it was switched on ``age`` samples before each.
-
-    Shapes: ``z`` (n, size), ``owner``, ``sample`` (m,); returns (m, size).
-    """
+    """What the filter holds at m samples if it was switched on ``age`` samples before each: (m, size)."""
     began = sample - age
     start = linear.start(taken([record.y for record in records], owner, began))
     power = np.linalg.matrix_power(linear.transition, age)

@@ -27,10 +27,7 @@ def random_signals(
     rng: np.random.Generator,
     kinds: tuple[str, ...],
 ) -> np.ndarray:
-    """Draw random bounded signals, held over each sampling interval.
-
-    Shapes: ``bounds`` of length k; returns (steps, n, k).
-    """
+    """Draw random bounded signals (steps, n, k), held over each sampling interval."""
     out = np.zeros((steps, n, len(bounds)))
     t = np.arange(steps) * dt
     for row in range(n):

@@ -22,10 +22,7 @@ LARGEST_SCALED = 10.0  # of a normalised observation, as stable-baselines3 cuts 
 
 @dataclass(frozen=True)
 class Player:
-    """A deterministic policy, the environment that it was trained in and what it is shown of it.
-
-    Shapes: ``mean``, ``scale`` (width,).
-    """
+    """A deterministic policy, the environment that it was trained in and what it is shown of it."""
 
     network: MLP
     head: Head
