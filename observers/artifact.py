@@ -434,6 +434,10 @@ class Artifact:
                 if not np.isfinite(tensor).all():
                     raise ArtifactError(f"its tensor {name} is not finite")
             artifact: Artifact = _get(cls, tensors, "", described)
+            expected: dict[str, np.ndarray] = {}
+            _put(expected, "", artifact)
+            if unknown := sorted(tensors.keys() - expected.keys()):
+                raise ArtifactError(f"unknown tensors: {', '.join(unknown)}")
         return artifact
 
 

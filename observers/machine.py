@@ -2,6 +2,8 @@
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
 from typing import Any, TypeVar
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -15,14 +17,34 @@ def kernel(**options: Any) -> Callable[[_F], _F]:
     def compiled(function: _F) -> _F:
         import numba
 
-        named = _named(function)
-        try:
-            made: _F = numba.njit(named, cache=True, **options)
-        except RuntimeError:  # no folder can be written
-            made = numba.njit(named, **options)
+        named = _named(function, options)
+        made: Any = numba.njit(named, **options)
+        with suppress(RuntimeError):  # no folder can be written
+            made._cache = _forgiving()(named)
         return made
 
     return compiled
+
+
+@cache
+def _forgiving() -> Any:
+    """Numba's cache, except that files which cannot be read or written cost a compilation and raise nothing."""
+    from numba.core.caching import FunctionCache
+
+    class Forgiving(FunctionCache):
+        def load_overload(self, *arguments: Any) -> Any:
+            try:
+                return super().load_overload(*arguments)  # type: ignore[no-untyped-call]
+            except Exception:  # cut off by a power failure, say
+                with suppress(Exception):
+                    self.flush()  # type: ignore[no-untyped-call]
+                return None
+
+        def save_overload(self, *arguments: Any) -> None:
+            with suppress(Exception):  # a full disk, say
+                super().save_overload(*arguments)  # type: ignore[no-untyped-call]
+
+    return Forgiving
 
 
 def part(**options: Any) -> Callable[[_F], _F]:
@@ -34,20 +56,21 @@ def part(**options: Any) -> Callable[[_F], _F]:
     def known(function: _F) -> _F:
         from numba.extending import register_jitable
 
-        made: _F = register_jitable(**options)(_named(function))
+        made: _F = register_jitable(**options)(_named(function, options))
         return made
 
     return known
 
 
-def _named(function: _F) -> _F:
+def _named(function: _F, options: dict[str, Any]) -> _F:
     """Name a function by its content.
 
     Machine code of several processes is linked by name, so that functions that differ must not share one. Nor do they
     share a file, which two processes may write at once.
     """
     code, cells = function.__code__, [cell.cell_contents for cell in function.__closure__ or ()]
-    content = code.co_code, code.co_consts, code.co_names, [getattr(each, "__qualname__", each) for each in cells]
+    how = [(name, sorted(value) if isinstance(value, set) else value) for name, value in sorted(options.items())]
+    content = code.co_code, code.co_consts, code.co_names, [getattr(each, "__qualname__", each) for each in cells], how
     function.__qualname__ = f"{code.co_qualname}_{hashlib.sha256(repr(content).encode()).hexdigest()[:16]}"
     return function
 

@@ -230,7 +230,7 @@ def explained(path: str | os.PathLike[str], error: type[ValueError]) -> Iterator
     except ValueError as problem:
         raise error(f"{path}: {problem}") from problem
     except (TypeError, IndexError, AttributeError, OverflowError, RecursionError) as problem:
-        raise error(f"{path} is damaged: {problem!r}") from problem
+        raise error(f"{path} is damaged: {problem!r}; get it again") from problem
 
 
 def put_mlp(tensors: MutableMapping[str, np.ndarray], prefix: str, mlp: MLP) -> None:

@@ -36,13 +36,16 @@ class Engine:
         workers = min(self.workers, len(todo))
         attempt = delayed(partial(_attempt, run, Path.cwd()))
         while todo:
-            # As many as there are workers are handed out, so that those that a dead worker takes along are the first.
-            parallel = Parallel(workers, return_as="generator_unordered", batch_size=1, pre_dispatch=workers)
+            suspects = {index: job for index, job in todo.items() if lost[index]}
+            # As many are handed out as there are workers: a dead worker was at one of the first. Those go one by one.
+            handed = 1 if suspects else workers
+            # joblib would run a single job in this process, which a job must not be able to kill.
+            parallel = Parallel(max(2, workers), return_as="generator_unordered", batch_size=1, pre_dispatch=handed)
             try:
-                for index, failure in parallel([attempt(*item) for item in todo.items()]):
+                for index, failure in parallel([attempt(*item) for item in (suspects or todo).items()]):
                     yield todo.pop(index), failure
             except Exception as error:  # a worker died: what a job raises comes as its failure
-                for index in list(todo)[:workers]:
+                for index in [index for index in suspects or todo if index in todo][:handed]:
                     lost[index] += 1
                     if lost[index] == TRIES:
                         yield todo.pop(index), f"was lost {TRIES} times with its worker: {error}"
@@ -73,8 +76,7 @@ def engine(workers: int | None = None, *, backend: Backend = "loky", address: st
             try:
                 yield Engine(workers)
             finally:
-                if workers > 1:
-                    get_reusable_executor(reuse=True).shutdown(kill_workers=True)
+                get_reusable_executor(reuse=True).shutdown(kill_workers=True)
     elif address is None:
         raise ValueError(f"--backend {backend} needs the --address of its cluster, as in {ADDRESSES[backend]}")
     else:

@@ -69,13 +69,12 @@ def follow(observer, y, u):
 def estimates():
     """Estimates and covariances of every map that ships, on the records that are kept beside them."""
     path = FOLDER / "records.npz"
-    if not path.exists():
-        made = {}
-        for name in SYSTEMS:
+    held = dict(np.load(path)) if path.exists() else {}
+    if new := [name for name in SYSTEMS if f"{name}/clean/y" not in held]:
+        for name in new:
             for kind, y, u in records(kkl_gym.get_system(name)):
-                made[f"{name}/{kind}/y"], made[f"{name}/{kind}/u"] = y, u
-        np.savez_compressed(path, **made)
-    held = np.load(path)
+                held[f"{name}/{kind}/y"], held[f"{name}/{kind}/u"] = y, u
+        np.savez_compressed(path, **held)
     found = {}
     for name in SYSTEMS:
         low, high = kkl_gym.get_system(name).box()

@@ -225,6 +225,7 @@ def nothing_estimated(tensors, meta):
     (lambda t, m: m.update(system=3), "name must be a string"),
     (lambda t, m: m.update(inverse=[]), "lacks"),
     (lambda t, m: m.update(invented=1.0), "unknown metadata keys: invented"),
+    (lambda t, m: t.update(extra=np.zeros(1)), "unknown tensors: extra"),
     (lambda t, m: m["inverse"].update(invented=1.0), "unknown metadata keys: inverse.invented"),
     (lambda t, m: m["inverse"].update(activation="gelu"), "gelu"),
     (lambda t, m: m["inverse"].update(measurement_noise_max=[1.0]), "measurement_noise_max must be a positive"),

@@ -25,9 +25,7 @@ def run(jobs, workers=2, **options):
 def test_a_failure_does_not_stop_the_others(workers, tmp_path):
     jobs = [Busy(name, tmp_path) for name in ("a", *FAILURES, "z")]
     assert run(jobs, workers) == {"a": None, **FAILURES, "z": None}
-    processes = {number for job in jobs for number in job.processes}
-    assert len(processes) <= workers
-    assert (processes == {os.getpid()}) == (workers == 1)
+    assert os.getpid() not in {number for job in jobs for number in job.processes}
 
 
 def threads(job):
@@ -44,17 +42,19 @@ def test_a_worker_has_one_thread(monkeypatch, tmp_path):
 @needs_proc
 def test_what_a_dead_worker_was_at_is_begun_again(tmp_path):
     jobs = [Busy("victim", tmp_path, 2.0, kills=1), *(Busy(name, tmp_path) for name in "abc")]
-    assert list(run(jobs).items()) == [("a", None), ("b", None), ("c", None), ("victim", None)]  # as they end
+    assert run(jobs) == dict.fromkeys(("victim", "a", "b", "c"))
     assert len(jobs[0].processes) == 2
 
 
 @needs_proc
 def test_a_job_that_kills_its_workers_stops_neither_the_others_nor_this_process(tmp_path):
-    jobs = [*(Busy(name, tmp_path) for name in "abc"), Busy("killer", tmp_path, kills=100)]
+    jobs = [Busy("a", tmp_path, 1.0), Busy("killer", tmp_path, kills=100), *(Busy(name, tmp_path) for name in "bc")]
     failures = run(jobs)
-    assert len(failures) == 4
-    assert f"was lost {TRIES} times" in failures["killer"]
-    assert len(jobs[-1].processes) == TRIES
+    assert f"was lost {TRIES} times" in failures.pop("killer")
+    assert failures == dict.fromkeys("abc")
+    assert len(jobs[1].processes) == TRIES
+    alone = Busy("alone", tmp_path, kills=100)
+    assert "lost" in run([alone], workers=1)["alone"]
 
 
 PARENT = """

@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -133,8 +133,10 @@ class Agent:
         """Read an agent."""
         tensors, described = storage.read(path, key=_KEY, error=AgentError, what="an agent")
         with storage.explained(path, AgentError):
-            if described.pop("format") != FORMAT:
-                raise AgentError(f"it has another format than {FORMAT}, which kkl-gym reads: train the agent again")
+            if (number := described.pop("format")) != FORMAT:
+                raise AgentError(f"it has format {number!r}, kkl-gym reads {FORMAT}: train the agent again")
+            if unknown := sorted(described.keys() - {"activation", *(entry.name for entry in fields(cls))}):
+                raise AgentError(f"unknown metadata keys: {', '.join(unknown)}")
             network = storage.get_mlp(tensors, "", described.pop("activation"))
             task = described.pop("task")
             if task["start_box"] is not None:

@@ -36,6 +36,8 @@ class ErrorBars(Teaching):
         from training.recorded.errorbars import learn_recorded_error_bars
         from training.teaching.errorbars import learn_error_bars  # torch takes seconds that help need not wait for
 
+        if Artifact.read(resolve(self.observer)).flow is not None:
+            console.print(f"{self.observer} tracks; what is written does not: then run kkl-gym tracking on it")
         out = Path("runs/errorbars") / resolve(self.observer).name if self.out is None else self.out
         return self.taught(
             out,

@@ -137,7 +137,7 @@ def test_damaged_and_foreign_files(saved, tmp_path):
 @pytest.mark.parametrize(("change", "says"), [
     (lambda t, d: t.update({"0.bias": np.full_like(t["0.bias"], np.nan)}), ""),
     (lambda t, d: t.pop("1.bias"), ""),
-    (lambda t, d: d.update(format=9), "another format"),
+    (lambda t, d: d.update(format=9), "has format 9"),
     (lambda t, d: d.pop("activation"), "incomplete"),
     (lambda t, d: d.update(invented=1), ""),
     (lambda t, d: d.update(squashed=0), "squashed must be a bool"),

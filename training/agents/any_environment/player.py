@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
@@ -114,8 +114,10 @@ class Player:
         """Read an agent."""
         tensors, described = storage.read(path, key=KEY, error=AgentError, what="an agent for any environment")
         with storage.explained(path, AgentError):
-            if described.pop("format") != FORMAT:
-                raise AgentError(f"it has another format than {FORMAT}, which kkl-gym reads: train the agent again")
+            if (number := described.pop("format")) != FORMAT:
+                raise AgentError(f"it has format {number!r}, kkl-gym reads {FORMAT}: train the agent again")
+            if unknown := sorted(described.keys() - {"activation", *(entry.name for entry in fields(cls))}):
+                raise AgentError(f"unknown metadata keys: {', '.join(unknown)}")
             network = storage.get_mlp(tensors, "", described.pop("activation"))
             task: dict[str, Any] = described.pop("task")
             return cls(
