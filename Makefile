@@ -7,7 +7,7 @@ SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 STATIC := $(SYSTEMS:%=%-static)
 SMALL := $(SYSTEMS:%=%-small)
 
-.PHONY: demo install test test-coverage guard test-slow test-long test-browser lint format maps results figures benchmark ablation \
+.PHONY: demo install test test-coverage guard test-slow test-research test-long test-browser lint format maps results figures benchmark ablation \
 	certificates agents environments speed sizes clients docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
@@ -27,6 +27,9 @@ guard: $(VENV)/ready  ## what must not change: estimates, dynamics, names, held-
 
 test-slow: $(VENV)/ready  ## the tests that train for minutes
 	$(BIN)/pytest -m slow
+
+test-research: $(VENV)/ready  ## the longer tests of examples/research, five minutes
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m research
 
 test-long: $(VENV)/ready  ## campaigns of kills, flipped bits and bad input, half an hour; they print counts
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m long -s

@@ -30,10 +30,7 @@ _POWERS = "take fractional powers of negative numbers by kkl_gym.elementary.sqrt
 
 
 def components(equations: Equations, *args: Any) -> Any:
-    """Call a system's f, h or step, and check what comes back.
-
-    Shapes: ``*args`` of length nx, and for ``step`` one of length nu.
-    """
+    """Call a system's f, h or step with nx floats (``step``: and nu), and check what comes back."""
     values, x = _called(equations, *args), args[0]
     if name_of(equations) in ("f", "step"):
         n, wanted = len(x), f"{len(x)} components, one for each state"
@@ -44,10 +41,7 @@ def components(equations: Equations, *args: Any) -> Any:
 
 
 def input_matrix(system: Any, x: Any) -> Any:
-    """Call a system's g, and check what comes back.
-
-    Shapes: ``x`` of length nx; returns (nx, nu).
-    """
+    """Call a system's g, and check what comes back. Shapes: ``x`` of length nx; returns (nx, nu)."""
     rows, nx, nu = _called(system.g, x), len(x), system.nu
     wanted = f"{nx} rows, one for each state, of {nu} components, one for each input"
     if not _is_sequence(rows) or len(rows) != nx:
@@ -58,10 +52,7 @@ def input_matrix(system: Any, x: Any) -> Any:
 
 
 def rate_at(system: Any, x: Any) -> Any:
-    """Call a system's rate, and check what comes back.
-
-    Shapes: ``x`` of length nx.
-    """
+    """Call a system's rate, and check what comes back. Shapes: ``x`` of length nx."""
     value = _called(system.rate, x)
     if not _fits(value, x[0]):
         raise returned(system.rate, "one number in 1/s for each state x", _misfit(value, x[0]))
@@ -133,10 +124,7 @@ def _checked_starts(system: Any) -> np.ndarray:
 
 
 def target_of(system: Any) -> Any:
-    """A system's target, checked.
-
-    Shapes: returns of length nx.
-    """
+    """A system's target, checked."""
     found, nx = f"target of {system.name!r}", system.nx
     try:
         target = system.target
@@ -155,10 +143,7 @@ def _unfinished(what: str, error: Exception) -> EquationError:
 
 
 def blame(error: Exception, system: Any, *args: Any) -> None:
-    """Raise an EquationError if an exception comes from a system's equations of motion, and return otherwise.
-
-    Shapes: ``*args`` of length nx and nu.
-    """
+    """Raise an EquationError if an exception comes from a system's equations of motion, and return otherwise."""
     if isinstance(error, EquationError | NotImplementedError):
         return
     for equations in (system.step, system.f, system.g, system.rate):
@@ -176,10 +161,7 @@ def blame(error: Exception, system: Any, *args: Any) -> None:
 
 
 def complex_motion(system: Any, x: Any) -> EquationError:
-    """Say that a motion left the real numbers, as ``x ** 0.5`` does for floats below zero.
-
-    Shapes: ``x`` of length nx.
-    """
+    """Say that a motion left the real numbers, as ``x ** 0.5`` does for floats below zero."""
     found = f"complex ones on the way from {held(x)}: {_POWERS}"
     return returned(system.step if system.discrete else system.f, "real numbers", found)
 

@@ -89,10 +89,7 @@ class Memory:
         *,
         change: np.ndarray | float = np.inf,
     ) -> np.ndarray:
-        """The least and the largest that can be shown, at any age; the worst signals come within 1 % of them.
-
-        Shapes: ``low``, ``high`` (ny,), ``u_low``, ``u_high`` (nu,), ``change`` (ny,), or float; returns (2, size).
-        """
+        """The least and the largest that can be shown at any age, (2, size); the worst signals come within 1 %."""
         ages = {*range(1, min(64, self._filled)), *np.geomspace(64, max(64, self._filled), 64).astype(int).tolist()}
         with np.errstate(under="ignore"):
             weights = self.rise * self.decay ** np.arange(max(ages))[:, None]
@@ -111,10 +108,7 @@ class Memory:
         return within, np.abs(of_changes).sum(1)
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Forget all, as if the outputs had rested at ``y0`` and no input had acted.
-
-        Shapes: ``y0`` (ny,) or (n, ny); returns (size,) or (n, size).
-        """
+        """Forget all, as if outputs (ny,) or (n, ny) had rested at ``y0`` and no input had acted."""
         if y0.ndim == 1:
             if self._matrices is None:
                 return self.reset(y0[None])[0]
@@ -128,10 +122,7 @@ class Memory:
         return self.shown()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Forget the past in some rows of a batch.
-
-        Shapes: ``y0`` (number of True in rows, ny), ``rows`` (n,); returns (number of True in rows, size).
-        """
+        """Forget the past in rows (n,) of a batch, whose first outputs are ``y0`` (number of True in rows, ny)."""
         if self._y is None:
             raise RuntimeError("reset all environments before some of them")
         self._y[rows] = y0
@@ -139,10 +130,7 @@ class Memory:
         return self.shown(rows)
 
     def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """Take in the next outputs, and the inputs that led to them.
-
-        Shapes: ``y`` (ny,) or (n, ny), ``u`` (nu,) or (n, nu), ``rows`` (n,); returns (size,) or (n, size).
-        """
+        """Take in the next outputs, (ny,) or (n, ny), and the inputs, (nu,) or (n, nu), that led to them."""
         if y.ndim == 1:
             if self._row is None:
                 return self.advance(y[None], u[None])[0]
@@ -171,10 +159,7 @@ class Memory:
         return self.shown()
 
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """What is shown of a batch as things stand.
-
-        Shapes: ``rows`` (n,); returns (n, size) or (number of True in rows, size).
-        """
+        """What is shown of a batch, or of its rows, as things stand: (n, size), or (number of True in rows, size)."""
         w, coordinates = self._w, self._spare
         if (self._ages < self._filled).any():
             ages = np.minimum(self._ages, self._filled - 1)

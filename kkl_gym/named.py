@@ -71,10 +71,7 @@ def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]
 
 
 class Reader:
-    """Reads named signals from observations and from what ``info`` holds.
-
-    Shapes: ``low``, ``high`` (n,).
-    """
+    """Reads named signals from observations and from what ``info`` holds. Shapes: ``low``, ``high`` (n,)."""
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str) -> None:
         there, self._source = observed(space), source
@@ -106,10 +103,7 @@ class Reader:
             self.low[i], self.high[i] = -1.0, 1.0
 
     def __call__(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The signals.
-
-        Shapes: returns (*batch, n).
-        """
+        """The signals. Shapes: returns (*batch, n)."""
         parts = [] if self._outputs is None else [self._outputs(observation, batch)]
         parts += [self._of_info(info, entry, batch) for entry in self._infos]
         y = np.concatenate(parts, axis=-1)[..., self._take]
@@ -141,10 +135,7 @@ def _info(entry: str) -> tuple[str, int | None]:
 
 
 class InputReader:
-    """Reads named inputs from actions.
-
-    Shapes: ``largest`` (n,).
-    """
+    """Reads named inputs from actions. Shapes: ``largest`` (n,)."""
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str) -> None:
         self._inputs, there = Inputs(space, source=source), acting(space)
@@ -155,10 +146,7 @@ class InputReader:
         self.largest = np.maximum(abs(self._inputs.low), abs(self._inputs.high))[self._take]
 
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The inputs: bounded boxes scaled to [-1, 1] and cut there, discrete actions one-hot.
-
-        Shapes: returns (*batch, n).
-        """
+        """The inputs, (*batch, n): bounded boxes scaled to [-1, 1] and cut there, discrete actions one-hot."""
         return self._inputs(action, batch)[..., self._take]
 
 

@@ -17,11 +17,7 @@ NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single 
 
 
 class Plant:
-    """A system, its sampling interval, its noise and the spaces that follow.
-
-    Shapes: ``start_box`` of length nx, or None, ``measurement_noise`` of length ny, ``start_box`` (nx,) each,
-    ``state_space`` (nx,), ``output_space`` (ny,), ``action_space`` (nu,), ``weights`` (nx,).
-    """
+    """A system, its sampling interval, its noise and the spaces that follow."""
 
     def __init__(
         self,
@@ -60,19 +56,12 @@ class Plant:
     def draw_noise(
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw ``NOISE_BLOCK`` samples, which :meth:`noise` scales.
-
-        Shapes: ``w`` (NOISE_BLOCK, nx), ``v`` (NOISE_BLOCK, ny); returns ``w`` (NOISE_BLOCK, nx), ``v`` (NOISE_BLOCK,
-        ny).
-        """
+        """Draw ``NOISE_BLOCK`` samples, (NOISE_BLOCK, nx) and (NOISE_BLOCK, ny), which :meth:`noise` scales."""
         n, nx, ny = NOISE_BLOCK, len(self._w_range), self._ny
         return rng.random((n, nx), out=w), rng.standard_normal((n, ny), out=v)
 
     def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Scale what was drawn.
-
-        Shapes: ``drawn_w`` (..., nx), ``drawn_v`` (..., ny); returns ``w`` (..., nx), ``v`` (..., ny).
-        """
+        """Scale what was drawn, (..., nx) and (..., ny)."""
         return (drawn_w - 0.5) * self._w_range, drawn_v * self._v_scale
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
@@ -83,10 +72,7 @@ class Plant:
         return rng.uniform(low, high)
 
     def start(self, x0: Any) -> np.ndarray:
-        """The start that a user asks for.
-
-        Shapes: ``x0`` (nx,); returns (nx,).
-        """
+        """The start that a user asks for. Shapes: ``x0`` (nx,); returns (nx,)."""
         start = real_array("x0", x0)
         low, high = np.array(self.system.bounds).T
         if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():

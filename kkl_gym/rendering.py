@@ -35,10 +35,7 @@ class Trails:
         self.rows: list[deque[list[float]]] = [deque(maxlen=TRAIL) for _ in range(num_envs)]
 
     def add(self, states: np.ndarray, samples: np.ndarray) -> None:
-        """Take in one state of each row; sample 0 begins a trail.
-
-        Shapes: ``states`` (num_envs, nx), ``samples`` (num_envs,).
-        """
+        """Take in one state of each row, (num_envs, nx); sample 0 begins a trail."""
         for trail, state, sample in zip(self.rows, states.tolist(), samples.tolist(), strict=True):
             if sample == 0:
                 trail.clear()
@@ -49,8 +46,6 @@ class Canvas:
     """A phase portrait of two of a system's states: target, true trail, estimates, and the input as a bar.
 
     What does not move is drawn once and kept as an image, so that a frame takes milliseconds.
-
-    Shapes: ``box`` of length nx.
     """
 
     def __init__(
@@ -94,10 +89,7 @@ class Canvas:
         estimates: Iterable[Sequence[float]] = (),
         u: Sequence[float] | np.ndarray | None = None,
     ) -> np.ndarray:
-        """Draw one frame.
-
-        Shapes: ``trail`` of length nx, ``estimates`` of length nx, ``u`` of length nu; returns (height, width, 3).
-        """
+        """Draw one frame, (height, width, 3), of states and estimates so far and of the last input."""
         self._canvas.restore_region(self._still)
         for states, artists in zip((trail, estimates), self._lines, strict=True):
             points = np.array(list(states)).reshape(-1, self._nx)[:, self._states]
@@ -125,10 +117,7 @@ class Window:
         self._clock = pygame.time.Clock()
 
     def show(self, frame: np.ndarray) -> None:
-        """Show a frame, as soon as it is due; opens the window if there is none yet.
-
-        Shapes: ``frame`` (height, width, 3).
-        """
+        """Show a frame (height, width, 3) as soon as it is due; opens the window if there is none yet."""
         pygame = self._pygame
         if not self._open():
             pygame.display.init()

@@ -13,10 +13,7 @@ from observers.thresholds import MANY_ROWS
 
 
 def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Values as float32 within bounds.
-
-    Shapes: ``values`` (..., width), ``low``, ``high`` (width,); returns (..., width).
-    """
+    """Values (..., width) as float32 within bounds (width,)."""
     many = values.ndim == 2 and len(values) >= MANY_ROWS and low.shape == high.shape == values.shape[1:]
     kernels = _kernels() if many else None
     if kernels is None:
@@ -31,10 +28,7 @@ def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray
 
 
 def held(actions: np.ndarray, u_max: np.ndarray) -> np.ndarray:
-    """The inputs that actions hold: cut at -1 and 1, and multiplied with the input bounds.
-
-    Shapes: ``actions`` (n, nu), ``u_max`` (nu,); returns (nu, n).
-    """
+    """The inputs (nu, n) that actions (n, nu) hold: cut at -1 and 1, and multiplied with the input bounds."""
     kernels = _kernels() if len(actions) >= MANY_ROWS else None
     if kernels is None:
         u = np.maximum(actions, -1.0)
@@ -49,11 +43,7 @@ def held(actions: np.ndarray, u_max: np.ndarray) -> np.ndarray:
 def judged(
     x: np.ndarray, bounds: tuple[np.ndarray, np.ndarray], *, target: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which states are within their bounds, and what reward they earn.
-
-    Shapes: ``x`` (nx, n), ``bounds`` (nx,) each, ``target`` (nx,), ``weights`` (nx,); returns ``inside`` (n,),
-    ``reward`` (n,).
-    """
+    """Which states (nx, n) are within their bounds, and what reward they earn: (n,) each."""
     kernels = _kernels() if x.shape[1] >= MANY_ROWS else None
     if kernels is None:
         low, high = (bound[:, None] for bound in bounds)

@@ -76,10 +76,7 @@ class Outputs:
             self.low[side], self.high[side] = -1.0, 1.0
 
     def __call__(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The outputs in an observation.
-
-        Shapes: returns (*batch, ny).
-        """
+        """The outputs in an observation. Shapes: returns (*batch, ny)."""
         parts = [
             _signals(self._source, part, observation if key is None else observation[key], batch)
             for key, part in self._parts.items()
@@ -101,10 +98,7 @@ class Outputs:
 
 
 class Inputs:
-    """What of an environment's actions acts, at equal size: bounded boxes in [-1, 1], one-hot where Discrete.
-
-    Shapes: ``low``, ``high`` (nu,).
-    """
+    """What of an environment's actions acts, at equal size: bounded boxes in [-1, 1], one-hot where Discrete."""
 
     def __init__(self, space: Space, *, source: str) -> None:
         self._space, self._source = space, f"the action of {source}"
@@ -119,10 +113,7 @@ class Inputs:
         self.low[scaled], self.high[scaled] = -1.0, 1.0
 
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The inputs in an action.
-
-        Shapes: returns (*batch, nu).
-        """
+        """The inputs in an action. Shapes: returns (*batch, nu)."""
         u = _signals(self._source, self._space, action, batch)
         if not all_finite(u):
             raise ValueError(f"{self._source} must hold numbers within ±{LARGEST:g}, got {shown(action)}")

@@ -82,10 +82,7 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, 
 
 
 def forced(system: System, u: Components, w: Components) -> tuple[VectorField, Components]:
-    """Split x' = f(x) + g(x) u + w, with u and w held, into a vector field and a constant part.
-
-    Shapes: ``u`` of length nu, ``w`` of length nx; returns ``constant`` of length nx.
-    """
+    """Split x' = f(x) + g(x) u + w, with u and w held, into a vector field and nx constants."""
     if type(system).g is System.g:
         if len(u) == 0:
             return system.f, w
@@ -101,10 +98,7 @@ def forced(system: System, u: Components, w: Components) -> tuple[VectorField, C
 
 
 def advance(system: System, x: Components, u: Components, w: Components, dt: float) -> Components:
-    """One sampling interval from a single state, on Python floats.
-
-    Shapes: ``x`` of length nx, ``u`` of length nu, ``w`` of length nx; returns of length nx.
-    """
+    """One sampling interval from a single state, on Python floats."""
     end: Components = (math.nan,) * len(x)
     try:
         try:
@@ -180,10 +174,7 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
 
 
 def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
-    """One sampling interval from a batch of states, each row with the substeps that :func:`advance` would take.
-
-    Shapes: ``x`` (nx, n), ``u`` (nu, n), ``w`` (nx, n); returns (nx, n).
-    """
+    """One sampling interval from states (nx, n), each with the substeps that :func:`advance` would take."""
     try:
         return _advance_batch(system, x, u, w, dt)
     except SubstepsError:
@@ -205,10 +196,7 @@ def _advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, 
 def equal_substeps(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One sampling interval in substeps of one length for each row.
-
-    Shapes: ``x`` (nx, n), ``u`` (nu, n), ``w`` (nx, n); returns ``end`` (nx, n), ``again`` (n,).
-    """
+    """The ends (nx, n) of a sampling interval in substeps of one length for each row, and which to do again, (n,)."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need = np.broadcast_to(system.rate_under(x, u) * dt * PER_RATE, x.shape[1:])
         if (need <= 1).all():
@@ -230,10 +218,7 @@ def equal_substeps(
 def followed_rows(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, *, dt: float, end: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """What :func:`followed` makes of some rows of a batch that are within bounds.
-
-    Shapes: ``x`` (nx, n), ``u`` (nu, n), ``w`` (nx, n), ``end`` (nx, n), ``rows`` (m,); returns (nx, n).
-    """
+    """What :func:`followed` makes of ``rows`` (m,) of a batch that are within bounds; returns (nx, n)."""
     if len(rows):
         low, high = np.array(system.bounds, dtype=float).T[..., None]
         with np.errstate(all="ignore"):  # equations that are made of others may be NumPy's even for one state
@@ -274,10 +259,7 @@ def simulate(
     step: Step | None = None,
     report: Callable[[int], object] | None = None,
 ) -> np.ndarray:
-    """Trajectories of a batch of starts.
-
-    Shapes: ``x0`` (n, nx), ``u`` (steps, n, nu), or callable, ``w`` (steps, n, nx); returns (steps + 1, n, nx).
-    """
+    """Trajectories (steps + 1, n, nx) of starts (n, nx); ``u`` (steps, n, nu), or callable, ``w`` (steps, n, nx)."""
     x0 = np.asarray(x0, dtype=float)
     if x0.ndim != 2 or x0.shape[1] != system.nx or not np.isfinite(x0).all():
         raise ValueError(f"x0 must be finite with shape (n, {system.nx}), got shape {x0.shape}")

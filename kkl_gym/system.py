@@ -413,10 +413,7 @@ class System:
 
 
 def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> np.ndarray:
-    """Evaluate a system's f or h, which take and give components, on an array of states.
-
-    Shapes: ``x`` (..., nx); returns (..., m).
-    """
+    """Evaluate f or h, which take and give components, on an array of states: (..., nx) to (..., m)."""
     values = components(equations, np.moveaxis(x, -1, 0))
     return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in values], axis=-1)
 
@@ -432,10 +429,7 @@ def _starts(system: System) -> np.ndarray:
 
 
 def dot(row: Iterable[Any], u: Components) -> Any:
-    """A row of the input matrix times u.
-
-    Shapes: ``row`` of length nu, ``u`` of length nu.
-    """
+    """A row of the input matrix times u. Shapes: ``row``, ``u`` of length nu."""
     total = 0.0  # and not sum(), which from Python 3.12 on rounds in another way
     for gij, uj in zip(row, u, strict=True):
         total = total + gij * uj
@@ -452,10 +446,7 @@ def difference_steps(X: Box) -> list[tuple[float, float]]:
 
 
 def slope(field: Callable[[Any], Components], x: Components, X: Box, side: int = 1) -> Any:
-    """A norm of a vector field's derivative, differentiated numerically, with each state in units of X's half-width.
-
-    Shapes: ``x`` of length nx, ``X`` of length nx.
-    """
+    """A norm of a vector field's derivative, differentiated numerically, with states in units of X's half-widths."""
     steps = difference_steps(X)
     fx = field(x)
     total = 0.0
@@ -466,10 +457,7 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box, side: int =
 
 
 def typical_rate(system: System, starts: np.ndarray) -> float:
-    """Median over some starts of how fast f changes.
-
-    Shapes: ``starts`` (n, nx).
-    """
+    """Median over some starts of how fast f changes. Shapes: ``starts`` (n, nx)."""
     rate_at(system, starts.T)  # or say what is wrong with it
     rate = float(np.median(np.broadcast_to(system.rate_under(starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:

@@ -448,10 +448,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
 
 def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any] | None, np.ndarray]:
-    """A copy of reset options, out of which some environments take the mask, and the mask.
-
-    Shapes: returns ``mask`` (n,).
-    """
+    """A copy of reset options, out of which some environments take the mask, and the mask, (n,)."""
     given = dict(mapping("options", options))
     if given.get("reset_mask") is None:
         return None if options is None else given, np.ones(n, dtype=bool)
@@ -469,10 +466,7 @@ def autoreset_mode_of(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def last_of_episodes(obs: np.ndarray, info: Infos, ended: np.ndarray) -> Infos:
-    """``final_obs`` and ``final_info`` with their masks, as Gymnasium's vector environments report them.
-
-    Shapes: ``obs`` (n, width), ``ended`` (n,).
-    """
+    """``final_obs`` and ``final_info`` of ``ended`` (n,) with their masks, as Gymnasium's vectors report them."""
     final_obs = np.full(len(ended), None, dtype=object)
     for row in np.flatnonzero(ended):
         final_obs[row] = obs[row].copy()

@@ -55,10 +55,7 @@ def noise_level(name: str, level: Any) -> float:
 
 
 def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
-    """Return levels of noise as one float for all outputs, or a tuple of one for each.
-
-    Shapes: ``levels`` of length ny; returns of length ny.
-    """
+    """Return levels of noise as one float for all outputs, or a tuple of one for each."""
     if not isinstance(levels, list | tuple | np.ndarray) or (isinstance(levels, np.ndarray) and levels.ndim == 0):
         return noise_level(name, levels)
     if len(levels) != ny:
@@ -151,10 +148,7 @@ def _of_numbers(values: Any) -> bool:
 
 
 def bool_array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array of bools.
-
-    Shapes: ``shape`` : tuple of int.
-    """
+    """Return an array of bools."""
     try:
         array = values if type(values) is np.ndarray else np.asarray(values)
     except Exception as error:  # as in real_array

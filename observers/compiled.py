@@ -24,10 +24,7 @@ Layers = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
 class CompiledNetwork:
-    """A multilayer perceptron.
-
-    Shapes: ``bias`` (outputs,).
-    """
+    """A multilayer perceptron. Shapes: ``bias`` (outputs,)."""
 
     def __init__(self, layers: Layers, activation: str) -> None:
         network_kernels(activation)  # or say now that there is no Numba
@@ -43,19 +40,13 @@ class CompiledNetwork:
         self._spare: list[np.ndarray] = []  # what batches take, and put back: BLAS does let others in
 
     def single(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate for one sample.
-
-        Shapes: ``x`` (inputs,); returns (outputs,).
-        """
+        """Evaluate for one sample. Shapes: ``x`` (inputs,); returns (outputs,)."""
         out = np.empty(self.outputs, np.float32)
         network_kernels(self.activation).single(x, self.packed, self.widths, self.between, out)
         return out
 
     def batch(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate for many samples.
-
-        Shapes: ``x`` (n, inputs); returns (n, outputs).
-        """
+        """Evaluate for many samples. Shapes: ``x`` (n, inputs); returns (n, outputs)."""
         out = np.empty((len(x), self.outputs), np.float32)
         with self.memory() as memory:
             for here in self.pieces(len(x)):
@@ -69,10 +60,7 @@ class CompiledNetwork:
         return [slice(n * i // count, n * (i + 1) // count) for i in range(count)]
 
     def piece(self, h: np.ndarray, memory: np.ndarray, out: np.ndarray) -> None:
-        """Evaluate for the rows of a piece, all but the last biases.
-
-        Shapes: ``h`` (rows, inputs), ``out`` (rows, outputs).
-        """
+        """Evaluate for the rows of a piece, (rows, inputs), all but the last biases, into ``out`` (rows, outputs)."""
         *hidden, (last, _) = self._layers
         activate, rows = network_kernels(self.activation).activate, len(h)
         for i, ((weight, bias), tile) in enumerate(zip(hidden, self._tiles)):
@@ -136,19 +124,13 @@ class CompiledDecoder:
         )
 
     def single(self, z: np.ndarray, age: float) -> np.ndarray:
-        """Estimate for one sample.
-
-        Shapes: ``z`` (size,); returns (nx,).
-        """
+        """Estimate for one sample. Shapes: ``z`` (size,); returns (nx,)."""
         x_hat = np.empty(self._network.outputs)
         self._one(z, age, x_hat)
         return x_hat
 
     def batch(self, z: np.ndarray, age: float | np.ndarray) -> np.ndarray:
-        """Estimate for many samples.
-
-        Shapes: ``z`` (n, size), ``age`` (n,); returns (n, nx).
-        """
+        """Estimate for many samples. Shapes: ``z`` (n, size), ``age`` (n,); returns (n, nx)."""
         network, n, width = self._network, len(z), len(self._sums)
         kernels = batch_kernels(network.activation)
         ages = np.full(n, np.log1p(np.minimum(age, self._age_max) / self._age_unit))  # to Numba, of one type
@@ -185,10 +167,7 @@ def first_layer(
     conditions: Sequence[float],
     age: tuple[float, float] | None,
 ) -> np.ndarray:
-    """A network's first layer on the filter's state, in float64.
-
-    Shapes: returns (2 + size, outputs).
-    """
+    """A network's first layer on the filter's state, in float64. Shapes: returns (2 + size, outputs)."""
     weight, bias = (part.astype(float) for part in layer)
     modes, given = len(offset), len(offset) + len(conditions)
     first = np.vstack([bias, np.zeros_like(bias) if age is None else weight[given], whiten @ weight[:modes]])

@@ -11,10 +11,7 @@ from observers.machine import fast_kernel, fast_part
 
 
 class CompiledCovariance:
-    """From the filter's state to the covariance of the estimate's error, by one call for a single sample.
-
-    Shapes: ``largest`` (nx,).
-    """
+    """From the filter's state to the covariance of the estimate's error, by one call for a single sample."""
 
     def __init__(
         self,
@@ -40,19 +37,13 @@ class CompiledCovariance:
         self._one = functools.partial(_covary(activation), first, second, table, unit, end, largest_log, largest)
 
     def single(self, z: np.ndarray, age: float) -> np.ndarray:
-        """Evaluate for one sample.
-
-        Shapes: ``z`` (size,); returns (nx, nx).
-        """
+        """Evaluate for one sample. Shapes: ``z`` (size,); returns (nx, nx)."""
         covariance = np.empty(self._shape)
         self._one(z, age, covariance)
         return covariance
 
     def hidden(self, z: np.ndarray, age: float | np.ndarray) -> np.ndarray:
-        """Evaluate the first layer for many samples.
-
-        Shapes: ``z`` (n, size), ``age`` (n,); returns (n, width).
-        """
+        """Evaluate the first layer for many samples. Shapes: ``z`` (n, size), ``age`` (n,); returns (n, width)."""
         sums, (unit, end) = z @ self._first[2:], self._age
         h = np.empty(sums.shape, np.float32)
         batch_kernels(self._activation).enter(

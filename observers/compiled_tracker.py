@@ -63,11 +63,7 @@ class CompiledTracker:
     def advance(
         self, state: np.ndarray, u: np.ndarray, y: np.ndarray, rows: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Predict a sample, and take it in.
-
-        Shapes: ``state`` (n, width), ``u`` (n, nu), ``y`` (n, ny), ``rows`` (n,); returns ``x`` (n, nx), ``expected``
-        (n, ny).
-        """
+        """Predict a sample, and take it in; returns ``x`` (n, nx) and the outputs that were expected, (n, ny)."""
         x, expected = np.empty((len(y), self._nx)), np.empty((len(y), self._ny))
         self._many(u, y, np.ones(len(y), dtype=bool) if rows is None else rows, state, x, expected)
         return x, expected
@@ -75,11 +71,7 @@ class CompiledTracker:
     def single(
         self, state: np.ndarray, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Predict a single sample, take it in, and take the filter along.
-
-        Shapes: ``state`` (1, width), ``z`` (size,), ``y`` (ny,), ``u`` (nu,), ``y_next`` (ny,); returns ``x`` (nx,),
-        ``y_next`` (ny,), ``z_next`` (size,).
-        """
+        """Predict a single sample, take it in, and take the filter along; returns ``x``, ``y_next``, ``z_next``."""
         told, nx, ny = np.empty(self._told), self._nx, self._ny
         self._one(z, y, u, y_next, state, told)
         return told[:nx], told[nx + ny : nx + 2 * ny], told[nx + 2 * ny :]
@@ -87,10 +79,7 @@ class CompiledTracker:
     def take(
         self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: np.ndarray, x: np.ndarray | None
     ) -> None:
-        """Take what T_inv says, where it is surer by the traces of both covariances or the tracker is lost.
-
-        Shapes: ``lost`` (k,), ``where`` (k,), ``state`` (n, width), ``x`` (n, nx).
-        """
+        """Take what T_inv says, where it is surer by the traces of both covariances or the tracker is lost."""
         self._take(*said, lost, where, state, _NONE if x is None else x)
 
 

@@ -76,10 +76,7 @@ class Expression:
         object.__setattr__(self, "components", checked)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate it.
-
-        Shapes: ``x`` (..., nx); returns (..., number of components).
-        """
+        """Evaluate it. Shapes: ``x`` (..., nx); returns (..., number of components)."""
         rows = np.moveaxis(np.asarray(x, dtype=float), -1, 0)
         with np.errstate(all="ignore"):
             values = [_evaluated(part, rows) for part in self.components]

@@ -132,10 +132,7 @@ class Flow:
         return degree_of(self.polynomial.shape[1], self.nx + self.nu) or 0
 
     def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Evaluate.
-
-        Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx).
-        """
+        """Evaluate. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         return self.x_offset + self.x_scale * self.scaled((x - self.x_offset) / self.x_scale, u / self.u_scale)
 
     def scaled(self, s: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -38,10 +38,7 @@ class ForwardMap:
         check_shapes(self, {"x_offset": (nx,), "x_scale": (nx,), "z_offset": (nz,), "z_scale": (nz,)})
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate T.
-
-        Shapes: ``x`` (..., nx); returns (..., nz).
-        """
+        """Evaluate T. Shapes: ``x`` (..., nx); returns (..., nz)."""
         z = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
         return self.z_offset + self.z_scale * z
 

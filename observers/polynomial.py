@@ -22,10 +22,7 @@ def degree_of(terms: int, variables: int) -> int | None:
 
 @functools.cache
 def table(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """What monomials are made of, in the order of their degrees.
-
-    Shapes: returns ``earlier, by`` (terms,).
-    """
+    """What monomials are made of, in the order of their degrees. Shapes: returns ``earlier, by`` (terms,)."""
     earlier, by, newest = [0], [0], [0]
     for _ in range(degree):
         made = [(t, j) for t in newest for j in range(by[t], variables)]  # each once: by variables that do not fall
@@ -39,10 +36,7 @@ def table(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def monomials(q: np.ndarray, degree: int) -> np.ndarray:
-    """Evaluate them, of degree 1 at least.
-
-    Shapes: ``q`` (..., variables); returns (..., terms).
-    """
+    """Evaluate them, of degree 1 at least. Shapes: ``q`` (..., variables); returns (..., terms)."""
     variables = q.shape[-1]
     terms = np.empty((*q.shape[:-1], count(variables, degree)))
     terms[..., 0], terms[..., 1 : 1 + variables] = 1.0, q

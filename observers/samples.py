@@ -26,10 +26,7 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None) ->
 def check_output(
     artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], *, first: bool = False
 ) -> np.ndarray | None:
-    """Find what is missing of samples.
-
-    Shapes: returns (..., ny), or None.
-    """
+    """Find what is missing of samples. Shapes: returns (..., ny), or None."""
     if y.shape != (*batch, artifact.ny):
         raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
     if all_finite(y):
@@ -49,10 +46,7 @@ def check_output(
 
 
 def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
-    """Return inputs as floats, zeros where there are none.
-
-    Shapes: ``u`` (..., nu), or None; returns (..., nu).
-    """
+    """Return inputs as floats, zeros where there are none. Shapes: ``u`` (..., nu), or None; returns (..., nu)."""
     nu = artifact.nu
     if u is None:
         return np.zeros((*batch, nu))
@@ -73,10 +67,7 @@ def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...])
 
 
 def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """Return the filter's state at the first sample.
-
-    Shapes: ``y0`` (..., ny), ``x0`` (..., nx), or None; returns ``z0`` (..., size).
-    """
+    """Return the filter's state (..., size) at the first sample (..., ny), from ``x0`` (..., nx) if it is known."""
     if x0 is None:
         return artifact.filter.start(y0), 0
     artifact.require_known_start()
@@ -94,11 +85,7 @@ def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tu
 def checked_record(
     artifact: Artifact, y: np.ndarray, u: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Return a record as floats, and what is missing of it.
-
-    Shapes: ``y`` (steps, ..., ny), ``u`` (steps - 1, ..., nu) or (steps, ..., nu), or None; returns ``y`` (steps, ...,
-    ny), ``gaps`` (steps, ..., ny), or None.
-    """
+    """Return a record (steps, ..., signals) as floats, and what is missing of it; of ``u`` the last may be absent."""
     y = real_array("y", y)
     if y.ndim < 2 or not len(y):
         raise ValueError(f"y must be a record of shape (steps, ..., {artifact.ny}), got {y.shape}")

@@ -15,10 +15,7 @@ from observers.machine import kernel, part
 
 
 class SparseUpdate:
-    """z_next = z transition^T + terms drive, for a transition with few entries off its diagonal.
-
-    Shapes: ``transition`` (size, size), ``drive`` (m, size).
-    """
+    """z_next = z transition^T + terms drive, for a transition with few entries off its diagonal."""
 
     def __init__(self, transition: np.ndarray, drive: np.ndarray) -> None:
         gains, _, mixing = parts = without_zeros(transition, drive)
@@ -28,10 +25,7 @@ class SparseUpdate:
         self._batch, self._one = partial(_kernel(), *parts), partial(_single_kernel(), *parts)
 
     def __call__(self, z: np.ndarray, *terms: np.ndarray) -> np.ndarray:
-        """Return the next z.
-
-        Shapes: ``z`` (n, size), ``*terms`` (n, ...); returns (n, size).
-        """
+        """Return the next z. Shapes: ``z`` (n, size), ``*terms`` (n, ...); returns (n, size)."""
         rows, size = self._shape
         if z.shape[1:] != (size,):
             raise ValueError(f"expected z of shape (n, {size}), got {z.shape}")
@@ -43,10 +37,7 @@ class SparseUpdate:
         return z_next
 
     def single(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
-        """Return the next z of one sample.
-
-        Shapes: ``z`` (size,), ``y``, ``u``, ``y_next`` (ny,), (nu,), (ny,); returns (size,).
-        """
+        """Return the next z (size,) of one sample, from ``y`` (ny,), ``u`` (nu,) and ``y_next`` (ny,)."""
         z_next = np.empty(len(z))
         u = u.copy()  # the user's own: to Numba, an array that is read-only or has strides is of another type
         self._one(z, y, u, y_next, z_next)

@@ -70,10 +70,7 @@ class Spread:
 
 
 class Covariance:
-    """A spread at given levels of noise: what T_inv's network is given, and the age, to covariances.
-
-    Shapes: ``scale`` (nx,).
-    """
+    """A spread at given levels of noise: what T_inv's network is given, and the age, to covariances."""
 
     def __init__(self, spread: Spread, levels: tuple[float, float], scale: np.ndarray) -> None:
         self._nx, self._mlp = spread.nx, spread.in_units(scale)
@@ -82,10 +79,7 @@ class Covariance:
         self._log_factors = Factors(spread.levels, spread.ages, spread.factors).log_roots(*levels).tolist()
 
     def __call__(self, inputs: np.ndarray, age: Any) -> np.ndarray:
-        """Evaluate.
-
-        Shapes: ``inputs`` (..., inputs); returns (..., nx, nx).
-        """
+        """Evaluate. Shapes: ``inputs`` (..., inputs); returns (..., nx, nx)."""
         nx, out = self._nx, self._mlp(inputs)
         if out.ndim == 1:  # a single sample: every call would be felt
             entries = _entries(out.tolist(), nx, self._log_factor(float(age)))

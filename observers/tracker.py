@@ -86,8 +86,6 @@ class Tracker:
     Within the window M is what T_inv says of these errors. That is its own covariance, and the square of what the two
     estimates differ by. Later T_inv is not asked, and M is the diagonal of P: a filter on a motion that contracts is
     too sure of what it takes to go together. A factor then makes regions hold what they should.
-
-    Shapes: ``measurement_noise`` of length ny.
     """
 
     def __init__(

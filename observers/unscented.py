@@ -62,10 +62,7 @@ CUBATURE = Points()
 def predicted(
     x: np.ndarray, P: np.ndarray, *, move: Callable[[np.ndarray], np.ndarray], Q: np.ndarray, points: Points = CUBATURE
 ) -> Gaussian:
-    """Move a batch of Gaussians.
-
-    Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``Q`` (nx, nx).
-    """
+    """Move a batch of Gaussians. Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``Q`` (nx, nx)."""
     nx = x.shape[-1]
     mean, spread = points.moments(move(points.of(x, P)), nx)
     return mean, points.products(spread, spread, nx) + Q
@@ -80,10 +77,7 @@ def corrected(
     R: np.ndarray,
     points: Points = CUBATURE,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Condition a batch of Gaussians on samples.
-
-    Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``y`` (n, ny), ``R`` (ny, ny); returns ``nis`` (n,).
-    """
+    """Condition Gaussians (n, nx), (n, nx, nx) on samples (n, ny) with covariance R; ``nis`` is (n,)."""
     expected, S, across = transformed(x, P, function=output, points=points)
     x, P, white = conditioned(x, P, y - expected, S + R, across, np.isnan(y))
     return x, P, (white**2).sum(-1) / np.maximum((~np.isnan(y)).sum(-1), 1)
@@ -92,10 +86,7 @@ def corrected(
 def transformed(
     x: np.ndarray, P: np.ndarray, *, function: Callable[[np.ndarray], np.ndarray], points: Points = CUBATURE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a function makes of a batch of Gaussians.
-
-    Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx); returns (n, k), (n, k, k) and (n, nx, k).
-    """
+    """What a function makes of a batch of Gaussians: means (n, k), covariances (n, k, k) and across (n, nx, k)."""
     nx, at = x.shape[-1], points.of(x, P)
     mean, spread = points.moments(function(at), nx)
     return mean, points.products(spread, spread, nx), points.products(at - x, spread, nx)

@@ -9,10 +9,7 @@ from observers import LinearFilter
 
 
 def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
-    """Covariances of the filter's error due to unit white noise on each output, by the number of samples since reset.
-
-    Shapes: ``ages`` (n,); returns (n, ny, size, size).
-    """
+    """Covariances (ages, ny, size, size) of z's error due to unit white noise on each output, by age in samples."""
     phi = linear.transition
     out = np.empty((len(ages), linear.B.shape[1], linear.size, linear.size))
     for j, (early, late, equilibrium) in enumerate(_columns(linear)):

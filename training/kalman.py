@@ -32,10 +32,7 @@ def unknown_start(system: System) -> Gaussian:
 def measurement_covariance(
     system: System, measurement_noise: float | Sequence[float], *, floor: float = NOISE_FLOOR
 ) -> np.ndarray:
-    """Covariance of the measurement noise that a filter assumes: no less than a part of the system's default.
-
-    Shapes: ``measurement_noise`` of length ny; returns (ny, ny).
-    """
+    """Covariance (ny, ny) of the measurement noise that a filter assumes: at least a part of the system's default."""
     least = floor * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
@@ -44,10 +41,7 @@ def measurement_covariance(
 def process_intensity(
     system: System, process_noise: float, dt: float, *, least: float = LEAST_PROCESS_NOISE
 ) -> np.ndarray:
-    """Intensity of the white noise that a filter assumes in place of the environments' process noise, never quite 0.
-
-    Shapes: returns (nx, nx).
-    """
+    """Intensity (nx, nx) of the white noise that a filter assumes for the plant's process noise, never quite 0."""
     assumed = max(process_noise, least / system.pace)
     return np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)
 
@@ -70,34 +64,22 @@ class KalmanFilter(ABC):
         self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Begin with the start, corrected by the first sample.
-
-        Shapes: ``y0`` (n, ny); returns (n, nx).
-        """
+        """Begin with the start, corrected by the first sample. Shapes: ``y0`` (n, ny); returns (n, nx)."""
         self.x, self.P, self.nis = self._corrected(*self._starts(len(y0)), y0)
         return self.decode()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
-        """Begin anew in some rows.
-
-        Shapes: ``y0`` (number of rows, ny), ``rows`` (n,).
-        """
+        """Begin anew in some rows. Shapes: ``y0`` (number of rows, ny), ``rows`` (n,)."""
         self.x, self.P, self.nis = self.x.copy(), self.P.copy(), self.nis.copy()
         self.x[rows], self.P[rows], self.nis[rows] = self._corrected(*self._starts(len(y0)), y0)
 
     def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Predict over one sample and correct.
-
-        Shapes: ``y`` (n, ny), ``u`` (n, nu); returns (n, nx).
-        """
+        """Predict over one sample and correct. Shapes: ``y`` (n, ny), ``u`` (n, nu); returns (n, nx)."""
         self.advance(y, u)
         return self.decode()
 
     def advance(self, y: np.ndarray, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
-        """Do what :meth:`step` does without the estimate, in some rows only if ``rows`` are given.
-
-        Shapes: ``y`` (n, ny), ``u`` (n, nu), ``rows`` (n,).
-        """
+        """Do what :meth:`step` does without the estimate, in some rows only if ``rows`` are given."""
         held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
         x, P, nis = self._moved(held, y)
         if rows is not None:

@@ -19,20 +19,14 @@ ROUNDING = 1e-9  # of z, in a linear regression
 
 @dataclass(frozen=True)
 class Told:
-    """What z tells of x.
-
-    Shapes: ``left`` (nx,), ``linear`` (nx,).
-    """
+    """What z tells of x. Shapes: ``left`` (nx,), ``linear`` (nx,)."""
 
     left: np.ndarray
     linear: np.ndarray
 
 
 def told(z: np.ndarray, x: np.ndarray, *, others_z: np.ndarray, others_x: np.ndarray) -> Told:
-    """Find what z tells of x.
-
-    Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
-    """
+    """Find what z tells of x. Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...)."""
     deviation = np.where(np.ptp(x, 0) > 0, x.std(0), np.nan)
     design = np.column_stack([np.ones(len(others_z)), others_z])
     gram = design.T @ design + ROUNDING * len(design) * np.eye(len(design.T))

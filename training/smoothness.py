@@ -32,10 +32,7 @@ FASTEST_MODE = 0.5  # bound of |fast end| * dt
 
 @dataclass(frozen=True)
 class Smoothness:
-    """What the z of neighbouring states say of T.
-
-    Shapes: ``roughness`` (ny * modes,), ``exponent`` (ny * modes,).
-    """
+    """What the z of neighbouring states say of T. Shapes: ``roughness`` (ny * modes,), ``exponent`` (ny * modes,)."""
 
     spectrum: Spectrum
     distance: float

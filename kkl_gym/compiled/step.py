@@ -30,11 +30,7 @@ class SamplingStep(Generic[Values]):
     obstacle: str | None = None
 
     def __call__(self, x: Values, u: Values, w: Values, dt: float) -> Values:
-        """Take the step.
-
-        Shapes: ``x`` (nx, n), or sequence of float, ``u`` (nu, n), or sequence of float, ``w`` (nx, n), or sequence of
-        float; returns (nx, n), or sequence of float.
-        """
+        """Take the step, for arrays of a batch (nx, n) and (nu, n), or for sequences of floats."""
         return self.advance(x, u, w, dt)
 
 
@@ -82,10 +78,7 @@ def _reason(error: Exception) -> str:
 
 
 def trial_states(system: System, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """States at which compiled equations are compared with the others.
-
-    Shapes: returns (2 n, nx), (3 n, nx).
-    """
+    """States at which compiled equations are compared with the others. Shapes: returns (2 n, nx), (3 n, nx)."""
     low, high = np.array(system.bounds, dtype=float).T
     random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])
     ends = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])

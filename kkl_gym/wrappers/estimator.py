@@ -23,38 +23,23 @@ class Estimator(Protocol):
     space: gym.spaces.Box
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> object:
-        """Forget the past and take in the first samples.
-
-        Shapes: ``y0`` (n, ny), ``x0`` (n, nx).
-        """
+        """Forget the past and take in the first samples. Shapes: ``y0`` (n, ny), ``x0`` (n, nx)."""
         ...
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in some rows and take in their first samples.
-
-        Shapes: ``y0`` (number of True in rows, ny), ``rows`` (n,), ``x0`` (number of True in rows, nx).
-        """
+        """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
         ...
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in one sample and the input that led to it.
-
-        Shapes: ``y`` (n, ny), ``u`` (n, nu), or None, ``rows`` (n,).
-        """
+        """Take in samples (..., ny) and the inputs (..., nu) that led to them."""
         ...
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains.
-
-        Shapes: ``rows`` (n,); returns (number of rows, ...).
-        """
+        """What ``info`` gains. Shapes: ``rows`` (n,); returns (number of rows, ...)."""
         ...
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What of a report is the observation.
-
-        Shapes: returns (number of rows, width).
-        """
+        """What of a report is the observation. Shapes: returns (number of rows, width)."""
         ...
 
 
@@ -143,10 +128,7 @@ class KKLEstimator:
         return dataclasses.replace(artifact, flow=None)
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
-        """The input as far as the map knows it.
-
-        Shapes: ``u`` (..., nu); returns (..., nu), or None.
-        """
+        """The input as far as the map knows it. Shapes: ``u`` (..., nu); returns (..., nu), or None."""
         if not self._blind:
             return u
         if not self._ignore_input and u.any():
@@ -157,31 +139,19 @@ class KKLEstimator:
         return None
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past and take in the first samples.
-
-        Shapes: ``y0`` (..., ny), ``x0`` (..., nx).
-        """
+        """Forget the past and take in the first samples. Shapes: ``y0`` (..., ny), ``x0`` (..., nx)."""
         self.observer.reset(y0, x0 if self._known_start else None)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in some rows and take in their first samples.
-
-        Shapes: ``y0`` (number of True in rows, ny), ``rows`` (n,), ``x0`` (number of True in rows, nx).
-        """
+        """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
         self.observer.restart(y0, rows, x0 if self._known_start else None)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in samples and the inputs that led to them.
-
-        Shapes: ``y`` (..., ny), ``u`` (..., nu), or None, ``rows`` (...,).
-        """
+        """Take in samples (..., ny) and the inputs (..., nu) that led to them."""
         self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains.
-
-        Shapes: ``rows`` (...,).
-        """
+        """What ``info`` gains. Shapes: ``rows`` (...,)."""
         found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
         if self.estimate == "x":
             found["x_hat"] = self.observer.decode(rows)
@@ -194,10 +164,7 @@ class KKLEstimator:
         return found
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What of a report is the observation.
-
-        Shapes: returns (..., width).
-        """
+        """What of a report is the observation. Shapes: returns (..., width)."""
         if self._uncertainty:
             return np.concatenate([report["x_hat"], deviations(report["x_cov"])], axis=-1)
         return report["x_hat" if self.estimate == "x" else "z"]
@@ -212,18 +179,12 @@ class KKLEstimator:
 
 
 def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
-    """Values as observations: float32, within the bounds of their space.
-
-    Shapes: ``values`` (..., width), ``space`` (width,); returns (..., width).
-    """
+    """Values (..., width) as observations: float32, within the bounds of their space."""
     return clipped(values, space.low, space.high)
 
 
 def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of states and of their standard deviations behind them, which are no larger than the bounds are wide.
-
-    Shapes: ``low``, ``high`` (nx,); returns ``low, high`` (2 nx,).
-    """
+    """Bounds (2 nx,) of states and of their standard deviations, which are no larger than the bounds are wide."""
     with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
         return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
 

@@ -48,10 +48,7 @@ class VectorEstimate(VectorWrapper):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Reset environments and observers, all or the rows of ``options["reset_mask"]``.
-
-        Shapes: ``seed`` of length num_envs; returns ``observations`` (num_envs, width).
-        """
+        """Reset environments and observers, all or the rows of ``options["reset_mask"]``."""
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         if not isinstance(info, dict) or not isinstance(info["y"], np.ndarray):
@@ -70,11 +67,7 @@ class VectorEstimate(VectorWrapper):
         return obs, info
 
     def step(self, actions: np.ndarray) -> Step:
-        """Step the environments, and the observers with the new samples and the inputs that led to them.
-
-        Shapes: ``actions`` (num_envs, nu); returns ``observations`` (num_envs, width), ``rewards`` (num_envs,),
-        ``terminated, truncated`` (num_envs,).
-        """
+        """Step the environments, and the observers with the new samples and the inputs that led to them."""
         _, reward, terminated, truncated, info = self.env.step(actions)
         before, ended = self._ended, terminated | truncated
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
@@ -483,10 +476,7 @@ def _merged(old: Infos, new: Infos) -> Infos:
 
 
 def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Shape a mask over rows to go with values.
-
-    Shapes: ``mask`` (n,), ``values`` (n, ...); returns (n, 1, ...).
-    """
+    """Shape a mask over rows to go with values. Shapes: ``mask`` (n,), ``values`` (n, ...); returns (n, 1, ...)."""
     return mask.reshape(-1, *(1,) * (values.ndim - 1))
 
 

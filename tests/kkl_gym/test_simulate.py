@@ -80,10 +80,10 @@ class Exploding(Drift):
 ])  # fmt: skip
 def test_accuracy_from_twice_the_training_box(name, duration):
     system, every = get_system(name), round(0.1 / DT)
-    x0 = np.random.default_rng(7).uniform(*system.box(2), (30, system.nx))
+    x0 = np.random.default_rng(7).uniform(*system.box(2), (200 if name in ("rossler", "lorenz") else 100, system.nx))
     found = simulate(system, x0, round(duration / DT), DT)[::every]
-    stays = np.flatnonzero(np.isfinite(found[-1]).all(-1))
-    assert len(stays) >= 10
+    stays = np.flatnonzero(np.isfinite(found[-1]).all(-1))[:100]
+    assert len(stays) == 100
 
     def field(t, flat):
         return np.ravel(system.f(flat.reshape(system.nx, -1)))

@@ -16,6 +16,7 @@ from examples.research.agents.statistics import interval, middle, normalised
 from examples.research.agents.tables import report_systems, write_environments
 from examples.research.agents.window import Stacks, WindowEstimator, learn_window, show_window
 from training.agents.any_environment.information import Stacked, part_of
+from training.agents.any_environment.learning import hyperparameters, settings_of
 from training.agents.any_environment.observing import SETTINGS, wander
 from training.agents.any_environment.task import HIDDEN_VELOCITIES
 from training.progress import progress_bars
@@ -103,6 +104,9 @@ def test_planned_agents():
     names = [agent.name for agent in environment_agents.planned(tasks, Path(), kinds=("state", "y"), seeds=2)]
     assert len(names) == 7  # levels of noise share the agents on the state
     assert [name for name in names if "state" in name] == ["Pendulum-v1/state/0", "Pendulum-v1/state/1"]
+    for env_id in ("CartPole-v1", "Pendulum-v1", "LunarLander-v3", "HalfCheetah-v5"):  # all learn from as many steps
+        algorithms = ("ppo_lstm", "sac" if env_id in settings_of("sac") else "ppo")
+        assert len({hyperparameters(name, env_id)["n_timesteps"] for name in algorithms}) == 1
 
 
 def test_settings_of_memories_and_stacks_concern_those_agents_alone():

@@ -68,10 +68,7 @@ class Agent:
         return self.training.get("seed", 0)
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
-        """Act.
-
-        Shapes: ``obs`` (n, width); returns (n, nu).
-        """
+        """Act. Shapes: ``obs`` (n, width); returns (n, nu)."""
         action = self.network(obs)
         bounded: np.ndarray = np.tanh(action) if self.squashed else np.clip(action, -1.0, 1.0)
         return bounded

@@ -11,10 +11,7 @@ WORST = 10.0  # of the cost, three scales off in every state; beyond it, network
 
 
 def paid(task: ControlTask, total: Any, age: Any, terminated: Any) -> Any:
-    """Minus the cost c, at most ``WORST``, from the reward 1/(1 + 4c) averaged over an action's samples.
-
-    Shapes: ``total`` (n,), ``age`` (n,), ``terminated`` (n,); returns () or (n,).
-    """
+    """Minus the cost c, at most ``WORST``, from the reward 1/(1 + 4c) averaged over an action's samples."""
     samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
     remaining = np.where(terminated, task.steps - np.ceil(age / task.repeat), 0.0)
     cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, WORST)
@@ -33,10 +30,7 @@ class Cost(VectorWrapper):
         self._task = task
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step, and replace the rewards.
-
-        Shapes: ``actions`` (n, nu).
-        """
+        """Step, and replace the rewards. Shapes: ``actions`` (n, nu)."""
         obs, total, terminated, truncated, info = self.env.step(actions)
         age = info["final_info"]["sample"] if terminated.any() else info["sample"]
         return obs, paid(self._task, total, age, terminated), terminated, truncated, info

@@ -60,10 +60,7 @@ class Features(VectorWrapper):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Reset the environments and what is remembered of them.
-
-        Shapes: returns ``obs`` (n, stacked * (width + actions)).
-        """
+        """Reset the environments and what is remembered of them; returns (n, stacked * (width + actions))."""
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         first = self._first(info)
@@ -72,10 +69,7 @@ class Features(VectorWrapper):
         return self._shown(), info
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
-        """Step the environments.
-
-        Shapes: ``actions`` (n, nu).
-        """
+        """Step the environments. Shapes: ``actions`` (n, nu)."""
         _, reward, terminated, truncated, info = self.env.step(actions)
         values = {key: info[key] for key in self._keys}
         ended = info.get("_final_info", np.zeros(self.num_envs, dtype=bool))

@@ -39,18 +39,12 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode.
-
-        Shapes: returns ``observation`` (nx,).
-        """
+        """Start an episode. Shapes: returns ``observation`` (nx,)."""
         _, info = self.env.reset(seed=seed, options=options)
         return self._seen(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Act for a period.
-
-        Shapes: ``action`` (nu,); returns ``observation`` (nx,).
-        """
+        """Act for a period. Shapes: ``action`` (nu,); returns ``observation`` (nx,)."""
         _, total, terminated, truncated, info = self.env.step(action)
         reward = float(paid(self._task, total, info["sample"], terminated))
         return self._seen(info), reward, terminated, truncated, info

@@ -13,11 +13,7 @@ Policy = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes side by side, at the instants at which the agent acts.
-
-    Shapes: ``x`` (steps + 1, n, nx), ``x_hat`` (steps + 1, n, nx), or None, ``y`` (steps + 1, n, ny), ``u`` (steps, n,
-    nu), ``escaped`` (n,).
-    """
+    """Episodes side by side, (steps + 1, n, signals), at the instants at which the agent acts."""
 
     x: np.ndarray
     x_hat: np.ndarray | None

@@ -35,10 +35,7 @@ def of_bounds(system: System, n: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Motions:
-    """Motions of several kinds.
-
-    Shapes: ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
-    """
+    """Motions of several kinds. Shapes: ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu)."""
 
     kinds: tuple[str, ...]
     x: np.ndarray
@@ -100,10 +97,7 @@ class Subject:
             return 1.0 / self.duration
 
     def derivative(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """The drift under inputs: its mean over a sampling interval in discrete time.
-
-        Shapes: ``x`` (n, nx), ``u`` (n, nu); returns (n, nx).
-        """
+        """The drift at ``x`` (n, nx) under ``u`` (n, nu): its mean over a sampling interval in discrete time."""
         system = self.system
         with np.errstate(all="ignore"):
             if system.discrete:
@@ -116,10 +110,7 @@ class Subject:
             return out
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """df/dx by central differences, with states in half-widths of X.
-
-        Shapes: ``x`` (n, nx); returns (m, nx, nx).
-        """
+        """df/dx by central differences, with states in half-widths of X. Shapes: ``x`` (n, nx); returns (m, nx, nx)."""
         columns = []
         with np.errstate(all="ignore"):
             for j, half in enumerate(self.half):
@@ -156,10 +147,7 @@ class Subject:
         return motions.x[:, motions.stays & motions.rows("X")]
 
     def substeps(self, x: np.ndarray) -> np.ndarray:
-        """The substeps that sampling intervals ask for under the largest input, not rounded, and one at least.
-
-        Shapes: ``x`` (steps, n, nx); returns (steps,).
-        """
+        """Substeps (steps,) for ``x`` (steps, n, nx) under the largest input, not rounded, and one at least."""
         with np.errstate(all="ignore"):
             rate = self.system.rate_under(np.moveaxis(x, -1, 0), self.system.u_max)
             need = np.broadcast_to(rate, x.shape[:-1]) * self.dt / RATE_STEP

@@ -239,10 +239,7 @@ def show(
 
 
 def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
-    """Mean of what episodes gave, with a bootstrap 95 % interval over the episodes.
-
-    Shapes: ``values`` (n,).
-    """
+    """Mean of what episodes gave, with a bootstrap 95 % interval over the episodes. Shapes: ``values`` (n,)."""
     mean = float(np.mean(values))
     if len(values) < 2:
         return mean, np.nan, np.nan

@@ -38,10 +38,7 @@ def judged(
     seed: int,
     ekf: bool,
 ) -> list[dict[str, Any]]:
-    """Judge error bars, and a Kalman filter's covariance beside them, on trajectories.
-
-    Shapes: ``level`` of length ny.
-    """
+    """Judge error bars, and a Kalman filter's covariance beside them, on trajectories."""
     dt, steps = artifact.filter.dt, len(trajectories.x)
     first, settled = (round(seconds * system.pace / dt) for seconds in (FIRST, SETTLED))
     spans = {

@@ -138,10 +138,7 @@ def train_in_environment(
 def show_returns(
     progress: ProgressBars, player: Player, episodes: int, seed: int = 0, *, trusted: str | None = None
 ) -> np.ndarray:
-    """Play episodes; print their mean return, and how good estimates were where the truth is shown.
-
-    Shapes: returns (episodes,).
-    """
+    """Play episodes; print their mean return, and how good estimates were where the truth is shown."""
     first, returns = agent_evaluation_seed(seed, episodes), []
     states, estimates = list[np.ndarray](), list[np.ndarray]()
     with player.make(env_id=trusted) as env, progress.phase(f"playing {episodes} episodes", episodes) as report:

@@ -147,10 +147,7 @@ def read_parameter(text: str) -> tuple[str, float]:
 
 
 def read_unknown(text: str) -> tuple[str, tuple[float, ...]]:
-    """Read an unknown parameter, written as ``mu=1.5``, or with limits as ``mu=1.5:0.5:6``.
-
-    Shapes: returns ``numbers`` of length 1 or 3.
-    """
+    """Read an unknown parameter, written as ``mu=1.5``, or with limits as ``mu=1.5:0.5:6``."""
     name, _, values = text.partition("=")
     try:
         numbers = tuple(float(value) for value in values.split(":"))

@@ -19,10 +19,7 @@ INTERVAL = 0.95  # of the mean NEES of a filter that is consistent
 
 @dataclass(frozen=True)
 class Coverage:
-    """How many errors lie in the regions that covariances say, in a span of time.
-
-    Shapes: ``joint`` (regions,), ``states`` (regions, nx), ``rms``, ``said`` (nx,).
-    """
+    """How many errors lie in the regions (regions,) that covariances say, together and by state, in a span of time."""
 
     joint: np.ndarray
     states: np.ndarray
@@ -41,10 +38,7 @@ def coverage(
     seed: int,
     spans: tuple[slice, ...] = (slice(None),),
 ) -> list[Coverage]:
-    """Judge an observer's error bars on test trajectories. It is told the levels of noise, nothing of another plant.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """Judge an observer's error bars on test trajectories; it knows the levels of noise, nothing of another plant."""
     artifact.require_spread()
     observer = KKLObserver(artifact, measurement_noise, process_noise=trajectories.process_noise)
     y = measured(system, trajectories, observer.measurement_noise, seed)
@@ -66,10 +60,7 @@ def kalman_coverage(
     seed: int,
     spans: tuple[slice, ...] = (slice(None),),
 ) -> list[Coverage]:
-    """Judge the covariance that an extended Kalman filter says, on what :func:`coverage` takes.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """Judge the covariance that an extended Kalman filter says, on what :func:`coverage` takes."""
     y = measured(system, trajectories, measurement_noise, seed)
 
     def estimates() -> Iterator[tuple[np.ndarray, np.ndarray]]:

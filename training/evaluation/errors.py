@@ -31,10 +31,7 @@ class NoStartsError(ValueError):
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors in percent of each trajectory that stayed within bounds, and how many did not.
-
-    Shapes: ``full`` (n,), ``late`` (n,), ``nrmse`` (n, nx).
-    """
+    """Errors of each trajectory that stayed within bounds, (n,) and (n, nx), and how many did not."""
 
     full: np.ndarray
     late: np.ndarray
@@ -44,10 +41,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class UnseenTrajectories:
-    """Test trajectories, measured without noise.
-
-    Shapes: ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu), ``inside`` (drawn,).
-    """
+    """Test trajectories, ``x`` (steps + 1, n, nx), measured without noise, and which of those drawn are inside."""
 
     x: np.ndarray
     u: np.ndarray
@@ -70,10 +64,7 @@ class UnseenTrajectories:
 
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts, uniform in the training box X, or in a multiple of X (as in the paper) without X itself.
-
-    Shapes: returns (n, nx).
-    """
+    """Starts (n, nx), uniform in X, or in a multiple of X (as in the paper) without X itself."""
     if domain == "X":
         return system.draw_starts(rng, n)
     low, high = system.box()
@@ -223,10 +214,7 @@ def estimates(
     measurement_noise: Level,
     seed: int,
 ) -> np.ndarray:
-    """What an observer makes of test trajectories: its errors are what :func:`errors` measures.
-
-    Shapes: ``measurement_noise`` of length ny; returns (steps + 1, n, nx).
-    """
+    """What an observer makes of test trajectories, (steps + 1, n, nx): its errors are what :func:`errors` measures."""
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
     y = measured(system, trajectories, level, seed)
@@ -245,8 +233,6 @@ def kalman_errors(
     """Errors of an extended Kalman filter on the trajectories and the noise that :func:`errors` takes.
 
     It knows the system's equations, the inputs and both levels of noise, and that starts are uniform in X.
-
-    Shapes: ``measurement_noise`` of length ny.
     """
     x_hat = kalman_estimates(system, trajectories, dt, measurement_noise=measurement_noise, seed=seed)
     return _errors(trajectories, x_hat, dt, skip)
@@ -255,10 +241,7 @@ def kalman_errors(
 def kalman_estimates(
     system: System, trajectories: UnseenTrajectories, dt: float, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """What the filter of :func:`kalman_errors` makes of test trajectories.
-
-    Shapes: ``measurement_noise`` of length ny; returns (steps + 1, n, nx).
-    """
+    """What the filter of :func:`kalman_errors` makes of test trajectories, (steps + 1, n, nx)."""
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     y = measured(system, trajectories, level, seed)
     kalman = kalman_filter(system, dt, trajectories.process_noise, level)
@@ -270,19 +253,13 @@ def kalman_estimates(
 
 
 def kalman_filter(system: System, dt: float, process_noise: float, measurement_noise: Level) -> ExtendedKalmanFilter:
-    """Make an extended Kalman filter that is told both levels of noise, and assumes a little process noise at least.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """An extended Kalman filter that knows both levels of noise, and assumes a little process noise at least."""
     Q = process_intensity(system, process_noise, dt)
     return ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, measurement_noise))
 
 
 def measured(system: System, trajectories: UnseenTrajectories, level: Level, seed: int) -> np.ndarray:
-    """Measure trajectories.
-
-    Shapes: ``level`` of length ny; returns (steps + 1, n, ny).
-    """
+    """Measure trajectories. Shapes: returns (steps + 1, n, ny)."""
     rng = generator(Stream.EVALUATION, seed, 1)
     return noisy_output(trajectories.plant or system, trajectories.x, measurement_noise=level, rng=rng)
 

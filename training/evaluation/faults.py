@@ -36,10 +36,7 @@ def simulate_faults(
     policy: Controller | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> pd.DataFrame:
-    """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor."""
     allowed = deadline(system, duration)
     if not allowed <= duration / 2:
         raise ValueError(

@@ -38,10 +38,7 @@ def as_cell(level: Level) -> float | str:
 
 
 def multiple(system: System, factor: float) -> Level:
-    """Return a multiple of a system's own level of measurement noise.
-
-    Shapes: returns of length ny.
-    """
+    """Return a multiple of a system's own level of measurement noise."""
     return noise_levels("measurement_noise", np.multiply(factor, system.measurement_noise), system.ny)
 
 
@@ -49,8 +46,6 @@ def level_for(artifact: Artifact, system: System, given: Level | None = None) ->
     """Return the level of measurement noise that is asked for; by default the system's own, as far as a map knows it.
 
     A map that is told one level for all outputs gets the largest of those that are the system's own.
-
-    Shapes: ``given`` of length ny; returns of length ny.
     """
     if given is not None:
         return noise_levels("measurement_noise", given, system.ny)
@@ -62,10 +57,7 @@ def level_for(artifact: Artifact, system: System, given: Level | None = None) ->
 
 
 def beyond(artifact: Artifact, level: Level) -> str:
-    """Say why a map cannot be told a level of measurement noise.
-
-    Shapes: ``level`` of length ny.
-    """
+    """Say why a map cannot be told a level of measurement noise."""
     try:
         if artifact.inverse.within(level) == level:
             return ""

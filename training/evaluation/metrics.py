@@ -35,10 +35,7 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
 
 
 def percentage_error(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Symmetric absolute percentage error at each step, whose mean over the steps is :func:`smape`.
-
-    Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (steps - skip, n).
-    """
+    """Symmetric absolute percentage error at each step, (steps - skip, n), whose mean is :func:`smape`."""
     x, x_hat = _compared(x, x_hat, skip)
     size = np.linalg.norm(x, axis=-1) + np.linalg.norm(x_hat, axis=-1)
     return np.asarray(_percentage(np.linalg.norm(x - x_hat, axis=-1), size))
@@ -56,10 +53,7 @@ def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarr
 
 
 def rmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Root of the mean over the steps of |x - x_hat|^2.
-
-    Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,).
-    """
+    """Root of the mean over the steps of |x - x_hat|^2. Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,)."""
     x, x_hat = _compared(x, x_hat, skip)
     return np.asarray(np.sqrt(((x - x_hat) ** 2).sum(-1).mean(0)))
 

@@ -31,10 +31,7 @@ def parameter_errors(
     policy: Controller | None = None,
     plant: System | None = None,
 ) -> np.ndarray:
-    """Errors of estimated parameters after the transient, on a plant or on many from the ranges of the training.
-
-    Shapes: ``measurement_noise`` of length ny; returns (number,).
-    """
+    """Errors of estimated parameters after the transient, on a plant or on many from the ranges of the training."""
     nx, estimated = system.nx, artifact.estimated_parameters
     moving = plant or with_parameters(system, {name: artifact.parameter_ranges[name] for name in estimated})
     level = noise_levels("measurement_noise", measurement_noise, system.ny)

@@ -25,10 +25,7 @@ _MOST_SAMPLES = 2**32 - 1  # that C's unsigned long can count everywhere
 
 @dataclass(frozen=True)
 class Exported:
-    """An observer as it leaves this package.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """An observer as it leaves this package."""
 
     artifact: Artifact
     name: str
@@ -47,10 +44,7 @@ class Exported:
         measurement_noise: float | tuple[float, ...] | None = None,
         process_noise: float | None = None,
     ) -> "Exported":
-        """Read an observer that is to be exported.
-
-        Shapes: ``measurement_noise`` of length ny.
-        """
+        """Read an observer that is to be exported."""
         choice("precision", precision, PRECISIONS)
         text, path = os.fspath(name_or_path), resolve(name_or_path)
         artifact = Artifact.read(path)

@@ -32,10 +32,7 @@ FITTED = 100_000  # samples from which the filter's coordinates are found
 
 @dataclass(frozen=True)
 class Filtered:
-    """A filter's state beside records, from where it has forgotten its start.
-
-    Shapes: ``z`` (m, size), ``y`` (m, ny), ``u`` (m, nu), ``noise`` (ny,).
-    """
+    """``z`` (m, size), ``y`` (m, ny), ``u`` (m, nu) of records, from where a filter has forgotten its start."""
 
     z: list[np.ndarray]
     y: list[np.ndarray]

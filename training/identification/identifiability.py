@@ -19,28 +19,19 @@ POINTS = 64
 
 
 def hidden_directions(information: np.ndarray) -> np.ndarray:
-    """Find the changes of parameters that leave the outputs as they are, or nearly.
-
-    Shapes: ``information`` (p, p); returns (p, k).
-    """
+    """The changes of parameters, (p, k), that leave the outputs as they are, or nearly."""
     values, vectors = np.linalg.eigh(information)
     return vectors[:, (values <= NOTHING * values[-1]) | (values <= HARDLY**-2)]
 
 
 def told_directions(information: np.ndarray) -> np.ndarray:
-    """Find the changes of parameters that the outputs show, however faintly.
-
-    Shapes: ``information`` (p, p); returns (p, k).
-    """
+    """The changes of parameters, (p, k), that the outputs show, however faintly."""
     values, vectors = np.linalg.eigh(information)
     return vectors[:, values > NOTHING * max(values[-1], 0.0)]
 
 
 def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fraction | float]]:
-    """Products of powers of parameters that outputs tell, where they do not tell all parameters one by one.
-
-    Shapes: ``names`` of length p, ``hidden`` (p, k).
-    """
+    """Products of powers of parameters that outputs tell, where ``hidden`` (p, k) are changes that they do not."""
     p, k = hidden.shape
     if p == k:
         return []

@@ -57,10 +57,7 @@ class Product:
 
 @dataclass(frozen=True)
 class Identified:
-    """Parameters that records of outputs tell, and those that they do not.
-
-    Shapes: ``noise`` (ny,), ``expected_noise`` (ny,).
-    """
+    """Parameters that records of outputs tell, and those that they do not."""
 
     system: System
     standard_errors: dict[str, float | None]

@@ -19,10 +19,7 @@ MOST_ROWS = 60_000  # motions simulated at once
 
 @dataclass(frozen=True)
 class Windows:
-    """Equally long stretches of records, each with a start of its own.
-
-    Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), ``x0`` (n, nx).
-    """
+    """Equally long stretches of records, ``y`` (steps + 1, n, ny), each with a start of its own."""
 
     y: np.ndarray
     u: np.ndarray
@@ -30,10 +27,7 @@ class Windows:
 
 
 class Shooting:
-    """The least squares of one set of windows.
-
-    Shapes: ``unit`` (p,).
-    """
+    """The least squares of one set of windows. Shapes: ``unit`` (p,)."""
 
     def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
         self.system, self.dt, self.unit, self.names = system, dt, unit, tuple(limits)
@@ -69,10 +63,7 @@ class Shooting:
 
 @dataclass
 class Motions:
-    """Starts of windows with what follows from them.
-
-    Shapes: ``x0`` (n, nx), ``y``, ``r`` (steps + 1, n, ny), ``each`` (n,).
-    """
+    """Starts (n, nx) of windows with what follows: ``y`` and residuals ``r`` (steps + 1, n, ny)."""
 
     x0: np.ndarray
     y: np.ndarray

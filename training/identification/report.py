@@ -13,10 +13,7 @@ SHOWN = 3  # records that took no part
 
 
 def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
-    """Correlation of residuals with those of so many samples before.
-
-    Shapes: ``residuals`` (steps + 1, n); returns (lags,).
-    """
+    """Correlation (lags,) of residuals (steps + 1, n) with those of so many samples before."""
     r = residuals - np.nanmean(residuals)
     products = [np.nanmean(r[lag:] * r[:-lag]) for lag in range(1, min(lags, len(r) - 1) + 1)]
     return np.array(products) / max(np.nanmean(r**2), 1e-300)

@@ -171,7 +171,7 @@ def shoot(
     for others, as of friction, tell the ``noise`` instead. All windows count then, by the share 1 / (1 + mean square of
     their residuals over the noise's): the less, the worse they are explained.
 
-    Shapes: ``theta`` (p,), ``noise`` of length ny.
+    Shapes: ``theta`` (p,).
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):
@@ -305,11 +305,7 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
 
 
 def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What parameters change in the outputs beyond what starts make up for.
-
-    Shapes: ``J`` (steps + 1, n, ny, nx + p), ``weight`` (ny,); returns ``curvature`` (n, p, p), ``beyond`` (steps + 1,
-    n, ny, p), ``by_parameters`` (n, nx, p).
-    """
+    """What parameters change in the outputs beyond what starts make up for."""
     H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
     by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
     beyond = J[..., nx:] + np.einsum("knyx,nxp->knyp", J[..., :nx], by_parameters)

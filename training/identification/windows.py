@@ -151,10 +151,7 @@ def _unsettled(fit: Fit) -> tuple[bool, float]:
 
 
 def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarray], length: int) -> Windows:
-    """Cut windows of one length out of records.
-
-    Shapes: ``length`` of length : int.
-    """
+    """Cut windows of one length out of records."""
 
     def cut(values: Sequence[np.ndarray], samples: int) -> np.ndarray:
         return np.stack([values[index][k : k + samples] for index, k in starts], 1)
@@ -165,10 +162,7 @@ def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarr
 
 @dataclass(frozen=True)
 class Prediction:
-    """Outputs of a window of a record that took no part in the fit, predicted from the window's first half.
-
-    Shapes: ``y`` (steps + 1, ny).
-    """
+    """Outputs of a window of a record that took no part in the fit, predicted from the window's first half."""
 
     record: Record
     first: int
@@ -184,10 +178,7 @@ class Prediction:
 def predict(
     shooting: Shooting, theta: np.ndarray, records: Sequence[Record], guess: Guess, *, first: int, length: int
 ) -> list[Prediction]:
-    """Predict the outputs of records from half of a window at their beginning.
-
-    Shapes: ``theta`` (p,), ``length`` of length : int.
-    """
+    """Predict the outputs of records from half of a window at their beginning."""
     chosen = [record for record in records if len(record.y) > first + length]
     if not chosen:
         return []

@@ -27,20 +27,14 @@ JUDGED = 1000  # courses that are not learned from
 
 @dataclass(frozen=True)
 class Courses:
-    """Motions from many states, over up to ``SAMPLES`` samples, each under an input that is held.
-
-    Shapes: ``x`` (samples + 1, n, nx), ``u`` (n, nu).
-    """
+    """Motions (samples + 1, n, nx) from many states, over up to ``SAMPLES`` samples, under inputs that are held."""
 
     x: np.ndarray
     u: np.ndarray
 
 
 def draw_courses(system: System, x: np.ndarray, u: np.ndarray, dt: float, *, samples: int = SAMPLES) -> Courses:
-    """Simulate motions.
-
-    Shapes: ``x`` (n, nx), ``u`` (n, nu).
-    """
+    """Simulate motions. Shapes: ``x`` (n, nx), ``u`` (n, nu)."""
     x, u, samples = x[:COURSES], u[:COURSES], min(samples, SAMPLES)
     try:
         later = simulate(system, x, samples, dt, u=np.broadcast_to(u, (samples, *u.shape)) if u.shape[1] else None)

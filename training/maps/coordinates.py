@@ -32,10 +32,7 @@ class Coordinates:
 
 
 def coordinates(z: np.ndarray, noise: np.ndarray, silent: np.ndarray | None = None) -> Coordinates:
-    """Find the coordinates for a filter's states.
-
-    Shapes: ``z`` (n, size), ``noise`` (size, size), ``silent`` (size, k).
-    """
+    """The coordinates for ``z`` (n, size) under ``noise`` (size, size), without the directions ``silent`` (size, k)."""
     if silent is not None and silent.size:
         telling = np.eye(len(silent)) - silent @ np.linalg.pinv(silent)
         rest = coordinates(z @ telling.T, telling @ noise @ telling.T)

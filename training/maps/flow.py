@@ -50,10 +50,7 @@ LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of 
 
 @dataclass(frozen=True)
 class Increments:
-    """States, inputs, and how states change over a sample.
-
-    Shapes: ``x``, ``u``, ``change`` (n, nx), (n, nu) and (n, nx), ``x_offset``, ``x_scale`` (nx,).
-    """
+    """States (n, nx), inputs (n, nu), and how states change over a sample."""
 
     x: np.ndarray
     u: np.ndarray
@@ -108,10 +105,7 @@ def _log_uniform(rng: np.random.Generator, ends: tuple[float, float]) -> np.ndar
 
 
 class FlowProblem(nn.Module):
-    """The network of :class:`observers.Flow`, on what a polynomial leaves of the increments.
-
-    Shapes: ``u_scale`` (nu,), ``polynomial`` (nx, terms), ``gain`` (nx,).
-    """
+    """The network of :class:`observers.Flow`, on what a polynomial (nx, terms) leaves of the increments."""
 
     def __init__(
         self,
@@ -208,10 +202,7 @@ def fit_flow(
     device: torch.device | None = None,
     **of_plant: Any,
 ) -> Flow:
-    """Fit a flow.
-
-    Shapes: ``u_scale`` (nu,).
-    """
+    """Fit a flow. Shapes: ``u_scale`` (nu,)."""
     device = device or torch.device("cpu")
     problem = FlowProblem(increments, u_scale, degrees=degrees, small=small, device=device)
     optimise_at_once(
@@ -231,10 +222,7 @@ def fit_flow(
 
 
 def usual_error(flow: Flow, increments: Increments) -> np.ndarray:
-    """Find what a flow is usually off by after a sample.
-
-    Shapes: returns (nx,).
-    """
+    """Find what a flow is usually off by after a sample. Shapes: returns (nx,)."""
     return np.asarray(OF_MEDIAN * np.median(_missed(flow, increments), axis=0))
 
 
@@ -244,10 +232,7 @@ def _missed(flow: Flow, increments: Increments) -> np.ndarray:
 
 
 def usual_bend(flow: Flow, increments: Increments) -> np.ndarray | None:
-    """Find what a flow is usually off by where states move far within a sample.
-
-    Shapes: returns (nx,), or None.
-    """
+    """Find what a flow is usually off by where states move far within a sample. Shapes: returns (nx,), or None."""
     moved = ((increments.change / flow.x_scale) ** 2).sum(-1)
     far = moved >= np.quantile(moved, 1 - FARTHEST)
     shares = _missed(flow, increments)[far] / np.maximum(moved[far, None], TINY)

@@ -17,10 +17,7 @@ def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -
 
 
 def along(T: TensorMap, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Values of a map and its derivatives along a vector field.
-
-    Shapes: ``x`` (n, nx), ``f`` (n, nx); returns ``value`` (n, nz), ``derivative`` (n, nz).
-    """
+    """Values (n, nz) of a map and its derivatives along a vector field."""
     value, derivative = torch.func.jvp(T, (x,), (f,))  # type: ignore[misc]
     return value, derivative
 
@@ -28,9 +25,6 @@ def along(T: TensorMap, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor,
 def residual(
     T: TensorMap, x: torch.Tensor, *, f: torch.Tensor, h: torch.Tensor, A: torch.Tensor, B: torch.Tensor
 ) -> torch.Tensor:
-    """How far a map is from solving the equation, P(x) = dT/dx f - A T - B h.
-
-    Shapes: ``x`` (n, nx), ``f`` (n, nx), ``h`` (n, ny), ``A`` (nz, nz), ``B`` (nz, ny); returns (n, nz).
-    """
+    """How far a map is from solving the equation, P(x) = dT/dx f - A T - B h, at n states: (n, nz)."""
     value, derivative = along(T, x, f)
     return derivative - value @ A.T - h @ B.T

@@ -24,10 +24,7 @@ PER_AGE = 6  # samples of each run about each age: at a single one all motions m
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of an observer that tracks, and what it says of them.
-
-    Shapes: ``error`` (ages, n, nx), ``covariance``, ``in_doubt`` (ages, n, nx, nx).
-    """
+    """Errors (ages, n, nx) of an observer that tracks, and what it says of them."""
 
     error: np.ndarray
     covariance: np.ndarray
@@ -36,10 +33,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Regions:
-    """Where along runs errors are looked at.
-
-    Shapes: ``knots`` (m,).
-    """
+    """Where along runs errors are looked at. Shapes: ``knots`` (m,)."""
 
     knots: np.ndarray
     steps: int
@@ -65,10 +59,7 @@ class Regions:
         return len(LEVELS), len(self.knots)
 
     def factors(self, distances: list[np.ndarray], group: np.ndarray) -> np.ndarray:
-        """Find factors from errors.
-
-        Shapes: ``distances`` (ages, n) each, ``group`` (ages, n); returns (levels, knots).
-        """
+        """Find factors (levels, knots) from squared distances (ages, n) of errors."""
         return self._table(group, lambda i, cell: [self._factor(distances[i][cell], COVERAGE)])[..., 0]
 
     def factors_and_doubts(self, errors: list["Errors"], group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -127,10 +118,7 @@ class Regions:
 
 
 def usual_mean(values: np.ndarray, motion: np.ndarray) -> float:
-    """Return the mean of values along motions, as ``RUNS`` motions usually show it: the median of such means.
-
-    Shapes: ``values`` (n,), ``motion`` (n,).
-    """
+    """The mean of values along motions, as ``RUNS`` motions usually show it: the median of such means."""
     motions, motion = np.unique(motion, return_inverse=True)
     groups = max(1, len(motions) // RUNS)
     of = motion % groups
@@ -152,11 +140,7 @@ def distances_along(
     level: float | tuple[float, ...],
     ages: np.ndarray,
 ) -> np.ndarray:
-    """Run an observer from its reset on, and compare its errors with its own covariances.
-
-    Shapes: ``x``, ``y`` (steps + 1, n, nx) and (steps + 1, n, ny), ``u`` (steps, n, nu), ``level`` of length ny,
-    ``ages`` (m,); returns (m, n).
-    """
+    """Run an observer from its reset on; squared distances (ages, n) of its errors in its own covariances."""
     observer = KKLObserver(artifact, level)
     return np.array(
         [squared_distance(x[k] - observer.decode(), observer.covariance) for k in _at(observer, y, u, ages)]
@@ -205,10 +189,7 @@ def _at(observer: KKLObserver, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -
 
 
 def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Squared Mahalanobis distance e^T P^-1 e: of Gaussian errors it has the chi-square distribution with nx degrees.
-
-    Shapes: ``error`` (..., nx), ``covariance`` (..., nx, nx); returns (...,).
-    """
+    """e^T P^-1 e, (...,): of Gaussian errors it has the chi-square distribution with nx degrees."""
     scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # units may differ by orders of magnitude
     scaled = error / scale
     correlation = covariance / (scale[..., :, None] * scale[..., None, :])

@@ -12,10 +12,7 @@ LEAST = 0.1  # of the mean square of a scaled state, added to it: errors of smal
 
 @dataclass(frozen=True)
 class StateScale:
-    """Scaled states are (x - offset) / scale.
-
-    Shapes: ``offset`` (nx,), ``scale`` (nx,).
-    """
+    """Scaled states are (x - offset) / scale. Shapes: ``offset`` (nx,), ``scale`` (nx,)."""
 
     offset: np.ndarray
     scale: np.ndarray
@@ -24,10 +21,7 @@ class StateScale:
 
     @classmethod
     def of(cls, x: np.ndarray, scaling: Scaling, *, nx: int | None = None) -> Self:
-        """Find the scale of some states.
-
-        Shapes: ``x`` (..., nx).
-        """
+        """Find the scale of some states. Shapes: ``x`` (..., nx)."""
         axes = tuple(range(x.ndim - 1))
         if scaling == "relative":
             offset, scale = x.mean(axes), x.std(axes)

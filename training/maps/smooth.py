@@ -32,10 +32,7 @@ class Smooth:
 
 
 def decoder(artifact: Artifact, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0) -> Smooth:
-    """T_inv of free motion long after reset, in physical units.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """T_inv of free motion long after reset, in physical units."""
     inverse = (artifact.free_inverse or artifact.inverse).part(slice(artifact.nx))
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
     told = inverse.noise_features(measurement_noise, process_noise)
@@ -63,10 +60,7 @@ def _scaled(mlp: MLP, first: np.ndarray, bias: np.ndarray, *, scale: np.ndarray,
 
 
 def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
-    """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x).
-
-    Shapes: ``x`` (n, nx); returns (n, nz).
-    """
+    """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x): (n, nz)."""
     if artifact.forward is None:
         raise ValueError("this observer holds no forward map T")
     at, A, B = (torch.tensor(values) for values in (x, artifact.filter.A, artifact.filter.B))

@@ -68,10 +68,7 @@ def with_spread(
     progress: ProgressBars,
     device: torch.device,
 ) -> InverseMap:
-    """Give a map a network of its errors.
-
-    Shapes: ``ages`` (m,).
-    """
+    """Give a map a network of its errors. Shapes: ``ages`` (m,)."""
     problem = SpreadProblem(inverse, sampler, nx, width=WIDTH, depth=DEPTH, device=device)
     optimise_at_once(name, problem.network, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed)
     ones = np.ones((*(() if tables == 1 else (tables,)), len(LEVELS), len(ages)))

@@ -58,10 +58,7 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class Stretches:
-    """Parts of records side by side, each from a sample at which the filter may be switched on.
-
-    Shapes: ``x``, ``y``, ``u`` (steps + 1, n, nx), (steps + 1, n, ny) and (steps, n, nu).
-    """
+    """Parts of records side by side, each from a sample at which the filter may be switched on."""
 
     x: np.ndarray
     y: np.ndarray
@@ -126,10 +123,7 @@ def factors_along(
     rng: np.random.Generator,
     report: Callable[[float], object] | None = None,
 ) -> np.ndarray:
-    """Find factors for an observer's covariances.
-
-    Shapes: returns (levels, knots).
-    """
+    """Find factors for an observer's covariances. Shapes: returns (levels, knots)."""
     return regions.factors(_along(distances_along, artifact, runs, regions, rng, report), _known(runs, regions))
 
 
@@ -141,10 +135,7 @@ def factors_and_doubts_along(
     rng: np.random.Generator,
     report: Callable[[float], object] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find factors and doubts for the covariances of an observer that tracks.
-
-    Shapes: returns ``factors, doubts`` (levels, knots).
-    """
+    """Find factors and doubts (levels, knots) for the covariances of an observer that tracks."""
     return regions.factors_and_doubts(_along(errors_along, artifact, runs, regions, rng, report), _known(runs, regions))
 
 

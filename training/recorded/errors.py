@@ -31,10 +31,7 @@ def recorded_errors(
     *,
     measurement_noise: float | tuple[float, ...] = 0.0,
 ) -> RecordedErrors:
-    """Run an observer along records and compare its estimates with the recorded states.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """Run an observer along records and compare its estimates with the recorded states."""
     after = settling_time(artifact.filter) if after is None else after
     first = int(np.ceil(after / artifact.filter.dt - 1e-6))  # times are rounded
     apart, x = [np.zeros((0, artifact.nx))], [np.zeros((0, artifact.nx))]

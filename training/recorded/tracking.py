@@ -125,10 +125,7 @@ def check_trackable(config: RecordedConfig) -> None:
 
 
 def linear_output(records: Sequence[Record], known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Find C with y = C x.
-
-    Shapes: ``known`` (ny, nx); returns ``C`` (ny, nx), ``left`` (ny,).
-    """
+    """Find C with y = C x. Shapes: ``known`` (ny, nx); returns ``C`` (ny, nx), ``left`` (ny,)."""
     y, x = (np.concatenate([getattr(record, name) for record in records if record.x is not None]) for name in "yx")
     both = np.isfinite(np.column_stack([x, y])).all(-1)
     if not both.any():

@@ -34,10 +34,7 @@ def windows(records: Sequence[Record], linear: LinearFilter, *, ages: np.ndarray
 
 
 def samples_as_old(records: Sequence[Record], age: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the samples with a state that have so many before them.
-
-    Shapes: returns ``owner, sample`` (n,).
-    """
+    """Find the samples with a state that have so many before them. Shapes: returns ``owner, sample`` (n,)."""
     found = [
         np.zeros(0, int) if record.x is None else age + np.flatnonzero(~np.isnan(record.x[age:]).any(-1))
         for record in records
@@ -59,10 +56,7 @@ def restarted(
     sample: np.ndarray,
     age: int,
 ) -> np.ndarray:
-    """What the filter holds at some samples if it was switched on ``age`` samples before each.
-
-    Shapes: ``z`` (n, size), ``owner``, ``sample`` (m,); returns (m, size).
-    """
+    """What the filter holds at m samples if it was switched on ``age`` samples before each: (m, size)."""
     began = sample - age
     start = linear.start(taken([record.y for record in records], owner, began))
     power = np.linalg.matrix_power(linear.transition, age)

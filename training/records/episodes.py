@@ -14,10 +14,7 @@ from training.records.signals import Signals
 
 @dataclass(frozen=True)
 class Episode:
-    """What happened from a reset to the end.
-
-    Shapes: ``rewards`` (n,), ``infos`` (n + 1, ...).
-    """
+    """What happened from a reset to the end. Shapes: ``rewards`` (n,), ``infos`` (n + 1, ...)."""
 
     observations: Any
     actions: Any

@@ -19,10 +19,7 @@ Choose = Callable[[Sequence[str]], Sequence[str]]  # from the names of all colum
 
 
 def read_columns(path: Path, choose: Choose) -> tuple[tuple[str, ...], Columns]:
-    """Read some columns of a file.
-
-    Shapes: returns ``columns`` (n,).
-    """
+    """Read some columns of a file. Shapes: returns ``columns`` (n,)."""
     readers = {".npz": _npz, ".csv": _csv, ".parquet": _parquet}
     if path.suffix.lower() not in readers:
         raise ValueError(

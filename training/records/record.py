@@ -16,10 +16,7 @@ LARGEST = 1e100  # of a sample; sums of squares are finite up to there
 
 @dataclass(frozen=True)
 class Record:
-    """Samples from one run of a plant.
-
-    Shapes: ``t`` (n,), ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx).
-    """
+    """Samples from one run of a plant. Shapes: ``t`` (n,), ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx)."""
 
     name: str
     t: np.ndarray

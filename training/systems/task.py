@@ -16,10 +16,7 @@ MOST_SAMPLES = 100_000  # of an episode: all of them are kept while it is played
 
 @dataclass(frozen=True)
 class ControlTask:
-    """Bring a system to its target and hold it there.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """Bring a system to its target and hold it there."""
 
     system: str | System
     measurement_noise: float | tuple[float, ...] = 0.5

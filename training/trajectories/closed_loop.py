@@ -19,10 +19,7 @@ GROUPS = 50  # of closed-loop trajectories with a noise level and a time for whi
 
 @dataclass(frozen=True)
 class ClosedLoop(Trajectories):
-    """Trajectories under a controller that acts on an observer's estimate; z holds the noise that the observer saw.
-
-    Shapes: ``measurement_noise`` (n, ny).
-    """
+    """Trajectories under a controller that acts on an observer's estimate; z holds the noise that the observer saw."""
 
     measurement_noise: np.ndarray
 

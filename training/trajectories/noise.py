@@ -20,10 +20,7 @@ ALIKE = 0.5
 def draw_process_noise(
     system: System, level: float | np.ndarray, *, n: int, steps: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draw process noise, uniform in a box and held over each sampling interval.
-
-    Shapes: ``level`` (n,); returns (steps, n, nx).
-    """
+    """Process noise (steps, n, nx) of levels (n,), uniform in a box and held over each sampling interval."""
     bound = np.multiply.outer(level, system.scale)
     return np.asarray(bound * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))
 

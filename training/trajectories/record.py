@@ -54,10 +54,7 @@ class Motions:
 
 
 def recording_ages(steps: int, n: int) -> np.ndarray:
-    """Ages at which to record trajectories: half of them even in the logarithm, which catches the transient.
-
-    Shapes: returns (at most n,).
-    """
+    """Ages, n at most, at which to record: half of them even in the logarithm, which catches the transient."""
     late = max(2, n - n // 2)  # the first and the greatest age at least
     even = np.linspace(0, steps, late).round()
     early = np.geomspace(1, steps, n - late).round()
@@ -75,10 +72,7 @@ def record(
     motions: Motions | None = None,
     report: Callable[[float], object] = lambda done: None,
 ) -> Trajectories:
-    """Simulate trajectories and run the filter beside them.
-
-    Shapes: ``ages`` (m,).
-    """
+    """Simulate trajectories and run the filter beside them. Shapes: ``ages`` (m,)."""
     motions = motions or Motions(kinds=KINDS)
     if not linear.nu:
         motions = dataclasses.replace(motions, kinds=(), policy=None)

@@ -13,10 +13,7 @@ DRIVEN = ("steps", "sine", "pulses")
 def random_inputs(
     system: System, n: int, steps: int, *, dt: float, rng: np.random.Generator, kinds: tuple[str, ...] = KINDS
 ) -> np.ndarray:
-    """Draw random inputs, held over each sampling interval.
-
-    Shapes: returns (steps, n, nu).
-    """
+    """Draw random inputs, held over each sampling interval. Shapes: returns (steps, n, nu)."""
     return random_signals(system.u_max, n, steps, dt=dt, pace=system.pace, rng=rng, kinds=kinds)
 
 
@@ -30,10 +27,7 @@ def random_signals(
     rng: np.random.Generator,
     kinds: tuple[str, ...],
 ) -> np.ndarray:
-    """Draw random bounded signals, held over each sampling interval.
-
-    Shapes: ``bounds`` of length k; returns (steps, n, k).
-    """
+    """Draw random bounded signals (steps, n, k), held over each sampling interval."""
     out = np.zeros((steps, n, len(bounds)))
     t = np.arange(steps) * dt
     for row in range(n):

@@ -33,10 +33,7 @@ RUNS = 50  # on which its observer is measured
 
 
 def settings(system: System, spectrum: Spectrum, measurement_noise: Level) -> dict[str, Any]:
-    """Find the settings of a :class:`training.config.Config` that make an observer for some noise.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """Find the settings of a :class:`training.config.Config` that make an observer for some noise."""
     largest = np.maximum(HEADROOM * np.asarray(measurement_noise), multiple(system, LEAST_NOISE))
     return {
         "eigenvalues": spectrum.eigenvalues,
@@ -49,10 +46,7 @@ def settings(system: System, spectrum: Spectrum, measurement_noise: Level) -> di
 
 @dataclass(frozen=True)
 class Trial:
-    """An observer of free motion, trained for a spectrum: a job.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """An observer of free motion, trained for a spectrum: a job."""
 
     system: str
     parameters: Mapping[str, float]

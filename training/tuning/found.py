@@ -24,10 +24,7 @@ EXTENDED = "default's real ones and more"
 
 @dataclass(frozen=True)
 class Found:
-    """What tuning found for a system.
-
-    Shapes: ``noise`` of length ny.
-    """
+    """What tuning found for a system."""
 
     system: System
     noise: Level

@@ -78,10 +78,7 @@ def judge(
     seed: int = 0,
     report: Callable[[float], object] = lambda share: None,
 ) -> Judged:
-    """Judge the intervals of :mod:`training.smoothness` and the paper's.
-
-    Shapes: ``measurement_noise`` of length ny.
-    """
+    """Judge the intervals of :mod:`training.smoothness` and the paper's."""
     probe = Probe(system, dt, duration, seed=seed)
     candidates, papers = intervals(system, dt), Spectrum(papers_spectrum(system))
     choices, found = list[Choice](), list[Smoothness]()

@@ -137,10 +137,7 @@ class Probe:
         return np.unique([_rounded(w) for w in at if w > 0])
 
     def response(self, spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Run the filter with some spectrum along the motions.
-
-        Shapes: returns (ages, motions, size), (ages, motions, nx, size), (ages, size, size).
-        """
+        """z, its derivatives by the start and the noise's covariance, by age, of the filter with some spectrum."""
         linear = spectrum.filter(self.system.ny, self.dt)
         steps, n, ny, nx = self.signal.shape
         signals = np.moveaxis(self.signal, -1, 2).reshape(steps, n * nx, ny)
@@ -149,24 +146,15 @@ class Probe:
         return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages).sum(1)
 
     def error(self, spectrum: Spectrum, measurement_noise: Level) -> float:
-        """Predict the error of the best decoder.
-
-        Shapes: ``measurement_noise`` of length ny.
-        """
+        """Predict the error of the best decoder."""
         return self._relative(self._information(*self.response(spectrum), measurement_noise))
 
     def least(self, measurement_noise: Level) -> float:
-        """Predict the error of whoever knows the equations and remembers every sample of y.
-
-        Shapes: ``measurement_noise`` of length ny.
-        """
+        """Predict the error of whoever knows the equations and remembers every sample of y."""
         return self._relative(self._all_information(measurement_noise))
 
     def error_of_states(self, spectrum: Spectrum | None, measurement_noise: Level) -> np.ndarray:
-        """Predict the error of the best decoder, or the least possible, for each state.
-
-        Shapes: ``measurement_noise`` of length ny; returns (nx,).
-        """
+        """Predict the error of the best decoder, or the least possible, for each state."""
         if spectrum is None:
             information = self._all_information(measurement_noise)
         else:
@@ -174,10 +162,7 @@ class Probe:
         return np.asarray(self.share @ np.linalg.norm(self._left(information), axis=-1).mean(1))
 
     def unknown_of_starts(self, measurement_noise: Level) -> np.ndarray:
-        """Predict what all of y leaves unknown of where a run started.
-
-        Shapes: ``measurement_noise`` of length ny; returns (nx, nx).
-        """
+        """Predict what all of y leaves unknown of where a run started: a covariance (nx, nx)."""
         known = np.linalg.cholesky(self._known).T
         root = known @ _inverse_root(self._all_information(measurement_noise)[-1] + self._known)
         return np.asarray((root @ root.mT).mean(0))
@@ -214,10 +199,7 @@ class Probe:
         return found
 
     def choose(self, measurement_noise: Level, most: int = 21, anew: bool = False) -> list[Choice]:
-        """Choose spectra of more and more modes, each the one before and the mode, or pair, that helps most.
-
-        Shapes: ``measurement_noise`` of length ny.
-        """
+        """Choose spectra of more and more modes, each the one before and the mode, or pair, that helps most."""
         z, Z, P = self._of_library
         ny, everything = self.system.ny, self.start + self.library
         size, n = everything.modes, len(everything.eigenvalues)
@@ -255,10 +237,7 @@ class Probe:
             found.append(Choice(chosen, error))
 
     def bessel(self, measurement_noise: Level, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
-        """Find Bessel filters to compare with.
-
-        Shapes: ``measurement_noise`` of length ny.
-        """
+        """Find Bessel filters to compare with."""
         found, cutoffs = [], list(cutoffs)
         for order in orders:
             options = []

@@ -42,6 +42,7 @@ IN_ENVIRONMENTS = {
     "y": "y",
 }
 PANELS_IN_A_ROW = 3
+NARROWEST = 7.0  # inches, of a figure with its title
 POINTS = 60  # of a learning curve
 WINDOW = 0.05  # share of a training's steps over which a learning curve is averaged
 
@@ -216,7 +217,7 @@ def draw_scores(path: Path, rows: "pd.DataFrame", kinds: Mapping[str, str], titl
     found, tasks = cells(rows), list(dict.fromkeys(rows.task))
     columns = min(PANELS_IN_A_ROW, max(1, len(tasks)))
     lines = -(-len(tasks) // columns)
-    with drawing(path, 2.6 * columns + 1.5, 2.6 * lines + 0.6) as figure:
+    with drawing(path, max(NARROWEST, 2.6 * columns + 1.5), 2.6 * lines + 0.6) as figure:
         axes = figure.subplots(max(1, lines), columns, sharey=True, squeeze=False).ravel()
         for ax, task in zip(axes, tasks):
             _draw_panel(ax, [found.get((task, kind)) for kind in kinds][::-1])

@@ -31,6 +31,7 @@ MEASURES = (
 )
 NRMSE = re.compile(r"nrmse\d+")  # columns of results.csv
 NEVER = 1e12  # stands for an infinite time or error, of which no quantile can be taken
+NARROWEST = 7.0  # inches, of a figure with its title
 DOMAINS = {"X": "starts in X", "1.5X": "starts in 1.5X \\ X", "2X": "starts in 2X \\ X"}
 
 
@@ -194,7 +195,8 @@ def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figu
     summary = summarise(results, "smape").set_index(["system", "method", "starts", "noise"])
     domains = [domain for domain in DOMAINS if domain in set(results.starts)]
     levels = sorted(set(results.noise), key=_size)
-    size = (2.4 + 0.9 * len(systems) * len(levels), 1.4 + (0.3 + 0.24 * len(labels)) * len(domains))
+    width = max(NARROWEST, 2.4 + 0.9 * len(systems) * len(levels))
+    size = (width, 1.4 + (0.3 + 0.24 * len(labels)) * len(domains))
     image: Any = None
     with style():
         figure = Figure(figsize=size)

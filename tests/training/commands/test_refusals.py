@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import linear_system
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from recorded_runs import as_csv, swing
@@ -90,8 +91,8 @@ def _records():
         ("demo --live --duration 3", "leave out --duration and --gif beside --live"),
     ],
 )
-def test_refused(arguments, message, capsys, monkeypatch):
-    monkeypatch.setenv("MPLBACKEND", "agg")
+def test_refused(arguments, message, capsys):
+    plt.switch_backend("agg")  # stable-baselines3 sets another one when parts of it are imported
     with pytest.raises(SystemExit) as end:
         main(arguments.split())
     said = f"{end.value}\n" if end.value.code != 2 else capsys.readouterr().err

@@ -22,10 +22,7 @@ LARGEST_SCALED = 10.0  # of a normalised observation, as stable-baselines3 cuts 
 
 @dataclass(frozen=True)
 class Player:
-    """A deterministic policy, the environment that it was trained in and what it is shown of it.
-
-    Shapes: ``mean``, ``scale`` (width,).
-    """
+    """A deterministic policy, the environment that it was trained in and what it is shown of it."""
 
     network: MLP
     head: Head
@@ -83,10 +80,7 @@ class Player:
         return env
 
     def act(self, observation: np.ndarray, action_space: gym.Space[Any]) -> Any:
-        """Act.
-
-        Shapes: ``observation`` (width,) or (n, width).
-        """
+        """Act. Shapes: ``observation`` (width,) or (n, width)."""
         if self.mean is not None:
             observation = np.clip((observation - self.mean) / self.scale, -LARGEST_SCALED, LARGEST_SCALED)
         out = self.network(np.asarray(observation, dtype=np.float32))

@@ -6,10 +6,7 @@ import torch
 
 
 class Batch(NamedTuple):
-    """Samples on which the inverse is fitted.
-
-    Shapes: ``inputs`` (batch, inputs), ``x`` (batch, nx), ``weight`` (batch,), ``cell`` (batch,).
-    """
+    """Samples on which the inverse is fitted, with the weight and the cell of each."""
 
     inputs: torch.Tensor
     x: torch.Tensor
