@@ -168,7 +168,7 @@ NONE = [np.nan] * 3
     [
         ([0.9, 0.04, 0.01], [np.nan, 0.5, 0.5], "determined", 1),
         ([0.5, 0.3, 0.29], [np.nan, 0.5, 0.5], "partly (29 % left)", 1),
-        ([0.9, 0.5, 0.4], [np.nan, 0.3, 0.03], "up to a constant", 2),
+        ([0.9, 0.41, 0.4], [np.nan, 0.3, 0.03], "up to a constant", 2),
         ([0.9, 0.07, 0.07], [np.nan, 0.02, 0.02], "partly (7 % left)", 1),  # its change is no better seen
         ([0.99, 0.95, 1.0], NONE, "not determined", None),
         (NONE, NONE, "never moves", None),
