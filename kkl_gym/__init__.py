@@ -32,10 +32,7 @@ for _name, _id in ENV_IDS.items():
 
 if OWN_ID not in gym.registry:
     gym.register(
-        OWN_ID,
-        entry_point="kkl_gym.own:single",
-        vector_entry_point="kkl_gym.own:vector",
-        max_episode_steps=5000,
+        OWN_ID, entry_point="kkl_gym.own:single", vector_entry_point="kkl_gym.own:vector", max_episode_steps=5000
     )
 
 __all__ = [

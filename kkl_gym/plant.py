@@ -140,8 +140,6 @@ def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarra
     Evaluated at random states, and at corners, faces' centres and the centre, which must have an output. For more than
     six states these are not all, but for each output the two corners to which it rises and falls from the centre. They
     are exact for outputs that are monotone in each state.
-
-    Shapes: ``margin`` (ny,); returns ``low, high`` (ny,).
     """
     low, high = np.array(system.bounds, dtype=float).T
     rng, nx = np.random.default_rng(0), system.nx

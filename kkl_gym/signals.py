@@ -23,8 +23,6 @@ class Outputs:
 
     Observations are read as :func:`gymnasium.spaces.flatten` writes them: boxes row by row, the parts of a Dict or
     Tuple one after the other, Discrete ones one-hot. Of a Dict, keys that are not measured are not looked at.
-
-    Shapes: ``low``, ``high`` (ny,).
     """
 
     def __init__(self, space: Space, measured: Entries | None, angles: Angles, *, source: str) -> None:

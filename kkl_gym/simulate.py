@@ -143,8 +143,6 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
 
     For motions that change faster and faster within the interval, as when something ignites, and to make sure of an
     escape: steps that were too long at the end may have led out of the bounds by themselves.
-
-    Shapes: ``x`` of length nx, ``u`` of length nu, ``w`` of length nx, ``end`` of length nx; returns of length nx.
     """
     if system.discrete:
         return end

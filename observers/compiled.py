@@ -301,13 +301,7 @@ def single_network(activation: str) -> Callable[..., None]:
     active = active_kernel(activation)
 
     @fast_part
-    def evaluate(
-        x: np.ndarray,
-        packed: np.ndarray,
-        widths: np.ndarray,
-        between: np.ndarray,
-        out: np.ndarray,
-    ) -> None:
+    def evaluate(x: np.ndarray, packed: np.ndarray, widths: np.ndarray, between: np.ndarray, out: np.ndarray) -> None:
         h, into, at = between[0], between[1], 0
         for j in range(len(x)):
             h[j] = x[j]

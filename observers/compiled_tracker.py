@@ -26,8 +26,6 @@ class CompiledTracker:
     Where a method takes a state, that is an array (n, width) in memory without gaps, which is written over. A row holds
     the estimate (nx), its covariance (nx^2), the running mean square of the innovations, that of their trend, the
     number of samples of which anything was there, and the trend itself (ny). A single sample has a state of one row.
-
-    Shapes: ``C`` (ny, nx).
     """
 
     def __init__(

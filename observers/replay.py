@@ -70,12 +70,7 @@ def along(
 
 
 def replayed(
-    observer: Any,
-    y: np.ndarray,
-    u: np.ndarray | None,
-    x0: np.ndarray | None,
-    *,
-    of: Callable[[Any], np.ndarray],
+    observer: Any, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, *, of: Callable[[Any], np.ndarray]
 ) -> np.ndarray:
     """A property of a KKLObserver at each sample of a record, through which it is run."""
     y, u, gaps = checked_record(observer.artifact, y, u)

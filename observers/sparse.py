@@ -93,12 +93,7 @@ def _single_kernel() -> Callable[..., None]:
 def _kernel() -> Callable[..., None]:
     @kernel()
     def update(
-        gains: np.ndarray,
-        places: np.ndarray,
-        mixing: np.ndarray,
-        z: np.ndarray,
-        terms: np.ndarray,
-        z_next: np.ndarray,
+        gains: np.ndarray, places: np.ndarray, mixing: np.ndarray, z: np.ndarray, terms: np.ndarray, z_next: np.ndarray
     ) -> None:
         n, size = z.shape
         for row in range(n):

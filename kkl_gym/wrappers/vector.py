@@ -118,8 +118,6 @@ class VectorEstimate(VectorWrapper):
 
         Estimates are drawn on :class:`kkl_gym.KKLVectorEnv`, where the observers report ``x_hat``. For Sync and Async
         vectors put :class:`kkl_gym.KKLObservation` into each environment.
-
-        Shapes: returns (height, width, 3), length num_envs, or None.
         """
         env: Any = self.env
         return env.render() if self._trails is None else env.unwrapped.draw(self._trails)

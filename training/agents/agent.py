@@ -13,15 +13,7 @@ from kkl_gym import SYSTEMS, System, get_system
 from observers import MLP, storage
 from observers.errors import ArtifactError
 from observers.names import resolve
-from training.agents.information import (
-    EKF_PROCESS_NOISE,
-    INFORMATION,
-    OBSERVED,
-    STACKED,
-    Features,
-    Information,
-    make,
-)
+from training.agents.information import EKF_PROCESS_NOISE, INFORMATION, OBSERVED, STACKED, Features, Information, make
 from training.jobs import describe
 from training.systems import ControlTask
 

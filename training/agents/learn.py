@@ -99,12 +99,7 @@ def learn(
 
 
 def learn_recurrent(
-    task: ControlTask,
-    of: Literal["y", "state"],
-    folder: Path,
-    *,
-    seed: int = 0,
-    timesteps: int | None = None,
+    task: ControlTask, of: Literal["y", "state"], folder: Path, *, seed: int = 0, timesteps: int | None = None
 ) -> Callable[[], Policy]:
     """Train RecurrentPPO on the noisy output, or on the full state as a control, each with the action before."""
     name, settings = hyperparameters(task, "ppo_lstm")

@@ -30,13 +30,7 @@ def default_levels(artifact: Artifact) -> list[Level]:
 
 
 def judged(
-    artifact: Artifact,
-    system: System,
-    trajectories: UnseenTrajectories,
-    *,
-    level: Level,
-    seed: int,
-    ekf: bool,
+    artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, level: Level, seed: int, ekf: bool
 ) -> list[dict[str, Any]]:
     """Judge error bars, and a Kalman filter's covariance beside them, on trajectories."""
     dt, steps = artifact.filter.dt, len(trajectories.x)

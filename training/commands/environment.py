@@ -121,14 +121,7 @@ def train_in_environment(
     from training.agents.any_environment.learning import learn_to_play
 
     task = options.task(env_id, measurement_noise)
-    learn_to_play(
-        task,
-        information,
-        folder,
-        aggregate=options.aggregate,
-        progress=progress,
-        **how,
-    )
+    learn_to_play(task, information, folder, aggregate=options.aggregate, progress=progress, **how)
     path = folder / "agent.safetensors"
     if path.exists():  # recurrent policies are no perceptrons, and leave the learning curve alone
         show_returns(progress, Player.read(path), 100, trusted=env_id)

@@ -11,15 +11,7 @@ from rich.table import Column, Table
 from kkl_gym import SYSTEMS
 from observers.storage import require_writable, write
 from training import markdown
-from training.commands.options import (
-    NoiseLevel,
-    Observers,
-    OwnPolicy,
-    OwnSystem,
-    Seconds,
-    read_observers,
-    read_policy,
-)
+from training.commands.options import NoiseLevel, Observers, OwnPolicy, OwnSystem, Seconds, read_observers, read_policy
 from training.evaluation.levels import beyond, level_for
 from training.figures import ALARM, ESTIMATE, MEASURED, RIVAL, TRUTH, drawing
 from training.progress import progress_bars

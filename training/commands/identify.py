@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from kkl_gym.system import System
 from kkl_gym.systems import get_system, system_of
 from observers import Artifact
 from observers.names import resolve
@@ -75,7 +74,7 @@ class Identify:
             records = self.records.read(progress, system)
             learned = identify(
                 system,
-                limits(system, unknown),
+                limits(unknown),
                 records,
                 folder,
                 dt=self.dt,
@@ -139,7 +138,7 @@ class Adapt:
                 system,
                 records,
                 folder,
-                unknown=limits(system, guesses),
+                unknown=limits(guesses),
                 settings=self.training,
                 resume=self.resume,
                 console=progress,
@@ -161,7 +160,7 @@ def merged(unknown: Sequence[Sequence[tuple[str, tuple[float, ...]]]]) -> dict[s
     return dict(pairs)
 
 
-def limits(system: System, unknown: Mapping[str, tuple[float, ...]]) -> dict[str, tuple[float, float]]:
+def limits(unknown: Mapping[str, tuple[float, ...]]) -> dict[str, tuple[float, float]]:
     """Limits of unknown parameters: those given, or ten times as large and small as the first guess."""
     found: dict[str, tuple[float, float]] = {}
     for name, (guess, *ends) in unknown.items():

@@ -1,1 +1,1 @@
-"""Judging an observer: errors on unseen trajectories, coverage, faults, certificates, reports."""
+"""Judging an observer: errors on unseen trajectories, coverage, faults, reports."""

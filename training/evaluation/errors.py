@@ -207,12 +207,7 @@ def errors(
 
 
 def estimates(
-    artifact: Artifact,
-    system: System,
-    trajectories: UnseenTrajectories,
-    *,
-    measurement_noise: Level,
-    seed: int,
+    artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
     """What an observer makes of test trajectories, (steps + 1, n, nx): its errors are what :func:`errors` measures."""
     level = noise_levels("measurement_noise", measurement_noise, system.ny)

@@ -5,7 +5,6 @@ An estimate that is not finite counts as one infinitely far away.
 
 import numpy as np
 
-SETTLED = 0.1  # of a trajectory's root mean square size
 STILL = 1e-12  # of a state's size: a standard deviation below it is rounding
 
 
@@ -38,24 +37,9 @@ def percentage_error(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndar
     """Symmetric absolute percentage error at each step, (steps - skip, n), whose mean is :func:`smape`."""
     x, x_hat = _compared(x, x_hat, skip)
     size = np.linalg.norm(x, axis=-1) + np.linalg.norm(x_hat, axis=-1)
-    return np.asarray(_percentage(np.linalg.norm(x - x_hat, axis=-1), size))
-
-
-def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """SMAPE with absolute values of the components in place of norms, averaged over steps and components.
-
-    This is what the notebooks released with the paper print, after the first 20 % of the steps.
-
-    Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,).
-    """
-    x, x_hat = _compared(x, x_hat, skip)
-    return np.asarray(_percentage(np.abs(x - x_hat), np.abs(x) + np.abs(x_hat)).mean((0, 2)))
-
-
-def rmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Root of the mean over the steps of |x - x_hat|^2. Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,)."""
-    x, x_hat = _compared(x, x_hat, skip)
-    return np.asarray(np.sqrt(((x - x_hat) ** 2).sum(-1).mean(0)))
+    error = np.linalg.norm(x - x_hat, axis=-1)
+    ratio = np.divide(error, size, out=np.zeros_like(size), where=(size > 0) & np.isfinite(size))
+    return np.where(np.isfinite(size), 200.0 * ratio, 200.0)
 
 
 def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
@@ -96,24 +80,7 @@ def by_state(values: np.ndarray) -> dict[str, np.ndarray]:
     return {f"nrmse{i + 1}": column for i, column in enumerate(values.T)}
 
 
-def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
-    """Time from which |x - x_hat| stays below a tenth of the root mean square of |x|.
-
-    Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,).
-    """
-    x, x_hat = _compared(x, x_hat, 0)
-    limit = SETTLED * np.sqrt((x**2).sum(-1).mean(0))
-    outside = np.linalg.norm(x - x_hat, axis=-1) > limit
-    last = len(x) - 1 - outside[::-1].argmax(0)
-    return np.where(outside.any(0), np.where(last == len(x) - 1, np.inf, (last + 1) * dt), 0.0)
-
-
 def _compared(x: np.ndarray, x_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np.ndarray]:
     if x.shape != x_hat.shape or not 0 <= skip < len(x):
         raise ValueError(f"cannot compare {x.shape} with {x_hat.shape} after {skip} steps")
     return x[skip:], np.where(np.isfinite(x_hat), x_hat, np.inf)[skip:]
-
-
-def _percentage(error: np.ndarray, size: np.ndarray) -> np.ndarray:
-    ratio = np.divide(error, size, out=np.zeros_like(size), where=(size > 0) & np.isfinite(size))
-    return np.where(np.isfinite(size), 200.0 * ratio, 200.0)

@@ -211,11 +211,7 @@ def _parameters(
         "dt": dt,
         "records": [record.fingerprint for record in records],
     }
-    with (
-        claimed_run(folder, identity, resume),
-        log_to(folder) as log,
-        progress_bars(console, folder / LOG) as progress,
-    ):
+    with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console, folder / LOG) as progress:
         found = estimate_parameters(
             system,
             unknown,

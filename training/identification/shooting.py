@@ -102,8 +102,6 @@ def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
     """Which windows are so short that what is still unknown of the parameters changes their outputs linearly.
 
     Beyond that, chaos makes least squares blind: they have many minima, and their curvature says nothing of errors.
-
-    Shapes: returns (n,).
     """
     theta, problem = np.array(list(fit.parameters.values())), Problem(shooting, windows)
     at = problem.follow(theta, settled(shooting, theta, windows), problem.rows)
@@ -170,8 +168,6 @@ def shoot(
     Windows that the model explains much worse than most do not count. Where a model is good for some motions and rough
     for others, as of friction, tell the ``noise`` instead. All windows count then, by the share 1 / (1 + mean square of
     their residuals over the noise's): the less, the worse they are explained.
-
-    Shapes: ``theta`` (p,).
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):

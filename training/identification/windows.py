@@ -46,8 +46,6 @@ def fit_windows(
     growth, which no start explains for long: residuals are no longer white then, and standard errors that follow the
     scatter of windows fall no further. Chaos also makes many minima. So longer windows are fitted from two sides, a
     standard error of the shorter ones away, and count only if both fits come to rest, and in one place.
-
-    Shapes: ``guesses`` (p,) each.
     """
     longest = min(max(len(record.y) for record in records) - 1 - first, MOST_SAMPLES)
     best, starts, length = _first_fit(shooting, guesses, records, guess, first=first, longest=longest)

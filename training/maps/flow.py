@@ -64,13 +64,7 @@ class Increments:
 
 
 def draw_increments(
-    system: System,
-    dt: float,
-    *,
-    duration: float,
-    nu: int,
-    rng: np.random.Generator,
-    policy: Controller | None = None,
+    system: System, dt: float, *, duration: float, nu: int, rng: np.random.Generator, policy: Controller | None = None
 ) -> Increments:
     """Simulate motions, and from states about them one sample further."""
     steps = round(duration / dt)
@@ -108,13 +102,7 @@ class FlowProblem(nn.Module):
     """The network of :class:`observers.Flow`, on what a polynomial (nx, terms) leaves of the increments."""
 
     def __init__(
-        self,
-        increments: Increments,
-        u_scale: np.ndarray,
-        *,
-        degrees: Sequence[int],
-        small: bool,
-        device: torch.device,
+        self, increments: Increments, u_scale: np.ndarray, *, degrees: Sequence[int], small: bool, device: torch.device
     ) -> None:
         super().__init__()
         inputs = scaled_inputs(increments, u_scale)

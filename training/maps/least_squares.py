@@ -69,8 +69,6 @@ def solve_forward(
 
     Collocation points should lie along motions, because the equation transports T along them: a box that motions leave
     and enter holds T only up to what came in, and its corners are where it then goes wrong.
-
-    Shapes: ``points`` (n, nx).
     """
     x = points[rng.permutation(len(points))[: POINTS * features]]
     offset, scale = x.mean(0), np.where(x.std(0) > 0, x.std(0), 1.0)

@@ -14,8 +14,6 @@ def windows(records: Sequence[Record], linear: LinearFilter, *, ages: np.ndarray
 
     The filter is linear. One that starts at sample k therefore differs from one that has run since the record's
     beginning by transition^age times their difference at k, and no window is filtered by itself.
-
-    Shapes: ``ages`` (m,).
     """
     z = [along(linear, record) for record in records]
     xs, zs = [], []

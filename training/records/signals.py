@@ -17,9 +17,6 @@ class Signals:
 
     A measured, an input or a hidden signal is the name of a column, or ``cos(column)`` or ``sin(column)`` of an angle
     in rad.
-
-    Shapes: ``measured`` of length ny, default (), ``inputs`` of length nu, default (), ``hidden`` of length nx, default
-    ().
     """
 
     time: str = ""

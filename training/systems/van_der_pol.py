@@ -12,11 +12,7 @@ PROFILE = Profile(
     # number and ends are as measured, by the errors of trained observers.
     eigenvalues=evenly_spaced(15, -0.4, -20.0),
     # Slower modes have a rougher T; more of them average more of the noise.
-    spinn_settings={
-        "eigenvalues": evenly_spaced(11, -4.0, -16.0),
-        "noise_free_share": 0.2,
-        "high_noise_emphasis": 4.5,
-    },
+    spinn_settings={"eigenvalues": evenly_spaced(11, -4.0, -16.0), "noise_free_share": 0.2, "high_noise_emphasis": 4.5},
     # Its phase is the hardest of all to tell from noise. Slow complex modes at frequencies of y help there, as
     # `kkl-gym tune` chooses them, and so do more samples at high noise. No input within its bound leads the oscillator
     # out of X, so stronger ones do.

@@ -196,10 +196,7 @@ class _Run:
     ) -> np.ndarray:
         """Squared distances of the errors in units of the covariance, (ages, n)."""
         decoders = Decoders.of(
-            artifact,
-            slice(artifact.nx),
-            measurement_noise=level_of(artifact, level),
-            process_noise=process_noise,
+            artifact, slice(artifact.nx), measurement_noise=level_of(artifact, level), process_noise=process_noise
         )
         parts, x_hat = decoders.estimate(z, (self.regions.ages * artifact.filter.dt)[:, None])
         return squared_distance(x - x_hat, decoders.covariance(parts))

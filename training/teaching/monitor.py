@@ -118,9 +118,7 @@ def sound_trajectories(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories with process noise, every other one under random inputs if the map knows inputs.
 
-    Those that leave the system's bounds are drawn anew.
-
-    Shapes: returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
+    Those that leave the system's bounds are drawn anew. Returns ``x`` (steps + 1, n, nx) and ``u`` (steps, n, nu).
     """
     dt = artifact.filter.dt
     check_duration(duration, dt)

@@ -44,8 +44,6 @@ def record_closed_loop(
     find out by itself. For the same reason noise is not added afterwards, but is what the observer and through it the
     controller saw. Groups of trajectories differ in noise level, in how long an action is held, and in the level of
     process noise if the observer is told it. Trajectories of a group differ in how much is added to an action.
-
-    Shapes: ``ages`` (m,).
     """
     dt = artifact.filter.dt
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))

@@ -67,12 +67,7 @@ class Stacked(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorAr
     """
 
     def __init__(
-        self,
-        env: gym.Env[np.ndarray, Any],
-        count: int,
-        angles: Sequence[tuple[int, int]] = (),
-        *,
-        actions: bool = True,
+        self, env: gym.Env[np.ndarray, Any], count: int, angles: Sequence[tuple[int, int]] = (), *, actions: bool = True
     ) -> None:
         RecordConstructorArgs.__init__(self, count=count, angles=angles, actions=actions)
         gym.Wrapper.__init__(self, env)

@@ -7,11 +7,4 @@ from training.maps.samplers.trajectory import AGE_UNIT, TrajectorySampler
 
 Sampler = TrajectorySampler | ClosedLoopSampler | ForwardMapSampler
 
-__all__ = [
-    "AGE_UNIT",
-    "Batch",
-    "ClosedLoopSampler",
-    "ForwardMapSampler",
-    "Sampler",
-    "TrajectorySampler",
-]
+__all__ = ["AGE_UNIT", "Batch", "ClosedLoopSampler", "ForwardMapSampler", "Sampler", "TrajectorySampler"]

@@ -35,9 +35,7 @@ class TrajectorySampler:
     improve in proportion. Where parameters differ, motions of the system's own are in cells apart: their errors can be
     smaller, and in cells with the others they would count for little.
 
-    Shapes: ``measurement_noise_max`` of length ny, ``measurement_noise`` of length ny, default 0.5, ``error`` (size,
-    size), ``silent`` (size, k), ``noise_gain`` (modes,) or (ny, modes), ``measurement_noise_max``,
-    ``measurement_noise_unit`` (ny,).
+    Shapes: ``error`` (size, size), ``silent`` (size, k), ``noise_gain`` (modes,) or (ny, modes).
     """
 
     AGES_PER_BATCH = 32
