@@ -52,5 +52,5 @@ def restoring(path: Path) -> Iterator[None]:
     except (ValueError, KeyError, RuntimeError, TypeError, IndexError, AttributeError) as error:
         line = (str(error) if not isinstance(error, KeyError) else f"it lacks {error}").partition("\n")[0]
         raise ValueError(
-            f"the checkpoint {path} is damaged or of an older version, remove it to train that stage anew: {line}"
+            f"the checkpoint {path} is damaged or of another version, remove it to train that stage anew: {line}"
         ) from error
