@@ -45,7 +45,7 @@ def test_what_is_saved_is_loaded(path):
 def damaged(path):
     """A single line that names the file."""
     return pytest.raises(
-        ValueError, match=rf"\Athe checkpoint {re.escape(str(path))} is damaged or of an older.*: .+\Z"
+        ValueError, match=rf"\Athe checkpoint {re.escape(str(path))} is damaged or of another.*: .+\Z"
     )
 
 
