@@ -44,9 +44,7 @@ def test_what_is_saved_is_loaded(path):
 
 def damaged(path):
     """A single line that names the file."""
-    return pytest.raises(
-        ValueError, match=rf"\Athe checkpoint {re.escape(str(path))} is damaged or of another.*: .+\Z"
-    )
+    return pytest.raises(ValueError, match=rf"\Athe checkpoint {re.escape(str(path))} is damaged or of another.*: .+\Z")
 
 
 def test_a_flipped_bit_is_noticed_or_changes_nothing(path):
