@@ -3,22 +3,23 @@
 from observers.artifact import Artifact
 from observers.errors import ArtifactError
 from observers.expression import Expression
-from observers.factors import Factors
+from observers.factors import ErrorCovariance, Factors
 from observers.filter import LinearFilter
-from observers.flow import Flow
 from observers.forward import ForwardMap
 from observers.inverse import InverseMap
 from observers.loading import load
 from observers.monitor import Limits, Monitor
+from observers.motion import Equations, Flow, Motion
 from observers.names import shipped
 from observers.network import MLP
 from observers.observer import KKLObserver
-from observers.spread import Spread
 
 __all__ = [
     "MLP",
     "Artifact",
     "ArtifactError",
+    "Equations",
+    "ErrorCovariance",
     "Expression",
     "Factors",
     "Flow",
@@ -28,7 +29,7 @@ __all__ = [
     "Limits",
     "LinearFilter",
     "Monitor",
-    "Spread",
+    "Motion",
     "load",
     "shipped",
 ]

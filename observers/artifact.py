@@ -16,14 +16,13 @@ from observers import storage
 from observers.checks import is_finite, noise_levels, shown
 from observers.errors import ArtifactError
 from observers.expression import Expression
-from observers.factors import Factors
+from observers.factors import ErrorCovariance, Factors
 from observers.filter import LinearFilter
-from observers.flow import Flow
 from observers.forward import ForwardMap
 from observers.inverse import InverseMap
 from observers.monitor import Limits
+from observers.motion import Equations, Flow, Motion
 from observers.network import MLP
-from observers.spread import Spread
 
 FORMAT = 1
 USUAL_NOISE = 0.5  # standard deviation of the measurement noise where no other is given
@@ -55,9 +54,9 @@ class Artifact:
     free_inverse : InverseMap, optional
         T_inv of z_y alone, in use as long as no input has acted since reset. Motions without input keep to far fewer
         states than driven ones, which a map that knows of no input can rely on.
-    flow : Flow, optional
-        The system's motion over a sample. An observer that has it tracks: T_inv says where its estimate begins, and
-        from there the flow moves it and each sample corrects it.
+    motion : Motion, optional
+        The system's motion, by its equations or by a learned flow. An observer that has it tracks: a Kalman filter on
+        the motion carries the estimate, and T_inv initialises it.
     measurement_noise : float or tuple of float, length ny, default 0.5
         Standard deviation of the noise that is usual on each sample, of all outputs or each. Observers assume it where
         they are told nothing else. It is cut at the largest that the maps are told.
@@ -95,7 +94,7 @@ class Artifact:
     h: Expression | None = None
     limits: Limits | None = None
     free_inverse: InverseMap | None = None
-    flow: Flow | None = None
+    motion: Motion | None = None
     measurement_noise: float | tuple[float, ...] = USUAL_NOISE
     parameter_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     estimated_parameters: tuple[str, ...] = ()
@@ -127,9 +126,9 @@ class Artifact:
         free, nz = self.free_inverse, len(self.filter.A)
         if free is not None:
             self._check_free(free)
-        for spread in (self.inverse.spread, None if free is None else free.spread):
-            if spread is not None and spread.nx != self.nx:
-                raise ArtifactError(f"error bars of {spread.nx} states do not fit {self.nx} states")
+        for error in (self.inverse.error_covariance, None if free is None else free.error_covariance):
+            if error is not None and error.nx != self.nx:
+                raise ArtifactError(f"a covariance of {error.nx} states does not fit {self.nx} states")
         if self.forward is not None and (self.forward.mlp.inputs, self.forward.mlp.outputs) != (self.nx, nz):
             raise ArtifactError(
                 f"a forward map of {self.forward.mlp.inputs} states to {self.forward.mlp.outputs} values "
@@ -142,8 +141,8 @@ class Artifact:
                 f"an output h of {len(self.h.components)} components and {self.h.states} states does not fit {self.ny} "
                 f"outputs and {self.nx} states, or there is a C beside it"
             )
-        if self.flow is not None:
-            self._check_flow(self.flow)
+        if self.motion is not None:
+            self._check_motion(self.motion)
         if self.signals is not None:
             self._check_signals(self.signals)
         if self.environment is not None:
@@ -174,20 +173,20 @@ class Artifact:
         ]
         if process_noise[0] != process_noise[1]:
             raise ArtifactError("the maps of free and of driven motion differ in what they are told of process noise")
-        if (free.spread is None) != (driven.spread is None):
-            raise ArtifactError("of the maps of free and of driven motion one has error bars and the other has none")
+        if (free.error_covariance is None) != (driven.error_covariance is None):
+            raise ArtifactError("of the maps of free and of driven motion one has a covariance and the other has none")
 
-    def _check_flow(self, flow: Flow) -> None:
-        sizes, expected = (flow.nx, flow.nu, len(flow.least_measurement_noise)), (self.nx, self.nu, self.ny)
-        if sizes != expected:
-            raise ArtifactError(f"a flow of {sizes} states, inputs and outputs does not fit an observer of {expected}")
-        if self.inverse.spread is None or not self.knows_output:
-            raise ArtifactError("a flow needs error bars and the output h(x) beside it")
+    def _check_motion(self, motion: Motion) -> None:
+        sizes, expected = (motion.nx, len(motion.least_measurement_noise)), (self.nx, self.ny)
+        if sizes != expected or not motion.fits_inputs(self.nu):
+            raise ArtifactError(
+                f"a motion of {sizes} states and outputs, or its inputs, does not fit an observer of {expected} states "
+                f"and outputs and {self.nu} inputs"
+            )
+        if self.inverse.error_covariance is None or not self.knows_output:
+            raise ArtifactError("a motion needs T_inv's covariance and the output h(x) beside it")
         if self.parameter_ranges:
-            raise ArtifactError(f"a flow is of one plant, not of a range of {', '.join(self.parameter_ranges)}")
-        tables = {each.factors.ndim == 3 for each in (flow.factors, flow.free_factors) if each is not None}
-        if tables != {self.process_noise_max is not None}:
-            raise ArtifactError("factors of a flow must be by process noise if the map is told that, and only then")
+            raise ArtifactError(f"a motion is of one plant, not of a range of {', '.join(self.parameter_ranges)}")
 
     def _check_signals(self, signals: Mapping[str, Sequence[str]]) -> None:
         counts = {"measured": self.ny, "inputs": self.nu, "hidden": self.nx}
@@ -308,34 +307,22 @@ class Artifact:
 
     def require_known_start(self) -> None:
         """Raise ArtifactError unless an observer can begin at a known state: by T, or by tracking from there."""
-        if self.flow is None and self.signals is not None:
-            self.require_flow()
-        elif self.flow is None and self.forward is None:
+        if self.motion is None and self.forward is None:
             raise ArtifactError(
-                f"this map for {self.system!r} can begin at no known state: it holds no forward map T and no flow; "
-                "take one that does, as SYSTEM and SYSTEM-spinn of those that ship, or make one by kkl-gym tracking or "
-                "kkl-gym train SYSTEM --pipeline spinn"
+                f"this map for {self.system!r} can begin at no known state: it holds neither a motion nor T; kkl-gym "
+                "train makes one that tracks, and kkl-gym train SYSTEM --pipeline spinn one with T"
             )
 
-    def require_spread(self) -> Spread:
-        """Return the error bars of T_inv, or raise ArtifactError, which says how to learn them."""
-        if self.inverse.spread is None:
-            data = "" if self.signals is None else " --data FILE"
-            raise ArtifactError(
-                f"this map for {self.system!r} holds no error bars; kkl-gym errorbars NAME_OR_FILE{data} learns them, "
-                "and writes a map that has them"
-            )
-        return self.inverse.spread
+    def require_covariance(self) -> None:
+        """Raise ArtifactError unless T_inv has a covariance."""
+        if self.inverse.error_covariance is None:
+            raise ArtifactError(f"this map for {self.system!r} holds no covariance; kkl-gym train makes one that does")
 
-    def require_flow(self) -> Flow:
-        """Return the flow by which the observer tracks, or raise ArtifactError, which says how to learn one."""
-        if self.flow is None:
-            data = "" if self.signals is None else " --data FILE"
-            raise ArtifactError(
-                f"this map for {self.system!r} holds no flow; kkl-gym tracking NAME_OR_FILE{data} learns one, and "
-                "writes a map that has it"
-            )
-        return self.flow
+    def require_motion(self) -> Motion:
+        """Return the motion by which the observer tracks, or raise ArtifactError, which says how to make one."""
+        if self.motion is None:
+            raise ArtifactError(f"this map for {self.system!r} does not track; kkl-gym train makes one that does")
+        return self.motion
 
     @property
     def process_noise_max(self) -> float | None:
@@ -445,12 +432,14 @@ _PARTS: dict[str, type] = {  # what fields hold that are parts with fields of th
     "inverse": InverseMap,
     "free_inverse": InverseMap,
     "forward": ForwardMap,
+    "motion": Motion,
+    "equations": Equations,
+    "field": Expression,
     "flow": Flow,
     "limits": Limits,
     "h": Expression,
-    "spread": Spread,
+    "error_covariance": ErrorCovariance,
     "factors": Factors,
-    "free_factors": Factors,
 }
 
 

@@ -1,4 +1,4 @@
-"""Outputs h(x) as data: what a file says of them can be evaluated, and nothing in it runs."""
+"""Functions of state and input as data: a file can hold f, g and h, and nothing in it runs."""
 
 import functools
 import reprlib
@@ -48,10 +48,10 @@ _RULES: dict[str, _Rule] = {
 
 @dataclass(frozen=True)
 class Expression:
-    """A function of the state, component by component, as JSON can hold it.
+    """A function of the state and the input, component by component, as JSON can hold it.
 
-    A component is a number, a state ``["x", index]``, or a list of a name and its arguments, such as
-    ``["*", 2.0, ["sin", ["x", 0]]]``. The names are those of arithmetic (``+``, ``*``, ``**``, ``%``), of
+    A component is a number, a state ``["x", index]``, an input ``["u", index]``, or a list of a name and its arguments,
+    such as ``["*", 2.0, ["sin", ["x", 0]]]``. The names are those of arithmetic (``+``, ``*``, ``**``, ``%``), of
     ``kkl_gym.elementary`` and of comparisons (``<``, ``<=``, ``>``, ``>=``, ``and``, ``or``, ``not``), which ``where``
     takes as its first argument.
 
@@ -70,37 +70,46 @@ class Expression:
 
     def __post_init__(self) -> None:
         if not isinstance(self.components, list | tuple) or not self.components:
-            raise ValueError(f"an output h(x) must be a list of components, got {reprlib.repr(self.components)}")
+            raise ValueError(f"an expression must be a list of components, got {reprlib.repr(self.components)}")
         left = [MOST_PARTS]
         checked = tuple(_checked(part, False, MOST_LEVELS, left) for part in self.components)
         object.__setattr__(self, "components", checked)
 
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate it. Shapes: ``x`` (..., nx); returns (..., number of components)."""
-        rows = np.moveaxis(np.asarray(x, dtype=float), -1, 0)
+    def __call__(self, x: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Evaluate it. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., number of components)."""
+        rows = {"x": np.moveaxis(np.asarray(x, dtype=float), -1, 0)}
+        if u is not None:
+            rows["u"] = np.moveaxis(np.asarray(u, dtype=float), -1, 0)
+        out = np.empty((*rows["x"].shape[1:], len(self.components)))
         with np.errstate(all="ignore"):
-            values = [_evaluated(part, rows) for part in self.components]
-        return np.stack([np.broadcast_to(value, rows.shape[1:]) for value in values], axis=-1)
+            for i, part in enumerate(self.components):
+                out[..., i] = _evaluated(part, rows)
+        return out
 
     @property
     def states(self) -> int:
-        """Number of states that it asks for."""
-        return max(map(_states, self.components))
+        """Number of states that it needs."""
+        return max(_count(part, "x") for part in self.components)
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs that it needs."""
+        return max(_count(part, "u") for part in self.components)
 
 
 def _checked(part: Any, condition: bool, levels: int, left: list[int]) -> Any:
     """A part of an expression as numbers and tuples; ``left`` holds how many parts more there may be."""
     left[0] -= 1
     if left[0] < 0 or levels < 0:
-        raise ValueError(f"an output h(x) has at most {MOST_PARTS} parts, on at most {MOST_LEVELS} levels")
+        raise ValueError(f"an expression has at most {MOST_PARTS} parts, on at most {MOST_LEVELS} levels")
     if is_finite(part) and not condition:
         return float(part)
     if not isinstance(part, list | tuple) or not part or not isinstance(part[0], str):
         raise ValueError(f"an expression is a finite number, or a name and its arguments, got {reprlib.repr(part)}")
     name, *arguments = part
-    if name == "x" and not condition:
+    if name in ("x", "u") and not condition:
         if len(arguments) != 1 or type(arguments[0]) is not int or arguments[0] < 0:
-            raise ValueError(f'a state is written as ["x", index], got {reprlib.repr(part)}')
+            raise ValueError(f'a state is written as ["x", index], an input as ["u", index], got {reprlib.repr(part)}')
         return name, arguments[0]
     rule = _RULES.get(name)
     if rule is None or rule.gives != condition:
@@ -112,20 +121,23 @@ def _checked(part: Any, condition: bool, levels: int, left: list[int]) -> Any:
     return name, *(_checked(each, kind, levels - 1, left) for each, kind in zip(arguments, kinds, strict=True))
 
 
-def _evaluated(part: Any, x: np.ndarray) -> Any:
+def _evaluated(part: Any, rows: dict[str, np.ndarray]) -> Any:
     if isinstance(part, float):
         return np.float64(part)  # Python's own powers raise errors
     name, *arguments = part
-    if name == "x":
-        return x[arguments[0]]
-    function, values = _RULES[name].function, [_evaluated(each, x) for each in arguments]
+    if name in ("x", "u"):
+        return rows[name][arguments[0]]
+    function, values = _RULES[name].function, [_evaluated(each, rows) for each in arguments]
     return functools.reduce(function, values) if len(values) > 1 and name != "where" else function(*values)
 
 
-def _states(part: Any) -> int:
+def _count(part: Any, letter: str) -> int:
+    """One more than the largest index of a letter."""
     if isinstance(part, float):
         return 0
-    return int(part[1]) + 1 if part[0] == "x" else max(map(_states, part[1:]))
+    if part[0] in ("x", "u"):
+        return int(part[1]) + 1 if part[0] == letter else 0
+    return max(_count(each, letter) for each in part[1:])
 
 
 __all__ = ["Expression"]

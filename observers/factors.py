@@ -1,92 +1,135 @@
-"""What covariances are multiplied with, so that regions of 90 % hold 90 % of the errors."""
+"""Covariances by age and level of measurement noise, as calibration on runs finds them."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from observers.checks import shown
+from observers.errors import ArtifactError
 
-COVERAGE = 0.9  # of the regions that the factors make true
-_LARGEST = 1e12
+COVERAGE = 0.9  # of the regions that calibration makes true
+_MAX_FACTOR = 1e12
+
+
+def _check_grid(levels: np.ndarray, ages: np.ndarray) -> tuple[int, int]:
+    """Raise ArtifactError unless levels and ages rise from 0; returns how many there are."""
+    for name, values in (("levels", levels), ("ages", ages)):
+        rising = values.ndim == 1 and len(values) and values[0] == 0 and (np.diff(values) > 0).all()
+        if not rising or not np.isfinite(values).all():
+            raise ArtifactError(f"the {name} of a covariance must rise from 0, got {shown(values)}")
+    return len(levels), len(ages)
 
 
 @dataclass(frozen=True)
 class Factors:
-    """Factors by level of measurement noise, age, and process noise, found on runs that nothing else was fitted to.
+    """Factors of a filter's covariance, with which regions of 90 % hold 90 % of the errors.
 
-    With them, nine errors in ten lie where (x - x_hat)^T P^-1 (x - x_hat) is below the 90 % quantile of the chi-square
-    distribution with nx degrees of freedom. Between levels and ages their logarithms are interpolated, and beyond the
-    last ones they stay.
+    Nine errors in ten then have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of the chi-square distribution
+    with nx degrees of freedom. Between levels and ages factors are interpolated, and beyond the last they stay.
 
     Parameters
     ----------
     levels : ndarray, shape (k,)
-        Levels of measurement noise, rising from 0, in multiples of the largest that the map is told.
+        Levels of measurement noise, rising from 0, in multiples of the largest that the map was trained for.
     ages : ndarray, shape (m,)
         Seconds since reset, rising from 0.
-    factors : ndarray, shape (k, m) or (2, k, m)
-        At each of them; two tables are without process noise and with the highest level that the map is told.
-    doubt : ndarray, shape as the factors', optional
-        How far the covariance itself is doubted, from 0, which is meant by default, to 1. What takes its place so far
-        is up to who asks; :class:`observers.tracker.Tracker` does.
+    factors : ndarray, shape (k, m)
+        The factors.
 
     Raises
     ------
-    ValueError
-        If shapes do not go together, levels or ages do not rise from 0, a factor is not positive, or a doubt is not
-        within 0 and 1.
+    ArtifactError
+        If shapes do not fit, levels or ages do not rise from 0, or a factor is not positive.
     """
 
     levels: np.ndarray
     ages: np.ndarray
     factors: np.ndarray
-    doubt: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        for name in ("levels", "ages"):
-            values = getattr(self, name)
-            rising = values.ndim == 1 and len(values) and values[0] == 0 and (np.diff(values) > 0).all()
-            if not rising or not np.isfinite(values).all():
-                raise ValueError(f"the {name} of error bars must rise from 0, got {shown(values)}")
-        tables = (len(self.levels), len(self.ages))
-        if self.factors.shape not in (tables, (2, *tables)):
-            raise ValueError(
-                f"factors of shape {self.factors.shape} do not fit {tables[0]} levels and {tables[1]} ages"
-            )
-        if not ((self.factors > 0) & (self.factors <= _LARGEST)).all():
-            raise ValueError(f"factors must be positive and at most {_LARGEST:g}, got {shown(self.factors)}")
-        if self.doubt is None:
-            return
-        if self.doubt.shape != self.factors.shape:
-            raise ValueError(f"doubt of shape {self.doubt.shape} does not fit factors of shape {self.factors.shape}")
-        if not ((self.doubt >= 0) & (self.doubt <= 1)).all():
-            raise ValueError(f"doubt must be within 0 and 1, got {shown(self.doubt)}")
+        sizes = _check_grid(self.levels, self.ages)
+        if self.factors.shape != sizes:
+            raise ArtifactError(f"factors of shape {self.factors.shape} do not fit {sizes[0]} levels, {sizes[1]} ages")
+        if not ((self.factors > 0) & (self.factors <= _MAX_FACTOR)).all():
+            raise ArtifactError(f"factors must be positive and at most {_MAX_FACTOR:g}, got {shown(self.factors)}")
 
-    def log_roots(self, measurement_noise: float, process_noise: float) -> np.ndarray:
-        """Logarithms of the factors' square roots at each age.
-
-        Parameters
-        ----------
-        measurement_noise, process_noise : float
-            Levels in multiples of the highest that the map is told.
-
-        Returns
-        -------
-        ndarray, shape (m,)
-            What logarithms of standard deviations rise by.
-        """
-        return self._by_age(np.log(self.factors) / 2, measurement_noise, process_noise)
-
-    def doubts(self, measurement_noise: float, process_noise: float) -> np.ndarray:
-        """How far the covariance is doubted at each age, shape (m,), at levels as :meth:`log_roots` takes them."""
-        doubt = np.zeros_like(self.factors) if self.doubt is None else self.doubt
-        return self._by_age(doubt, measurement_noise, process_noise)
-
-    def _by_age(self, tables: np.ndarray, measurement_noise: float, process_noise: float) -> np.ndarray:
-        if tables.ndim == 3:
-            share = min(process_noise, 1.0)
-            tables = (1.0 - share) * tables[0] + share * tables[1]
-        return np.array([np.interp(measurement_noise, self.levels, column) for column in tables.T])
+    def at_level(self, level: float) -> np.ndarray:
+        """Return the factors at a level, in multiples of the largest. Shapes: returns (m,)."""
+        return np.array([np.interp(level, self.levels, column) for column in self.factors.T])
 
 
-__all__ = ["COVERAGE", "Factors"]
+@dataclass(frozen=True)
+class ErrorCovariance:
+    """The covariance of x - T_inv(z), by level of measurement noise and age since reset.
+
+    It is scaled so that regions of 90 % hold 90 % of the errors, see :class:`Factors`.
+
+    Parameters
+    ----------
+    levels : ndarray, shape (k,)
+        As for :class:`Factors`.
+    ages : ndarray, shape (m,)
+        As for :class:`Factors`.
+    covariance : ndarray, shape (k, m, nx, nx)
+        Covariances in units of the states.
+
+    Raises
+    ------
+    ArtifactError
+        If shapes do not fit, levels or ages do not rise from 0, or a matrix is not positive definite.
+    """
+
+    levels: np.ndarray
+    ages: np.ndarray
+    covariance: np.ndarray
+
+    def __post_init__(self) -> None:
+        sizes = _check_grid(self.levels, self.ages)
+        shape = self.covariance.shape
+        if len(shape) != 4 or shape[:2] != sizes or shape[2] != shape[3] or not shape[2]:
+            raise ArtifactError(f"covariances of shape {shape} do not fit {sizes[0]} levels and {sizes[1]} ages")
+        variances = np.diagonal(self.covariance, axis1=-2, axis2=-1)
+        if not (variances > 0).all():
+            raise ArtifactError("a covariance must be positive definite")
+        scale = np.sqrt(variances)
+        correlation = self.covariance / (scale[..., :, None] * scale[..., None, :])
+        if not np.allclose(correlation, correlation.mT) or not (np.linalg.eigvalsh(correlation) > 0).all():
+            raise ArtifactError("a covariance must be positive definite")
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return self.covariance.shape[-1]
+
+    def at_level(self, level: float) -> "CovarianceByAge":
+        """Return the covariances at a level, in multiples of the largest."""
+        level = min(max(level, 0.0), float(self.levels[-1]))
+        i = min(int(np.searchsorted(self.levels, level, side="right")), len(self.levels) - 1)
+        low, high = self.levels[max(i - 1, 0)], self.levels[i]
+        share = (level - low) / (high - low) if high > low else 0.0
+        return CovarianceByAge(self.ages, (1 - share) * self.covariance[max(i - 1, 0)] + share * self.covariance[i])
+
+
+class CovarianceByAge:
+    """Covariances (m, nx, nx) at ages (m,) in seconds, interpolated between them."""
+
+    def __init__(self, ages: np.ndarray, covariance: np.ndarray) -> None:
+        self._ages, self._covariance = ages, covariance
+
+    def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
+        """Return the covariances at ages (...,), which broadcast to ``shape``; returns (..., nx, nx)."""
+        ages = np.broadcast_to(np.asarray(age, dtype=float), shape or np.shape(age))
+        i = np.clip(np.searchsorted(self._ages, ages, side="right"), 1, max(1, len(self._ages) - 1))
+        if len(self._ages) == 1:
+            return np.array(np.broadcast_to(self._covariance[0], (*ages.shape, *self._covariance.shape[1:])))
+        low, high = self._ages[i - 1], self._ages[i]
+        share = np.clip((ages - low) / (high - low), 0.0, 1.0)[..., None, None]
+        return np.asarray((1 - share) * self._covariance[i - 1] + share * self._covariance[i])
+
+
+def standard_deviations(covariance: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (..., nx) of covariances (..., nx, nx)."""
+    return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+
+
+__all__ = ["COVERAGE", "CovarianceByAge", "ErrorCovariance", "Factors", "standard_deviations"]

@@ -9,7 +9,7 @@ import numpy as np
 from observers.checks import is_finite
 from observers.errors import ArtifactError, check_shapes
 from observers.network import MLP
-from observers.spread import Spread
+from observers.factors import ErrorCovariance
 
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
@@ -59,14 +59,14 @@ class InverseMap:
         Seconds that count as one.
     age_max : float, default 0
         Seconds after which the age no longer matters.
-    spread : Spread, optional
-        The covariance of the state's error, where it was learned.
+    error_covariance : ErrorCovariance, optional
+        The covariance of the state's error, where it was calibrated.
 
     Raises
     ------
     ArtifactError
-        If a shape does not fit the network, which has no outputs, or the spread does not, a unit is not positive and
-        finite, or nor is the end of what is told.
+        If a shape does not fit the network, or it has no outputs, a unit is not positive and
+        finite, or nor is the largest level.
     """
 
     mlp: MLP
@@ -82,7 +82,7 @@ class InverseMap:
     process_noise_max: float = math.inf
     age_unit: float = 1.0
     age_max: float = 0.0
-    spread: Spread | None = None
+    error_covariance: ErrorCovariance | None = None
 
     def __post_init__(self) -> None:
         if self.features != tuple(name for name in FEATURES if name in self.features) or not self.features:
@@ -116,16 +116,8 @@ class InverseMap:
         if not nx:
             raise ArtifactError("a map must estimate one state at least, its network has no outputs")
         check_shapes(self, {"z_offset": (size,), "x_offset": (nx,), "x_scale": (nx,)})
-        spread = self.spread
-        if spread is not None and spread.mlp.inputs != self.mlp.inputs:
-            raise ArtifactError(
-                f"error bars of {spread.mlp.inputs} inputs do not fit a network of {self.mlp.inputs} inputs"
-            )
-        told = spread is not None and "measurement_noise" in self.features
-        if spread is not None and (not told or (spread.factors.ndim == 3) != ("process_noise" in self.features)):
-            raise ArtifactError(
-                f"error bars with factors of shape {spread.factors.shape} do not fit a map that is told {self.features}"
-            )
+        if self.error_covariance is not None and "measurement_noise" not in self.features:
+            raise ArtifactError("a covariance by level of noise needs a map that depends on the level")
 
     def _each(self, name: str) -> tuple[Any, ...]:
         """A unit or an end: of each output where noise_gain has rows, else the only one there is."""
@@ -155,8 +147,7 @@ class InverseMap:
         if range(self.mlp.outputs)[outputs] == range(self.mlp.outputs):
             return self
         x_offset, x_scale = self.x_offset[outputs], self.x_scale[outputs]
-        spread = self.spread if self.spread and range(self.spread.nx) == range(self.mlp.outputs)[outputs] else None
-        return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, spread=spread)
+        return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, error_covariance=None)
 
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
         """Cut levels of measurement noise at the largest that the map is told.
@@ -191,11 +182,9 @@ class InverseMap:
         sigma = np.reshape(measurement_noise, (-1, 1))
         return 1.0 / (1.0 + ((sigma * np.atleast_2d(self.noise_gain)) ** 2).sum(0))
 
-    def shares(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> tuple[float, float]:
-        """Return levels of noise in multiples of the highest that the map is told, of the noisiest output."""
-        return float(np.max(np.divide(measurement_noise, self.measurement_noise_max))), (
-            process_noise / self.process_noise_max
-        )
+    def share(self, measurement_noise: float | tuple[float, ...]) -> float:
+        """Return a level in multiples of the largest in training, of the noisiest output."""
+        return float(np.max(np.divide(measurement_noise, self.measurement_noise_max)))
 
     def noise_features(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> list[float]:
         """Return what the network is told of noise.

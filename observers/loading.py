@@ -14,6 +14,7 @@ def load(
     *,
     process_noise: float | None = None,
     monitor: bool = False,
+    tracking: bool | None = None,
     compiled: bool | None = None,
 ) -> KKLObserver:
     """Return the observer behind a name.
@@ -22,7 +23,7 @@ def load(
     ----------
     name_or_path : str or PathLike
         A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
-    measurement_noise, process_noise, monitor, compiled
+    measurement_noise, process_noise, monitor, tracking, compiled
         As for :class:`KKLObserver`.
 
     Returns
@@ -44,5 +45,6 @@ def load(
         measurement_noise,
         process_noise=process_noise,
         monitor=monitor,
+        tracking=tracking,
         compiled=compiled,
     )

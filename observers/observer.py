@@ -9,12 +9,12 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.checks import bool_array, noise_level, noise_levels, real_array
 from observers.compiled import available
-from observers.decoder import Decoders, Parts
+from observers.decoder import Decoders
+from observers.factors import standard_deviations
 from observers.monitor import Monitor
 from observers.replacement import check_replacement
 from observers.replay import along, filled, replayed
 from observers.samples import check_arguments, check_output, first_state, held_input
-from observers.spread import deviations
 from observers.thresholds import SOON
 from observers.tracker import Tracker
 
@@ -29,9 +29,9 @@ class KKLObserver:
     A filter that is switched on needs some time. Where the state x_0 is known and the artifact holds the forward map T,
     ``reset(y_0, x_0)`` begins at z_0 = T(x_0) instead. T also gives :attr:`mismatch`, the distance of z from T(x_hat).
 
-    Where the artifact holds a flow, the observer tracks: T_inv initialises the estimate, the learned motion predicts
-    it, and each sample corrects it (:class:`observers.tracker.Tracker`). T_inv's estimate replaces it where its
-    covariance is smaller, or where the samples show divergence.
+    Where the artifact holds a motion, the observer tracks: a Kalman filter predicts the estimate by the system's
+    equations, or by a learned flow, and corrects it by each sample (:class:`observers.tracker.Tracker`). T_inv's
+    estimate replaces it where T_inv is surer, or where the samples show divergence.
 
     Parameters
     ----------
@@ -47,9 +47,12 @@ class KKLObserver:
         monitor's limits have too.
     monitor : bool, default False
         Whether to watch if the samples fit the estimates, see :attr:`score`.
+    tracking : bool, optional
+        Whether to track; False takes T_inv alone, without any model at run time. None tracks where the artifact holds a
+        motion.
     compiled : bool, optional
-        Whether single samples run compiled by Numba (the extra ``fast``), in a third of the time, or a twentieth where
-        the observer tracks; compilation takes seconds, once. True compiles here, such as before a loop in real time,
+        Whether single samples run compiled by Numba (the extra ``fast``), several times as fast; compilation takes
+        seconds, once. True compiles here, such as before a loop in real time,
         and after unpickling. False uses NumPy. None uses NumPy until a :meth:`reset` after 1,000 samples. The two agree
         to rounding. Batches of 128 rows or more always use Numba where it is installed.
 
@@ -70,18 +73,17 @@ class KKLObserver:
         *,
         process_noise: float | None = None,
         monitor: bool = False,
+        tracking: bool | None = None,
         compiled: bool | None = None,
     ) -> None:
-        check_arguments(artifact, monitor, compiled)
+        check_arguments(artifact, monitor, compiled, tracking)
         self.artifact = artifact
-        self._monitored = bool(monitor)
+        self._monitored, self._tracking = bool(monitor), tracking
         self._compile, self._compiled = compiled, bool(compiled)
         self._samples = 0  # single ones
         self._z: np.ndarray | None = None
         self._tracker: Tracker | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
-        self._parts: Parts | None  # which networks made the last estimate, and from what
-        self._asked = False  # for the last estimate's covariance: then the next one's is made with the estimate
         self._process_noise = self._level(process_noise)
         self.measurement_noise = artifact.measurement_noise if measurement_noise is None else measurement_noise
         self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
@@ -107,8 +109,8 @@ class KKLObserver:
         if monitor is not None and self._z is not None:
             monitor.reset(self._z.shape[:-1])
         self._measurement_noise, self._monitor = level, monitor
-        self._x_hat, self._parts = None, None
-        self._tell()
+        self._x_hat = None
+        self._set_levels()
 
     @property
     def process_noise(self) -> float:
@@ -117,22 +119,27 @@ class KKLObserver:
 
     @process_noise.setter
     def process_noise(self, level: float | None) -> None:
-        self._process_noise, self._x_hat, self._parts = self._level(level), None, None
-        self._tell()
+        self._process_noise, self._x_hat = self._level(level), None
+        self._set_levels()
 
     def _level(self, process_noise: float | None) -> float:
         if process_noise is None:
             return self.artifact.process_noise_max or 0.0
         return noise_level("process_noise", process_noise)
 
-    def _tell(self) -> None:
-        """Tell the maps the levels of noise."""
+    @property
+    def tracking(self) -> bool:
+        """Whether the observer tracks; else its estimate is T_inv's alone."""
+        return self._tracker is not None
+
+    def _set_levels(self) -> None:
+        """Make maps and tracker for the levels of noise."""
         nx = self.artifact.nx
         self._states = self._decoders(slice(nx))
         self._parameters = self._decoders(slice(nx, None)) if self.artifact.estimated_parameters else None
         before, self._tracker = self._tracker, self._new_tracker()
         if before is not None and self._tracker is not None and self._z is not None:
-            self._tracker.go_on(before)
+            self._tracker.take_over(before)
 
     @property
     def _levels(self) -> dict[str, Any]:
@@ -143,8 +150,9 @@ class KKLObserver:
         }
 
     def _new_tracker(self) -> Tracker | None:
-        """One that has not begun, where the artifact holds a flow."""
-        return None if self.artifact.flow is None else Tracker(self.artifact, self._states, **self._levels)
+        if self.artifact.motion is None or self._tracking is False:
+            return None
+        return Tracker(self.artifact, self._states, **self._levels)
 
     def _decoders(self, outputs: slice) -> Decoders:
         """The maps, or some of their outputs, at the levels of noise."""
@@ -161,11 +169,12 @@ class KKLObserver:
         """Make the machine code for single samples now, by a sample that is forgotten."""
         linear = self.artifact.filter
         y, z = np.zeros(self.artifact.ny), np.zeros(linear.size)
-        parts, _ = self._states.estimate(linear.advance_single(z, y, np.zeros(linear.nu), y), 0.0)
-        if self.artifact.inverse.spread is not None:
-            self._states.covariance(parts)
-        if self._tracker is not None:
-            self._tracker.warm_up(z)
+        u = np.zeros(linear.nu)
+        self._states(linear.advance_single(z, y, u, y), 0.0)
+        tracker = self._new_tracker()
+        if tracker is not None:
+            tracker.reset(y)
+            tracker.advance(y, u)
 
     def __copy__(self) -> "KKLObserver":
         """Another that stands where this one does, and goes its own way: what is changed in place is copied too."""
@@ -200,15 +209,16 @@ class KKLObserver:
             self._measurement_noise,
             process_noise=self._process_noise,
             monitor=self._monitored,
+            tracking=self._tracking,
             compiled=self._compiled or self._compile,
         )
         other._compile, other._samples = self._compile, self._samples
         if self._z is not None:
             other._z, other._y, other._age = self._z, self._y, self._age
             if other._tracker is not None and self._tracker is not None:
-                other._tracker.go_on(self._tracker)
+                other._tracker.take_over(self._tracker)
             elif other._tracker is not None:
-                other._tracker.reset(self._z, self._age)
+                other._tracker.reset(self._y)
             if other._monitor is not None:
                 other._monitor.reset(self._z.shape[:-1])
         vars(self).update(vars(other))
@@ -230,7 +240,7 @@ class KKLObserver:
         x0 : array_like, shape (..., nx), optional
             The state, where it is known. The filter then starts at z_y = T(x0) and z_u = 0, as if it had run for ever
             beside a motion without input: there is no transient. An observer that tracks begins at x0 itself, cut at
-            the flow's bounds, with T or without. Where only some rows are known, :meth:`restart` those.
+            the bounds of the states, with T or without. Where only some rows are known, :meth:`restart` those.
 
         Returns
         -------
@@ -241,18 +251,19 @@ class KKLObserver:
         ------
         ValueError
             If a shape is wrong, an entry is not a finite real number, or x0 is given and the artifact holds neither T
-            nor a flow; the observer is then as it was.
+            nor a motion; the observer is then as it was.
         """
         y0, x0 = real_array("y", y0).copy(), None if x0 is None else real_array("x0", x0)  # callers reuse arrays
         check_output(self.artifact, y0, y0.shape[:-1], first=True)
         z0, age = first_state(self.artifact, y0, x0)
         if self._compile is None and not self._compiled and y0.ndim == 1 and self._samples >= SOON and available():
             self._compiled = True
-            self._tell()
+            self._set_levels()
             self._warm_up()
         if self._tracker is not None:
-            self._tracker.reset(z0, age, x0)
-        self._z, self._y, self._age, self._x_hat, self._parts = z0, y0, age, None, None
+            self._tracker.reset(y0, x0)
+            self._tracker.supervise(z0, age)
+        self._z, self._y, self._age, self._x_hat = z0, y0, age, None
         if self._monitor is not None:
             self._monitor.reset(y0.shape[:-1])
         return self.decode()
@@ -316,11 +327,13 @@ class KKLObserver:
         check_output(self.artifact, y0, (int(rows.sum()),), first=True)
         z[rows], age = first_state(self.artifact, y0, x0)
         if self._tracker is not None:
-            self._tracker.restart(rows, z[rows], age, x0)
+            self._tracker.restart(rows, y0, x0)
         self._z, self._y = z, self._y.copy()
         self._y[rows] = y0
         self._age = np.where(rows, age, self._age)
-        self._x_hat, self._parts = None, None
+        self._x_hat = None
+        if self._tracker is not None:
+            self._tracker.supervise(z, self._age, rows)
         if self._monitor is not None:
             self._monitor.restart(rows)
 
@@ -328,7 +341,7 @@ class KKLObserver:
         """Take in the next sample.
 
         Without a sample the observer coasts on its own prediction of the output, h(x_hat), which makes z' = A z + B
-        h(T_inv(z)) a model of the system; one that tracks coasts on its learned motion. Of several outputs some may be
+        h(T_inv(z)) a model of the system; one that tracks coasts on its motion. Of several outputs some may be
         missing, such as those of slower sensors: it then coasts on these alone. Where the artifact holds no h, the last
         value of a missing output is held.
 
@@ -383,18 +396,14 @@ class KKLObserver:
             rows = None
             self._samples += 1
         tracker, linear = self._tracker, self.artifact.filter
-        moved = None if tracker is None else tracker.step_single(self._z, self._y, u, y)
-        if moved is not None:
-            z, y = moved
-        else:
-            if tracker is not None:
-                h = tracker.advance(y, u, rows)
-                if gaps is not None:
-                    y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
-            elif gaps is not None:
-                y = filled(self.artifact, self._states, y, gaps, u, z=self._z, before=self._y, age=self._age)
-            advance = linear.advance_single if self._compiled and not batch else linear.advance
-            z = advance(self._z, self._y, u, y)
+        if tracker is not None:
+            h = tracker.advance(y, u, rows)
+            if gaps is not None:
+                y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
+        elif gaps is not None:
+            y = filled(self.artifact, self._states, y, gaps, u, z=self._z, before=self._y, age=self._age)
+        advance = linear.advance_single if self._compiled and not batch else linear.advance
+        z = advance(self._z, self._y, u, y)
         if rows is None:
             self._z, self._y, self._age = z, y, self._age + 1
         else:
@@ -402,9 +411,9 @@ class KKLObserver:
             kept[rows] = z[rows]
             self._z, self._y = kept, np.where(rows[..., None], y, self._y)
             self._age = self._age + rows
-        self._x_hat, self._parts = None, None
+        self._x_hat = None
         if tracker is not None:
-            tracker.supervise(self._z, self._age, rows, True if gaps is None else ~gaps.all(-1))
+            tracker.supervise(self._z, self._age, rows)
         if self._monitor is not None and not missing:
             self._x_hat = self.decode()
             seen = None if rows is None else rows[..., None]
@@ -438,11 +447,7 @@ class KKLObserver:
         z, age = self._moment(rows)
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
-        if rows is not None:
-            return self._states(z, age)
-        self._parts, x_hat = self._states.estimate(z, age, self._asked)
-        self._asked = False
-        return x_hat
+        return self._states(z, age)
 
     @property
     def parameters_hat(self) -> np.ndarray:
@@ -462,7 +467,7 @@ class KKLObserver:
     def covariance(self) -> np.ndarray:
         """Covariance of the error x - x_hat of the current estimate, shape (..., nx, nx).
 
-        It is that of the errors in the runs of the calibration, given z, the levels of noise and the age: 90 % of the
+        It is calibrated on runs, by level of noise and age; a tracker's also follows its filter: 90 % of the
         errors there have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of the chi-square distribution with nx
         degrees of freedom. On another plant, under a faulty sensor or far from the training it is too small. Computed
         when asked for.
@@ -472,17 +477,17 @@ class KKLObserver:
         RuntimeError
             Before :meth:`reset`.
         ArtifactError
-            If the artifact holds no error bars. It is a ValueError.
+            If the artifact holds no covariance. It is a ValueError.
         """
         return self.decode_covariance()
 
     @property
     def std(self) -> np.ndarray:
         """Standard deviation of each state's error, shape (..., nx): the roots of :attr:`covariance`'s diagonal."""
-        return deviations(self.decode_covariance())
+        return standard_deviations(self.decode_covariance())
 
     def decode_covariance(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the covariance of what :meth:`decode` returns; it is quicker right after that, of all rows.
+        """Return the covariance of the error of what :meth:`decode` returns.
 
         Parameters
         ----------
@@ -494,19 +499,17 @@ class KKLObserver:
         ndarray, shape (..., nx, nx) or (number of True in rows, nx, nx)
             As :attr:`covariance`, which also raises the same.
         """
-        if self._tracker is not None:  # its artifact has error bars
-            z, _ = self._moment(None)  # not a copy: the tracker knows by it whether T_inv was asked already
-            covariance = self._tracker.covariance(z, self._age)
+        if self._tracker is not None:
+            z, _ = self._moment(None)
+            covariance = self._tracker.covariance(self._age)
             return covariance if rows is None else covariance[bool_array("rows", rows, z.shape[:-1])]
-        self.artifact.require_spread()
-        self._asked = True
-        if rows is None and self._parts is not None:
-            return self._states.covariance(self._parts)
+        self.artifact.require_covariance()
         return self._states.covariances(*self._moment(rows))
 
     def _twin(self) -> "KKLObserver":
         """Another of the same artifact, levels of noise and compilation, without a monitor."""
-        return KKLObserver(self.artifact, **self._levels | {"compiled": self._compiled or self._compile})
+        compiled = self._compiled or self._compile
+        return KKLObserver(self.artifact, **self._levels | {"compiled": compiled, "tracking": self._tracking})
 
     def _moment(self, rows: np.ndarray | None) -> tuple[np.ndarray, Any]:
         """The filter's state and its age in seconds, of some rows."""
@@ -592,9 +595,9 @@ class KKLObserver:
         Raises
         ------
         ValueError
-            As :meth:`estimate`, and if the artifact holds no error bars.
+            As :meth:`estimate`, and if the artifact holds no covariance.
         """
-        self.artifact.require_spread()
+        self.artifact.require_covariance()
         if self._tracker is not None:
             return replayed(self._twin(), y, u, x0, of=KKLObserver.decode_covariance)
         return along(self.artifact, self._states, y, u, of=self._states.covariances, x0=x0)

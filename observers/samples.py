@@ -9,7 +9,7 @@ from observers.checks import LARGEST, all_finite, flag, real_array, shown
 from observers.compiled import available
 
 
-def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None) -> None:
+def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tracking: bool | None) -> None:
     """Raise ValueError or ImportError unless an observer can be made of an artifact in the way that is asked for."""
     if not isinstance(artifact, Artifact):
         raise ValueError(f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names")
@@ -19,6 +19,10 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None) ->
             f"this artifact for {artifact.system!r} holds no limits to monitor by; training.calibrate(artifact, "
             f"system) finds {found}, and returns an artifact that does"
         )
+    if tracking is not None and flag("tracking", tracking):
+        artifact.require_motion()
+    if monitor and tracking is False and artifact.motion is not None:
+        raise ValueError("the limits of this artifact are those of the observer that tracks: leave tracking=False out")
     if compiled is not None and flag("compiled", compiled) and not available():
         raise ImportError("compiled=True needs Numba: pip install kkl-gym[fast], or leave compiled out")
 

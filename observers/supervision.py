@@ -1,16 +1,15 @@
-"""How a tracker notices by its innovations that it is off: limits of what chance makes of them, a test of whiteness.
+"""Divergence detection: a limit of the NIS and a whiteness test of the innovations.
 
-Innovations, in units of the standard deviation that a Kalman filter expects of them, are independent and have a mean
-square of 1 where the filter is right. Where it is lost they are large. Where it is off by less than the noise, but by
-more than it believes, they are hardly larger, but agree with those before. So they do where the noise itself is not
-white.
+Innovations in units of their standard deviations are white and have a mean square of 1 where the filter is consistent.
+Where it diverged they are large. Where it is off by less than the noise, but by more than its covariance says, they are
+hardly larger but correlated; so they are where the noise itself is not white.
 """
 
 import math
 from dataclasses import dataclass
 from typing import Self
 
-from observers.flow import Flow
+from observers.motion import Motion
 
 # Limits are the normal distribution's quantile for 1e-5. Running means are more skewed than what their limits are taken
 # of, so that chance exceeds these more often: of the mean square of innovations up to five times as often, most where
@@ -18,7 +17,7 @@ from observers.flow import Flow
 _BEYOND_CHANCE = 4.265
 _TREND = 0.25  # windows over which innovations are averaged to see whether they agree
 _LONG = 4.0  # windows over which the square of that is averaged
-INFLATION = 10.0  # what a covariance is multiplied with where innovations agree with one another
+INFLATION = 10.0  # of the covariance where innovations are not white
 
 
 @dataclass(frozen=True)
@@ -33,9 +32,9 @@ class Supervision:
     trend_limit: float
 
     @classmethod
-    def of(cls, flow: Flow, dt: float) -> Self:
-        """That of a flow on samples every ``dt`` seconds."""
-        window, ny = max(1, round(flow.window / dt)), len(flow.least_measurement_noise)
+    def of(cls, motion: Motion, dt: float) -> Self:
+        """Return that of a motion on samples every ``dt`` seconds."""
+        window, ny = max(1, round(motion.window / dt)), len(motion.least_measurement_noise)
         share, trend_share, long_share = (-math.expm1(-1 / (each * window)) for each in (1.0, _TREND, _LONG))
         memory = (1 - trend_share) ** 2 * (1 - long_share)  # of a trend's square, a sample later
         return cls(

@@ -26,7 +26,7 @@ from examples.research.speed import sizes
 from kkl_gym import SYSTEMS
 from observers import Artifact, load
 from observers.names import resolve
-from observers.spread import deviations
+from observers.factors import standard_deviations
 from observers.storage import replacing, write
 from training.agents import picture
 from training.agents.agent import Agent
@@ -115,7 +115,7 @@ def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
     (environment,) = shown(name, None)
     episode = demo.play(environment, round(duration / environment.system.dt), None, seed=0)
     observer = load(name, environment.system.measurement_noise)
-    width = chi_square(BAND, 1)[()] ** 0.5 * deviations(observer.estimate_covariance(episode.y))
+    width = chi_square(BAND, 1)[()] ** 0.5 * standard_deviations(observer.estimate_covariance(episode.y))
 
     def draw(path: Path) -> None:
         motion = episode.motion

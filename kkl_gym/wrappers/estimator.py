@@ -14,7 +14,7 @@ from kkl_gym.rows import clipped
 from observers import Artifact, KKLObserver, LinearFilter, shipped
 from observers.checks import choice, flag
 from observers.names import resolve
-from observers.spread import deviations
+from observers.factors import standard_deviations
 
 
 class Estimator(Protocol):
@@ -166,7 +166,7 @@ class KKLEstimator:
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """What of a report is the observation. Shapes: returns (..., width)."""
         if self._uncertainty:
-            return np.concatenate([report["x_hat"], deviations(report["x_cov"])], axis=-1)
+            return np.concatenate([report["x_hat"], standard_deviations(report["x_cov"])], axis=-1)
         return report["x_hat" if self.estimate == "x" else "z"]
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:

@@ -14,7 +14,7 @@ from kkl_gym.system import System
 from kkl_gym.vector import with_mask
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
 from observers import KKLObserver, load, shipped
-from observers.spread import deviations
+from observers.factors import standard_deviations
 from training.agents.tasks import deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 from training.systems import ControlTask, profile
@@ -189,7 +189,7 @@ def estimate_and_spread(system: System) -> Feature:
     scale = np.array(system.scale)
 
     def feature(info: Mapping[str, np.ndarray]) -> np.ndarray:
-        sizes = np.log10(np.maximum(deviations(info["x_cov"]) / scale, SUREST))
+        sizes = np.log10(np.maximum(standard_deviations(info["x_cov"]) / scale, SUREST))
         return np.concatenate([deviation(system, info["x_hat"]), sizes], axis=1)
 
     return feature

@@ -7,7 +7,7 @@ import numpy as np
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.spread import deviations
+from observers.factors import standard_deviations
 from training.evaluation.errors import UnseenTrajectories, kalman_filter, measured
 from training.evaluation.levels import Level
 from training.maps.regions import chi_square, squared_distance
@@ -101,7 +101,7 @@ def _judged(
     squares: list[np.ndarray] = []
     said: list[np.ndarray] = []
     for rows, (x_hat, covariance) in zip(_chunks(x.shape[1]), estimates, strict=True):
-        error, std = x[:, rows] - x_hat, deviations(covariance)
+        error, std = x[:, rows] - x_hat, standard_deviations(covariance)
         distances.append(squared_distance(error, covariance))
         ratios.append((error / std) ** 2)
         squares.append(error**2)

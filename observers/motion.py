@@ -1,0 +1,223 @@
+"""How a state moves over one sample: by the system's equations, or by a flow that was learned."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from observers.checks import is_finite
+from observers.errors import ArtifactError, check_shapes
+from observers.expression import Expression
+from observers.factors import Factors
+from observers.network import MLP
+
+_MAX_LEVEL = 1e30  # of a process noise or a window: its square stays finite
+_MAX_SUBSTEPS = 1024
+
+
+@dataclass(frozen=True)
+class Equations:
+    """x' = f(x) + g(x) u with u held, integrated over a sample; or x_next = field(x, u) in discrete time.
+
+    Parameters
+    ----------
+    field : Expression
+        f(x) + g(x) u, nx components; in discrete time the next state.
+    substeps : int, default 1
+        Runge-Kutta steps of order four in a sample; 0 for a system in discrete time.
+
+    Raises
+    ------
+    ArtifactError
+        If ``substeps`` is not an integer from 0 to 1024.
+    """
+
+    field: Expression
+    substeps: int = 1
+
+    def __post_init__(self) -> None:
+        if type(self.substeps) is not int or not 0 <= self.substeps <= _MAX_SUBSTEPS:
+            raise ArtifactError(f"substeps must be an integer from 0 to {_MAX_SUBSTEPS}, got {self.substeps!r}")
+
+    def __call__(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """Return the states a sample later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        f = self.field
+        if not self.substeps:
+            return f(x, u)
+        h = dt / self.substeps
+        for _ in range(self.substeps):
+            k1 = f(x, u)
+            k2 = f(x + h / 2 * k1, u)
+            k3 = f(x + h / 2 * k2, u)
+            k4 = f(x + h * k3, u)
+            x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+        return x
+
+
+@dataclass(frozen=True)
+class Flow:
+    """A learned step of scaled states s under scaled inputs v: s + linear @ [1, s, v] + gain * mlp([s, v]).
+
+    Parameters
+    ----------
+    mlp : MLP
+        A network of nx + nu inputs and nx outputs.
+    linear : ndarray, shape (nx, 1 + nx + nu)
+        The affine part.
+    gain : ndarray, shape (nx,)
+        Scale of the network's outputs.
+    u_scale : ndarray, shape (nu,)
+        Scale of the inputs: v = u / u_scale.
+
+    Raises
+    ------
+    ArtifactError
+        If a shape does not fit, or a scale is not positive.
+    """
+
+    mlp: MLP
+    linear: np.ndarray
+    gain: np.ndarray
+    u_scale: np.ndarray
+
+    def __post_init__(self) -> None:
+        nx = self.mlp.outputs
+        if self.u_scale.ndim != 1 or self.mlp.inputs != nx + len(self.u_scale):
+            raise ArtifactError(f"a flow of {nx} states and {len(self.u_scale)} inputs needs as many network inputs")
+        check_shapes(self, {"linear": (nx, 1 + self.mlp.inputs), "gain": (nx,)})
+        if not (self.u_scale > 0).all():
+            raise ArtifactError(f"u_scale of a flow must be positive, got {self.u_scale}")
+
+    def __call__(self, s: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return the scaled states a sample later. Shapes: ``s`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        q = np.concatenate([s, np.broadcast_to(u / self.u_scale, (*s.shape[:-1], len(self.u_scale)))], -1)
+        return np.asarray(s + self.linear[:, 0] + q @ self.linear[:, 1:].T + self.gain * self.mlp(q))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a tracker needs beside T_inv: how states move, how uncertain that is, and how it was calibrated.
+
+    Scaled states are s = (x - x_offset) / x_scale. All standard deviations are of scaled states, or of outputs in their
+    own units.
+
+    Parameters
+    ----------
+    equations : Equations, optional
+        The system's equations, in units of the states.
+    flow : Flow, optional
+        A learned step, where there are no equations. There is one of the two.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Scaling of the states.
+    low, high : ndarray, shape (nx,)
+        Bounds of the states, at which estimates are cut.
+    mean : ndarray, shape (nx,)
+        Mean of the states at which motions start: the estimate before the first sample.
+    covariance : ndarray, shape (nx, nx)
+        Their covariance.
+    error : ndarray, shape (nx,)
+        Standard deviation of the motion's own error over a sample.
+    process_noise : ndarray, shape (nx,)
+        Standard deviation that process noise of level 1 adds in a sample.
+    least_process_noise : float
+        Level of process noise that is assumed at least: with Q = 0 the gain would vanish.
+    least_measurement_noise : ndarray, shape (ny,)
+        Standard deviations of the measurement noise that are assumed at least.
+    window : float
+        Seconds over which innovations are averaged, and after a start within which T_inv is consulted.
+    factors : Factors
+        Factors of the filter's covariance, with which regions of 90 % hold 90 % of the errors.
+
+    Raises
+    ------
+    ArtifactError
+        If a shape does not fit, a scale is not positive, bounds do not rise, or a variance is negative.
+    """
+
+    x_offset: np.ndarray
+    x_scale: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    error: np.ndarray
+    process_noise: np.ndarray
+    least_process_noise: float
+    least_measurement_noise: np.ndarray
+    window: float
+    factors: Factors
+    equations: Equations | None = None
+    flow: Flow | None = None
+
+    def __post_init__(self) -> None:
+        nx = len(self.x_offset) if self.x_offset.ndim == 1 else 0
+        if (self.equations is None) == (self.flow is None):
+            raise ArtifactError("a motion is by equations or by a flow: it has one of the two")
+        if self.equations is not None:
+            field = self.equations.field
+            sizes = len(field.components), field.states <= nx
+        else:
+            assert self.flow is not None
+            sizes = self.flow.mlp.outputs, True
+        if not nx or sizes != (nx, True):
+            raise ArtifactError(f"a motion of {nx} states does not fit its equations or its flow")
+        check_shapes(self, dict.fromkeys(("x_scale", "low", "high", "mean", "error", "process_noise"), (nx,)))
+        check_shapes(self, {"covariance": (nx, nx)})
+        if self.least_measurement_noise.ndim != 1:
+            raise ArtifactError("least_measurement_noise must have shape (ny,)")
+        for name in ("x_scale", "least_measurement_noise"):
+            if not (getattr(self, name) > 0).all():
+                raise ArtifactError(f"{name} of a motion must be positive, got {getattr(self, name)}")
+        for name in ("error", "process_noise"):
+            if not (getattr(self, name) >= 0).all():
+                raise ArtifactError(f"{name} of a motion must not be negative, got {getattr(self, name)}")
+        if not np.allclose(self.covariance, self.covariance.T) or np.linalg.eigvalsh(self.covariance)[0] <= 0:
+            raise ArtifactError(f"the covariance of a motion must be positive definite, got {self.covariance}")
+        if not (self.low < self.high).all():
+            raise ArtifactError(f"bounds of a motion must go from low to high, got {self.low} and {self.high}")
+        for name in ("least_process_noise", "window"):
+            value = getattr(self, name)
+            if not is_finite(value) or not 0 < value <= _MAX_LEVEL:
+                raise ArtifactError(f"{name} of a motion must be positive and at most {_MAX_LEVEL:g}, got {value!r}")
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(self.x_offset)
+
+    def fits_inputs(self, nu: int) -> bool:
+        """Whether the motion is one under so many inputs."""
+        if self.flow is not None:
+            return len(self.flow.u_scale) == nu
+        assert self.equations is not None
+        return self.equations.field.inputs <= nu
+
+    @property
+    def scaled_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of scaled states, (nx,) each."""
+        return (self.low - self.x_offset) / self.x_scale, (self.high - self.x_offset) / self.x_scale
+
+    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """Return states a sample later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        if self.equations is not None:
+            return self.equations(x, u, dt)
+        assert self.flow is not None
+        return self.x_offset + self.x_scale * self.flow((x - self.x_offset) / self.x_scale, u)
+
+    def scaled_step(self, s: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """Return scaled states a sample later. Shapes: ``s`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        if self.flow is not None:
+            return self.flow(s, u)
+        return np.asarray((self.step(self.x_offset + self.x_scale * s, u, dt) - self.x_offset) / self.x_scale)
+
+    def variances(
+        self, measurement_noise: float | tuple[float, ...], process_noise: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances of Q, (nx,), in scaled states and of R, (ny,), that are assumed at levels of noise."""
+        level = max(process_noise, self.least_process_noise)
+        return (
+            (level * self.process_noise) ** 2 + self.error**2,
+            np.maximum(measurement_noise, self.least_measurement_noise) ** 2,
+        )
+
+
+__all__ = ["Equations", "Flow", "Motion"]
