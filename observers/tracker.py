@@ -10,11 +10,10 @@ from observers.artifact import Artifact
 from observers.decoder import Decoders
 from observers.supervision import INFLATION, Supervision
 from observers.thresholds import MANY_ROWS
-from observers.tracker_kernel import TrackerKernel
-from observers.unscented import Gaussian, Points, conditioned, factor, transformed
+from observers.tracker_kernel import RELINEARISATIONS, TrackerKernel
+from observers.unscented import Points, conditioned, factor, transformed
 
 KNOWN = 1e-3  # standard deviation of a known start, in scaled states
-RELINEARISATIONS = 2  # of a step within the first window: with 0 errors without noise rise by 40 to 80 %
 
 
 class Tracker:
