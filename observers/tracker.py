@@ -254,9 +254,9 @@ class Tracker:
         self._state = self._state.copy()
         s = self._within((x - self._motion.x_offset) / self._motion.x_scale)
         self._x[where[taken]], self._P[where[taken]] = s[taken], P[taken]
-        lost = where[lost]
-        self._state[lost, self._end : self._end + 2] = 1.0
-        self._state[lost, self._end + 3 :] = 0.0
+        again = where[lost]
+        self._state[again, self._end : self._end + 2] = 1.0
+        self._state[again, self._end + 3 :] = 0.0
 
     def _packed(self, x: np.ndarray, P: np.ndarray, watched: np.ndarray) -> np.ndarray:
         return np.concatenate([x, P.reshape(len(x), x.shape[1] ** 2), watched], axis=1)
