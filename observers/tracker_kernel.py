@@ -65,7 +65,8 @@ class TrackerKernel:
     def advance(self, state: np.ndarray, u: np.ndarray, y: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Predict and correct in some rows; returns the predicted outputs, (n, ny)."""
         expected = np.empty((len(state), self._ny))
-        self._advance(np.ascontiguousarray(u), np.ascontiguousarray(y), rows, state, expected)
+        u, y = np.array(u, order="C"), np.ascontiguousarray(y)  # Numba compiles anew for what is read-only
+        self._advance(u, y, rows, state, expected)
         return expected
 
 
