@@ -57,12 +57,12 @@ def test_vector_is_single(path, mode):
 def test_where_there_is_none(path, saved):
     plain = saved(system="van_der_pol", dt=0.01)
     env = gym.make("KKLVanDerPol-v0")
-    with pytest.raises(ArtifactError, match="no error bars"):
+    with pytest.raises(ArtifactError, match="no covariance"):
         KKLObservation(env, plain, uncertainty=True)
     with pytest.raises(ValueError, match="estimate='x'"):
         KKLObservation(env, path, uncertainty=True, estimate="z")
     with pytest.raises(ValueError, match="uncertainty must be True or False"):
         KKLObservation(env, path, uncertainty="no")
-    with pytest.raises(ArtifactError, match="no error bars"):
+    with pytest.raises(ArtifactError, match="no covariance"):
         KKLObservation(env, path, uncertainty=True).replace_observer(plain)
     assert "x_cov" not in KKLObservation(env, path).reset(seed=0)[1]

@@ -92,7 +92,7 @@ def test_known_starts_need_a_map_with_T(saved):
         KKLObservation(KKLEnv("lorenz"), "lorenz-static", known_start=True)
     with pytest.raises(ArtifactError, match="no known state"):
         KKLVectorObservation(KKLVectorEnv("lorenz", 2), "lorenz-static", known_start=True)
-    assert KKLObservation(KKLEnv("lorenz"), known_start=True).observer.artifact.flow is not None
+    assert KKLObservation(KKLEnv("lorenz"), known_start=True).observer.artifact.motion is not None
     assert KKLObservation(KKLEnv("lorenz"), "lorenz-spinn", known_start=True).observer.artifact.forward is not None
 
 
@@ -100,7 +100,7 @@ def test_where_z_is_shown_it_does_not_track():
     def tracks(**options):
         env = KKLObservation(KKLEnv("lorenz"), **options)
         env.reset(seed=0)
-        return env.observer.artifact.flow is not None
+        return env.observer.artifact.motion is not None
 
     assert tracks()
     assert not tracks(estimate="z")

@@ -93,5 +93,5 @@ def test_steps_that_do_not_fit():
             replace(exact_equations(), substeps=wrong)
     for name, wrong in (("linear", np.zeros((2, 3))), ("gain", np.ones(3)), ("u_scale", np.ones(2)),
                         ("u_scale", np.zeros(1)), ("u_scale", np.ones((1, 1)))):  # fmt: skip
-        with pytest.raises(ArtifactError, match="flow|shape|fit"):
+        with pytest.raises(ArtifactError, match=r"flow|shape|fit"):
             replace(exact_flow(nu=1), **{name: wrong})
