@@ -175,7 +175,15 @@ def test_networks(activation, width):
     expected = h @ mlp.weights[-1].T + mlp.biases[-1]
     size = np.abs(expected).max()
     assert np.abs(mlp(x) - expected).max() < ACCURATE * size
-    assert np.abs([mlp.compiled.single(row) for row in x] - expected).max() < ACCURATE * size
+    artifact = random_artifact(inputs=False, noise=False, age=False)
+    whiten, zeros = np.eye(3, artifact.filter.size), np.zeros(3)
+    inverse = replace(
+        artifact.inverse, mlp=mlp, whiten=whiten, noise_gain=zeros, x_offset=zeros[:2], x_scale=np.ones(2)
+    )
+    observer = KKLObserver(replace(artifact, inverse=inverse), compiled=True)
+    found = [observer.reset(row) for row in x[:, :1].astype(float)]
+    inputs = (x[:, :1] @ artifact.filter.equilibrium.T - inverse.z_offset)[:, :3]
+    assert np.abs(found - mlp(inputs)).max() < ACCURATE * np.abs(found).max()
     assert np.array_equal(mlp(x.reshape(2, 150, 3)).reshape(300, 2), mlp(x))
 
 
