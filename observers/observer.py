@@ -13,13 +13,13 @@ from observers.decoder import Decoders
 from observers.factors import standard_deviations
 from observers.monitor import Monitor
 from observers.replacement import check_replacement
-from observers.replay import along, filled, replayed
+from observers.replay import RecordEstimates, filled
 from observers.samples import check_arguments, check_output, first_state, held_input
 from observers.thresholds import SOON
 from observers.tracker import Tracker
 
 
-class KKLObserver:
+class KKLObserver(RecordEstimates):
     """z' = A z + B y, x_hat = T_inv(z): a causal state estimate from sampled outputs (paper, sec. 3.2).
 
     ``x_hat_0 = reset(y_0)``, then ``x_hat_k+1 = step(y_k+1, u_k)`` with u_k the input held over [t_k, t_k+1].
@@ -181,8 +181,7 @@ class KKLObserver:
         other = object.__new__(type(self))
         vars(other).update(vars(self))
         other._monitor = copy.deepcopy(self._monitor)
-        if self._tracker is not None:
-            other._tracker = other._new_tracker() if self._z is None else self._tracker.copied()
+        other._tracker = copy.copy(self._tracker)
         return other
 
     def replace(self, artifact: Artifact) -> None:
@@ -204,14 +203,7 @@ class KKLObserver:
             observer is then as it was.
         """
         check_replacement(self.artifact, artifact)
-        other = KKLObserver(
-            artifact,
-            self._measurement_noise,
-            process_noise=self._process_noise,
-            monitor=self._monitored,
-            tracking=self._tracking,
-            compiled=self._compiled or self._compile,
-        )
+        other = self._twin(artifact, monitor=self._monitored)
         other._compile, other._samples = self._compile, self._samples
         if self._z is not None:
             other._z, other._y, other._age = self._z, self._y, self._age
@@ -227,9 +219,7 @@ class KKLObserver:
     @property
     def z(self) -> np.ndarray:
         """The filter's state [z_y, z_u], a copy of shape (..., nz * (1 + nu)); raises RuntimeError before reset."""
-        if self._z is None:
-            raise RuntimeError("call reset(y0) before the observer is used")
-        return self._z.copy()
+        return self._moment(None)[0].copy()
 
     def reset(self, y0: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
         """Forget the past and take in the first sample.
@@ -440,14 +430,10 @@ class KKLObserver:
         ValueError, RuntimeError
             If ``rows`` does not fit the batch; before :meth:`reset`.
         """
-        if self._tracker is not None:
-            if self._z is None:
-                raise RuntimeError("call reset(y0) before the observer is used")
-            x_hat = self._tracker.estimate
-            return x_hat if rows is None else x_hat[bool_array("rows", rows, self._z.shape[:-1])]
         z, age = self._moment(rows)
-        if self._x_hat is not None:
-            return self._x_hat.copy() if rows is None else self._x_hat[rows]
+        x_hat = self._x_hat if self._tracker is None else self._tracker.estimate
+        if x_hat is not None:
+            return x_hat.copy() if rows is None else x_hat[rows]
         return self._states(z, age)
 
     @property
@@ -500,17 +486,17 @@ class KKLObserver:
         ndarray, shape (..., nx, nx) or (number of True in rows, nx, nx)
             As :attr:`covariance`, which also raises the same.
         """
+        z, age = self._moment(rows)
         if self._tracker is not None:
-            z, _ = self._moment(None)
             covariance = self._tracker.covariance(self._age)
-            return covariance if rows is None else covariance[bool_array("rows", rows, z.shape[:-1])]
+            return covariance if rows is None else covariance[rows]
         self.artifact.require_covariance()
-        return self._states.covariances(*self._moment(rows))
+        return self._states.covariances(z, age)
 
-    def _twin(self) -> "KKLObserver":
-        """Another of the same artifact, levels of noise and compilation, without a monitor."""
-        compiled = self._compiled or self._compile
-        return KKLObserver(self.artifact, **self._levels | {"compiled": compiled, "tracking": self._tracking})
+    def _twin(self, artifact: Artifact, *, monitor: bool = False) -> "KKLObserver":
+        """Another with the same levels of noise, tracking and compilation."""
+        options = self._levels | {"compiled": self._compiled or self._compile, "tracking": self._tracking}
+        return KKLObserver(artifact, monitor=monitor, **options)
 
     def _moment(self, rows: np.ndarray | None) -> tuple[np.ndarray, Any]:
         """The filter's state and its age in seconds, of some rows."""
@@ -529,76 +515,3 @@ class KKLObserver:
                 "with kkl-gym train --uncertain all=0.1 --estimate-parameters"
             )
         return self._parameters
-
-    def estimate(self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None) -> np.ndarray:
-        """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
-
-        The observer's own state is left as it was.
-
-        Parameters
-        ----------
-        y : array_like, shape (steps, ..., ny)
-            Outputs; the first row is y_0. Later ones are NaN where they are missing.
-        u : array_like, shape (steps - 1, ..., nu), optional
-            The input held after each row but the last, by default zero. A last row more is ignored.
-        x0 : array_like, shape (..., nx), optional
-            The state at y_0, where it is known, as for :meth:`reset`.
-
-        Returns
-        -------
-        ndarray, shape (steps, ..., nx)
-            Estimates.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`reset` and :meth:`step`.
-        """
-        if self._tracker is not None:
-            return replayed(self._twin(), y, u, x0, of=KKLObserver.decode)
-        return along(self.artifact, self._states, y, u, of=self._states, x0=x0)
-
-    def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Estimate the system's uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
-
-        Parameters
-        ----------
-        y, u
-            As for :meth:`estimate`.
-
-        Returns
-        -------
-        ndarray, shape (steps, ..., number)
-            Estimates.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`estimate`, and if the artifact estimates no parameters.
-        """
-        return along(self.artifact, self._states, y, u, of=self._identifier())
-
-    def estimate_covariance(
-        self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Covariances of the errors of what :meth:`estimate` returns.
-
-        Parameters
-        ----------
-        y, u, x0
-            As for :meth:`estimate`.
-
-        Returns
-        -------
-        ndarray, shape (steps, ..., nx, nx)
-            What :attr:`covariance` would be at each sample.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`estimate`, and if the artifact holds no covariance.
-        """
-        self.artifact.require_covariance()
-        if self._tracker is not None:
-            return replayed(self._twin(), y, u, x0, of=KKLObserver.decode_covariance)
-        return along(self.artifact, self._states, y, u, of=self._states.covariances, x0=x0)

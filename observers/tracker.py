@@ -120,13 +120,8 @@ class Tracker:
         self._state = self._state.copy()
         self._state[rows.ravel()] = begun._state
 
-    def copied(self) -> "Tracker":
-        """Return another tracker in the same state."""
-        other = copy.copy(self)
-        other._state = self._state.copy()
-        return other
-
     def __copy__(self) -> "Tracker":
+        """Another in the same state, which no method changes in place, with the same machine code."""
         other = object.__new__(type(self))
         vars(other).update(vars(self))
         return other
