@@ -52,9 +52,8 @@ class KKLObserver(RecordEstimates):
         motion.
     compiled : bool, optional
         Whether single samples run compiled by Numba (the extra ``fast``), several times as fast; compilation takes
-        seconds, once. True compiles here, such as before a loop in real time,
-        and after unpickling. False uses NumPy. None uses NumPy until a :meth:`reset` after 1,000 samples. The two agree
-        to rounding. Batches of 128 rows or more always use Numba where it is installed.
+        seconds, once. True compiles here and after unpickling, False uses NumPy, None uses NumPy until a :meth:`reset`
+        after 1,000 samples. The two agree to rounding. Batches of 128 rows or more use Numba where it is installed.
 
     Raises
     ------
@@ -78,7 +77,7 @@ class KKLObserver(RecordEstimates):
     ) -> None:
         check_arguments(artifact, monitor, compiled, tracking)
         self.artifact = artifact
-        self._monitored, self._tracking = bool(monitor), tracking
+        self._monitored, self._tracking = bool(monitor), None if tracking is None else bool(tracking)
         self._compile, self._compiled = compiled, bool(compiled)
         self._samples = 0  # single ones
         self._z: np.ndarray | None = None
@@ -134,12 +133,14 @@ class KKLObserver(RecordEstimates):
 
     def _set_levels(self) -> None:
         """Make maps and tracker for the levels of noise."""
-        nx = self.artifact.nx
-        self._states = self._decoders(slice(nx))
-        self._parameters = self._decoders(slice(nx, None)) if self.artifact.estimated_parameters else None
-        before, self._tracker = self._tracker, self._new_tracker()
-        if before is not None and self._tracker is not None and self._z is not None:
-            self._tracker.take_over(before)
+        artifact, levels = self.artifact, self._levels
+        self._states = Decoders.of(artifact, slice(artifact.nx), **levels)
+        self._parameters: Decoders | None = None  # made where they are asked for
+        before, self._tracker = self._tracker, None
+        if artifact.motion is not None and self._tracking is not False:
+            self._tracker = Tracker(artifact, self._states, **levels)
+            if before is not None and self._z is not None:
+                self._tracker.take_over(before)
 
     @property
     def _levels(self) -> dict[str, Any]:
@@ -148,15 +149,6 @@ class KKLObserver(RecordEstimates):
             "process_noise": self._process_noise,
             "compiled": self._compiled,
         }
-
-    def _new_tracker(self) -> Tracker | None:
-        if self.artifact.motion is None or self._tracking is False:
-            return None
-        return Tracker(self.artifact, self._states, **self._levels)
-
-    def _decoders(self, outputs: slice) -> Decoders:
-        """The maps, or some of their outputs, at the levels of noise."""
-        return Decoders.of(self.artifact, outputs, **self._levels)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -167,11 +159,9 @@ class KKLObserver(RecordEstimates):
 
     def _warm_up(self) -> None:
         """Make the machine code for single samples now, by a sample that is forgotten."""
-        linear = self.artifact.filter
-        y, z = np.zeros(self.artifact.ny), np.zeros(linear.size)
-        u = np.zeros(linear.nu)
-        self._states(linear.advance_single(z, y, u, y), 0.0)
-        tracker = self._new_tracker()
+        linear, tracker = self.artifact.filter, copy.copy(self._tracker)
+        y, u = np.zeros(self.artifact.ny), np.zeros(linear.nu)
+        self._states(linear.advance_single(np.zeros(linear.size), y, u, y), 0.0)
         if tracker is not None:
             tracker.reset(y)
             tracker.advance(y, u)
@@ -509,9 +499,12 @@ class KKLObserver(RecordEstimates):
         return z, age * self.artifact.filter.dt
 
     def _identifier(self) -> Decoders:
-        if self._parameters is None:
+        artifact = self.artifact
+        if not artifact.estimated_parameters:
             raise ValueError(
-                f"this observer for {self.artifact.system!r} estimates no parameters: train one that does "
+                f"this observer for {artifact.system!r} estimates no parameters: train one that does "
                 "with kkl-gym train --uncertain all=0.1 --estimate-parameters"
             )
+        if self._parameters is None:
+            self._parameters = Decoders.of(artifact, slice(artifact.nx, None), **self._levels)
         return self._parameters

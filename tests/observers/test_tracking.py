@@ -281,7 +281,7 @@ def test_without_tracking_it_is_the_map_without_a_motion(options):
     artifact = tracking(**options)
     bare, (y, u) = replace(artifact, motion=None), signals(artifact, 30, (3,))
     y[5:9, 1], y[12, :, 0] = np.nan, np.nan
-    one, other = KKLObserver(artifact, 0.1, tracking=False), KKLObserver(bare, 0.1)
+    one, other = KKLObserver(artifact, 0.1, tracking=np.False_), KKLObserver(bare, 0.1)
     assert (one.tracking, KKLObserver(artifact).tracking, other.tracking) == (False, True, False)
     for k in range(30):
         if k == 20:
