@@ -134,7 +134,7 @@ class KKLObserver(RecordEstimates):
     def _set_levels(self) -> None:
         """Make maps and tracker for the levels of noise."""
         artifact, levels = self.artifact, self._levels
-        self._states = Decoders.of(artifact, slice(artifact.nx), **levels)
+        self._states = Decoders(artifact, slice(artifact.nx), **levels)
         self._parameters: Decoders | None = None  # made where they are asked for
         before, self._tracker = self._tracker, None
         if artifact.motion is not None and self._tracking is not False:
@@ -169,9 +169,8 @@ class KKLObserver(RecordEstimates):
     def __copy__(self) -> "KKLObserver":
         """Another that stands where this one does, and goes its own way: what is changed in place is copied too."""
         other = object.__new__(type(self))
-        vars(other).update(vars(self))
-        other._monitor = copy.deepcopy(self._monitor)
-        other._tracker = copy.copy(self._tracker)
+        mine = {"_monitor": copy.deepcopy(self._monitor), "_tracker": copy.copy(self._tracker)}
+        vars(other).update(vars(self) | mine)
         return other
 
     def replace(self, artifact: Artifact) -> None:
@@ -226,7 +225,7 @@ class KKLObserver(RecordEstimates):
         Returns
         -------
         ndarray, shape (..., nx)
-            The first estimate: T_inv(z_0), or x0 where the observer tracks and x0 is given.
+            The first estimate: T_inv(z_0), or that of the tracker, which is x0 where it is given.
 
         Raises
         ------
@@ -276,10 +275,8 @@ class KKLObserver(RecordEstimates):
 
         Raises
         ------
-        RuntimeError
-            Before :meth:`reset`.
-        ValueError
-            If the artifact holds no T.
+        RuntimeError, ValueError
+            Before :meth:`reset`; if the artifact holds no T.
         """
         z, T = self.z, self.artifact.require_forward()
         apart = (T(self.decode()) - z[..., : len(T.z_scale)]) / T.z_scale
@@ -307,13 +304,10 @@ class KKLObserver(RecordEstimates):
         y0, x0 = real_array("y", y0), None if x0 is None else real_array("x0", x0)
         check_output(self.artifact, y0, (int(rows.sum()),), first=True)
         z[rows], age = first_state(self.artifact, y0, x0)
+        self._z, self._y, self._x_hat = z, self._y.copy(), None
+        self._y[rows], self._age = y0, np.where(rows, age, self._age)
         if self._tracker is not None:
             self._tracker.restart(rows, y0, x0)
-        self._z, self._y = z, self._y.copy()
-        self._y[rows] = y0
-        self._age = np.where(rows, age, self._age)
-        self._x_hat = None
-        if self._tracker is not None:
             self._tracker.supervise(z, self._age, rows)
         if self._monitor is not None:
             self._monitor.restart(rows)
@@ -385,14 +379,9 @@ class KKLObserver(RecordEstimates):
             y = filled(self.artifact, self._states, y, gaps, u, z=self._z, before=self._y, age=self._age)
         advance = linear.advance_single if self._compiled and not batch else linear.advance
         z = advance(self._z, self._y, u, y)
-        if rows is None:
-            self._z, self._y, self._age = z, y, self._age + 1
-        else:
-            kept = self._z.copy()
-            kept[rows] = z[rows]
-            self._z, self._y = kept, np.where(rows[..., None], y, self._y)
-            self._age = self._age + rows
-        self._x_hat = None
+        if rows is not None:
+            z, y = np.where(rows[..., None], z, self._z), np.where(rows[..., None], y, self._y)
+        self._z, self._y, self._age, self._x_hat = z, y, self._age + (1 if rows is None else rows), None
         if tracker is not None:
             tracker.supervise(self._z, self._age, rows)
         if self._monitor is not None and not missing:
@@ -506,5 +495,5 @@ class KKLObserver(RecordEstimates):
                 "with kkl-gym train --uncertain all=0.1 --estimate-parameters"
             )
         if self._parameters is None:
-            self._parameters = Decoders.of(artifact, slice(artifact.nx, None), **self._levels)
+            self._parameters = Decoders(artifact, slice(artifact.nx, None), **self._levels)
         return self._parameters
