@@ -76,7 +76,7 @@ def test_variances_have_floors():
     *(({name: -np.ones(2)}, f"{name} of a motion must not be negative") for name in ("error", "process_noise")),
     ({"least_measurement_noise": np.ones((1, 1))}, "least_measurement_noise must have shape"),
     ({"covariance": np.ones(2)}, "covariance"),
-    *(({"covariance": np.array(wrong)}, "covariance of a motion must be positive definite")
+    *(({"covariance": np.array(wrong)}, "a covariance must be positive definite, got")
       for wrong in ([[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]])),
     ({"low": np.full(2, 50.0)}, "bounds of a motion must go from low to high"),
     *(({name: wrong}, f"{name} of a motion must be positive and at most")
@@ -85,6 +85,12 @@ def test_variances_have_floors():
 def test_motions_that_do_not_fit(changes, words):
     with pytest.raises(ArtifactError, match=words):
         replace(linear_motion(), **changes)
+
+
+def test_covariances_may_be_in_any_units():
+    units = np.array([1e-12, 1e12])
+    covariance = linear_motion().covariance * np.outer(units, units)
+    assert replace(linear_motion(), covariance=covariance).covariance is covariance
 
 
 def test_steps_that_do_not_fit():
