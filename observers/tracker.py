@@ -258,8 +258,8 @@ class Tracker:
 
         y = output(s)
         if s.ndim == 3 and not np.isfinite(y).all():  # sigma points may lie where h is undefined
-            for nearer in (self._within(s), s.mean(0, keepdims=True)):
-                y = np.where(np.isfinite(y), y, output(nearer))
+            y = np.where(np.isfinite(y), y, output(self._within(s)))
+            y = np.where(np.isfinite(y), y, y[0])
         return y
 
     def _within(self, s: np.ndarray) -> np.ndarray:
