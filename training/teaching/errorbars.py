@@ -195,7 +195,7 @@ class _Run:
         self, artifact: Artifact, x: np.ndarray, z: np.ndarray, *, level: float, process_noise: float
     ) -> np.ndarray:
         """Squared distances of the errors in units of the covariance, (ages, n)."""
-        decoders = Decoders(
+        decoders = Decoders.of(
             artifact, slice(artifact.nx), measurement_noise=level_of(artifact, level), process_noise=process_noise
         )
         parts, x_hat = decoders.estimate(z, (self.regions.ages * artifact.filter.dt)[:, None])
