@@ -33,7 +33,8 @@ STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attrib
 class Config:
     """A training run; together with the system it determines the artifact.
 
-    The defaults are those of the preset "fast" of input-aware maps.
+    The defaults are those of the preset "fast" of input-aware maps. A source reads what concerns its motions: of
+    simulated ones their number and kinds, of recorded ones what is held out.
 
     Raises
     ------
@@ -52,13 +53,13 @@ class Config:
     positive. A slow pair averages the noise on a component of y that oscillates at its frequency."""
     dt: Positive = 0.01
     """Sampling interval in seconds."""
-    trajectories: Count = 4000
+    trajectories: Count = 500
     """Number of simulated trajectories."""
     duration: Positive = 50.0
     """Length of each trajectory in seconds."""
     samples: Annotated[int, Field(ge=2)] = 200
     """Points recorded along each trajectory."""
-    width: Count = 128
+    width: Count = 20
     """Neurons in each hidden layer."""
     depth: Count = 3
     """Number of hidden layers."""
@@ -72,7 +73,7 @@ class Config:
     """Highest learning rate; after a short warm-up it decays to zero along a cosine."""
     forward_steps: Annotated[int, Field(ge=0)] = 0
     """Batches for the forward map (spinn)."""
-    inverse_steps: Count = 18000
+    inverse_steps: Count = 1500
     """Batches for each inverse map."""
     random_features: Annotated[int, Field(ge=0)] = 0
     """Solve for the forward map by least squares with so many random features, 1500 say, instead of training it
@@ -122,6 +123,29 @@ class Config:
     high_noise_emphasis: Positive = 2.0
     """How often samples have high levels of measurement noise, which are harder to learn. 1 draws the level evenly on
     a logarithmic scale over the two decades below measurement_noise_max; higher values draw high levels more often."""
+    windows: Count = 8000
+    """Starts of the filter for each age (recorded motions)."""
+    members: Count = 1
+    """Networks that are fitted from other random numbers and averaged: what one makes up beyond few records, the others
+    do not. They end as one network, as wide as all together."""
+    arbitrary_zero: tuple[str, ...] = ()
+    """Measured signals whose zero is arbitrary, such as angles of encoders that were zeroed anywhere: the map depends
+    on how they change, not on where they are (recorded motions)."""
+    untold_noise: NotNegative = 0.0
+    """Standard deviation of further noise in every sample, over the largest level, of which the map is not informed: it
+    keeps networks from learning the noise of few records by heart."""
+    held_out: Annotated[float, Field(ge=0, lt=1)] = 0.2
+    """Share of the records that is not trained on, on which covariances are calibrated and errors measured; whole
+    records where there are five or more, else the end of each."""
+    tracking: bool = True
+    """Whether the observer tracks (all but spinn): a Kalman filter on the system's equations, or on a learned flow,
+    that T_inv initialises."""
+    flow_steps: Count = 5000
+    """Batches for a flow, which is learned where there are no equations."""
+    runs: Annotated[int, Field(ge=100)] = 300
+    """Simulated motions on which covariances and the monitor's limits are calibrated."""
+    false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    """Probability that a sound motion of twenty seconds, at the pace of the shipped systems, raises an alarm."""
     truncation: Positive = 1e-6
     """Part epsilon of the filter's start that may be left where the forward map's data begins (paper, sec. 5.2)."""
     closed_loop_trajectories: Annotated[int, Field(ge=0)] = 0
@@ -173,7 +197,7 @@ class Config:
                 f"random_features = {self.random_features} solve for T: forward_steps must be 0 beside them"
             )
         if self.pipeline != "spinn":
-            own = ("collocation", "box_factor", "adaptive", "solved_output_layer", "transients", "scaling")
+            own = ("collocation", "box_factor", "adaptive", "solved_output_layer", "transients")
             defaults = {entry.name: entry.default for entry in dataclasses.fields(self)}
             changed = [f"{name} = {getattr(self, name)!r}" for name in own if getattr(self, name) != defaults[name]]
             if changed:
@@ -201,13 +225,13 @@ def read_changes(path: Path) -> dict[str, Any]:
     return _validated(found, str(path))
 
 
-def settings_of(training: Mapping[str, Any]) -> Config:
+def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
     """The configuration behind what an artifact says of its training."""
     known = setting_types()
     found = {name: value for name, value in training.items() if name in known and value is not None}
     if not {"pipeline", "eigenvalues"} <= set(found):
         raise ValueError("the observer does not say how it was trained, so that it cannot be trained again")
-    return Config(**_validated(found, "the observer's training"))
+    return Config(**{**_validated(found, "the observer's training"), **changes})
 
 
 def _validated(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
