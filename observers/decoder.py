@@ -29,9 +29,7 @@ class Decoders:
     ) -> Self:
         """Return those of an artifact at levels of noise, for some of the maps' outputs."""
         driven, free = (
-            None
-            if inverse is None
-            else Decoder(inverse, outputs, measurement_noise, process_noise, compiled=compiled)
+            None if inverse is None else Decoder(inverse, outputs, measurement_noise, process_noise, compiled=compiled)
             for inverse in (artifact.inverse, artifact.free_inverse)
         )
         assert driven is not None

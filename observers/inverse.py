@@ -8,8 +8,8 @@ import numpy as np
 
 from observers.checks import is_finite
 from observers.errors import ArtifactError, check_shapes
-from observers.network import MLP
 from observers.factors import ErrorCovariance
+from observers.network import MLP
 
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end

@@ -10,11 +10,10 @@ from observers.artifact import Artifact
 from observers.decoder import Decoders
 from observers.supervision import INFLATION, Supervision
 from observers.thresholds import MANY_ROWS
-from observers.tracker_kernel import TrackerKernel
-from observers.unscented import Gaussian, Points, conditioned, factor, transformed
+from observers.tracker_kernel import RELINEARISATIONS, TrackerKernel
+from observers.unscented import Points, conditioned, factor, transformed
 
 KNOWN = 1e-3  # standard deviation of a known start, in scaled states
-RELINEARISATIONS = 2  # of a step within the first window: with 0 errors without noise rise by 40 to 80 %
 
 
 class Tracker:
@@ -255,9 +254,9 @@ class Tracker:
         self._state = self._state.copy()
         s = self._within((x - self._motion.x_offset) / self._motion.x_scale)
         self._x[where[taken]], self._P[where[taken]] = s[taken], P[taken]
-        lost = where[lost]
-        self._state[lost, self._end : self._end + 2] = 1.0
-        self._state[lost, self._end + 3 :] = 0.0
+        again = where[lost]
+        self._state[again, self._end : self._end + 2] = 1.0
+        self._state[again, self._end + 3 :] = 0.0
 
     def _inverted(self, z: np.ndarray, age: np.ndarray, learned: np.ndarray, where: np.ndarray) -> Gaussian:
         """T_inv's estimates of z in some rows and their covariances in scaled states, at ages in seconds."""
