@@ -11,7 +11,7 @@ from observers.decoder import Decoders
 from observers.supervision import INFLATION, Supervision
 from observers.thresholds import MANY_ROWS
 from observers.tracker_kernel import RELINEARISATIONS, TrackerKernel
-from observers.unscented import Points, conditioned, factor, transformed
+from observers.unscented import Gaussian, Points, conditioned, factor, transformed
 
 KNOWN = 1e-3  # standard deviation of a known start, in scaled states
 
@@ -143,7 +143,7 @@ class Tracker:
 
         Returns the predicted outputs, (..., ny), which are not finite where a covariance broke down.
         """
-        n, ny = len(self._state), len(self._R)
+        n, ny = len(self._state), len(self._motion.least_measurement_noise)
         y, u = y.reshape(n, ny), u.reshape(n, u.shape[-1])
         taken = np.ones(n, dtype=bool) if rows is None else rows.flatten()
         machine = self._machine
