@@ -110,7 +110,9 @@ class _MapLesson:
         name = f"{self.source.name}, free" if free else self.source.name
         report = self.run.progress.bar(f"motions of {name}", self.config.trajectories)
         with self.run.timed("motions"):
-            return self.source.pairs(linear, free=free, report=report)
+            pairs = self.source.pairs(linear, free=free, report=report)
+        report(self.config.trajectories)
+        return pairs
 
     def _along(self, pairs: Pairs, linear: LinearFilter, error: np.ndarray | None = None) -> TrajectorySampler:
         """Batches along motions; z may have an error of some covariance beside."""

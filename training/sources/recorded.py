@@ -147,6 +147,7 @@ class RecordedSource:
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
         """How states change from each recorded sample to the next, on what is trained on and what is held out."""
+        self._require_trackable()
         return self._increments(self.kept), self._increments(self.held_out)
 
     def _increments(self, records: Sequence[Record]) -> Increments:
@@ -173,13 +174,6 @@ class RecordedSource:
 
     def motion(self, **how: Any) -> Motion:
         """The motion of a tracker by a flow."""
-        if self.config.arbitrary_zero:
-            raise ValueError(
-                f"a tracker compares {', '.join(self.config.arbitrary_zero)} with what it predicts, and cannot do "
-                "without the zero: train without arbitrary_zero"
-            )
-        if not self.held_out:
-            raise ValueError("covariances are calibrated on what is held out: held_out must be positive, got 0")
         x = np.concatenate([record.x for record in self.kept if record.x is not None])
         x = x[np.isfinite(x).all(-1)]
         low, high = x.min(0), x.max(0)
@@ -196,6 +190,16 @@ class RecordedSource:
             "factors": Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1))),
         }
         return Motion(**parts | how)
+
+    def _require_trackable(self) -> None:
+        if self.config.arbitrary_zero:
+            raise ValueError(
+                f"a tracker compares {', '.join(self.config.arbitrary_zero)} with what it predicts, and cannot do "
+                "without the zero: train without arbitrary_zero"
+            )
+        if not self.held_out:
+            raise ValueError("covariances are calibrated on what is held out: held_out must be positive, got 0")
+        self._output()
 
     def _output(self) -> tuple[np.ndarray, np.ndarray]:
         return linear_output(self.kept)
