@@ -142,7 +142,7 @@ class Config:
     that T_inv initialises."""
     flow_steps: Count = 5000
     """Batches for a flow, which is learned where there are no equations."""
-    runs: Annotated[int, Field(ge=100)] = 300
+    runs: Annotated[int, Field(ge=100)] = 400
     """Simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Probability that a sound motion of twenty seconds, at the pace of the shipped systems, raises an alarm."""

@@ -139,7 +139,7 @@ class RecordedSource:
         u = np.zeros((steps, len(first), 0))
         if self.nu:
             u = np.concatenate([np.asarray(piece.u) for piece in whole])[where[:-1]]
-        return Runs(x, np.concatenate([piece.y for piece in whole])[where], u, np.zeros(len(first)))
+        return Runs(x, np.concatenate([piece.y for piece in whole])[where], u, np.zeros(len(first)), np.ones(len(first), bool))
 
     def equations(self) -> Equations:
         """There are none."""
