@@ -14,9 +14,9 @@ from kkl_gym.system import System
 from observers import Artifact
 from training.config import Pipeline
 from training.evaluation.levels import multiple
-from training.pipeline import train
 from training.presets import preset
 from training.spectrum import papers_spectrum
+from training.train_observer import train
 from training.tuning import Probe, Spectrum
 
 Settings = Mapping[str, Any]
@@ -64,7 +64,9 @@ class Ablation(KKLMethod):
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
-        config = within(preset(task.system, self.pipeline, "fast"), task.budget, task.seed)
+        size = "large" if self.pipeline == "input-aware" else "default"
+        changes = {"tracking": False}
+        config = within(preset(task.system, self.pipeline, size=size, changes=changes), task.budget, task.seed)
         config = replace(config, **self.changes(task))
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 
