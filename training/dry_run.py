@@ -55,8 +55,6 @@ def estimate(
     parts = shares(config, few.artifact.nu)
     more = _short_run(system, replace(config, cpu_seconds=CPU_SECONDS / min(parts.values())), device=device)
     seconds = {"simulating": few.seconds["simulating"] * max(1.0, config.trajectories / CHUNK)}
-    if config.random_features:
-        seconds["solving"] = more.seconds["solving"]
     for stage in few.losses:
         batches = config.forward_steps if stage == "forward" else config.inverse_steps
         (done, _), (done_later, _) = few.losses[stage][-1], more.losses[stage][-1]

@@ -25,7 +25,6 @@ from training.config import Config
 from training.jobs import claimed_run, describe
 from training.maps.forward import ForwardProblem, transients, truncation_step
 from training.maps.inverse import InverseProblem
-from training.maps.least_squares import POINTS, solve_forward
 from training.maps.networks import Network, on_torch
 from training.maps.optimise import Log, Stage, log_to, optimise
 from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
@@ -46,7 +45,6 @@ from training.trajectories.signals import DRIVEN, KINDS
 
 # Of each stage in the CPU time; those of input-aware maps have equal shares.
 SPINN_SHARES = {"forward": 0.5, "inverse": 0.5}
-SOLVED_SHARES = {"inverse": 0.75}  # solving takes about the rest
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory, at the pace of the shipped systems
 
@@ -65,7 +63,7 @@ class Result:
     losses : dict of str to list of (int, float)
         For each stage that trained a network, its error after so many batches.
     seconds : dict of str to float
-        What each of these stages took, "simulating", and "solving" for T with random features.
+        What each of these stages took, and "simulating".
     """
 
     artifact: Artifact
@@ -92,8 +90,8 @@ def train(
     3. The training trajectories are simulated with the filter beside them; those of input-aware maps have process noise
        and inputs, random ones or a policy's. In all stages uncertain parameters differ between trajectories, see
        :func:`training.trajectories.parameters.uncertain_plant`.
-    4. Forward map (spinn): T is trained on them and on its equation, or solved for, and z' = T(x') takes the place of
-       the simulated z. An input-aware map has no T. Batches are drawn along the trajectories, with measurement noise
+    4. Forward map (spinn): T is trained on them and on its equation, and z' = T(x') takes the place of the simulated z.
+       An input-aware map has no T. Batches are drawn along the trajectories, with measurement noise
        added to z.
     5. The inverse is fitted on these batches, and the observer is put together.
     6. Closed loop (if the configuration has it): a controller acts on that observer's estimates, and the same inverse
@@ -263,16 +261,8 @@ class _Run:
         return x if self.config.collocation == "motions" else self.system.draw_starts(self.rng, len(x))
 
     def learn_forward(self, trajectories: Trajectories, points: np.ndarray) -> ForwardMap:
-        """T, trained or solved for."""
+        """T, trained on pairs and on its equation."""
         system, config, linear = self.system, self.config, self.linear
-        if config.random_features:
-            features = config.random_features
-            self.samples["forward_samples"] = min(POINTS * features, len(points))
-            with (
-                self.timed("solving"),
-                self.progress.phase(f"solving for T with {features} features", linear.size) as report,
-            ):
-                return solve_forward(system, linear, features=features, points=points, rng=self.rng, report=report)
         late = self.settled
         self.samples["forward_samples"] = int(late.sum()) * config.trajectories + len(points)
         network = Network(system.nx, linear.size, width=config.width, depth=config.depth, activation=config.activation)
@@ -286,7 +276,6 @@ class _Run:
             physics_weight=config.physics_weight,
             batch=config.batch,
             device=self.device,
-            adaptive=config.adaptive,
         )
         self.minimise("forward", problem, config.forward_steps)
         if config.solved_output_layer:
@@ -321,7 +310,7 @@ class _Run:
 
     def fit(self, stage: str, network: Network, sampler: Sampler) -> None:
         """Train a network on the sampler's batches."""
-        problem = InverseProblem(network, sampler, self.device, lipschitz_penalty=self.config.lipschitz_penalty)
+        problem = InverseProblem(network, sampler, self.device)
         self.minimise(stage, problem, self.config.inverse_steps)
 
     def close_the_loop(self, sampler: TrajectorySampler, artifact: Artifact, feedback: Controller) -> ClosedLoopSampler:
@@ -409,7 +398,7 @@ class _Run:
 def shares(config: Config, nu: int) -> dict[str, float]:
     """Stages of a run that train networks, with their parts in the CPU time."""
     if config.pipeline == "spinn":
-        return SOLVED_SHARES if config.random_features else SPINN_SHARES
+        return SPINN_SHARES
     closed_loop = ["closed-loop"] if config.closed_loop_trajectories else []
     stages = ["inverse", *(["free"] if config.free_inverse and nu and config.policy is None else []), *closed_loop]
     return {stage: 1 / len(stages) for stage in stages}
