@@ -100,7 +100,13 @@ def preset(system: System, pipeline: Pipeline, name: Preset, *, changes: Mapping
             transients=False,
         )
         return override(config, changes)
-    chosen = {**sizes, "box_factor": 2.0, "forward_steps": 10_000, "noise_free_share": 0.35}
+    chosen = {
+        **sizes,
+        "box_factor": 2.0,
+        "forward_steps": 6_000,
+        "inverse_steps": 12_000,
+        "noise_free_share": 0.35,
+    }
     settings = dict(profile(system).spinn_settings)
     if "eigenvalues" in settings:
         settings["eigenvalues"] = _rounded(settings["eigenvalues"])
