@@ -25,6 +25,7 @@ from training.maps.inverse import InverseProblem
 from training.maps.networks import Network
 from training.maps.samplers import ForwardMapSampler
 from training.maps.scaling import StateScale
+from training.maps.step import Captured
 from training.progress import progress_bars
 from training.spectrum import Spectrum
 
@@ -161,9 +162,7 @@ def test_the_first_batches_run_and_the_others_replay_a_graph(monkeypatch):
     monkeypatch.setattr(torch.cuda, "stream", lambda stream: contextlib.nullcontext())
     monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: Graph(events))
     monkeypatch.setattr(torch.cuda, "graph", lambda graph: contextlib.nullcontext(events.append("capture")))
-    run = training.maps.optimise.Captured(
-        lambda: events.append(torch.get_float32_matmul_precision()), torch.Generator()
-    )
+    run = Captured(lambda: events.append(torch.get_float32_matmul_precision()), torch.Generator())
     for _ in range(6):
         run()
     assert events == ["high"] * 3 + ["generator", "capture", "high"] + ["replay"] * 3
@@ -172,7 +171,7 @@ def test_the_first_batches_run_and_the_others_replay_a_graph(monkeypatch):
     def reads():
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    run = training.maps.optimise.Captured(reads, torch.Generator())
+    run = Captured(reads, torch.Generator())
     run.WARM_UP = 0
     with pytest.raises(RuntimeError, match=r"cannot be captured as a CUDA graph.*stream is capturing.*--device cpu"):
         run()
