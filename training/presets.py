@@ -132,7 +132,8 @@ def preset(
             transients=False,
         )
         return override(config, changes)
-    chosen = {**sizes, **LARGE, "box_factor": 2.0, "forward_steps": 10_000, "noise_free_share": 0.35}
+    batches = {"forward_steps": 6_000, "inverse_steps": 12_000}
+    chosen = {**sizes, **LARGE, **batches, "box_factor": 2.0, "noise_free_share": 0.35}
     settings = dict(profile(system).spinn_settings)
     if "eigenvalues" in settings:
         settings["eigenvalues"] = _rounded(settings["eigenvalues"])

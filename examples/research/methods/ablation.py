@@ -21,7 +21,6 @@ from training.tuning import Probe, Spectrum
 
 Settings = Mapping[str, Any]
 
-PENALTY = 0.03  # of the mean square error for a factor e in the Lipschitz constant
 NO_NOISE = 0.02  # of the system's own measurement noise: the largest in training of inverses for none
 # One inverse for free and driven motion, with samples drawn alike for all systems.
 TOGETHER: Settings = {
@@ -41,7 +40,6 @@ PAPERS: Settings = {
     "scaling": "range",
     "transients": False,
     "solved_output_layer": False,
-    "adaptive": False,
 }
 # Name, label and the settings of the paper that are the preset's from this step on.
 SPINN_STEPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
@@ -97,17 +95,7 @@ def _spinn() -> list[Ablation]:
     for name, label, more in SPINN_STEPS:
         given_back += more
         methods.append(Ablation(name, label, _without(given_back), "spinn"))
-    adaptive: Settings = {"adaptive": True}
-    return [
-        *methods,
-        Ablation("ablation-spinn-adaptive", "... adaptive points", lambda task: adaptive, "spinn"),
-        Ablation(
-            "ablation-spinn-lipschitz",
-            "... Lipschitz penalty",
-            lambda task: {**adaptive, "lipschitz_penalty": PENALTY},
-            "spinn",
-        ),
-    ]
+    return methods
 
 
 def _without_noise(task: Task) -> Settings:
