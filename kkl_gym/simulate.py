@@ -22,9 +22,9 @@ from observers.checks import check_dt
 RATE_STEP = 0.4
 # A millionth less, so that rates which rounding takes to either side of a power of two get the same substeps.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
-# Largest estimate of a substep's error, in half-widths of X. The error itself is smaller by 1e5 near TOLERANCE, with
-# which the shipped systems without their formulas keep the same 1e-5. ROUGH is for systems with a formula, which is
-# overruled only where it fails, as when something ignites.
+# Largest estimate of a substep's error, in half-widths of X. The error itself is smaller by a thousand there. With
+# TOLERANCE, stiff systems and the shipped ones without their formulas keep the same 1e-5. ROUGH is for systems with a
+# formula, which is overruled only where it fails, as when something ignites: a hundred times what the shipped reach.
 TOLERANCE, ROUGH = 3e-6, 0.1
 ATTEMPTS = 3  # at substeps of one length; afterwards, and beyond MOST_EQUAL of them, their length follows the error
 MOST_EQUAL = 1 << 10
@@ -43,9 +43,10 @@ STAGES = (
     (9 / 44, -9 / 11, 63 / 44, 18 / 11, 0, -16 / 11),
 )
 WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
-# Of the slopes: the difference of the two halfway, and a little of their fourth divided difference over 0, 1/3, 1/2, 2/3
-# and 1, for derivatives that depend on time alone. Times h, it is of order h^5.
-ERROR = tuple((0, 0, 0, 0, -1, 1, 0)[i] + each / 256 for i, each in enumerate((1, 0, -9, -9, 16, 0, 1)))
+# An estimate of the error, of order h^5 when multiplied by h: the difference of the two slopes halfway. Where the
+# derivative depends on time alone it is zero, so that a little of the fourth divided difference over the interval is
+# added, which is (1, 0, -9, -9, 16, 0, 1).
+ERROR = (1 / 256, 0, -9 / 256, -9 / 256, 16 / 256 - 1, 1, 1 / 256)
 # Of the state, of a constant slope and of the slopes of the stages before.
 _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
 _ERROR = np.array(ERROR)
@@ -90,7 +91,8 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, float
         lines += [f"        k{row}_{i} = k{row}_{i} + d{i}" for i in components]
     lines += [f"        x{i} = {moved(i, len(STAGES), WEIGHTS)}" for i in components]
     for i in components:
-        lines += [f"        e{i} = h * s{i} * (" + " + ".join(f"{c!r} * k{j}_{i}" for j, c in enumerate(ERROR) if c) + ")"]
+        weighted = " + ".join(f"{c!r} * k{j}_{i}" for j, c in enumerate(ERROR) if c)
+        lines += [f"        e{i} = h * s{i} * ({weighted})"]
     lines += ["        e = " + " + ".join(f"e{i} * e{i}" for i in components)]
     lines += ["        if not e <= error:", "            error = e"]  # where it is no number, too
     lines += [f"    return ({unpacked('x')}), error"]
@@ -115,12 +117,14 @@ def forced(system: System, u: Components, w: Components) -> tuple[VectorField, C
     return field, w
 
 
-@functools.lru_cache(maxsize=256)
-def per_tolerance(kind: type[System], tolerance: float | None = None) -> tuple[float, ...]:
-    """One over the tolerance of each state's error, (nx,)."""
+def _per_tolerance(kind: type[System], tolerance: float | None = None) -> tuple[float, ...]:
     if tolerance is None:
         tolerance = TOLERANCE if kind.rate is System.rate else ROUGH
     return tuple(2.0 / (high - low) / tolerance for low, high in kind.X)
+
+
+per_tolerance: Callable[..., tuple[float, ...]] = functools.lru_cache(maxsize=256)(_per_tolerance)
+"""One over the tolerance of each state's error, (nx,), of a class of systems; kept, as every step asks."""
 
 
 def advance(system: System, x: Components, u: Components, w: Components, dt: float) -> Components:
@@ -279,9 +283,7 @@ def followed_rows(
     return end
 
 
-def _step_batch(
-    system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any
-) -> tuple[np.ndarray, np.ndarray]:
+def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> tuple[np.ndarray, np.ndarray]:
     """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,), and the squares of its errors, (n,).
 
     Few, large operations, because each call of numpy costs as much as its work on a thousand numbers: a stage is one
