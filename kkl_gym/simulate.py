@@ -245,8 +245,8 @@ def equal_substeps(
                 break
             substeps[rows], error[rows] = _powers(substeps[rows] * error[rows] ** 0.1), np.nan
             rows = rows[substeps[rows] > 0]
-            h, columns = dt / substeps[rows], (values[:, rows] for values in (x, u, w))
-            out[:, rows], error[rows] = _substeps(system, *columns, h, substeps[rows])
+            n = substeps[rows]
+            out[:, rows], error[rows] = _substeps(system, x[:, rows], u[:, rows], w[:, rows], dt / n, n)
         again = ~(error <= 1)
         out[:, again] = np.nan
     return out, again
