@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 
 from kkl_gym.equations import blame
-from kkl_gym.system import Components, System, dot
+from kkl_gym.system import Components, System, dot, rate_under
 from observers.checks import check_dt
 
 # rate * substep stays below this where a system has a formula for its rate. Chosen so that every shipped system keeps
@@ -165,7 +165,7 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
     """
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
-        found: list[float] = _advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
+        found: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
     except Exception:
         return None
     return found if np.isfinite(found).all() else None
@@ -209,7 +209,13 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
 def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
     """One sampling interval from states (nx, n), each with the substeps that :func:`advance` would take."""
     try:
-        return _advance_batch(system, x, u, w, dt)
+        if system.discrete:
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                moved = system.step(x, u)
+                return np.array([np.broadcast_to(xi, x.shape[1:]) for xi in moved], dtype=float) + w * dt
+        out, lost = equal_substeps(system, x, u, w, dt)
+        rows = np.flatnonzero(np.isnan(out[0])) if lost else np.arange(0)
+        return followed_rows(system, x, u, w, dt=dt, end=out, rows=rows)
     except SubstepsError:
         raise
     except Exception as error:
@@ -217,19 +223,8 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
         raise
 
 
-def _advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        if system.discrete:
-            moved = system.step(x, u)
-            return np.array([np.broadcast_to(xi, x.shape[1:]) for xi in moved], dtype=float) + w * dt
-        out, again = equal_substeps(system, x, u, w, dt)
-    return followed_rows(system, x, u, w, dt=dt, end=out, rows=np.flatnonzero(again))
-
-
-def equal_substeps(
-    system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The ends (nx, n) of a sampling interval in substeps of one length for each row, and which to do again, (n,)."""
+def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
+    """The ends (nx, n) of substeps of one length for each row, NaN where these do not do, and whether any do not."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need: Any = 1.0 if type(system).rate is System.rate else system.rate(x) * dt * PER_RATE
         if np.all(need <= 1):
@@ -247,9 +242,9 @@ def equal_substeps(
             rows = rows[substeps[rows] > 0]
             n = substeps[rows]
             out[:, rows], error[rows] = _substeps(system, x[:, rows], u[:, rows], w[:, rows], dt / n, n)
-        again = ~(error <= 1)
-        out[:, again] = np.nan
-    return out, again
+    lost = ~(error <= 1)
+    out[:, lost] = np.nan
+    return out, bool(lost.any())
 
 
 def _powers(need: np.ndarray) -> np.ndarray:
@@ -360,7 +355,7 @@ def check_duration(duration: float, dt: float) -> None:
 def check_interval(system: System, dt: float) -> None:
     """Raise an error if a sampling interval does not suit a system at all."""
     if not system.discrete:
-        rate = float(system.rate_under(tuple(np.mean(system.X, axis=1).tolist()), system.u_max))
+        rate = float(rate_under(system, tuple(np.mean(system.X, axis=1).tolist()), system.u_max))
         if rate * dt * PER_RATE > MAX_SUBSTEPS:
             raise SubstepsError(
                 f"{system.name} changes at a rate of {rate:.4g}/s in the middle of X, for which dt = {dt:g} s would "

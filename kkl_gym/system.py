@@ -181,7 +181,7 @@ class System:
 
     @property
     def typical_rate(self) -> float:
-        """Median of :meth:`rate_under` over a thousand starts and the largest input, in 1/s; ValueError if it is 0."""
+        """Median rate of f(x) + g(x) u over a thousand starts and the largest input, in 1/s; ValueError if it is 0."""
         return _typical_rate(self)
 
     def f(self, x: Components) -> Components:
@@ -338,27 +338,6 @@ class System:
         """
         return slope(self.f, x, self.X)
 
-    def rate_under(self, x: Components, u: Components) -> Any:
-        """How fast f(x) + g(x) u changes under a held input, in 1/s.
-
-        It is :meth:`rate` where g is constant, and where that is overridden.
-
-        Parameters
-        ----------
-        x : sequence of length nx
-            Components of the state.
-        u : sequence of length nu
-            Input.
-
-        Returns
-        -------
-        float, or of the kind that the components of ``x`` are
-            The rate in 1/s.
-        """
-        if type(self).g is System.g or type(self).rate is not System.rate:
-            return self.rate(x)
-        return slope(lambda x: [fi + dot(row, u) for fi, row in zip(self.f(x), self.g(x), strict=True)], x, self.X)
-
     def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the training box, or of a multiple of it about ``X_centre``, cut at the bounds.
 
@@ -441,10 +420,17 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
     return total**0.5
 
 
+def rate_under(system: System, x: Components, u: Components) -> Any:
+    """How fast f(x) + g(x) u changes under a held input, in 1/s; its rate if g is constant, or that is a formula."""
+    if type(system).g is System.g or type(system).rate is not System.rate:
+        return system.rate(x)
+    return slope(lambda x: [fi + dot(row, u) for fi, row in zip(system.f(x), system.g(x), strict=True)], x, system.X)
+
+
 def typical_rate(system: System, starts: np.ndarray) -> float:
     """Median over some starts of how fast f changes. Shapes: ``starts`` (n, nx)."""
     rate_at(system, starts.T)  # or say what is wrong with it
-    rate = float(np.median(np.broadcast_to(system.rate_under(starts.T, system.u_max), len(starts))))
+    rate = float(np.median(np.broadcast_to(rate_under(system, starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:
         raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
     return rate

@@ -14,15 +14,7 @@ import numpy as np
 
 from kkl_gym.compiled.step import Advance, SamplingStep, shared_step, trial_states
 from kkl_gym.equations import components, input_matrix, rate_at
-from kkl_gym.simulate import (
-    ATTEMPTS,
-    MOST_EQUAL,
-    PER_RATE,
-    advance_batch,
-    equal_substeps,
-    per_tolerance,
-    runge_kutta,
-)
+from kkl_gym.simulate import ATTEMPTS, MOST_EQUAL, PER_RATE, advance_batch, equal_substeps, per_tolerance, runge_kutta
 from kkl_gym.system import System
 
 MAX_OPERATIONS = 400  # of f + g u; beyond, such as for a network as f, compiling takes many seconds
@@ -57,7 +49,7 @@ class CompiledBatch:
         for points in trial_states(system, _TRIALS, np.random.default_rng(0)):
             rng, n = np.random.default_rng(0), len(points)
             at = points.T, u_max * rng.uniform(-1, 1, (nu, n)), scale * rng.uniform(-1, 1, (nx, n)), system.dt
-            found, expected = self._substeps(*at)[0], self._in_numpy(*at)[0]
+            found, expected = self._substeps(*at)[0], equal_substeps(system, *at)[0]
             expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan  # what escapes may be either
             if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
                 raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
@@ -68,12 +60,8 @@ class CompiledBatch:
         try:
             lost = self.kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
         except ArithmeticError:  # negative powers of zero, which Numba raises even so
-            return self._in_numpy(x, u, w, dt)
+            return equal_substeps(self.system, x, u, w, dt)
         return out, lost
-
-    def _in_numpy(self, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
-        out, again = equal_substeps(self.system, x, u, w, dt)
-        return out, bool(again.any())
 
 
 def batch_step(system: System) -> SamplingStep[np.ndarray]:

@@ -20,7 +20,7 @@ from kkl_gym import elementary
 from kkl_gym.compiled.reading import Read
 from kkl_gym.compiled.step import Advance, SamplingStep, shared_step, trial_states
 from kkl_gym.simulate import ATTEMPTS, MOST_EQUAL, PER_RATE, advance, per_tolerance, runge_kutta
-from kkl_gym.system import Components, System
+from kkl_gym.system import Components, System, rate_under
 
 _TRIALS = 200  # states of each kind at which both are compared
 _MOST_SUBSTEPS = 64  # of a state that is compared: Python would take long for more
@@ -74,7 +74,7 @@ def compiled_step(system: System) -> Advance[Components]:
         for x in map(tuple, np.concatenate(trial_states(system, _TRIALS, rng)).tolist()):
             u, w = (u_max * rng.uniform(-1, 1, nu)).tolist(), (scale * rng.uniform(-1, 1, nx)).tolist()
             try:
-                if not system.rate_under(x, u) * system.dt * PER_RATE <= _MOST_SUBSTEPS:
+                if not rate_under(system, x, u) * system.dt * PER_RATE <= _MOST_SUBSTEPS:
                     continue
                 end = kernel(*x, *u, *w, system.dt)
             except Exception:  # Python takes the step

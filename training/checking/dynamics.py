@@ -9,7 +9,7 @@ import numpy as np
 
 from kkl_gym.envs import KKLEnv
 from kkl_gym.simulate import RATE_STEP, SubstepsError, simulate
-from kkl_gym.system import Box, System
+from kkl_gym.system import Box, System, rate_under
 from training.checking.finding import Finding, Verdict, number, percent
 from training.checking.subject import Motions, Subject
 from training.systems import named_policy
@@ -36,8 +36,8 @@ def rate(subject: Subject) -> Iterator[Finding]:
     typical, own = system.typical_rate, type(system).rate is not System.rate
     x = np.concatenate([subject.inner, subject.outer])
     with np.errstate(all="ignore"):
-        worst = float(np.nanmax(system.rate_under(subject.everywhere.T, system.u_max)))
-        said = np.broadcast_to(np.asarray(system.rate_under(x.T, system.u_max), dtype=float), len(x))
+        worst = float(np.nanmax(rate_under(system, subject.everywhere.T, system.u_max)))
+        said = np.broadcast_to(np.asarray(rate_under(system, x.T, system.u_max), dtype=float), len(x))
         norm = float(np.nanmedian(System.rate(system, x.T)))
     fastest = np.abs(np.linalg.eigvals(subject.jacobian(x))).max(1)
     found = f"typically {number(typical)}/s in X, at most {number(worst)}/s within the bounds"
