@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from training.config import Config
+    from training.diagnosis import Observability, observability
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
     from training.guided import GuidedKalmanFilter
     from training.identification.learning import adapt, identify
-    from training.observable import Observability, observability
     from training.pipeline import Result, train
     from training.presets import preset
     from training.rollouts import learn
@@ -39,7 +39,7 @@ _MODULES = {
     "Config": "config",
     "GuidedKalmanFilter": "guided",
     "KKLTrainingCallback": "rollouts.callback",
-    "Observability": "observable",
+    "Observability": "diagnosis",
     "Result": "pipeline",
     "adapt": "identification.learning",
     "calibrate": "teaching.monitor",
@@ -47,7 +47,7 @@ _MODULES = {
     "identify": "identification.learning",
     "learn": "rollouts",
     "nrmse": "evaluation.metrics",
-    "observability": "observable",
+    "observability": "diagnosis",
     "preset": "presets",
     "smape": "evaluation.metrics",
     "train": "pipeline",
