@@ -71,7 +71,6 @@ def test_own_system(tmp_path, monkeypatch):
 # What makes each of the commands for a system of one's own a matter of seconds.
 SMALL = {
     "check": "",
-    "tune": "--modes 2 --duration 5",
     "train": "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch 64 --inverse-steps 9 --threads 1",
     "evaluate": "--trajectories 3 --duration 8",
     "certify": "--trajectories 2",
