@@ -1,37 +1,21 @@
 """From records of outputs to parameters, and what the outputs say of each: :func:`estimate_parameters`."""
 
-import hashlib
-import itertools
-import json
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
-import torch
 
 from kkl_gym.system import System
-from observers import Artifact, KKLObserver, LinearFilter
 from observers.checks import is_finite, shown
-from training.identification.consistency import HORIZON, ConsistencyProblem, Filtered, filtered, noise_level, run_filter
 from training.identification.identifiability import combinations, hidden_directions, sign_symmetries, written
-from training.identification.motions import Shooting
+from training.identification.motions import SAMPLES_PER_STATE, Shooting
 from training.identification.shooting import CLUSTERS, Fit, UnexplainedError, shoot
-from training.identification.windows import LEAST_USED, MORE_COST, Guess, Prediction, fit_windows, predict
-from training.jobs import describe
-from training.maps.optimise import Log, Stage, optimise
+from training.identification.windows import LEAST_USED, MORE_COST, Prediction, fit_windows, noise_level, predict
 from training.progress import ProgressBars
-from training.records import Record, check_memory, check_signals, pieces
-from training.spectrum import Spectrum, evenly_spaced
+from training.records import Record, check_signals, pieces
 
-WIDTH, DEPTH, BATCH, STEPS, LEARNING_RATE = 128, 3, 512, 1500, 3e-3
-RECORDED = 20  # batches between two values of the parameters that a report shows
 HELD_OUT = 10  # every so many records one is left out of the fit, for tests of what it predicts
-FORGOTTEN = 0.01  # part of the filter's start that may be left in a first guess of the state
-LONGEST_MEMORY = 0.25  # of a record's length
-FASTEST, FASTEST_OF_SAMPLES, SPREAD = 1.5, 0.5, 22.5  # modes: fastest over the rate, over 1/dt, and over the slowest
 KEPT_RATIOS = 100.0  # by how much rather all parameters change by one factor than one of them alone, where y is silent
 BACK = (1.0, 0.5, 0.25)  # parts of the way to the nearest parameters, where states would leave their bounds beyond
 HANGS = 0.05  # relative change of a state that goes with parameters which y does not tell, over theirs
@@ -69,7 +53,6 @@ class Identified:
     expected_noise: np.ndarray
     fit: Fit
     predictions: list[Prediction]
-    history: list[tuple[int, dict[str, float]]]
 
     def to_json(self) -> dict[str, dict[str, float | None]]:
         """Value and standard error of each parameter; both None where the outputs do not tell it."""
@@ -122,69 +105,30 @@ class Identified:
 
 
 def estimate_parameters(
-    system: System,
-    unknown: Limits,
-    records: Sequence[Record],
-    folder: Path,
-    *,
-    progress: ProgressBars,
-    observer: Artifact | None = None,
-    seed: int = 0,
-    steps: int = STEPS,
-    log: Log | None = None,
-    resume: bool = False,
+    system: System, unknown: Limits, records: Sequence[Record], *, progress: ProgressBars, seed: int = 0
 ) -> Identified:
     """Find the parameters of a plant from records of its outputs.
 
-    1. A network that makes states of a filter's state, and rough parameters, are trained on nothing but outputs and
-       the equations (:mod:`training.identification.consistency`). An observer that is there already takes its place.
-    2. Shooting refines parameters and states over windows of growing length, from the rough ones or from those given
-       (:mod:`training.identification.windows`), and says how well each is known.
-    3. What the outputs do not tell goes back to what was given, as far as they allow.
+    Shooting fits parameters and starts on windows of growing length (:mod:`training.identification.windows`), and says
+    how well each parameter is known. What the outputs do not tell goes back to what was given, as far as they allow.
     """
     _check_unknown(system, unknown)
     check_signals(records, system)
-    dt = float(records[0].t[1] - records[0].t[0])
-    linear = _filter(system, records, dt, observer)
-    first = math.ceil(min(memory(linear), LONGEST_MEMORY * np.median([record.duration for record in records])) / dt)
-    least = first + 2 * HORIZON
-    check_memory(records, least * dt, progress.say)
+    least = SAMPLES_PER_STATE * system.nx
     whole = [record for record in pieces(records) if len(record.t) > least]
     if not whole:
-        raise ValueError(
-            f"no record has {least} samples, {least * dt:.3g} s, without a gap: the filter has to forget its start"
-        )
+        raise ValueError(f"no record has more than {least} samples without a gap, of which a start could be found")
     held_out = whole[HELD_OUT // 2 :: HELD_OUT] if len(whole) >= HELD_OUT // 2 else []
     fitted = [record for record in whole if not any(record is other for other in held_out)]
+    rng, dt = np.random.default_rng(seed), float(records[0].t[1] - records[0].t[0])
     given = np.array([system.parameters[name] for name in unknown])
-    history: list[tuple[int, dict[str, float]]] = []
-    guess: Guess
-    if observer is None:
-        system, guess, history = _self_consistent(
-            system,
-            unknown,
-            filtered(fitted, linear, first),
-            linear,
-            folder,
-            progress=progress,
-            seed=seed,
-            steps=steps,
-            log=log,
-            resume=resume,
-        )
-    else:
-        guess = _estimates(observer, noise_level(fitted))
-    with progress.phase("fitting parameters on windows"):
-        rough = np.array([system.parameters[name] for name in unknown])
-        unit = np.where(rough == 0, [0.1 * (high - low) for low, high in unknown.values()], np.abs(rough))
+    unit = np.where(given == 0, [0.1 * (high - low) for low, high in unknown.values()], np.abs(given))
+    with progress.phase("fitting parameters on windows", 100) as done:
         shooting = Shooting(system, dt, unknown, unit)
-        fit = fit_windows(
-            shooting, [rough] if observer else [rough, given], fitted, guess, first=first, report=progress.say
-        )
-        fit = _brought_back(shooting, fit, given)
-        found, length = np.array(list(fit.parameters.values())), len(fit.windows.y) - 1
-        predictions = predict(shooting, found, held_out, guess, first=first, length=length)
-    return _judged(fit, system, unknown, predictions=predictions, history=history, expected_noise=noise_level(fitted))
+        fit = fit_windows(shooting, fitted, rng, say=progress.say, report=lambda part: done(100 * part))
+        fit = _brought_back(fit, given)
+        predictions = predict(fit, held_out, rng)
+    return _judged(fit, system, unknown, predictions=predictions, expected_noise=noise_level(fitted))
 
 
 def _check_unknown(system: System, unknown: Limits) -> None:
@@ -199,83 +143,6 @@ def _check_unknown(system: System, unknown: Limits) -> None:
         value = system.parameters[name]
         if not (is_finite(low) and is_finite(high) and low < high and low <= value <= high):
             raise ValueError(f"{name} must start between finite limits, got {value:g} in {shown(low)} to {shown(high)}")
-
-
-def _filter(system: System, records: Sequence[Record], dt: float, observer: Artifact | None) -> LinearFilter:
-    """That of the observer, or one that forgets its start within a part of the records; inputs as recorded."""
-    if observer is not None:
-        return observer.filter
-    duration = float(np.median([record.duration for record in records]))
-    slowest = math.log(1 / FORGOTTEN) / (LONGEST_MEMORY * duration)
-    fastest = min(FASTEST * system.typical_rate, FASTEST_OF_SAMPLES / dt)
-    slowest = min(max(slowest, fastest / SPREAD), fastest / 2)
-    nu = 0 if records[0].u is None else system.nu
-    return Spectrum(evenly_spaced(4 * system.nx + 3, -slowest, -fastest)).filter(system.ny, dt, nu)
-
-
-def memory(linear: LinearFilter) -> float:
-    """Seconds after which a filter has forgotten its start well enough for a first guess of the state."""
-    return math.log(1 / FORGOTTEN) / linear.slowest
-
-
-def _self_consistent(
-    system: System,
-    unknown: Limits,
-    data: Filtered,
-    linear: LinearFilter,
-    folder: Path,
-    *,
-    progress: ProgressBars,
-    seed: int,
-    steps: int,
-    log: Log | None,
-    resume: bool,
-) -> tuple[System, Guess, list[tuple[int, dict[str, float]]]]:
-    """The system with rough parameters, a network's estimates by record and sample, and the parameters' course."""
-    torch.manual_seed(seed)
-    problem = ConsistencyProblem(system, unknown, data, linear=linear, width=WIDTH, depth=DEPTH, batch=BATCH)
-    digest = hashlib.sha256(json.dumps(describe(system), sort_keys=True).encode())
-    for y in data.y:
-        digest.update(y.tobytes())
-    stage = Stage(
-        name="consistency",
-        steps=steps,
-        learning_rate=LEARNING_RATE,
-        folder=folder,
-        fingerprint=digest.hexdigest()[:16],
-        seed=seed,
-        optimiser="soap",
-    )
-    course: list[tuple[int, dict[str, float]]] = []
-    batches = itertools.count()
-
-    def loss(generator: torch.Generator) -> dict[str, torch.Tensor]:
-        batch = next(batches)
-        if batch % RECORDED == 0:
-            course.append((batch, problem.parameters_found()))
-        return problem.loss(generator)
-
-    optimise(stage, problem, loss, progress, log=log, resume=resume)
-    found = problem.parameters_found()
-    progress.say("by self-consistency: " + ", ".join(f"{name} = {value:.4g}" for name, value in found.items()))
-
-    def guess(record: Record, at: np.ndarray) -> np.ndarray:
-        return problem.estimate(run_filter(record, linear, at))
-
-    return system.replace(found), guess, [*course, (steps, found)]
-
-
-def _estimates(observer: Artifact, noise: np.ndarray) -> Guess:
-    """What an observer estimates in a record."""
-    observer = replace(observer, flow=None)  # which is of its own plant
-    level = observer.inverse.within(np.minimum(noise, np.max(observer.inverse.measurement_noise_max)))
-
-    def guess(record: Record, at: np.ndarray) -> np.ndarray:
-        u = np.zeros((len(record.t), observer.nu)) if record.u is None else record.u
-        x_hat = KKLObserver(observer, level).estimate(record.y[:, None], u[:-1, None] if observer.nu else None)
-        return np.asarray(x_hat[at, 0])
-
-    return guess
 
 
 def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.ndarray:
@@ -302,9 +169,9 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     return np.where(comparable, values * np.exp(-back), values)
 
 
-def _brought_back(shooting: Shooting, fit: Fit, given: np.ndarray) -> Fit:
+def _brought_back(fit: Fit, given: np.ndarray) -> Fit:
     """What explains the records as well, with parameters as near to what was given as the system's bounds allow."""
-    values, hidden = np.array(list(fit.parameters.values())), hidden_directions(fit.relative_information)
+    shooting, values, hidden = fit.shooting, fit.theta, hidden_directions(fit.relative_information)
     if not hidden.size:
         return fit
     near = np.clip(nearest(values, given, hidden), shooting.low, shooting.high)
@@ -324,12 +191,11 @@ def _judged(
     unknown: Limits,
     *,
     predictions: list[Prediction],
-    history: list[tuple[int, dict[str, float]]],
     expected_noise: np.ndarray,
 ) -> Identified:
     """What the fit says of each parameter."""
     names, hidden = tuple(unknown), hidden_directions(fit.relative_information)
-    values = np.array(list(fit.parameters.values()))
+    values = fit.theta
     told = np.abs(hidden).max(1, initial=0.0) < TOLD
     seen = np.linalg.svd(hidden)[0][:, hidden.shape[1] :] if hidden.size else np.eye(len(names))
 
@@ -363,7 +229,6 @@ def _judged(
         expected_noise=expected_noise,
         fit=fit,
         predictions=predictions,
-        history=history,
     )
 
 

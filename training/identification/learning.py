@@ -12,13 +12,12 @@ from rich.console import Console
 
 from kkl_gym.system import System
 from observers import Artifact
-from observers.checks import check_dt, integer
+from observers.checks import check_dt
 from observers.storage import write
 from training.config import Config, override, settings_of
-from training.identification.identify import STEPS, Identified, Limits, estimate_parameters
+from training.identification.identify import Identified, Limits, estimate_parameters
 from training.identification.report import write_report
 from training.jobs import claimed_run, describe
-from training.maps.optimise import log_to
 from training.pipeline import Result, train
 from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars
@@ -47,7 +46,6 @@ def identify(
     *,
     dt: float | None = None,
     settings: Mapping[str, Any] | None = None,
-    steps: int = STEPS,
     seed: int = 0,
     resume: bool = False,
     console: Console | ProgressBars | None = None,
@@ -71,8 +69,6 @@ def identify(
         Sampling interval of the observer in seconds; by default that of the records.
     settings : mapping of str to object, optional
         Settings of :class:`training.Config` for the observer.
-    steps : int
-        Batches of the network that finds first guesses.
     seed : int
         Of everything random.
     resume : bool
@@ -91,23 +87,11 @@ def identify(
         If the records, or the parameters' names or limits, make no sense; see
         :func:`training.identification.identify.estimate_parameters`.
     """
-    integer("steps", steps, 0)
     check_signals(records, system)
     interval = sampling_interval(*records) if dt is None else check_dt(dt)
     given = {"dt": interval, "seed": seed, **(settings or {})}
     preset(system, "input-aware", "fast", changes={"eigenvalues": (-1.0,), **given})  # bad settings are refused early
-    found = _parameters(
-        system,
-        unknown,
-        records,
-        folder,
-        dt=interval,
-        steps=steps,
-        seed=seed,
-        resume=resume,
-        console=console,
-        observer=None,
-    )
+    found = _parameters(system, unknown, records, folder, dt=interval, seed=seed, resume=resume, console=console)
     inputs = bool(system.nu) and records[0].u is not None
     size = np.asarray(found.system.output_range)
     largest = np.maximum(NOISE_RANGE * found.noise, LEAST_NOISE * size)
@@ -171,19 +155,8 @@ def adapt(
         As for :func:`identify`, and if the observer's settings are not those of a training.
     """
     config = override(settings_of(observer.training), settings or {})
-    dt = observer.filter.dt
-    found = _parameters(
-        system,
-        unknown,
-        records,
-        folder,
-        dt=dt,
-        steps=0,
-        seed=config.seed,
-        resume=resume,
-        console=console,
-        observer=observer,
-    )
+    dt, seed = observer.filter.dt, config.seed
+    found = _parameters(system, unknown, records, folder, dt=dt, seed=seed, resume=resume, console=console)
     return _observer(found, config, folder, noise=None, resume=resume, console=console)
 
 
@@ -194,11 +167,9 @@ def _parameters(
     folder: Path,
     *,
     dt: float,
-    steps: int,
     seed: int,
     resume: bool,
     console: Console | ProgressBars | None,
-    observer: Artifact | None,
 ) -> Identified:
     """Identify, and write what was found."""
     check_steps(records, dt)
@@ -206,24 +177,12 @@ def _parameters(
     identity = {
         **describe(system),
         "unknown": dict(unknown),
-        "steps": steps,
         "seed": seed,
         "dt": dt,
         "records": [record.fingerprint for record in records],
     }
-    with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console, folder / LOG) as progress:
-        found = estimate_parameters(
-            system,
-            unknown,
-            uniform,
-            folder,
-            progress=progress,
-            observer=observer,
-            seed=seed,
-            steps=steps,
-            log=log,
-            resume=resume,
-        )
+    with claimed_run(folder, identity, resume), progress_bars(console, folder / LOG) as progress:
+        found = estimate_parameters(system, unknown, uniform, progress=progress, seed=seed)
         for line in found.told():
             progress.say(line)
         write(folder / "parameters.json", json.dumps(found.to_json(), indent=2) + "\n")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kkl_gym.compiled import batch_step
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
@@ -14,6 +15,8 @@ SETTLING = 12  # Levenberg-Marquardt steps of starts
 CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
 FIRST_DAMPING = 1e-3
 BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of windows, on which their starts are looked for again
+DRAWS, KEPT = 64, 4  # random starts tried for each window, and those of them that are settled
+SAMPLES_PER_STATE = 8  # of the shortest beginning: noise must not decide on the start
 MOST_ROWS = 60_000  # motions simulated at once
 
 
@@ -27,25 +30,34 @@ class Windows:
 
 
 class Shooting:
-    """The least squares of one set of windows. Shapes: ``unit`` (p,)."""
+    """Outputs of a system by its start and its unknown parameters, and their derivatives.
+
+    Substeps follow the rate of ``system``: its parameters must be near those that are asked about. Shapes: ``unit``
+    (p,), the sizes of changes of the parameters.
+    """
 
     def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
-        self.system, self.dt, self.unit, self.names = system, dt, unit, tuple(limits)
+        self.system, self.dt, self.limits, self.unit, self.names = system, dt, limits, unit, tuple(limits)
         self.low, self.high = np.array(list(limits.values()), dtype=float).T
         self.half = np.array([(high - low) / 2 for low, high in system.X])
+        self.given = np.array([system.parameters[name] for name in self.names])
+        ranges = zip((self.given - unit).tolist(), (self.given + unit).tolist(), strict=True)
+        self._both = with_parameters(system, dict(zip(self.names, ranges, strict=True)))
+        self._step = batch_step(self._both)
+
+    def around(self, theta: np.ndarray) -> "Shooting":
+        """The same about other parameters."""
+        system = self.system.replace(dict(zip(self.names, theta.tolist(), strict=True)))
+        return Shooting(system, self.dt, self.limits, self.unit)
 
     def outputs(self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Predicted outputs (steps + 1, n, ny) of motions with parameters (n, p), starts (n, nx) and inputs."""
-        ranges = {
-            name: (value - unit, value + unit)
-            for name, value, unit in zip(self.names, theta.mean(0), self.unit, strict=True)
-        }
-        both = with_parameters(self.system.replace(dict(zip(self.names, theta.mean(0), strict=True))), ranges)
         starts = np.concatenate([x0, theta], 1)
         parts = []
         for rows in np.array_split(np.arange(len(x0)), -(-len(x0) // MOST_ROWS)):
-            x = simulate(both, starts[rows], len(u), self.dt, u=u[:, rows] if u.shape[-1] else None)
-            parts.append(both.output(x))
+            held = u[:, rows] if u.shape[-1] else None
+            x = simulate(self._both, starts[rows], len(u), self.dt, u=held, step=self._step)
+            parts.append(self._both.output(x))
         return np.concatenate(parts, 1)
 
     def derivatives(
@@ -146,19 +158,36 @@ class Problem:
         at.take(found, rows[better], np.flatnonzero(better))
         return bool(better.any())
 
-    def part(self, rows: np.ndarray, x0: np.ndarray) -> "Problem":
-        """The same for some of the windows, from other starts."""
-        windows = Windows(self.windows.y[:, rows], self.windows.u[:, rows], x0)
-        return Problem(self.shooting, windows, self.weight**-0.5)
+    def part(self, rows: np.ndarray, x0: np.ndarray, length: int | None = None) -> "Problem":
+        """The same for some of the windows, or for their beginnings, from other starts."""
+        u = self.windows.u[:length, rows]
+        return Problem(self.shooting, Windows(self.windows.y[: len(u) + 1, rows], u, x0), self.weight**-0.5)
+
+    def beginnings(self) -> list[int]:
+        """Lengths of the windows' beginnings and of the windows."""
+        steps, nx = len(self.windows.u), self.shooting.system.nx
+        return sorted({min(max(round(part * steps), SAMPLES_PER_STATE * nx), steps) for part in (*BEGINNINGS, 1.0)})
 
     def found_from_beginnings(self, theta: np.ndarray) -> Motions:
         """Motions that fit the windows' beginnings, which get longer, and then the windows."""
         x0 = self.windows.x0
-        for part in BEGINNINGS:
-            length = max(round(part * len(self.windows.u)), 1)
-            beginnings = Windows(self.windows.y[: length + 1], self.windows.u[:length], x0)
-            x0 = Problem(self.shooting, beginnings, self.weight**-0.5).settled(theta).x0
-        return self.part(self.rows, x0).settled(theta)
+        for length in self.beginnings():
+            at = self.part(self.rows, x0, length).settled(theta)
+            x0 = at.x0
+        return at
+
+    def searched(self, theta: np.ndarray, rng: np.random.Generator) -> Motions:
+        """Motions that fit the windows best, of those from random starts in X."""
+        x0, length = self.windows.x0.copy(), self.beginnings()[0]
+        draws = self.shooting.system.draw_starts(rng, DRAWS)
+        for rows in np.array_split(self.rows, -(-len(x0) * DRAWS // MOST_ROWS)):
+            tried = self.part(np.repeat(rows, DRAWS), np.tile(draws, (len(rows), 1)), length)
+            each = tried.follow(theta, tried.windows.x0, tried.rows).each.reshape(-1, DRAWS)
+            kept = draws[np.argsort(each, 1)[:, :KEPT]].reshape(-1, x0.shape[1])
+            at = self.part(np.repeat(rows, KEPT), kept, length).settled(theta)
+            best = KEPT * np.arange(len(rows)) + at.each.reshape(-1, KEPT).argmin(1)
+            x0[rows] = at.x0[best]
+        return self.part(self.rows, x0).found_from_beginnings(theta)
 
     def settled(self, theta: np.ndarray) -> Motions:
         """Motions whose starts fit best with given parameters."""

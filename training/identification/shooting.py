@@ -1,6 +1,6 @@
 """Parameters of a system, and starts, that explain measured outputs: multiple shooting by Gauss-Newton."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,16 +34,16 @@ class UnexplainedError(ValueError):
 class Fit:
     """What shooting found.
 
-    Shapes: ``residuals`` (steps + 1, n, ny), ``noise`` (ny,), ``information`` (p, p), ``unit`` (p,), ``curvature``,
+    Shapes: ``theta`` (p,), ``residuals`` (steps + 1, n, ny), ``noise`` (ny,), ``information``, ``curvature``,
     ``white``, ``scattered`` (p, p), ``used`` (n,), ``starts_by_parameters`` (number used, nx, p).
     """
 
-    parameters: dict[str, float]
+    shooting: Shooting
+    theta: np.ndarray
     windows: Windows
     residuals: np.ndarray
     noise: np.ndarray
     information: np.ndarray
-    unit: np.ndarray
     curvature: np.ndarray
     white: np.ndarray
     scattered: np.ndarray
@@ -73,9 +73,19 @@ class Fit:
         return np.sqrt(np.maximum(np.einsum("ak,ab,bk->k", spread, kind, spread), 0.0))
 
     @property
+    def parameters(self) -> dict[str, float]:
+        """The parameters by name."""
+        return dict(zip(self.shooting.names, self.theta.tolist(), strict=True))
+
+    @property
+    def unit(self) -> np.ndarray:
+        """Units (p,) of the parameters in all that follows."""
+        return self.shooting.unit
+
+    @property
     def size(self) -> np.ndarray:
         """Sizes (p,) of the parameters found, over their units."""
-        values = np.abs(list(self.parameters.values())) / self.unit
+        values = np.abs(self.theta) / self.unit
         return np.where(values == 0, 1.0, values)
 
     @property
@@ -98,12 +108,12 @@ class Fit:
         return bool((self.errors(known, known) > COLOURED * self._errors(known, known, self.white)).any())
 
 
-def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
+def predictable(fit: Fit, windows: Windows) -> np.ndarray:
     """Which windows are so short that what is still unknown of the parameters changes their outputs linearly.
 
     Beyond that, chaos makes least squares blind: they have many minima, and their curvature says nothing of errors.
     """
-    theta, problem = np.array(list(fit.parameters.values())), Problem(shooting, windows)
+    shooting, theta, problem = fit.shooting, fit.theta, Problem(fit.shooting, windows)
     at = problem.follow(theta, settled(shooting, theta, windows), problem.rows)
     J = problem.derivatives(theta, at, problem.rows)
     _, beyond, by_parameters = _beyond_starts(J, problem.weight, at.x0.shape[1])
@@ -162,6 +172,7 @@ def shoot(
     precision: float = SMALL_STEP,
     rounds: int = ROUNDS,
     noise: Sequence[float] | None = None,
+    report: Callable[[float], object] = lambda part: None,
 ) -> Fit:
     """Least squares over parameters and starts at one length of windows.
 
@@ -178,7 +189,8 @@ def shoot(
     count = np.log1p if noise is not None else np.asarray
     fits = explained if noise is None else np.isfinite
     at, trusted = problem.settled(theta), np.ones(len(windows.x0), dtype=bool)
-    for _ in range(rounds):
+    for done in range(rounds):
+        report(done / rounds)
         used = fits(at.each) & trusted
         if not used.any():
             low, high = np.min(windows.x0, axis=0), np.max(windows.x0, axis=0)
@@ -194,8 +206,8 @@ def shoot(
             H, g, cost = H * share[:, None, None], g * share[:, None], 1.0
         if cost < EXACT:
             break
-        better, done = False, _left(*_reduced(H, g, used=used, nx=nx)[:2], cost) < precision
-        while not done and not better and damping < MOST_DAMPING:
+        better, rests = False, _left(*_reduced(H, g, used=used, nx=nx)[:2], cost) < precision
+        while not rests and not better and damping < MOST_DAMPING:
             S, s, along = _reduced(H, g, used=used, nx=nx, damping=damping)
             step = np.linalg.lstsq(S + damping * np.diag(S.diagonal()), s, rcond=1e-12)[0]
             new = np.clip(theta + step * shooting.unit, shooting.low, shooting.high)
@@ -212,8 +224,8 @@ def shoot(
             theta, at = new, tried
             gained = fall * len(windows.y) / cost
             slow = slow + 1 if gained < SLOW else 0
-            done = gained < precision**2 or slow == PATIENCE  # rounding, or chaos, leaves no more
-        if done or not better:
+            rests = gained < precision**2 or slow == PATIENCE  # rounding, or chaos, leaves no more
+        if rests or not better:
             if again == AGAIN:
                 break
             found = problem.look_again(theta, at, np.flatnonzero(~explained(at.each)))
@@ -283,12 +295,12 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
     gradients = np.einsum("knyp,kny->np", beyond, at.r[:, used] * problem.weight)
     few = len(gradients) / max(len(gradients) - len(theta), 1)  # windows, whose gradients add up to zero
     return Fit(
-        parameters=dict(zip(shooting.names, theta.tolist(), strict=True)),
+        shooting=shooting,
+        theta=theta,
         windows=replace(problem.windows, x0=at.x0),
         residuals=np.where(problem.there, at.r, np.nan),
         noise=noise,
         information=information,
-        unit=shooting.unit,
         curvature=curvature.sum(0),
         white=np.einsum("knya,knyb,y->ab", beyond, beyond, (problem.weight * noise) ** 2, optimize=True),
         scattered=few * gradients.T @ gradients,
