@@ -119,7 +119,7 @@ def simulated(system: Silverbox, record: Record) -> np.ndarray:
 
 
 def main(
-    path: Annotated[Path, tyro.conf.Positional], steps: int = 100, out: Path = Path("runs/silverbox"), seed: int = 0
+    path: Annotated[Path, tyro.conf.Positional], out: Path = Path("runs/silverbox"), seed: int = 0
 ) -> list[float]:
     """Identify, simulate the tests, print a table and draw a figure.
 
@@ -127,16 +127,15 @@ def main(
 
     Args:
         path: SNLS80mV.csv, or the folder that holds it.
-        steps: batches of the network that finds first guesses.
         out: the run's folder.
-        seed: of the network, the only thing that is random.
+        seed: of the random starts.
     """
     data, console = read(path), Console()
     out.mkdir(parents=True, exist_ok=True)
     begins = np.linspace(TRAINING[0], TRAINING[1] - LENGTH, RECORDS).astype(int)
     records = [part(data, begin, begin + LENGTH) for begin in begins]
     with progress_bars(console, out / LOG) as progress:
-        found = estimate_parameters(Silverbox(), LIMITS, records, out, progress=progress, steps=steps, seed=seed)
+        found = estimate_parameters(Silverbox(), LIMITS, records, progress=progress, seed=seed)
         for line in found.told():
             progress.say(line)
 

@@ -1,5 +1,6 @@
 """Motions that explain windows of measured outputs, for given parameters, and how they follow these."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -42,7 +43,7 @@ class Shooting:
         self.half = np.array([(high - low) / 2 for low, high in system.X])
         self.given = np.array([system.parameters[name] for name in self.names])
         ranges = zip((self.given - unit).tolist(), (self.given + unit).tolist(), strict=True)
-        self._both = with_parameters(system, dict(zip(self.names, ranges, strict=True)))
+        self._both = _with_parameters(system, tuple(zip(self.names, ranges, strict=True)))
         self._step = batch_step(self._both)
 
     def around(self, theta: np.ndarray) -> "Shooting":
@@ -71,6 +72,11 @@ class Shooting:
         flat = (at + np.diag(size)[:moved, None]).reshape(-1, len(size))
         beside = self.outputs(flat[:, nx:], flat[:, :nx], np.tile(u, (1, moved, 1)))
         return np.moveaxis((beside.reshape(len(y), moved, n, -1) - y[:, None]) / STEP, 1, -1)
+
+
+@functools.lru_cache(maxsize=8)  # a class of its own each time would be compiled each time
+def _with_parameters(system: System, ranges: tuple[tuple[str, tuple[float, float]], ...]) -> System:
+    return with_parameters(system, dict(ranges))
 
 
 @dataclass

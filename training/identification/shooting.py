@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from training.identification.identifiability import NOTHING, PART, told_directions
+from training.identification.identifiability import PART, told_directions
 from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped, settled
 
 RESETTLING = 3  # steps of starts after each of the parameters
@@ -18,10 +18,7 @@ EXACT = 1e-16  # mean square of residuals, over the outputs' variances, of which
 ROUNDING = 1e-14  # of an output's standard deviation: the least noise
 MOST_DAMPING = 1e9
 CLUSTERS = 20  # windows, of which the scatter says something
-CLAIM = 10.0  # times the median information, from which on a window is not an ordinary one
-# Rise of its squares, over the noise's, that it claims where parameters are as far off as ordinary ones leave unknown:
-CLAIMED, MOST_CLAIMED, SHOWN = 4.0, 100.0, 0.3  # from where on it has to show, up to where, and which part
-AGAIN = 3  # times at most that this happens
+AGAIN = 3  # times at most that starts of windows that are not explained are looked for again
 COLOURED = 1.5  # standard errors as windows scatter, over those for white noise: more than chance in 20 windows
 OUTLIER = 9.0  # median deviations from the median that a window's mean square may have
 
@@ -51,7 +48,6 @@ class Fit:
     cost: float
     left: float
     starts_by_parameters: np.ndarray
-    claims: int
 
     def errors(self, directions: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Standard errors along some directions, for white noise or as windows scatter, whichever are larger.
@@ -134,36 +130,6 @@ def explained(each: np.ndarray) -> np.ndarray:
     return np.isfinite(each) & (each <= median + OUTLIER * deviation)
 
 
-def believed(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray, cost: float) -> np.ndarray:
-    """Which windows (n,) tell of the parameters what they claim, if they are used.
-
-    Chaos lets some motions follow the parameters a thousand times as much as others do, as long as their starts
-    stay near: from starts a little further on they go with other parameters as well. Such a window claims much and
-    tells nothing. So what claims more than all ordinary windows together has to show it, where the parameters are
-    as far off as those leave unknown.
-    """
-    shooting = problem.shooting
-    rows, trusted = np.flatnonzero(used), np.ones(len(used), dtype=bool)
-    if len(rows) < CLUSTERS:
-        return trusted
-    J = problem.derivatives(theta, at, rows)
-    each, _, by_parameters = _beyond_starts(J, problem.weight / max(cost, EXACT), at.x0.shape[1])
-    ordinary = _ordinary(each)
-    for change in _unknown(each[ordinary].sum(0)).T:
-        for sign in (1.0, -1.0):
-            other = np.clip(theta + sign * change * shooting.unit, shooting.low, shooting.high)
-            moved = (other - theta) / shooting.unit
-            claimed = np.einsum("a,nab,b->n", moved, each, moved)
-            suspects = np.flatnonzero(~ordinary & ~(claimed < CLAIMED))
-            if not len(suspects):
-                continue
-            x0 = at.x0[rows[suspects]] + shooting.half * (by_parameters[suspects] @ moved)
-            found = problem.part(rows[suspects], x0).found_from_beginnings(other).each - at.each[rows[suspects]]
-            shown = found * problem.count[rows[suspects]] / max(cost, EXACT)
-            trusted[rows[suspects]] &= shown > SHOWN * np.fmin(claimed[suspects], MOST_CLAIMED)
-    return trusted
-
-
 def shoot(
     shooting: Shooting,
     theta: np.ndarray,
@@ -188,10 +154,10 @@ def shoot(
     # What a window's mean square counts: log(1 + it) grows with the share 1 / (1 + it).
     count = np.log1p if noise is not None else np.asarray
     fits = explained if noise is None else np.isfinite
-    at, trusted = problem.settled(theta), np.ones(len(windows.x0), dtype=bool)
+    at = problem.settled(theta)
     for done in range(rounds):
         report(done / rounds)
-        used = fits(at.each) & trusted
+        used = fits(at.each)
         if not used.any():
             low, high = np.min(windows.x0, axis=0), np.max(windows.x0, axis=0)
             raise UnexplainedError(
@@ -226,15 +192,10 @@ def shoot(
             slow = slow + 1 if gained < SLOW else 0
             rests = gained < precision**2 or slow == PATIENCE  # rounding, or chaos, leaves no more
         if rests or not better:
-            if again == AGAIN:
-                break
-            found = problem.look_again(theta, at, np.flatnonzero(~explained(at.each)))
-            before = trusted
-            trusted = trusted & believed(problem, theta, at, fits(at.each) & trusted, cost)
-            if not found and (before == trusted).all():
+            if again == AGAIN or not problem.look_again(theta, at, np.flatnonzero(~explained(at.each))):
                 break  # the fit says how far off it is
             again, damping, slow = again + 1, FIRST_DAMPING, 0
-    return _fit(problem, theta, at, explained(at.each) & trusted)
+    return _fit(problem, theta, at, explained(at.each))
 
 
 def _reduced(
@@ -248,32 +209,6 @@ def _reduced(
     along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))
     S = (H[:, nx:, nx:] - cross @ along[..., :-1])[used].sum(0)
     return S, (g[:, nx:] - (cross @ along[..., -1:])[..., 0])[used].sum(0), along
-
-
-def _ordinary(each: np.ndarray) -> np.ndarray:
-    """Which windows (n,) have not much more information (n, p, p) of any change of the parameters than others have."""
-    sizes = np.einsum("naa->na", each)
-    ordinary = (sizes <= CLAIM * np.median(sizes, 0)).all(1)
-    values, vectors = np.linalg.eigh(each[ordinary].sum(0))
-    known = values > NOTHING * max(values[-1], 0.0)
-    scaled = vectors[:, known] / np.sqrt(values[known])
-    share = np.linalg.eigvalsh(scaled.T @ each @ scaled).max(1, initial=0.0)
-    return np.asarray(ordinary & (share <= CLAIM * known.sum() / max(ordinary.sum(), 1)))
-
-
-def _claims(each: np.ndarray) -> int:
-    """How many windows have more information (n, p, p) than all ordinary ones together."""
-    ordinary = _ordinary(each)
-    unknown = _unknown(each[ordinary].sum(0))
-    claimed = np.einsum("pk,npq,qk->nk", unknown, each, unknown).max(1, initial=0.0)
-    return int((~ordinary & ~(claimed < CLAIMED)).sum())
-
-
-def _unknown(information: np.ndarray) -> np.ndarray:
-    """Changes (p, k) of parameters that information leaves unknown: a standard error, or the parameter's unit."""
-    values, vectors = np.linalg.eigh(information)
-    known = values > NOTHING * max(values[-1], 0.0)
-    return np.asarray(vectors[:, known] / np.sqrt(np.maximum(values[known], 1.0)))
 
 
 def _left(S: np.ndarray, s: np.ndarray, cost: float) -> float:
@@ -308,7 +243,6 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
         cost=float(np.mean(at.each[used])),
         left=_left(curvature.sum(0), gradients.sum(0), np.mean(at.each[used])),
         starts_by_parameters=by_parameters,
-        claims=_claims(curvature / max(float(np.mean(at.each[used])), EXACT)),
     )
 
 

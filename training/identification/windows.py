@@ -82,7 +82,7 @@ def fit_windows(
             theta = np.clip(best.theta + side, shooting.low, shooting.high)
             x0 = settled(shooting, theta, windows(records, starts, length // 2))
             fit = fitted(shooting, theta, windows(records, dict(zip(starts, x0, strict=True)), length))
-            if fit.left > LEFT or fit.claims > best.claims or not _lasts(fit, best):
+            if fit.left > LEFT or not _lasts(fit, best):
                 break
             longer.append(fit)
         if len(longer) < 2:

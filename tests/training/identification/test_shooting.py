@@ -95,22 +95,16 @@ def test_standard_errors_cover_the_truth_under_process_noise(process_noise, colo
     assert (np.mean(white) < 0.5) == coloured
 
 
-def recorded_swings(process_noise, n, steps):
-    """Records of the swing, its shooting, and the true state as a guess."""
-    rng = np.random.default_rng(1)
+@pytest.mark.parametrize(("process_noise", "length"), [(0.0, 64), (0.1, 16)])
+def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypatch):
+    monkeypatch.setattr(fitting, "FIRST_LENGTHS", (8,))
+    rng, steps, n = np.random.default_rng(1), 64, 45
     w = process_noise * rng.standard_normal((steps, n, 2))
     x = simulate(SWING, SWING.draw_starts(rng, n), steps, SWING.dt, w=w)
     y = x[..., :1] + 0.02 * rng.standard_normal((steps + 1, n, 1))
     records = [Record(str(i), SWING.dt * np.arange(steps + 1), y[:, i]) for i in range(n)]
-    shooting = Shooting(SWING, SWING.dt, {"stiffness": (0.4, 40.0)}, np.array([4.0]))
-    return shooting, records, lambda record, at: x[at, int(record.name)]
-
-
-@pytest.mark.parametrize(("process_noise", "length"), [(0.0, 64), (0.1, 16)])
-def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypatch):
-    monkeypatch.setattr(fitting, "FIRST_LENGTHS", (8,))
-    shooting, records, guess = recorded_swings(process_noise, 45, 64)
-    fit = fit_windows(shooting, [np.array([4.1])], records, guess, first=0)
+    shooting = Shooting(SWING.replace({"stiffness": 4.1}), SWING.dt, {"stiffness": (0.4, 40.0)}, np.array([4.0]))
+    fit = fit_windows(shooting, records, rng)
     assert len(fit.windows.u) == length
     assert abs(fit.parameters["stiffness"] - 4.0) < 3 * fit.standard_errors[0] < 0.3
 
