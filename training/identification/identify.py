@@ -1,4 +1,4 @@
-"""From records of outputs to parameters, and what the outputs say of each: :func:`estimate_parameters`."""
+"""From records of outputs to parameters with standard errors: :func:`estimate_parameters`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,26 +8,26 @@ import numpy as np
 
 from kkl_gym.system import System
 from observers.checks import is_finite, shown
-from training.identification.identifiability import combinations, hidden_directions, sign_symmetries, written
+from training.identification.identifiability import combinations, sign_symmetries, unidentifiable_directions, written
 from training.identification.motions import SAMPLES_PER_STATE, Shooting
 from training.identification.shooting import CLUSTERS, Fit, UnexplainedError, shoot
 from training.identification.windows import LEAST_USED, MORE_COST, Prediction, fit_windows, noise_level, predict
 from training.progress import ProgressBars
 from training.records import Record, check_signals, pieces
 
-HELD_OUT = 10  # every so many records one is left out of the fit, for tests of what it predicts
-KEPT_RATIOS = 100.0  # by how much rather all parameters change by one factor than one of them alone, where y is silent
-BACK = (1.0, 0.5, 0.25)  # parts of the way to the nearest parameters, where states would leave their bounds beyond
-HANGS = 0.05  # relative change of a state that goes with parameters which y does not tell, over theirs
-SIMULATED = 1e-7  # relative error that simulation leaves in any case
-TOLD = 0.05  # part that a parameter may have in what the outputs do not tell, and count as told
+HELD_OUT = 10  # one record of so many is held out of the fit
+KEPT_RATIOS = 100.0  # cost of a change of ratios of unidentifiable parameters, over that of a common factor
+BACK = (1.0, 0.5, 0.25)  # parts of the way to the nearest parameters; farther on states may leave their bounds
+UNSCALED = 0.05  # relative change of a state with unidentifiable parameters, over theirs
+SIMULATED = 1e-7  # relative error of simulation: lower bound of standard errors
+HIDDEN = 0.05  # part of a parameter in an unidentifiable direction that makes it unidentifiable
 
 Limits = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Product:
-    """A product of powers of parameters that the outputs tell."""
+    """An identifiable product of powers of parameters."""
 
     powers: dict[str, Fraction | float]
     value: float
@@ -41,13 +41,13 @@ class Product:
 
 @dataclass(frozen=True)
 class Identified:
-    """Parameters that records of outputs tell, and those that they do not."""
+    """Parameters of a system by records of its outputs; ``standard_errors`` are None where one is not identifiable."""
 
     system: System
     standard_errors: dict[str, float | None]
     products: list[Product]
     at_limits: tuple[str, ...]
-    hanging_states: tuple[str, ...]
+    unscaled_states: tuple[str, ...]
     symmetries: list[tuple[str, ...]]
     noise: np.ndarray
     expected_noise: np.ndarray
@@ -55,51 +55,41 @@ class Identified:
     predictions: list[Prediction]
 
     def to_json(self) -> dict[str, dict[str, float | None]]:
-        """Value and standard error of each parameter; both None where the outputs do not tell it."""
+        """Value and standard error of each parameter; both None where it is not identifiable."""
         return {
             name: {"value": None if error is None else self.system.parameters[name], "standard_error": error}
             for name, error in self.standard_errors.items()
         }
 
-    def told(self) -> list[str]:
-        """Lines for people: what was found, and what the outputs cannot tell."""
-        lines = [
-            f"{name} = {self.system.parameters[name]:.6g} +- {error:.2g}"
-            for name, error in self.standard_errors.items()
-            if error is not None
-        ]
+    def summary(self) -> list[str]:
+        """Lines for people: parameters and products with their standard errors, and what is not identifiable."""
+        values = self.system.parameters
+        lines = [f"{name} = {values[name]:.6g} +- {e:.2g}" for name, e in self.standard_errors.items() if e is not None]
         lines += [f"{name} is at its limit: give it a wider range" for name in self.at_limits]
         if self.fit.coloured:
-            lines.append(
-                "the residuals are not white: the standard errors are those that windows show by their scatter"
-            )
+            lines.append("the residuals are not white: the standard errors are those of the windows' scatter")
         elif self.fit.used.sum() < CLUSTERS:
             lines.append(f"fewer than {CLUSTERS} windows: the standard errors are right for white noise alone")
-        silent = [name for name, error in self.standard_errors.items() if error is None]
-        if silent:
-            known = [
-                product for product in self.products if len(product.powers) > 1 or set(product.powers) & set(silent)
-            ]
+        hidden = [name for name, error in self.standard_errors.items() if error is None]
+        if hidden:
+            known = [one for one in self.products if len(one.powers) > 1 or set(one.powers) & set(hidden)]
             only = ", ".join(f"{one.text} = {one.value:.6g} +- {one.standard_error:.2g}" for one in known)
-            lines.append(
-                f"the outputs do not tell {', '.join(silent)} one by one"
-                + (f": they tell {only} only" if only else ", nor any product of their powers")
-            )
-            used = ", ".join(f"{name} = {self.system.parameters[name]:.6g}" for name in silent)
-            lines.append(
-                f"the observer is made with {used}: nearest to what was given, of all that explain the outputs"
-            )
-            if self.hanging_states:
-                lines.append(f"the size of {', '.join(self.hanging_states)} in its estimates hangs on that choice")
+            lines.append(f"not identifiable from the outputs: {', '.join(hidden)}" + (f"; only {only}" if only else ""))
+            used = ", ".join(f"{name} = {values[name]:.6g}" for name in hidden)
+            lines.append(f"the observer has {used}: of all that explain the outputs, nearest to the first guesses")
+            if self.unscaled_states:
+                lines.append(
+                    f"the scale of {', '.join(self.unscaled_states)} is not identifiable: it follows"
+                )
         lines += [
-            f"the outputs stay the same if {', '.join(names)} change sign: which of both is true they cannot tell"
+            f"the outputs stay the same if {', '.join(names)} change sign: the signs are not identifiable"
             for names in self.symmetries
         ]
-        for j, (found, expected) in enumerate(zip(self.noise, self.expected_noise, strict=True)):
-            if found > 1.5 * expected + 1e-3 * np.nanstd(self.fit.windows.y[..., j]):
+        for j, (noise, expected) in enumerate(zip(self.noise, self.expected_noise, strict=True)):
+            if noise > 1.5 * expected + 1e-3 * np.nanstd(self.fit.windows.y[..., j]):
                 lines.append(
-                    f"output {j + 1}: residuals of {found:.3g} where samples show noise of {expected:.3g}: the model "
-                    "does not explain all of it"
+                    f"output {j + 1}: the residuals of {noise:.3g} exceed the noise of {expected:.3g}: the model does "
+                    "not explain all of it"
                 )
         return lines
 
@@ -107,10 +97,10 @@ class Identified:
 def estimate_parameters(
     system: System, unknown: Limits, records: Sequence[Record], *, progress: ProgressBars, seed: int = 0
 ) -> Identified:
-    """Find the parameters of a plant from records of its outputs.
+    """Estimate unknown parameters of a system from records of its outputs.
 
-    Shooting fits parameters and starts on windows of growing length (:mod:`training.identification.windows`), and says
-    how well each parameter is known. What the outputs do not tell goes back to what was given, as far as they allow.
+    Multiple shooting fits parameters and starts on windows of growing length (:func:`fit_windows`). Unidentifiable
+    directions of the parameters go back to the first guesses.
     """
     _check_unknown(system, unknown)
     check_signals(records, system)
@@ -132,7 +122,7 @@ def estimate_parameters(
 
 
 def _check_unknown(system: System, unknown: Limits) -> None:
-    """Raise ValueError unless some of the system's parameters are unknown, and start between finite limits."""
+    """Raise ValueError unless the unknown parameters are the system's, and start between finite limits."""
     if not unknown:
         raise ValueError("name a parameter that is unknown, as in --unknown mu=1.5")
     for name, (low, high) in unknown.items():
@@ -146,14 +136,14 @@ def _check_unknown(system: System, unknown: Limits) -> None:
 
 
 def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Of all parameters that explain the outputs as well, those nearest to what was given.
+    """Of all parameters that explain the outputs as well, those nearest to the given ones.
 
-    A parameter of which they say nothing at all stays as it was given. Of the others near is what keeps their ratios to
-    each other: a plant that is faster by a factor has them all larger.
+    A parameter without any influence on the outputs stays as given. For the others near means nearly equal ratios: a
+    plant that is faster by a factor has them all larger.
 
     Shapes: ``values`` (p,), ``given`` (p,), ``hidden`` (p, k); returns (p,).
     """
-    silent = (hidden**2).sum(1) > 1.0 - TOLD**2
+    silent = (hidden**2).sum(1) > 1.0 - HIDDEN**2
     if silent.any():
         rest = np.linalg.svd(hidden[~silent])[0][:, : hidden.shape[1] - silent.sum()]
         nearer = given.copy()
@@ -170,8 +160,8 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
 
 
 def _brought_back(fit: Fit, given: np.ndarray) -> Fit:
-    """What explains the records as well, with parameters as near to what was given as the system's bounds allow."""
-    shooting, values, hidden = fit.shooting, fit.theta, hidden_directions(fit.relative_information)
+    """A fit that explains the records as well, with parameters nearest to the given ones."""
+    shooting, values, hidden = fit.shooting, fit.theta, unidentifiable_directions(fit.relative_information)
     if not hidden.size:
         return fit
     near = np.clip(nearest(values, given, hidden), shooting.low, shooting.high)
@@ -193,10 +183,10 @@ def _judged(
     predictions: list[Prediction],
     expected_noise: np.ndarray,
 ) -> Identified:
-    """What the fit says of each parameter."""
-    names, hidden = tuple(unknown), hidden_directions(fit.relative_information)
+    """Standard errors, products and symmetries of a fit."""
+    names, hidden = tuple(unknown), unidentifiable_directions(fit.relative_information)
     values = fit.theta
-    told = np.abs(hidden).max(1, initial=0.0) < TOLD
+    identifiable = np.abs(hidden).max(1, initial=0.0) < HIDDEN
     seen = np.linalg.svd(hidden)[0][:, hidden.shape[1] :] if hidden.size else np.eye(len(names))
 
     def relative_error(exponents: np.ndarray) -> float:
@@ -205,7 +195,7 @@ def _judged(
         return max(float(found[0]), SIMULATED)
 
     errors = {
-        name: float(fit.unit[i] * fit.size[i] * relative_error(np.eye(len(names))[i])) if told[i] else None
+        name: float(fit.unit[i] * fit.size[i] * relative_error(np.eye(len(names))[i])) if identifiable[i] else None
         for i, name in enumerate(names)
     }
     products = []
@@ -219,7 +209,7 @@ def _judged(
         standard_errors=errors,
         products=products,
         at_limits=tuple(name for name, value in fit.parameters.items() if value in unknown[name] and errors[name]),
-        hanging_states=_hanging(fit, found, hidden * fit.size[:, None]),
+        unscaled_states=_unscaled(fit, found, hidden * fit.size[:, None]),
         symmetries=sign_symmetries(
             found,
             [name for name in names if unknown[name][0] <= -found.parameters[name]],
@@ -232,11 +222,11 @@ def _judged(
     )
 
 
-def _hanging(fit: Fit, system: System, hidden: np.ndarray) -> tuple[str, ...]:
-    """States that change with directions (p, k) of parameters, in their units, that the outputs do not tell."""
+def _unscaled(fit: Fit, system: System, hidden: np.ndarray) -> tuple[str, ...]:
+    """States that change with unidentifiable directions (p, k) of the parameters, in their units."""
     if not hidden.size:
         return ()
     half = np.array([(high - low) / 2 for low, high in system.X])
     size = np.sqrt(np.mean((fit.windows.x0 / half) ** 2, axis=0))
     change = np.sqrt(np.median((fit.starts_by_parameters @ hidden) ** 2, axis=0)).max(1)
-    return tuple(name for name, part in zip(system.state_names, change / size, strict=True) if part > HANGS)
+    return tuple(name for name, part in zip(system.state_names, change / size, strict=True) if part > UNSCALED)

@@ -1,8 +1,8 @@
-"""An observer for a plant of which outputs were recorded: its parameters, then its map."""
+"""Identification and training in one: :func:`identify` and :func:`adapt`."""
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,15 +24,15 @@ from training.progress import LOG, ProgressBars, progress_bars
 from training.records import Record, check_signals, resampled, sampling_interval
 from training.records import check_dt as check_steps
 
-NOISE_RANGE = 2.0  # largest measurement noise that a map is made for, over what the records show
-LEAST_NOISE = 0.002  # the same, over the output's range, where they show hardly any
+NOISE_RANGE = 2.0  # largest measurement noise that the observer is trained for, over that of the records
+LEAST_NOISE = 0.002  # the least of it, over the output's range
 INVERSE_STEPS = 12_000
 OBSERVER_FOLDER = "observer"
 
 
 @dataclass(frozen=True)
 class Learned:
-    """What records of outputs taught."""
+    """Identified parameters, and the observer that was trained for them."""
 
     identified: Identified
     result: Result
@@ -50,10 +50,10 @@ def identify(
     resume: bool = False,
     console: Console | ProgressBars | None = None,
 ) -> Learned:
-    """Learn parameters of a plant, and an observer for it, from records of its outputs. No state is ever seen.
+    """Identify parameters of a plant from records of its outputs, and train an observer for it.
 
-    The parameters come from :func:`training.identification.identify.estimate_parameters`. The observer then is trained
-    on simulated motions of the plant that was identified, for noise up to twice what the records show.
+    No state is needed. :func:`training.identification.identify.estimate_parameters` fits the parameters. The observer
+    is trained on simulated motions of the identified plant, for noise up to twice that of the records.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def identify(
     settings : mapping of str to object, optional
         Settings of :class:`training.Config` for the observer.
     seed : int
-        Of everything random.
+        Of the random starts, and of the observer's training.
     resume : bool
         Whether to go on from checkpoints in the folder.
     console : Console or ProgressBars, optional
@@ -84,29 +84,34 @@ def identify(
     Raises
     ------
     ValueError
-        If the records, or the parameters' names or limits, make no sense; see
-        :func:`training.identification.identify.estimate_parameters`.
+        If the records, or the parameters' names or limits, are invalid.
     """
     check_signals(records, system)
     interval = sampling_interval(*records) if dt is None else check_dt(dt)
     given = {"dt": interval, "seed": seed, **(settings or {})}
     preset(system, "input-aware", "fast", changes={"eigenvalues": (-1.0,), **given})  # bad settings are refused early
-    found = _parameters(system, unknown, records, folder, dt=interval, seed=seed, resume=resume, console=console)
     inputs = bool(system.nu) and records[0].u is not None
-    size = np.asarray(found.system.output_range)
-    largest = np.maximum(NOISE_RANGE * found.noise, LEAST_NOISE * size)
-    quiet = bool((found.noise < LEAST_NOISE * size / NOISE_RANGE).all())
-    changes: dict[str, Any] = {
-        "duration": 5000 * interval,
-        "inputs": inputs,
-        "inverse_steps": INVERSE_STEPS,
-        "measurement_noise_max": float(largest[0]) if len(largest) == 1 else tuple(largest.tolist()),
-        "noise_free_share": 0.5 if quiet else 0.2,
-        "high_noise_emphasis": 2.0 if quiet else 4.0,
-        **given,
-    }
-    config = preset(found.system, "input-aware", "fast", changes=changes)
-    return _observer(found, config, folder, noise=found.noise, resume=resume, console=console)
+
+    def configured(found: Identified) -> Config:
+        size = np.asarray(found.system.output_range)
+        quiet = bool((found.noise < LEAST_NOISE * size / NOISE_RANGE).all())
+        changes = {
+            "duration": 5000 * interval,
+            "inputs": inputs,
+            "inverse_steps": INVERSE_STEPS,
+            "measurement_noise_max": _level(np.maximum(NOISE_RANGE * found.noise, LEAST_NOISE * size)),
+            "noise_free_share": 0.5 if quiet else 0.2,
+            "high_noise_emphasis": 2.0 if quiet else 4.0,
+            **given,
+        }
+        return preset(found.system, "input-aware", "fast", changes=changes)
+
+    found, result = _learned(
+        system, unknown, records, folder, configured, dt=interval, seed=seed, resume=resume, console=console
+    )
+    artifact = dataclasses.replace(result.artifact, measurement_noise=_level(np.maximum(found.noise, 0.0)))
+    artifact.save(folder / f"{system.name}.safetensors")
+    return Learned(found, dataclasses.replace(result, artifact=artifact))
 
 
 def adapt(
@@ -120,17 +125,16 @@ def adapt(
     resume: bool = False,
     console: Console | ProgressBars | None = None,
 ) -> Learned:
-    """Learn an observer anew for a plant that differs from its model, from records of outputs.
+    """Identify a plant that differs from an observer's model, and train the observer again for it.
 
-    The observer's estimates take the place of the network from which :func:`identify` begins. What was chosen for its
-    training, noise levels among it, is chosen again.
+    The observer is trained by its own settings, noise levels among them.
 
     Parameters
     ----------
     observer : Artifact
         The observer.
     system : System
-        What it was made for.
+        The observer's model; its parameters are the first guesses.
     records : sequence of Record
         Outputs, and inputs where they acted, of one plant.
     folder : Path
@@ -156,57 +160,40 @@ def adapt(
     """
     config = override(settings_of(observer.training), settings or {})
     dt, seed = observer.filter.dt, config.seed
-    found = _parameters(system, unknown, records, folder, dt=dt, seed=seed, resume=resume, console=console)
-    return _observer(found, config, folder, noise=None, resume=resume, console=console)
+    found, result = _learned(
+        system, unknown, records, folder, lambda found: config, dt=dt, seed=seed, resume=resume, console=console
+    )
+    result.artifact.save(folder / f"{system.name}.safetensors")
+    return Learned(found, result)
 
 
-def _parameters(
+def _learned(
     system: System,
     unknown: Limits,
     records: Sequence[Record],
     folder: Path,
+    configured: Callable[[Identified], Config],
     *,
     dt: float,
     seed: int,
     resume: bool,
     console: Console | ProgressBars | None,
-) -> Identified:
-    """Identify, and write what was found."""
+) -> tuple[Identified, Result]:
+    """Identify the parameters, write them, and train the observer."""
     check_steps(records, dt)
     uniform = [resampled(record, dt) for record in records]
-    identity = {
-        **describe(system),
-        "unknown": dict(unknown),
-        "seed": seed,
-        "dt": dt,
-        "records": [record.fingerprint for record in records],
-    }
+    fingerprints = [record.fingerprint for record in records]
+    identity = {**describe(system), "unknown": dict(unknown), "seed": seed, "dt": dt, "records": fingerprints}
     with claimed_run(folder, identity, resume), progress_bars(console, folder / LOG) as progress:
         found = estimate_parameters(system, unknown, uniform, progress=progress, seed=seed)
-        for line in found.told():
+        for line in found.summary():
             progress.say(line)
         write(folder / "parameters.json", json.dumps(found.to_json(), indent=2) + "\n")
-        with progress.phase("drawing what was identified"):
+        with progress.phase("drawing identification.png"):
             write_report(folder / "identification.png", found)
-    return found
+    return found, train(found.system, configured(found), folder / OBSERVER_FOLDER, resume=resume, console=console)
 
 
-def _observer(
-    found: Identified,
-    config: Config,
-    folder: Path,
-    *,
-    noise: np.ndarray | None,
-    resume: bool,
-    console: Console | ProgressBars | None,
-) -> Learned:
-    """Train the observer for the plant that was identified, and write it."""
-    result = train(found.system, config, folder / OBSERVER_FOLDER, resume=resume, console=console)
-    artifact = result.artifact
-    if noise is not None:
-        usual = np.maximum(noise, 0.0)
-        artifact = dataclasses.replace(
-            artifact, measurement_noise=float(usual[0]) if len(usual) == 1 else tuple(usual.tolist())
-        )
-    artifact.save(folder / f"{found.system.name}.safetensors")
-    return Learned(found, dataclasses.replace(result, artifact=artifact))
+def _level(noise: np.ndarray) -> float | tuple[float, ...]:
+    """A noise level as artifacts and settings have it: one number for one output."""
+    return float(noise[0]) if len(noise) == 1 else tuple(noise.tolist())

@@ -1,4 +1,4 @@
-"""Motions that explain windows of measured outputs, for given parameters, and how they follow these."""
+"""Motions that fit windows of measured outputs for given parameters, and their derivatives."""
 
 import functools
 from collections.abc import Mapping
@@ -13,11 +13,11 @@ from training.trajectories.parameters import with_parameters
 
 STEP = 1e-8  # of a state's half-width, or of a parameter's unit, in numerical derivatives
 SETTLING = 12  # Levenberg-Marquardt steps of starts
-CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
+CONVERGED = 1e-3  # relative fall of a window's mean square below which its start has converged
 FIRST_DAMPING = 1e-3
-BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of windows, on which their starts are looked for again
-DRAWS, KEPT = 64, 4  # random starts tried for each window, and those of them that are settled
-SAMPLES_PER_STATE = 8  # of the shortest beginning: noise must not decide on the start
+BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # parts of windows to which starts are fitted first
+DRAWS, KEPT = 64, 4  # random starts of each window, and the best of them, which are fitted
+SAMPLES_PER_STATE = 8  # of the shortest beginning, so that noise does not decide on the start
 MOST_ROWS = 60_000  # motions simulated at once
 
 
@@ -33,8 +33,8 @@ class Windows:
 class Shooting:
     """Outputs of a system by its start and its unknown parameters, and their derivatives.
 
-    Substeps follow the rate of ``system``: its parameters must be near those that are asked about. Shapes: ``unit``
-    (p,), the sizes of changes of the parameters.
+    Substeps follow the rate of ``system``, whose parameters must be near the others. Shapes: ``unit`` (p,), the
+    parameters' units.
     """
 
     def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
@@ -95,7 +95,7 @@ class Motions:
 
 
 class Problem:
-    """The least squares of one set of windows."""
+    """The weighted squares of one set of windows."""
 
     def __init__(self, shooting: Shooting, windows: Windows, noise: np.ndarray | None = None) -> None:
         self.shooting, self.windows = shooting, windows
@@ -108,7 +108,7 @@ class Problem:
         self.rows = np.arange(len(windows.x0))
 
     def follow(self, theta: np.ndarray, x0: np.ndarray, rows: np.ndarray) -> Motions:
-        """Motions of some windows from starts, which are put within the bounds."""
+        """Motions of some windows from starts, which are clipped to the bounds."""
         x0, there = np.clip(x0, self.low, self.high), self.there[:, rows]
         y = self.shooting.outputs(np.tile(theta, (len(x0), 1)), x0, self.windows.u[:, rows])
         r = np.where(there & np.isfinite(y), self.windows.y[:, rows] - y, 0.0)
@@ -152,18 +152,6 @@ class Problem:
             damping[rows] *= np.where(better, 0.1, 10.0)
             moved, rows = rows[going], rows[going | ~better]
 
-    def look_again(self, theta: np.ndarray, at: Motions, rows: np.ndarray) -> bool:
-        """Find starts of some windows that fit better by way of their beginnings; say whether there are any.
-
-        Squares of long chaotic windows have many minima, those of their beginnings few.
-        """
-        if not len(rows):
-            return False
-        found = self.part(rows, at.x0[rows]).found_from_beginnings(theta)
-        better = found.each < (1.0 - CONVERGED) * at.each[rows]
-        at.take(found, rows[better], np.flatnonzero(better))
-        return bool(better.any())
-
     def part(self, rows: np.ndarray, x0: np.ndarray, length: int | None = None) -> "Problem":
         """The same for some of the windows, or for their beginnings, from other starts."""
         u = self.windows.u[:length, rows]
@@ -174,17 +162,13 @@ class Problem:
         steps, nx = len(self.windows.u), self.shooting.system.nx
         return sorted({min(max(round(part * steps), SAMPLES_PER_STATE * nx), steps) for part in (*BEGINNINGS, 1.0)})
 
-    def found_from_beginnings(self, theta: np.ndarray) -> Motions:
-        """Motions that fit the windows' beginnings, which get longer, and then the windows."""
-        x0 = self.windows.x0
-        for length in self.beginnings():
-            at = self.part(self.rows, x0, length).settled(theta)
-            x0 = at.x0
-        return at
-
     def searched(self, theta: np.ndarray, rng: np.random.Generator) -> Motions:
-        """Motions that fit the windows best, of those from random starts in X."""
-        x0, length = self.windows.x0.copy(), self.beginnings()[0]
+        """Motions that fit the windows, from random starts in X.
+
+        The squares of a long chaotic window have many minima, those of its beginning few: starts are fitted to the
+        beginning first, and from there to more and more of the window.
+        """
+        x0, (length, *longer) = self.windows.x0.copy(), self.beginnings()
         draws = self.shooting.system.draw_starts(rng, DRAWS)
         for rows in np.array_split(self.rows, -(-len(x0) * DRAWS // MOST_ROWS)):
             tried = self.part(np.repeat(rows, DRAWS), np.tile(draws, (len(rows), 1)), length)
@@ -193,7 +177,10 @@ class Problem:
             at = self.part(np.repeat(rows, KEPT), kept, length).settled(theta)
             best = KEPT * np.arange(len(rows)) + at.each.reshape(-1, KEPT).argmin(1)
             x0[rows] = at.x0[best]
-        return self.part(self.rows, x0).found_from_beginnings(theta)
+        at = self.part(self.rows, x0, length).settled(theta)
+        for length in longer:
+            at = self.part(self.rows, at.x0, length).settled(theta)
+        return at
 
     def settled(self, theta: np.ndarray) -> Motions:
         """Motions whose starts fit best with given parameters."""
@@ -202,13 +189,8 @@ class Problem:
         return at
 
 
-def settled(shooting: Shooting, theta: np.ndarray, windows: Windows) -> np.ndarray:
-    """Starts (n, nx) of windows that fit best with given parameters."""
-    return Problem(shooting, windows).settled(theta).x0
-
-
 def damped(H: np.ndarray, damping: "float | np.ndarray") -> np.ndarray:
-    """Matrices (n, d, d) with their diagonals made larger by a part, so that they can be solved for."""
+    """Matrices (n, d, d) with a part of their diagonals added (Levenberg-Marquardt)."""
     diagonal = np.einsum("naa->na", H)
     more = np.reshape(damping, (-1, 1)) * diagonal + 1e-12 * diagonal.max(1, keepdims=True, initial=0.0) + 1e-30
     return H + more[:, :, None] * np.eye(H.shape[-1])

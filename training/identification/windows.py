@@ -6,21 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from training.identification.identifiability import told_directions
-from training.identification.motions import Problem, Shooting, Windows, settled
+from training.identification.identifiability import identifiable_directions
+from training.identification.motions import Problem, Shooting, Windows
 from training.identification.shooting import CLUSTERS, Fit, UnexplainedError, predictable, shoot
 from training.records import Record
 
-FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows, which lead to the parameters
-MORE_NOISE = 1.5  # standard deviation of their residuals, over that of the noise that neighbouring samples show
-SMALL = 0.01  # of an output's standard deviation: residuals that are no matter without noise either
+FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows, fitted one after the other
+MORE_NOISE = 1.5  # largest standard deviation of their residuals, over the noise level
+SMALL = 0.01  # the same, over the output's standard deviation
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
-GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
-MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
-LEFT = 0.4  # standard errors that a fit may be from its least squares
-APART = 0.5  # standard errors that it may be from a fit that began elsewhere
+GAIN = 0.7  # standard errors at twice the length, over those before, that end the growth
+MORE_COST = 2.0  # largest mean square of the residuals at twice the length, over that before
+LEFT = 0.4  # standard errors: longest Gauss-Newton step that a fit may be short of its minimum
+APART = 0.5  # standard errors: largest distance of fits from two sides
 MOST_SAMPLES = 6400  # of a window
-DIFFERENCES = 4  # of y, in which hardly anything is left of its motion, and all of its noise
+DIFFERENCES = 4  # order of the differences of y that are taken for noise
 
 Starts = Mapping[tuple[int, int], np.ndarray]
 """States (nx,) by record and sample."""
@@ -32,7 +32,7 @@ def noise_level(records: Sequence[Record]) -> np.ndarray:
     gain = math.comb(2 * order, order)  # sum of the squares of the difference's coefficients
     parts = [np.diff(record.y, n=order, axis=0) ** 2 / gain for record in records if len(record.y) > order]
     blocks = [part.mean(0) for whole in parts for part in np.array_split(whole, max(1, len(whole) // 100))]
-    return np.sqrt(np.median(blocks, axis=0))  # the median, as fast parts of a motion pass for noise
+    return np.sqrt(np.median(blocks, axis=0))  # the median, as fast parts of a motion are no noise
 
 
 def fit_windows(
@@ -45,10 +45,9 @@ def fit_windows(
 ) -> Fit:
     """Fit parameters and starts on windows of growing length; ``report`` takes the part of it that is done.
 
-    Long windows say more, short ones find their way from rougher guesses. Chaos and process noise set an end to their
-    growth, which no start explains for long: residuals are no longer white then, and standard errors that follow the
-    scatter of windows fall no further. Chaos also makes many minima. So longer windows are fitted from two sides, a
-    standard error of the shorter ones away, and count only if both fits come to rest, and in one place.
+    Long windows give smaller standard errors, short ones converge from rougher guesses. Chaos and process noise end the
+    growth: residuals are no longer white then, and the least squares have many minima. So longer windows are fitted
+    from two sides, a standard error of the shorter ones away, and count only if both fits converge to one point.
     """
     longest = min(max(len(record.y) for record in records) - 1, MOST_SAMPLES)
     first = [length for length in FIRST_LENGTHS if length <= longest] or [longest]
@@ -69,18 +68,18 @@ def fit_windows(
         length *= 2
         starts = {key: starts[key] for key in _cuts(records, length) if key in starts}
         if len(starts) < CLUSTERS and best.coloured:
-            break  # longer windows would hide what these show
+            break  # too few longer windows to give standard errors for coloured residuals
         keep = predictable(best, windows(records, starts, length))
         if keep.mean() < LEAST_USED:
             break
         starts = {key: x for (key, x), kept in zip(starts.items(), keep, strict=True) if kept}
-        told = told_directions(best.information)
+        told = identifiable_directions(best.information)
         before = best.errors(told, told)
         aside = shooting.unit * (told @ np.minimum(before, 1.0))
         longer = list[Fit]()
         for side in (aside, -aside):
             theta = np.clip(best.theta + side, shooting.low, shooting.high)
-            x0 = settled(shooting, theta, windows(records, starts, length // 2))
+            x0 = Problem(shooting, windows(records, starts, length // 2)).settled(theta).x0
             fit = fitted(shooting, theta, windows(records, dict(zip(starts, x0, strict=True)), length))
             if fit.left > LEFT or not _lasts(fit, best):
                 break
@@ -90,7 +89,7 @@ def fit_windows(
         now = longer[0].errors(told, told)
         apart = np.abs(told.T @ ((longer[0].theta - longer[1].theta) / shooting.unit))
         if (apart > APART * now).any():
-            break  # so long windows have many minima, and their curvature says nothing of where the others are
+            break
         gain = now / before
         if (gain < 1).any():
             best = min(longer, key=lambda each: each.cost)
@@ -154,20 +153,15 @@ def windows(records: Sequence[Record], starts: Starts, length: int) -> Windows:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Outputs of a window of a record that took no part in the fit, predicted from the window's first half."""
+    """Outputs ``y`` (steps + 1, ny) of a held-out record, predicted from its first ``fitted`` samples."""
 
     record: Record
     y: np.ndarray
     fitted: int
 
-    @property
-    def residuals(self) -> np.ndarray:
-        """Measured minus predicted outputs, (steps + 1, ny)."""
-        return np.asarray(self.record.y[: len(self.y)] - self.y)
-
 
 def predict(fit: Fit, records: Sequence[Record], rng: np.random.Generator) -> list[Prediction]:
-    """Predict the outputs of records over a window of the fit's at their beginning, from the half of it."""
+    """Predict the outputs of the first window of records, each from the first half of it."""
     length, theta = len(fit.windows.u), fit.theta
     chosen = [record for record in records if len(record.y) > length]
     if not chosen:
