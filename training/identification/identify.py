@@ -78,9 +78,7 @@ class Identified:
             used = ", ".join(f"{name} = {values[name]:.6g}" for name in hidden)
             lines.append(f"the observer has {used}: of all that explain the outputs, nearest to the first guesses")
             if self.unscaled_states:
-                lines.append(
-                    f"the scale of {', '.join(self.unscaled_states)} is not identifiable: it follows"
-                )
+                lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: it follows")
         lines += [
             f"the outputs stay the same if {', '.join(names)} change sign: the signs are not identifiable"
             for names in self.symmetries

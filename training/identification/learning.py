@@ -17,7 +17,7 @@ from observers.storage import write
 from training.config import Config, override, settings_of
 from training.identification.identify import Identified, Limits, estimate_parameters
 from training.identification.report import write_report
-from training.jobs import claimed_run, describe
+from training.jobs import claimed_job, describe, refuse_checkpoints
 from training.pipeline import Result, train
 from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars
@@ -184,7 +184,10 @@ def _learned(
     uniform = [resampled(record, dt) for record in records]
     fingerprints = [record.fingerprint for record in records]
     identity = {**describe(system), "unknown": dict(unknown), "seed": seed, "dt": dt, "records": fingerprints}
-    with claimed_run(folder, identity, resume), progress_bars(console, folder / LOG) as progress:
+    if not resume:
+        refuse_checkpoints(folder / OBSERVER_FOLDER)
+    claimed = claimed_job(folder, identity, "a run of another configuration")
+    with claimed, progress_bars(console, folder / LOG) as progress:
         found = estimate_parameters(system, unknown, uniform, progress=progress, seed=seed)
         for line in found.summary():
             progress.say(line)

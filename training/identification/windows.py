@@ -73,9 +73,9 @@ def fit_windows(
         if keep.mean() < LEAST_USED:
             break
         starts = {key: x for (key, x), kept in zip(starts.items(), keep, strict=True) if kept}
-        told = identifiable_directions(best.information)
-        before = best.errors(told, told)
-        aside = shooting.unit * (told @ np.minimum(before, 1.0))
+        known = identifiable_directions(best.information)
+        before = best.errors(known, known)
+        aside = shooting.unit * (known @ np.minimum(before, 1.0))
         longer = list[Fit]()
         for side in (aside, -aside):
             theta = np.clip(best.theta + side, shooting.low, shooting.high)
@@ -86,8 +86,8 @@ def fit_windows(
             longer.append(fit)
         if len(longer) < 2:
             break
-        now = longer[0].errors(told, told)
-        apart = np.abs(told.T @ ((longer[0].theta - longer[1].theta) / shooting.unit))
+        now = longer[0].errors(known, known)
+        apart = np.abs(known.T @ ((longer[0].theta - longer[1].theta) / shooting.unit))
         if (apart > APART * now).any():
             break
         gain = now / before
@@ -127,10 +127,9 @@ def _first_fit(
             fit = fitted(shooting, theta, replace(cut, x0=Problem(shooting, cut).searched(theta, rng).x0))
         except UnexplainedError as error:
             problem = error
-            break
-        if best is not None and not (fit.used.mean() >= LEAST_USED and (fit.noise <= expected).all()):
-            break
-        best, theta = fit, fit.theta
+            continue
+        if best is None or (fit.used.mean() >= LEAST_USED and (fit.noise <= expected).all()):
+            best, theta = fit, fit.theta
     if best is None:
         raise problem
     return best
