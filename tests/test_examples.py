@@ -174,7 +174,7 @@ def test_adaptation(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_from_csv(tmp_path, capsys):
-    sizes = {"seconds": 4.0, "steps": 60, "inverse_steps": 400, "trajectories": 60}
+    sizes = {"seconds": 4.0, "inverse_steps": 400, "trajectories": 60}
     mu, with_estimate, with_state = example("from_csv")(**sizes, out=tmp_path)
     assert abs(mu - 3.3) < 0.4
     assert with_state < with_estimate < 0.3  # 0.38 without control

@@ -69,7 +69,6 @@ def _records():
         (f"{IDENTIFY} --unknown mu", "NAME=VALUE"),
         (f"{IDENTIFY} --unknown mu=0", "mu=0:LOW:HIGH"),
         (IDENTIFY, "--unknown mu=1.5"),
-        (f"{IDENTIFY} --unknown mu=2 --steps -5", "steps must be an integer, not negative, got -5"),
         ("adapt van_der_pol --data y.npz --out new", "out = new must be a file, NEW.safetensors"),
         ("errorbars lorenz-static --out bars", r"out = bars must end in \.safetensors"),
         ("tracking lorenz-static --data y.npz", "lorenz is simulated: leave --data and its columns out"),
