@@ -59,7 +59,7 @@ class Decoder:
         compiled: bool = False,
     ) -> None:
         error = inverse.error_covariance
-        self._error = None if error is None else error.at_level(inverse.share(measurement_noise))
+        self._error = None if error is None else error.at_level(inverse.shares(measurement_noise)[0])
         self._inverse = inverse = inverse.part(outputs)
         self.size = inverse.whiten.shape[1]
         self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)

@@ -58,7 +58,7 @@ class Train:
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
     config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None
-    """Settings that differ from the preset's, as `kkl-gym tune` writes them; options given here come before them."""
+    """JSON file of settings that differ from the preset's; options given here come before them."""
     closed_loop: bool = False
     """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
     (input-aware); takes half as long again. Writes NAME-closed-loop."""
@@ -165,8 +165,6 @@ class Train:
         changes = (read_changes(self.config) if self.config else {}) | self.settings
         if self.size == SMALL:
             changes = {**SMALL_SETTINGS, **changes}
-        if changes.get("random_features"):
-            changes.setdefault("forward_steps", 0)  # what is solved for is not trained
         if self.uncertain:
             named = [name for name, _ in self.uncertain]
             if len({*named}) < len(named):
@@ -231,8 +229,6 @@ def expected(config: Config, found: "Estimate") -> Table:
         size = f"{batches.get(stage, config.inverse_steps):,} batches of {config.batch:,}"
         if stage == "simulating":
             size = f"{config.trajectories:,} trajectories of {config.duration:g} s"
-        elif stage == "solving":
-            size = f"{config.random_features:,} random features"
         table.add_row(stage, size, duration(seconds))
     table.add_section()
     table.add_row("all", "", duration(sum(found.seconds.values())))

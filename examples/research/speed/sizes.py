@@ -43,7 +43,7 @@ class Sizes:
     widths: tuple[int, ...] = (16, 24, 40, 64, 128, 256)
     """Neurons in each hidden layer."""
     config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None
-    """Settings that differ from the preset's, as `kkl-gym tune` writes them."""
+    """JSON file of settings that differ from the preset's."""
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y, for errors under noise."""
     trajectories: int = 100
@@ -88,7 +88,7 @@ class Sizes:
 
     def _trained(self, system: System, changes: Mapping[str, Any], out: Path, progress: ProgressBars) -> Artifact:
         """Train an observer, or read an earlier training of the same."""
-        from training.pipeline import train
+        from training.train_observer import train
 
         config = preset(system, "input-aware", "fast", changes=changes)
         progress.say(f"an observer for {system.name} with hidden layers of {config.width}")
