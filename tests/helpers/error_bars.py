@@ -1,26 +1,24 @@
-"""Error bars of random weights for any artifact that is told measurement noise."""
+"""A random covariance of T_inv's error for any artifact that depends on the measurement noise."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from observers import MLP, Spread
+from observers import ErrorCovariance
 
 LEVELS, AGES = np.array([0.0, 0.3, 1.0]), np.array([0.0, 0.1, 1.0])
 
 
-def with_error_bars(artifact, seed=0, outputs=None, activation="tanh"):
-    rng = np.random.default_rng(seed)
+def covariances(nx, seed=0, factor=1.0):
+    """Random covariances by level and age, times a factor."""
+    root = np.random.default_rng(seed).normal(size=(len(LEVELS), len(AGES), nx, nx))
+    return ErrorCovariance(LEVELS, AGES, factor * (root @ root.mT + 0.5 * np.eye(nx)))
 
-    def layer(inputs, outputs):
-        return rng.normal(size=(outputs, inputs)) / inputs**0.5, rng.normal(size=outputs)
 
-    def extended(inverse):
-        count = outputs or artifact.nx * (artifact.nx + 1) // 2
-        first, last = layer(inverse.mlp.inputs, 8), layer(8, count)
-        tables = (2, 3, 3) if "process_noise" in inverse.features else (3, 3)
-        mlp = MLP([first[0], last[0]], [first[1], last[1]], activation)
-        return replace(inverse, spread=Spread(mlp, LEVELS, AGES, rng.uniform(0.5, 2.0, tables)))
+def with_error_bars(artifact, seed=0, factor=1.0):
+    def extended(inverse, seed):
+        return inverse and replace(inverse, error_covariance=covariances(artifact.nx, seed, factor))
 
-    free = artifact.free_inverse
-    return replace(artifact, inverse=extended(artifact.inverse), free_inverse=None if free is None else extended(free))
+    return replace(
+        artifact, inverse=extended(artifact.inverse, seed), free_inverse=extended(artifact.free_inverse, seed + 100)
+    )

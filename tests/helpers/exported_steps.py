@@ -72,10 +72,10 @@ def tracked(index):
 
 
 def t_inv(observer):
-    """What T_inv alone says of the filter's state of an observer that tracks, within the flow's bounds."""
-    alone, flow = copy.copy(observer), observer.artifact.flow
-    alone.replace(replace(observer.artifact, flow=None))
-    return np.clip(alone.decode(), flow.low, flow.high)
+    """What T_inv alone says of the filter's state of an observer that tracks, within the bounds of the motion."""
+    alone, motion = copy.copy(observer), observer.artifact.motion
+    alone.replace(replace(observer.artifact, motion=None))
+    return np.clip(alone.decode(), motion.low, motion.high)
 
 
 def noise(artifact, steps, rows=()):
@@ -149,7 +149,7 @@ def in_python(exported, y, u):
     artifact = exported.artifact
     if exported.precision == "double":
         return in_doubles(exported, y, u)
-    if artifact.flow is not None:
+    if artifact.motion is not None:
         return np.array([observer.decode() for observer in stepped(exported, y, u)])
     if artifact.estimated_parameters:  # one map says both
         artifact = replace(artifact, parameter_ranges={}, estimated_parameters=())

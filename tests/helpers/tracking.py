@@ -6,10 +6,12 @@ import numpy as np
 from linear_system import C, F, exact_observer
 from scipy.linalg import expm
 
-from observers import MLP, Factors, Flow, Spread
+from observers import MLP, Equations, ErrorCovariance, Expression, Factors, Flow, Motion
 
 DT, PROCESS, STD = 0.05, 0.02, 0.3  # s, standard deviation that noise of level 1 adds at each sample, that of T_inv
 AGE_MAX = 1.0  # s
+ONE = Factors(np.zeros(1), np.zeros(1), np.ones((1, 1)))
+X_OFFSET, X_SCALE, U_SCALE = np.array([0.3, -0.1]), np.array([2.0, 0.5]), 0.5
 
 
 def exact_motion(dt=DT):
@@ -20,38 +22,60 @@ def exact_motion(dt=DT):
     return moved[:2, :2], moved[:2, 2:]
 
 
-def exact_flow(dt=DT, ny=1, factors=None, x_scale=(2.0, 0.5)):
+def exact_flow(dt=DT, nu=0, x_scale=X_SCALE):
     """The oscillator's motion in scaled states, with a network that adds nothing."""
+    (Phi, Gamma), x_scale = exact_motion(dt), np.asarray(x_scale)
+    moved = Phi - np.eye(2)
+    linear = [
+        moved @ X_OFFSET / x_scale,
+        moved * x_scale / x_scale[:, None],
+        Gamma[:, :nu] * U_SCALE / x_scale[:, None],
+    ]
+    mlp = MLP([np.zeros((4, 2 + nu)), np.zeros((2, 4))], [np.zeros(4), np.zeros(2)], "tanh")
+    return Flow(mlp, np.column_stack(linear), gain=np.ones(2), u_scale=np.full(nu, U_SCALE))
+
+
+def exact_equations(dt=DT, nu=0):
+    """The oscillator between samples, in discrete time."""
     Phi, Gamma = exact_motion(dt)
-    x_scale, x_offset, u_scale = np.array(x_scale), np.array([0.3, -0.1]), np.array([0.5])
-    linear = np.hstack([(Phi - np.eye(2)) * x_scale / x_scale[:, None], Gamma * u_scale / x_scale[:, None]])
-    return Flow(
-        MLP([np.zeros((4, 3)), np.zeros((2, 4))], [np.zeros(4), np.zeros(2)], "tanh"),
-        x_offset=x_offset,
-        x_scale=x_scale,
-        u_scale=u_scale,
-        gain=np.ones(2),
-        polynomial=np.column_stack([(Phi - np.eye(2)) @ x_offset / x_scale, linear]),
-        low=np.array([-30.0, -30.0]),
-        high=np.array([30.0, 30.0]),
-        error=np.zeros(2),
-        process_noise=PROCESS / x_scale,
-        least_process_noise=1.0,
-        least_measurement_noise=np.full(ny, 0.01),
-        window=0.5,
-        factors=factors or Factors(np.zeros(1), np.zeros(1), np.ones((1, 1))),
+    return Equations(
+        Expression(
+            [
+                ["+", ["*", a, ["x", 0]], ["*", b, ["x", 1]], *(["*", g, ["u", 0]] for g in gamma[:nu])]
+                for (a, b), gamma in zip(Phi.tolist(), Gamma.tolist(), strict=True)
+            ]
+        ),
+        substeps=0,
     )
 
 
-def told(exact):
-    """The exact observer, with the input left out, as a map that is told measurement noise and age, and uses neither.
+def linear_motion(by="equations", nu=0, ny=1, factors=ONE, x_scale=X_SCALE):
+    """The exact motion in all that a tracker needs; the start is as unsure as T_inv."""
+    moved = {"equations": exact_equations(nu=nu)} if by == "equations" else {"flow": exact_flow(DT, nu, x_scale)}
+    return Motion(
+        **moved,
+        x_offset=X_OFFSET,
+        x_scale=np.asarray(x_scale),
+        low=np.array([-30.0, -30.0]),
+        high=np.array([30.0, 30.0]),
+        mean=np.zeros(2),
+        covariance=np.array([[0.4, 0.1], [0.1, 0.3]]),
+        error=np.zeros(2),
+        process_noise=PROCESS / np.asarray(x_scale),
+        least_process_noise=1.0,
+        least_measurement_noise=np.full(ny, 0.01),
+        window=0.5,
+        factors=factors,
+    )
 
-    Its error bars are a standard deviation of 0.3 of each state.
+
+def plain_observer(outputs=C):
+    """The exact observer as a map that depends on measurement noise and age, and uses neither; it takes no input.
+
+    Its covariance is that of a standard deviation of 0.3 of each state.
     """
+    exact = exact_observer(DT, outputs)
     weight = np.hstack([exact.inverse.mlp.weights[0], np.zeros((2, 2))])
-    biases = [np.zeros(4), np.array([np.log(STD), np.log(STD), 0.0])]
-    bars = MLP([np.zeros((4, weight.shape[1])), np.zeros((3, 4))], biases, "tanh")
-    spread = Spread(bars, np.zeros(1), np.zeros(1), np.ones((1, 1)))
     inverse = replace(
         exact.inverse,
         mlp=MLP([weight], [np.zeros(2)], "tanh"),
@@ -60,22 +84,22 @@ def told(exact):
         measurement_noise_max=1.0,
         age_unit=0.25,
         age_max=AGE_MAX,
-        spread=spread,
+        error_covariance=ErrorCovariance(np.zeros(1), np.zeros(1), STD**2 * np.eye(2)[None, None]),
     )
     training = {"pipeline": "input-aware", "eigenvalues": [-1.0, -2.5, -4.0], "dt": DT, "duration": 20.0, "batch": 512}
     return replace(exact, inverse=inverse, training=training)
 
 
-def plain_observer(outputs=C):
-    """The observer without a flow; it takes no input."""
-    return told(exact_observer(DT, outputs))
-
-
 def tracking_observer(outputs=C, **options):
-    """The observer with the exact flow, without input."""
-    artifact, flow = plain_observer(outputs), exact_flow(ny=len(outputs), **options)
-    mlp = MLP([np.zeros((4, 2)), np.zeros((2, 4))], [np.zeros(4), np.zeros(2)], "tanh")
-    return replace(artifact, flow=replace(flow, mlp=mlp, u_scale=np.zeros(0), polynomial=flow.polynomial[:, :3]))
+    """The observer with the exact motion, without input; options are those of :func:`linear_motion`."""
+    return replace(plain_observer(outputs), motion=linear_motion(ny=len(outputs), **options))
+
+
+def of_t_inv(artifact, std):
+    """The artifact with another standard deviation of T_inv."""
+    covariance = std**2 * np.eye(artifact.nx)[None, None]
+    error = ErrorCovariance(np.zeros(1), np.zeros(1), covariance)
+    return replace(artifact, inverse=replace(artifact.inverse, error_covariance=error))
 
 
 class KalmanFilter:

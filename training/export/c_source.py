@@ -1,4 +1,8 @@
-"""The step as C99: a header, a source without dependencies but math.h, and a program that shows how they are used."""
+"""The step as C99: a header, a source without dependencies but math.h, and a program that shows how they are used.
+
+A tracker's estimates and covariances are doubles whatever the precision is: P is what differences leave, and in floats
+its factor would break down.
+"""
 
 from textwrap import fill
 from typing import Any
@@ -6,43 +10,61 @@ from typing import Any
 import numpy as np
 
 import kkl_gym
-from training.export import c_templates, c_tracker_templates
-from training.export.c_map import levels, map_constants, map_functions, process_level
-from training.export.c_text import array, comment, number
-from training.export.c_tracker import tracker_constants, tracker_functions, tracker_networks
-from training.export.exported import Exported
+from observers.motion import Motion
+from observers.supervision import INFLATION, Supervision
+from observers.tracker import RELINEARISATIONS
+from training.export.c_map import map_constants, map_function, measurement_levels, process_level
+from training.export.c_text import (
+    activations,
+    array,
+    block,
+    comment,
+    defined,
+    function,
+    network_arrays,
+    network_calls,
+    number,
+    template,
+)
+from training.export.exported import Exported, sigma_points, table
+
+_LARGER = "#define LARGER(a, b) ((a) > (b) ? (a) : (b))\n"
+_TABULATE = "tabulated(map##_covariance, map##_levels, map##_ROWS, map##_ages, map##_COLUMNS, age, P)"
 
 
 def c_files(exported: Exported) -> dict[str, str]:
     """Write the observer in C."""
-    exported.refuse_nonlinear("C")
-    name, words = exported.name, _words(exported)
+    artifact, name = exported.artifact, exported.name
+    motion = artifact.motion
+    by_equations = motion is not None and motion.equations is not None
+    substeps = motion.equations.substeps if motion is not None and motion.equations is not None else 0
+    chosen = {
+        "inputs": artifact.nu > 0,
+        "autonomous": not artifact.nu,
+        "free": "free" in exported.maps,
+        "tracks": motion is not None,
+        "static": motion is None,
+        "flow": motion is not None and not by_equations,
+        "equations": by_equations,
+        "discrete": substeps == 0,
+        "continuous": substeps > 0,
+        "linear": artifact.C is not None,
+        "nonlinear": artifact.C is None,
+    }
+    words = {"NAME": name, "MACRO": name.upper(), "OUTPUTS": ", ".join(exported.outputs)}
+    words = {key: comment(text) for key, text in (words | {"INPUTS": ", ".join(exported.inputs)}).items()}
+    source = words | _functions(exported) | {"/* CONSTANTS */\n": _constants(exported)}
+    digits = "9" if exported.precision == "float" else "17"
     return {
-        f"{name}.h": _header(exported, words),
-        f"{name}.c": _source(exported, words),
-        f"{name}_main.c": _program(exported, words),
+        f"{name}.h": template("observer.h", words | _heading(exported), **chosen),
+        f"{name}.c": template("observer.c", source, **chosen),
+        f"{name}_main.c": template("main.c", words | {"DIGITS": digits}, **chosen),
     }
 
 
-def _words(exported: Exported) -> dict[str, Any]:
-    """What the templates have in common."""
-    artifact, real = exported.artifact, f"{exported.name}_real"
-    return {
-        "NAME": exported.name,
-        "MACRO": exported.name.upper(),
-        "nx": len(exported.estimates),
-        "ny": artifact.ny,
-        "nu": artifact.nu,
-        "nz": len(artifact.filter.A),
-        "size": artifact.filter.size,
-        "u": f", const {real} u[{artifact.nu}]" if artifact.nu else "",
-        "pass_u": ", u" if artifact.nu else "",
-    }
-
-
-def _header(exported: Exported, words: dict[str, Any]) -> str:
-    artifact = exported.artifact
-    tracks = artifact.flow is not None
+def _heading(exported: Exported) -> dict[str, str]:
+    """Words of the header."""
+    artifact, tracks = exported.artifact, exported.artifact.motion is not None
     finite = (
         "Where an output is missing, pass NaN: it is predicted. The first sample and inputs must be finite, and the "
         "compiler must know NaN, as it does without -ffast-math."
@@ -53,111 +75,139 @@ def _header(exported: Exported, words: dict[str, Any]) -> str:
         f"{exported.name}_reset takes in the first sample, {exported.name}_step every later one. {finite} Nothing is "
         "allocated, and observers share constants alone."
     ]
-    process = process_level(exported) if tracks else None  # of which the Kalman filter takes any
-    for level in levels(exported):
-        value, to = number(level.value), " for T_inv" if level == process else ""
+    process = process_level(exported)
+    for level in [*measurement_levels(exported), *([process] if process else [])]:
+        value = number(level.value)
+        to = " for T_inv" if tracks and level == process else ""  # the filter takes any level
         beyond = f"; what is beyond {number(level.end)} counts as that{to}" if np.isfinite(level.end) else ""
         paragraphs.append(
             f"{level.macro} is {level.meaning}, {value} unless the compiler is told otherwise, as in "
             f"-D{level.macro}={value}{beyond}."
         )
-    return c_templates.HEADER.format(
-        **words,
-        system=comment(artifact.system),
-        dt=number(artifact.filter.dt),
-        version=kkl_gym.__version__,
-        source=comment(exported.source),
-        checksum=exported.checksum,
-        outputs=comment(", ".join(exported.outputs)),
-        inputs=f" * u:     {comment(', '.join(exported.inputs))}\n" if artifact.nu else "",
-        estimates=comment(", ".join(exported.estimates)),
-        paragraphs="\n *\n".join(fill(text, 116, initial_indent=" * ", subsequent_indent=" * ") for text in paragraphs),
-        real=exported.precision,
-        age="    unsigned long age; /* samples since the first, as far as that matters */\n"
-        if exported.last_age
-        else "",
-        tracker=c_tracker_templates.FIELDS.format(**words) if tracks else "",
-        input_text=" and the input that was held since the last" if artifact.nu else "",
-    )
+    return {
+        "SYSTEM": comment(artifact.system),
+        "SECONDS": number(artifact.filter.dt),
+        "VERSION": kkl_gym.__version__,
+        "SOURCE": comment(exported.source),
+        "CHECKSUM": exported.checksum,
+        "ESTIMATES": comment(", ".join(exported.estimates)),
+        "PARAGRAPHS": "\n *\n".join(
+            fill(text, 116, initial_indent=" * ", subsequent_indent=" * ") for text in paragraphs
+        ),
+        "PRECISION": exported.precision,
+        "COUNT_X": str(len(exported.estimates)),
+        "COUNT_Y": str(artifact.ny),
+        "COUNT_U": str(artifact.nu),
+        "COUNT_Z": str(artifact.filter.size),
+    }
 
 
-def _source(exported: Exported, words: dict[str, Any]) -> str:
-    linear, nz = exported.artifact.filter, words["nz"]
-    parts = [
-        f'#include "{exported.name}.h"\n\n#include <math.h>\n#include <stddef.h>\n\n',
-        f"typedef {exported.name}_real real;\n",
-    ]
-    for level in levels(exported):
-        macro, end = level.macro, number(level.end)
-        parts.append(f"\n#ifndef {macro}\n#define {macro} {number(level.value)}\n#endif\n")
-        cut = f"(({macro}) < {end} ? ({macro}) : {end})" if np.isfinite(level.end) else f"({macro})"
-        parts.append(f"#define CUT_{macro} {cut}\n")
-    block = linear.transition[:nz, :nz]
-    rows, columns = np.nonzero(block - np.diag(block.diagonal()))
+def _constants(exported: Exported) -> str:
+    """Sizes, levels of noise and arrays."""
+    artifact, linear, macro = exported.artifact, exported.artifact.filter, exported.name.upper()
+    nz, process = len(linear.A), process_level(exported)
+    block_of_z = linear.transition[:nz, :nz]
+    rows, columns = np.nonzero(block_of_z)
+    sizes = {"NX": f"{macro}_NX", "NY": f"{macro}_NY", "NU": f"{macro}_NU", "NZ": nz, "SIZE": linear.size}
+    parts = [defined(sizes | {"TRANSITIONS": len(rows), "LAST_AGE": f"{exported.last_age}ul"})]
+    parts.append("#define SQUARE(a) ((a) * (a))\n")
+    for level in [*measurement_levels(exported), *([process] if process else [])]:
+        parts.append(f"\n#ifndef {level.macro}\n#define {level.macro} {number(level.value)}\n#endif\n")
     parts += [
         "\n/* The filter. */\n",
-        array("double", "diagonal", block.diagonal()),
-        array("double", "early_y", linear.early_y[:nz]),
-        array("double", "late_y", linear.late_y[:nz]),
-        array("double", "equilibrium", linear.equilibrium[:nz]),
+        array("double", "transition", block_of_z[rows, columns]),
+        array("unsigned short", "transition_row", rows),
+        array("unsigned short", "transition_column", columns),
+        *(array("double", name, getattr(linear, name)[:nz]) for name in ("early_y", "late_y", "equilibrium")),
+        *([array("double", "held_u", linear.held_u[nz : 2 * nz, 0])] if linear.nu else []),
+        *(map_constants(exported, label, inverse) for label, inverse in exported.maps.items()),
     ]
-    if len(rows):
-        parts += [
-            array("double", "mixing", block[rows, columns]),
-            array("unsigned short", "mixing_row", rows),
-            array("unsigned short", "mixing_column", columns),
-        ]
-    if linear.nu:
-        parts.append(array("double", "held_u", linear.held_u[nz : 2 * nz, 0]))
-    for label, inverse in exported.maps.items():
-        parts += map_constants(exported, label, inverse)
-    flow, networks = exported.artifact.flow, [inverse.mlp for inverse in exported.maps.values()]
-    if flow is not None:
-        parts += tracker_constants(exported, flow)
-        networks += tracker_networks(exported, flow)
-    parts.append(c_templates.LAYER)
-    for activation in dict.fromkeys(mlp.activation for mlp in networks if len(mlp.weights) > 1):
-        tanh = "tanhf" if exported.precision == "float" else "tanh"
-        body = c_templates.ACTIVATIONS[activation].format(tanh=tanh, half="(real)0.5")
-        parts.append(c_templates.ACTIVATION.format(activation=activation, body=body))
-    words = words | {"u": words["u"].replace(f"{exported.name}_real", "real")}
-    if flow is None:
-        parts += [map_functions(exported, label, inverse) for label, inverse in exported.maps.items()]
-        ask = c_templates.ASK_TWO if "free" in exported.maps else c_templates.ASK_ONE
-        parts.append(ask.format(**words, head=c_templates.ESTIMATE.format(**words), what="map(observer, x_hat)"))
-    else:
-        parts.append(tracker_functions(exported, flow, words))
-    last = exported.last_age
-    begin = "" if flow is None else c_tracker_templates.BEGIN
-    age_zero = "    observer->age = 0;\n" if last else ""
-    parts.append(c_templates.RESET.format(**words, begin=age_zero + begin))
-    parts.append(
-        c_templates.ADVANCE.format(nz=nz, mixing=c_templates.MIXING.format(count=len(rows)) if len(rows) else "")
-    )
-    parts.append(
-        c_templates.STEP.format(
-            **words,
-            take="" if flow is None else c_tracker_templates.TAKE.format(**words),
-            inputs=c_templates.INPUTS.format(**words) if linear.nu else "",
-            age_next=f"    if (observer->age < {last}ul)\n        observer->age++;\n" if last else "",
-            supervise="" if flow is None else "    supervise(observer, told);\n",
-        )
-    )
+    if artifact.motion is not None:
+        parts.append(_tracker_constants(exported, artifact.motion))
     return "".join(parts)
 
 
-def _program(exported: Exported, words: dict[str, Any]) -> str:
-    outputs, inputs = (comment(", ".join(names)) for names in (exported.outputs, exported.inputs))
-    macro, nu = words["MACRO"], exported.artifact.nu
-    return c_templates.PROGRAM.format(
-        NAME=exported.name,
-        MACRO=macro,
-        outputs=outputs,
-        line=f"the input that led to the next sample, {inputs}, then the sample" if nu else "the next sample",
-        missing="" if exported.artifact.flow is None else " * Outputs that are missing are nan, but for the first.\n",
-        digits=9 if exported.precision == "float" else 17,
-        declared=f"    {exported.name}_real u[{macro}_NU];\n" if nu else "",
-        first=f"u, {macro}_NU" if nu else f"y, {macro}_NY",
-        then=c_templates.READ_Y.format(MACRO=macro) if nu else "",
-        u=words["pass_u"],
-    )
+def _tracker_constants(exported: Exported, motion: Motion) -> str:
+    """Motion, Kalman filter, divergence detection and T_inv's covariance."""
+    artifact, measurement, process = exported.artifact, measurement_levels(exported), process_level(exported)
+    assert process is not None
+    watch, (low, high) = Supervision.of(motion, artifact.filter.dt), motion.scaled_bounds
+    level = f"LARGER({process.macro}, {number(motion.least_process_noise)})"
+    Q = [
+        f"SQUARE({level} * {number(b)}) + {number(a**2)}"
+        for a, b in zip(motion.error, motion.process_noise, strict=True)
+    ]
+    levels = measurement * (artifact.ny // len(measurement))
+    least = motion.least_measurement_noise
+    R = [f"SQUARE(LARGER({each.cut}, {number(a)}))" for each, a in zip(levels, least, strict=True)]
+    share = "0.0"
+    for each in measurement:
+        share = f"LARGER({share}, {each.cut} / {number(each.end)})"
+    middle, squares, other = sigma_points(motion.nx).weights(motion.nx)
+    units = np.outer(motion.x_scale, motion.x_scale)
+    macros: dict[str, Any] = {
+        "NOISE_SHARE": share,
+        "TABULATE(map, age, P)": _TABULATE,
+        "FAR": number((2 * other) ** -0.5),
+        "MIDDLE": number(middle),
+        "MIDDLE_SQUARES": number(squares),
+        "OTHER": number(other),
+        "RELINEARISATIONS": RELINEARISATIONS,
+        "WINDOW": f"{watch.window}ul",
+        "SHARE": number(watch.share),
+        "NIS_LIMIT": number(watch.limit),
+        "TREND_SHARE": number(watch.trend_share),
+        "TREND_SQUARE_SHARE": number(watch.trend_square_share),
+        "TREND_GAIN": number(watch.trend_gain),
+        "TREND_LIMIT": number(watch.trend_limit),
+        "INFLATION": number(INFLATION),
+    }
+    arrays = {
+        "x_offset": motion.x_offset,
+        "x_scale": motion.x_scale,
+        "low": low,
+        "high": high,
+        "start_mean": (motion.mean - motion.x_offset) / motion.x_scale,
+        "start_covariance": motion.covariance / units,
+    }
+    if artifact.C is not None:
+        arrays |= {"output_mean": artifact.C @ motion.x_offset, "C": artifact.C * motion.x_scale}
+    network = ""
+    if motion.flow is not None:
+        names = ("linear", "gain", *(["u_scale"] if artifact.nu else []))
+        arrays |= {f"flow_{name}": getattr(motion.flow, name) for name in names}
+        network = network_arrays("flow", motion.flow.mlp)
+    elif motion.equations is not None and motion.equations.substeps:
+        substeps = motion.equations.substeps
+        macros |= {"SUBSTEPS": substeps, "H": number(artifact.filter.dt / substeps)}
+    for label, inverse in exported.maps.items():
+        of_level, ages, covariance = table(inverse, motion.x_scale)
+        macros |= {f"{label}_ROWS": len(of_level), f"{label}_COLUMNS": len(ages)}
+        arrays |= {f"{label}_levels": of_level, f"{label}_ages": ages, f"{label}_covariance": covariance.ravel()}
+    return "".join([
+        "\n/* The motion, the Kalman filter on it, and T_inv's covariance. */\n",
+        _LARGER,
+        defined(macros),
+        *(array("double", name, values) for name, values in arrays.items()),
+        block("double", "Q", f"[{len(Q)}]", Q),
+        block("double", "R", f"[{len(R)}]", R),
+        network,
+    ])  # fmt: skip
+
+
+def _functions(exported: Exported) -> dict[str, Any]:
+    """Functions that differ between observers, by the words in the place of which they stand."""
+    artifact, motion = exported.artifact, exported.artifact.motion
+    networks = [inverse.mlp for inverse in exported.maps.values()]
+    words: dict[str, Any] = {}
+    if motion is not None and motion.flow is not None:
+        networks.append(motion.flow.mlp)
+        words = dict(zip(("FLOW_WIDTH", "/* LAYERS */", "MOVED"), network_calls("flow", motion.flow.mlp), strict=True))
+        words["/* FIELD */\n\n"] = ""
+    elif motion is not None and motion.equations is not None:
+        words["/* FIELD */\n"] = function("field", motion.equations.field)
+    if motion is not None and artifact.h is not None:
+        words["/* OUTPUT */\n"] = function("h", artifact.h)
+    maps = "".join(map_function(exported, label, inverse) for label, inverse in exported.maps.items())
+    words["/* FUNCTIONS */\n\n"] = activations(networks, exported.precision) + maps
+    return words

@@ -15,7 +15,7 @@ from observers.errors import ArtifactError
 from observers.inverse import InverseMap
 from observers.names import resolve
 from observers.storage import checksum
-from observers.supervision import Supervision
+from observers.unscented import Points
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
 # what distinguishes them would be lost in the last digits of floats.
@@ -62,18 +62,10 @@ class Exported:
             exported._check_range()
         return exported
 
-    def refuse_nonlinear(self, what: str) -> None:
-        """See that it does not track by an output that is not linear."""
-        if self.artifact.flow is not None and self.artifact.C is None:
-            raise ArtifactError(
-                f"{self.source} tracks by an output h(x) that is not linear, and {what} takes y = C x alone: export "
-                "the map that it was made from (kkl-gym tracking leaves it as it is), which is T_inv alone"
-            )
-
     def _check_range(self) -> None:
-        flow, scales = self.artifact.flow, [(each.x_offset, each.x_scale) for each in self.maps.values()]
-        if flow is not None:
-            scales.append((flow.x_offset, flow.x_scale))
+        motion, scales = self.artifact.motion, [(each.x_offset, each.x_scale) for each in self.maps.values()]
+        if motion is not None:
+            scales.append((motion.x_offset, motion.x_scale))
         largest = float(np.abs(np.concatenate(scales, axis=None)).max())
         if largest > float(np.finfo(np.float32).max):
             raise ArtifactError(
@@ -107,9 +99,6 @@ class Exported:
     def last_age(self) -> int:
         """Samples since the first after which the age no longer matters; 0 if it never does."""
         ends = [inverse.age_max for inverse in self.maps.values() if "age" in inverse.features]
-        if self.artifact.flow is not None:
-            dt = self.artifact.filter.dt
-            ends.append(Supervision.of(self.artifact.flow, dt).window * dt)
         return min(math.ceil(max(ends, default=0.0) / self.artifact.filter.dt), _MOST_SAMPLES)
 
     @property
@@ -151,9 +140,27 @@ class Exported:
         }
         if self.levels:
             described["measurement_noise"] = list(self.levels)
-        if self.told_process_noise or self.artifact.flow is not None:
+        if self.told_process_noise or self.artifact.motion is not None:
             described["process_noise"] = self.process_noise
         return described
+
+
+def sigma_points(nx: int) -> Points:
+    """The sigma points of :class:`observers.tracker.Tracker`."""
+    return Points(kappa=max(3.0 - nx, 0.0), beta=2.0)
+
+
+def table(inverse: InverseMap, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """T_inv's covariance in units of ``scale`` (nx,), by level (k,) and age (m,), two of each at least."""
+    error = inverse.error_covariance
+    assert error is not None
+    covariance = error.covariance / np.outer(scale, scale)
+    levels, ages = error.levels, error.ages
+    if len(levels) == 1:
+        levels, covariance = np.array([0.0, 1.0]), np.repeat(covariance, 2, 0)
+    if len(ages) == 1:
+        ages, covariance = np.array([0.0, 1.0]), np.repeat(covariance, 2, 1)
+    return levels, ages, covariance
 
 
 def identifier(name: str) -> str:

@@ -111,9 +111,9 @@ def test_names():
 
 def test_what_cannot_be_exported(make_artifact, tmp_path):
     inverse, tracker = make_artifact().inverse, tracking()
-    flow = replace(tracker.flow, x_offset=1e39 * tracker.flow.x_offset)
+    motion = replace(tracker.motion, x_offset=1e39 * tracker.motion.x_offset)
     huge = replace(make_artifact(), inverse=replace(inverse, x_scale=1e39 * inverse.x_scale))
-    for artifact in (huge, replace(tracker, flow=flow)):
+    for artifact in (huge, replace(tracker, motion=motion)):
         with pytest.raises(ValueError, match="beyond the range of floats: export it with --precision double"):
             exported_of(artifact, tmp_path)
     assert exported_of(huge, tmp_path, precision="double").precision == "double"
