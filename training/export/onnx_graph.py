@@ -27,8 +27,7 @@ def onnx_model(exported: Exported) -> Any:
     """
     from onnx import checker, helper
 
-    exported.refuse_nonlinear("ONNX")
-    artifact, linear, tracks = exported.artifact, exported.artifact.filter, exported.artifact.flow is not None
+    artifact, linear, tracks = exported.artifact, exported.artifact.filter, exported.artifact.motion is not None
     real, levels = _TYPES[exported.precision], len(exported.levels)
     inputs = {
         "z": linear.size,
@@ -45,18 +44,17 @@ def onnx_model(exported: Exported) -> Any:
     outputs = {name: width for name, width in outputs.items() if width}
     graph = Graph()
     given = {name: name if name in _STATES else graph.cast(name, np.float64) for name in inputs}
-    begins = graph("Equal", given["age"], graph.constant([0.0]))
-    tracker = TrackerNodes(graph, artifact, given, real) if tracks else None
+    begins = graph("Equal", given["age"], 0.0)
+    tracker = TrackerNodes(graph, artifact, given, begins, real) if tracks else None
     if tracker is None:
         z = _filtered(graph, exported, given, begins)
-        x_hat = Maps(graph, exported, z, given, real).estimate(given["age"])
+        x_hat = Maps(graph, exported, z, given, real).estimate()
     else:
         tracked, whole = tracker.taken()
-        first = graph("Where", begins, given["y_next"], whole)
-        z = _filtered(graph, exported, given | {"y": tracker.y, "y_next": first}, begins)
-        tracked = tracker.supervised(tracked, Maps(graph, exported, z, given, real), begins)
-        graph.named("tracker_next", tracker.packed(tracked, first))
-        x_hat = tracker.estimate(tracked)
+        z = _filtered(graph, exported, given | {"y": tracker.y, "y_next": whole}, begins)
+        tracked = tracker.supervised(tracked, Maps(graph, exported, z, given, real))
+        graph.named("tracker_next", graph.joined(*tracked, whole))
+        x_hat = tracker.estimate(tracked[0])
     graph.named("z_next", z)
     graph.named("x_hat", graph.cast(x_hat, real))
 
@@ -89,6 +87,6 @@ def _filtered(graph: Graph, exported: Exported, given: dict[str, str], begins: s
     linear = exported.artifact.filter
     signals = [given[name] for name in ("z", "y", "u", "y_next") if name in given]
     update = np.vstack([linear.transition.T, linear.early_y.T, linear.held_u.T, linear.late_y.T])
-    advanced = graph("MatMul", graph.joined(*signals), graph.constant(update))
-    start = graph("MatMul", given["y_next"], graph.constant(linear.equilibrium.T))
+    advanced = graph("MatMul", graph.joined(*signals), update)
+    start = graph("MatMul", given["y_next"], linear.equilibrium.T)
     return graph("Where", begins, start, advanced)

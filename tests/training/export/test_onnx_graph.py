@@ -34,7 +34,7 @@ def test_every_kind_of_map(index, precision):
     assert apart(exported, runner.along(y, u), expected) < TOLERANCES[precision]
 
 
-@pytest.mark.parametrize(("index", "precision"), [*((i, "double") for i in range(len(KINDS))), (2, "float")])
+@pytest.mark.parametrize(("index", "precision"), [*((i, "double") for i in range(len(KINDS))), (1, "float"), (5, "float")])
 def test_maps_that_track(index, precision):
     exported, y, u, expected = tracked_record(index)
     x_hat = Runner(replace(exported, precision=precision)).along(y[:, None], u[:, None])[:, 0]
@@ -64,7 +64,7 @@ def test_what_ships(name, precision, size):
 
 @pytest.mark.parametrize("tracks", [False, True])
 def test_rows_have_levels_of_their_own(tracks):
-    exported, y, u, _ = tracked_record(2) if tracks else mapped(1)
+    exported, y, u, _ = tracked_record(5) if tracks else mapped(1)
     y, u = (np.stack([each[:100]] * 2, 1) for each in ((y, u) if tracks else (y[:, 1], u[:, 1])))
     levels = [((0.2, 0.7), 0.1), ((0.9, 7.0), 0.6)]  # T_inv is told 2 and 0.2 at most, and the Kalman filter any
     told = {"measurement_noise": np.array([a for a, _ in levels]), "process_noise": np.array([[b] for _, b in levels])}
