@@ -11,8 +11,6 @@ import numpy as np
 
 import kkl_gym
 from observers.motion import Motion
-from observers.supervision import INFLATION, Supervision
-from observers.tracker import RELINEARISATIONS
 from training.export.c_map import map_constants, map_function, measurement_levels, process_level
 from training.export.c_text import (
     activations,
@@ -26,7 +24,7 @@ from training.export.c_text import (
     number,
     template,
 )
-from training.export.exported import Exported, sigma_points, table
+from training.export.exported import Exported, output_expression, table, tracker_arrays, tracker_numbers
 
 _LARGER = "#define LARGER(a, b) ((a) > (b) ? (a) : (b))\n"
 _TABULATE = "tabulated(map##_covariance, map##_levels, map##_ROWS, map##_ages, map##_COLUMNS, age, P)"
@@ -36,20 +34,17 @@ def c_files(exported: Exported) -> dict[str, str]:
     """Write the observer in C."""
     artifact, name = exported.artifact, exported.name
     motion = artifact.motion
-    by_equations = motion is not None and motion.equations is not None
-    substeps = motion.equations.substeps if motion is not None and motion.equations is not None else 0
+    equations = None if motion is None else motion.equations
     chosen = {
         "inputs": artifact.nu > 0,
         "autonomous": not artifact.nu,
         "free": "free" in exported.maps,
         "tracks": motion is not None,
         "static": motion is None,
-        "flow": motion is not None and not by_equations,
-        "equations": by_equations,
-        "discrete": substeps == 0,
-        "continuous": substeps > 0,
-        "linear": artifact.C is not None,
-        "nonlinear": artifact.C is None,
+        "flow": equations is None,
+        "equations": equations is not None,
+        "discrete": equations is not None and not equations.substeps,
+        "continuous": equations is not None and equations.substeps > 0,
     }
     words = {"NAME": name, "MACRO": name.upper(), "OUTPUTS": ", ".join(exported.outputs)}
     words = {key: comment(text) for key, text in (words | {"INPUTS": ", ".join(exported.inputs)}).items()}
@@ -110,10 +105,10 @@ def _constants(exported: Exported) -> str:
     rows, columns = np.nonzero(block_of_z)
     sizes = {"NX": f"{macro}_NX", "NY": f"{macro}_NY", "NU": f"{macro}_NU", "NZ": nz, "SIZE": linear.size}
     parts = [defined(sizes | {"TRANSITIONS": len(rows), "LAST_AGE": f"{exported.last_age}ul"})]
-    parts.append("#define SQUARE(a) ((a) * (a))\n")
-    for level in [*measurement_levels(exported), *([process] if process else [])]:
-        parts.append(f"\n#ifndef {level.macro}\n#define {level.macro} {number(level.value)}\n#endif\n")
+    levels = [*measurement_levels(exported), *([process] if process else [])]
     parts += [
+        "#define SQUARE(a) ((a) * (a))\n",
+        *(f"\n#ifndef {each.macro}\n#define {each.macro} {number(each.value)}\n#endif\n" for each in levels),
         "\n/* The filter. */\n",
         array("double", "transition", block_of_z[rows, columns]),
         array("unsigned short", "transition_row", rows),
@@ -131,83 +126,43 @@ def _tracker_constants(exported: Exported, motion: Motion) -> str:
     """Motion, Kalman filter, divergence detection and T_inv's covariance."""
     artifact, measurement, process = exported.artifact, measurement_levels(exported), process_level(exported)
     assert process is not None
-    watch, (low, high) = Supervision.of(motion, artifact.filter.dt), motion.scaled_bounds
-    level = f"LARGER({process.macro}, {number(motion.least_process_noise)})"
-    Q = [
-        f"SQUARE({level} * {number(b)}) + {number(a**2)}"
-        for a, b in zip(motion.error, motion.process_noise, strict=True)
-    ]
-    levels = measurement * (artifact.ny // len(measurement))
-    least = motion.least_measurement_noise
-    R = [f"SQUARE(LARGER({each.cut}, {number(a)}))" for each, a in zip(levels, least, strict=True)]
     share = "0.0"
     for each in measurement:
         share = f"LARGER({share}, {each.cut} / {number(each.end)})"
-    middle, squares, other = sigma_points(motion.nx).weights(motion.nx)
-    units = np.outer(motion.x_scale, motion.x_scale)
-    macros: dict[str, Any] = {
-        "NOISE_SHARE": share,
-        "TABULATE(map, age, P)": _TABULATE,
-        "FAR": number((2 * other) ** -0.5),
-        "MIDDLE": number(middle),
-        "MIDDLE_SQUARES": number(squares),
-        "OTHER": number(other),
-        "RELINEARISATIONS": RELINEARISATIONS,
-        "WINDOW": f"{watch.window}ul",
-        "SHARE": number(watch.share),
-        "NIS_LIMIT": number(watch.limit),
-        "TREND_SHARE": number(watch.trend_share),
-        "TREND_SQUARE_SHARE": number(watch.trend_square_share),
-        "TREND_GAIN": number(watch.trend_gain),
-        "TREND_LIMIT": number(watch.trend_limit),
-        "INFLATION": number(INFLATION),
-    }
-    arrays = {
-        "x_offset": motion.x_offset,
-        "x_scale": motion.x_scale,
-        "low": low,
-        "high": high,
-        "start_mean": (motion.mean - motion.x_offset) / motion.x_scale,
-        "start_covariance": motion.covariance / units,
-    }
-    if artifact.C is not None:
-        arrays |= {"output_mean": artifact.C @ motion.x_offset, "C": artifact.C * motion.x_scale}
-    network = ""
+    numbers = tracker_numbers(motion, artifact.filter.dt)
+    macros: dict[str, Any] = {name.upper(): value for name, value in numbers.items()}
+    macros |= {"NOISE_SHARE": share, "TABULATE(map, age, P)": _TABULATE, "FAR": (2 * numbers["other"]) ** -0.5}
+    arrays = tracker_arrays(motion)
     if motion.flow is not None:
         names = ("linear", "gain", *(["u_scale"] if artifact.nu else []))
         arrays |= {f"flow_{name}": getattr(motion.flow, name) for name in names}
-        network = network_arrays("flow", motion.flow.mlp)
-    elif motion.equations is not None and motion.equations.substeps:
-        substeps = motion.equations.substeps
-        macros |= {"SUBSTEPS": substeps, "H": number(artifact.filter.dt / substeps)}
+    elif motion.equations is not None and (substeps := motion.equations.substeps):
+        macros |= {"SUBSTEPS": substeps, "H": artifact.filter.dt / substeps}
     for label, inverse in exported.maps.items():
-        of_level, ages, covariance = table(inverse, motion.x_scale)
-        macros |= {f"{label}_ROWS": len(of_level), f"{label}_COLUMNS": len(ages)}
-        arrays |= {f"{label}_levels": of_level, f"{label}_ages": ages, f"{label}_covariance": covariance.ravel()}
-    return "".join([
-        "\n/* The motion, the Kalman filter on it, and T_inv's covariance. */\n",
-        _LARGER,
-        defined(macros),
-        *(array("double", name, values) for name, values in arrays.items()),
-        block("double", "Q", f"[{len(Q)}]", Q),
-        block("double", "R", f"[{len(R)}]", R),
-        network,
-    ])  # fmt: skip
+        levels, ages, covariance = table(inverse, motion.x_scale)
+        macros |= {f"{label}_ROWS": len(levels), f"{label}_COLUMNS": len(ages)}
+        arrays |= {f"{label}_levels": levels, f"{label}_ages": ages, f"{label}_covariance": covariance.ravel()}
+    level = f"LARGER({process.macro}, {number(motion.least_process_noise)})"
+    noise, least = (motion.error, motion.process_noise), motion.least_measurement_noise
+    Q = [f"SQUARE({level} * {number(added)}) + {number(error**2)}" for error, added in zip(*noise, strict=True)]
+    cuts = [each.cut for each in measurement] * (artifact.ny // len(measurement))
+    R = [f"SQUARE(LARGER({cut}, {number(each)}))" for cut, each in zip(cuts, least, strict=True)]
+    parts = ["\n/* The motion, the Kalman filter on it, and T_inv's covariance. */\n", _LARGER, defined(macros)]
+    parts += [array("double", name, values) for name, values in arrays.items()]
+    parts += [block("double", "Q", f"[{len(Q)}]", Q), block("double", "R", f"[{len(R)}]", R)]
+    return "".join(parts) + ("" if motion.flow is None else network_arrays("flow", motion.flow.mlp))
 
 
 def _functions(exported: Exported) -> dict[str, Any]:
     """Functions that differ between observers, by the words in the place of which they stand."""
-    artifact, motion = exported.artifact, exported.artifact.motion
-    networks = [inverse.mlp for inverse in exported.maps.values()]
+    motion, networks = exported.artifact.motion, [inverse.mlp for inverse in exported.maps.values()]
     words: dict[str, Any] = {}
-    if motion is not None and motion.flow is not None:
-        networks.append(motion.flow.mlp)
-        words = dict(zip(("FLOW_WIDTH", "/* LAYERS */", "MOVED"), network_calls("flow", motion.flow.mlp), strict=True))
-        words["/* FIELD */\n\n"] = ""
-    elif motion is not None and motion.equations is not None:
-        words["/* FIELD */\n"] = function("field", motion.equations.field)
-    if motion is not None and artifact.h is not None:
-        words["/* OUTPUT */\n"] = function("h", artifact.h)
+    if motion is not None:
+        moved = "" if motion.equations is None else function("field", motion.equations.field) + "\n"
+        words["/* MOTION */\n"] = moved + function("h", output_expression(exported.artifact))
+        if motion.flow is not None:
+            calls = network_calls("flow", motion.flow.mlp)
+            words |= dict(zip(("FLOW_WIDTH", "/* LAYERS */", "MOVED"), calls, strict=True))
+            networks.append(motion.flow.mlp)
     maps = "".join(map_function(exported, label, inverse) for label, inverse in exported.maps.items())
-    words["/* FUNCTIONS */\n\n"] = activations(networks, exported.precision) + maps
-    return words
+    return words | {"/* FUNCTIONS */\n\n": activations(networks, exported.precision) + maps}

@@ -34,7 +34,7 @@ _OPERATIONS = {  # of values in variables, as NumPy has them
 
 
 def template(name: str, words: Mapping[str, object], **chosen: bool) -> str:
-    """A file of the folder ``c`` with words replaced; of what lies between "// if" and "// end" stays what is chosen."""
+    """A file of the folder ``c``: words are replaced, and parts between "// if" and "// end" stay where chosen."""
     text = files("training.export").joinpath("c", name).read_text(encoding="utf-8")
 
     def kept(match: re.Match[str]) -> str:

@@ -1,5 +1,6 @@
 """What is exported: an observer, the levels of noise that it assumes, and what is said of where it comes from."""
 
+import dataclasses
 import math
 import os
 import re
@@ -12,9 +13,13 @@ from kkl_gym.systems import SYSTEMS
 from observers import Artifact, KKLObserver
 from observers.checks import choice
 from observers.errors import ArtifactError
+from observers.expression import Expression
 from observers.inverse import InverseMap
+from observers.motion import Motion
 from observers.names import resolve
 from observers.storage import checksum
+from observers.supervision import INFLATION, Supervision
+from observers.tracker import RELINEARISATIONS
 from observers.unscented import Points
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
@@ -145,9 +150,32 @@ class Exported:
         return described
 
 
-def sigma_points(nx: int) -> Points:
-    """The sigma points of :class:`observers.tracker.Tracker`."""
-    return Points(kappa=max(3.0 - nx, 0.0), beta=2.0)
+def output_expression(artifact: Artifact) -> Expression:
+    """h(x)."""
+    if artifact.h is not None:
+        return artifact.h
+    assert artifact.C is not None
+    return Expression(
+        [["+", 0.0, *(["*", c, ["x", i]] for i, c in enumerate(row) if c)] for row in artifact.C.tolist()]
+    )
+
+
+def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
+    """Weights of sigma points, and divergence detection."""
+    watch = Supervision.of(motion, dt)
+    points = Points(kappa=max(3.0 - motion.nx, 0.0), beta=2.0)  # as in observers.tracker
+    weights = dict(zip(("middle", "middle_squares", "other"), points.weights(motion.nx), strict=True))
+    others = {"trend_gain": watch.trend_gain, "inflation": INFLATION, "relinearisations": RELINEARISATIONS}
+    return weights | others | dataclasses.asdict(watch)
+
+
+def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
+    """Scaling of the states; bounds, and mean and covariance of where motions start, of scaled states."""
+    low, high = motion.scaled_bounds
+    mean = (motion.mean - motion.x_offset) / motion.x_scale
+    covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
+    scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}
+    return scaling | {"low": low, "high": high, "mean": mean, "covariance": covariance}
 
 
 def table(inverse: InverseMap, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

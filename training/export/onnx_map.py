@@ -69,7 +69,9 @@ class Maps:
 
     def _covariance(self, inverse: InverseMap, age: str, scale: np.ndarray) -> str:
         graph, (levels, ages, covariance) = self._graph, table(inverse, scale)
-        share = graph("Div", self._given["measurement_noise"], np.atleast_1d(inverse.measurement_noise_max).astype(float))
+        share = graph(
+            "Div", self._given["measurement_noise"], np.atleast_1d(inverse.measurement_noise_max).astype(float)
+        )
         share = graph("Min", graph("ReduceMax", share, axes=[1], keepdims=1), 1.0)
         of_level = graph("MatMul", graph.between(share, levels), covariance.reshape(len(levels), -1))
         by_age = graph("Reshape", of_level, np.array([-1, len(ages), len(scale) ** 2]))

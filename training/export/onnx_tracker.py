@@ -15,7 +15,7 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.supervision import INFLATION, Supervision
 from observers.tracker import RELINEARISATIONS
-from training.export.exported import sigma_points
+from training.export.exported import tracker_arrays, tracker_numbers
 from training.export.onnx_map import Maps
 from training.export.onnx_nodes import Graph
 
@@ -93,11 +93,15 @@ class TrackerNodes:
         graph, motion, inverse = self._graph, self._motion, self._artifact.inverse
         level = graph("Max", self._given["process_noise"], motion.least_process_noise)
         added = graph("Mul", level, motion.process_noise)
-        noise = graph("Min", self._given["measurement_noise"], np.atleast_1d(inverse.measurement_noise_max).astype(float))
+        noise = graph(
+            "Min", self._given["measurement_noise"], np.atleast_1d(inverse.measurement_noise_max).astype(float)
+        )
         noise = graph("Max", noise, motion.least_measurement_noise)
         variances = graph("Add", graph("Mul", added, added), motion.error**2), graph("Mul", noise, noise)
         sizes = motion.nx, self._artifact.ny
-        Q, R = (graph("Mul", graph("Unsqueeze", v, np.array([2])), np.eye(n)) for v, n in zip(variances, sizes, strict=True))
+        Q, R = (
+            graph("Mul", graph("Unsqueeze", v, np.array([2])), np.eye(n)) for v, n in zip(variances, sizes, strict=True)
+        )
         return Q, R
 
     def _predicted(self, x: str, P: str) -> Prediction:
@@ -117,7 +121,12 @@ class TrackerNodes:
 
     def _corrected(self, mean: str, P: str) -> tuple[str, str, str]:
         """What a sample says: mean + V white and P - V V^T are what is known then; and what was expected."""
-        graph, artifact, y, (ny, nx) = self._graph, self._artifact, self._given["y_next"], (self._artifact.ny, self._artifact.nx)
+        graph, artifact, y, (ny, nx) = (
+            self._graph,
+            self._artifact,
+            self._given["y_next"],
+            (self._artifact.ny, self._artifact.nx),
+        )
         if artifact.C is not None:
             C = artifact.C * self._motion.x_scale
             expected = graph("Add", graph("MatMul", mean, C.T), artifact.C @ self._motion.x_offset)
@@ -142,8 +151,10 @@ class TrackerNodes:
             if skipped:
                 column = graph("Where", skipped[j], 0.0, column)
             columns.append(column)
-            upright, across = (graph("Unsqueeze", part, np.array([axis])) for part, axis in (
-                (column, 2), (graph.part(column, 0, count), 1)))
+            upright, across = (
+                graph("Unsqueeze", part, np.array([axis]))
+                for part, axis in ((column, 2), (graph.part(column, 0, count), 1))
+            )
             rows = graph("Sub", rows, graph("MatMul", upright, across))
         return columns
 
@@ -156,14 +167,16 @@ class TrackerNodes:
             whole = graph.joined(*(graph("Unsqueeze", column, np.array([2])) for column in columns), axis=2)
             root = graph.part(whole, nx, 2 * nx)
             logs = [graph("Log", graph.part(column, j, j + 1)) for j, column in enumerate(columns)]
-            L = [graph("Mul", graph.part(column, 0, nx), (np.arange(nx) >= j) * 1.0) for j, column in enumerate(columns)]
+            L = [
+                graph("Mul", graph.part(column, 0, nx), (np.arange(nx) >= j) * 1.0) for j, column in enumerate(columns)
+            ]
             self._factors[P] = L, self._outer(root, root), graph("Sum", *logs)
         return self._factors[P]
 
     def _transformed(self, x: str, P: str, function: Callable[[str, int], str], width: int) -> Prediction:
         """What a function makes of a Gaussian, by sigma points."""
         graph, nx = self._graph, self._motion.nx
-        middle, squares, other = sigma_points(nx).weights(nx)
+        middle, squares, other = [tracker_numbers(self._motion, self._artifact.filter.dt)[n] for n in ("middle", "middle_squares", "other")]
         far = [graph("Mul", column, math.sqrt(0.5 / other)) for column in self._factored(P)[0]]
         points = [x, *(graph(sign, x, column) for column in far for sign in ("Add", "Sub"))]
         count, at = len(points), graph.joined(*points, axis=0)
@@ -236,7 +249,9 @@ class TrackerNodes:
         raised = graph("Mul", graph("Mul", trend, trend), watch.trend_gain)
         trend_square = averaged(trend_square, raised, watch.trend_square_share)
         coloured = graph("And", graph("Greater", trend_square, watch.trend_limit), graph("Greater", count, 0.0))
-        inflated = graph("Mul", self._flat(P), graph("Where", graph("And", coloured, graph("Not", begins)), INFLATION, 1.0))
+        inflated = graph(
+            "Mul", self._flat(P), graph("Where", graph("And", coloured, graph("Not", begins)), INFLATION, 1.0)
+        )
         goes_on = graph("And", sound, graph("Not", begins))
         return [
             graph("Where", sound, graph.within(x, *self._low_high), x_before),
@@ -257,7 +272,9 @@ class TrackerNodes:
     def _shifted(self, x: str, V: str, w: str) -> str:
         """x + V w, for w (n, ny)."""
         graph = self._graph
-        return graph("Add", x, graph("Squeeze", graph("MatMul", V, graph("Unsqueeze", w, np.array([2]))), np.array([2])))
+        return graph(
+            "Add", x, graph("Squeeze", graph("MatMul", V, graph("Unsqueeze", w, np.array([2]))), np.array([2]))
+        )
 
     def _outer(self, V: str, W: str) -> str:
         return self._graph("MatMul", V, self._transposed(W))

@@ -1,6 +1,5 @@
 """The step as a file of constants, which ``kkl_observer.js`` runs in browsers and in Node."""
 
-import dataclasses
 import os
 from importlib.resources import files
 from typing import Any
@@ -10,14 +9,12 @@ import numpy as np
 from observers import storage
 from observers.inverse import InverseMap
 from observers.motion import Motion
-from observers.supervision import INFLATION, Supervision
-from observers.tracker import RELINEARISATIONS
-from training.export.exported import Exported, sigma_points, table
+from training.export.exported import Exported, table, tracker_arrays, tracker_numbers
 
 KEY = "kkl_step"  # of the metadata
 _MAP_ARRAYS = ("z_offset", "whiten", "x_offset", "x_scale")
 _MAP_SCALARS = ("process_noise_unit", "process_noise_max", "age_unit", "age_max")
-_MOTION_ARRAYS = ("x_offset", "x_scale", "error", "process_noise", "least_measurement_noise")
+_MOTION_ARRAYS = ("error", "process_noise", "least_measurement_noise")
 _LIMIT_ARRAYS = ("levels", "mean", "low", "high")
 
 
@@ -75,28 +72,15 @@ def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: Inverse
 
 
 def _described_motion(tensors: dict[str, np.ndarray], motion: Motion, dt: float) -> dict[str, Any]:
-    """Add a motion's arrays, with bounds and start of scaled states; returns what else there is to say of it."""
-    arrays = {name: getattr(motion, name) for name in _MOTION_ARRAYS}
-    arrays["low"], arrays["high"] = motion.scaled_bounds
-    arrays["mean"] = (motion.mean - motion.x_offset) / motion.x_scale
-    arrays["covariance"] = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
+    """Add a motion's arrays; returns what else there is to say of it."""
+    arrays = tracker_arrays(motion) | {name: getattr(motion, name) for name in _MOTION_ARRAYS}
     arrays |= {name: getattr(motion.factors, name) for name in ("levels", "ages", "factors")}
-    watch = Supervision.of(motion, dt)
-    middle, squares, other = sigma_points(motion.nx).weights(motion.nx)
-    described: dict[str, Any] = {
-        "least_process_noise": motion.least_process_noise,
-        "relinearisations": RELINEARISATIONS,
-        **{"middle": middle, "middle_squares": squares, "other": other},
-        **dataclasses.asdict(watch),
-        "trend_gain": watch.trend_gain,
-        "inflation": INFLATION,
-    }
+    described = tracker_numbers(motion, dt) | {"least_process_noise": motion.least_process_noise}
     if motion.equations is not None:
         described |= {"field": motion.equations.field.components, "substeps": motion.equations.substeps}
     if motion.flow is not None:
         storage.put_mlp(tensors, "motion.", motion.flow.mlp)
-        described["activation"] = motion.flow.mlp.activation
         arrays |= {name: getattr(motion.flow, name) for name in ("linear", "gain")}
-        described["u_scale"] = motion.flow.u_scale.tolist()  # there may be none
+        described |= {"activation": motion.flow.mlp.activation, "u_scale": motion.flow.u_scale.tolist()}
     tensors |= {f"motion.{name}": np.asarray(values, dtype=float) for name, values in arrays.items()}
     return described

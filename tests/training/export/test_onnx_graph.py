@@ -34,7 +34,9 @@ def test_every_kind_of_map(index, precision):
     assert apart(exported, runner.along(y, u), expected) < TOLERANCES[precision]
 
 
-@pytest.mark.parametrize(("index", "precision"), [*((i, "double") for i in range(len(KINDS))), (1, "float"), (5, "float")])
+@pytest.mark.parametrize(
+    ("index", "precision"), [*((i, "double") for i in range(len(KINDS))), (1, "float"), (5, "float")]
+)
 def test_maps_that_track(index, precision):
     exported, y, u, expected = tracked_record(index)
     x_hat = Runner(replace(exported, precision=precision)).along(y[:, None], u[:, None])[:, 0]

@@ -2,6 +2,7 @@
 
 #include <math.h>
 #include <stddef.h>
+#include <string.h>
 
 typedef NAME_real real;
 
@@ -78,60 +79,74 @@ static double within(double s, int i)
     return s > high[i] ? high[i] : s;
 }
 
-/* FIELD */
+/* MOTION */
 
 /* Scaled states a sample later. */
-static void move(const double s[NX], const real *u, double next[NX])
+static void move(const double at[NX], const real *u, double next[NX])
 {
+    double s[NX + NU];
+    for (int i = 0; i < NX; i++)
+        s[i] = within(at[i], i);
 // if flow
     real a[FLOW_WIDTH], b[FLOW_WIDTH];
-    double in[NX + NU];
-    (void)u;
-    for (int i = 0; i < NX; i++)
-        in[i] = within(s[i], i);
 // if inputs
     for (int j = 0; j < NU; j++)
-        in[NX + j] = u[j] / flow_u_scale[j];
+        s[NX + j] = u[j] / flow_u_scale[j];
 // end inputs
     for (int i = 0; i < NX + NU; i++)
-        a[i] = (real)in[i];
+        a[i] = (real)s[i];
     /* LAYERS */
     for (int i = 0; i < NX; i++) {
-        next[i] = in[i] + flow_linear[i][0] + flow_gain[i] * (double)MOVED[i];
+        next[i] = s[i] + flow_linear[i][0] + flow_gain[i] * (double)MOVED[i];
         for (int j = 0; j < NX + NU; j++)
-            next[i] += flow_linear[i][1 + j] * in[j];
+            next[i] += flow_linear[i][1 + j] * s[j];
     }
+    (void)u;
 // end flow
 // if equations
-    double x[NX], at[NX];
+    double x[NX];
     for (int i = 0; i < NX; i++)
-        x[i] = x_offset[i] + x_scale[i] * within(s[i], i);
+        x[i] = x_offset[i] + x_scale[i] * s[i];
 // if discrete
-    field(x, u, at);
-    for (int i = 0; i < NX; i++)
-        x[i] = at[i];
+    field(x, u, next);
 // end discrete
 // if continuous
-    double k[4][NX]; /* Runge-Kutta's */
+    double k[4][NX]; /* of Runge and Kutta */
     for (int substep = 0; substep < SUBSTEPS; substep++) {
         field(x, u, k[0]);
         for (int n = 0; n < 3; n++) {
             for (int i = 0; i < NX; i++)
-                at[i] = x[i] + (n < 2 ? H / 2 : H) * k[n][i];
-            field(at, u, k[n + 1]);
+                next[i] = x[i] + (n < 2 ? H / 2 : H) * k[n][i];
+            field(next, u, k[n + 1]);
         }
         for (int i = 0; i < NX; i++)
-            x[i] += H / 6 * (k[0][i] + 2 * (k[1][i] + k[2][i]) + k[3][i]);
+            next[i] = x[i] += H / 6 * (k[0][i] + 2 * (k[1][i] + k[2][i]) + k[3][i]);
     }
 // end continuous
     for (int i = 0; i < NX; i++)
-        next[i] = (x[i] - x_offset[i]) / x_scale[i];
+        next[i] = (next[i] - x_offset[i]) / x_scale[i];
 // end equations
 }
 
-/* P = L L^T. Where there is no L, entries that are no numbers spread, and are noticed in the end. */
-static void factorise(double P[NX][NX], double L[NX][NX])
+/* Outputs of scaled states; where they are undefined, as they may be at sigma points, those within the bounds. */
+static void measure(const double s[NX], const real *u, double y[NY])
 {
+    double x[2][NX], near[NY];
+    for (int i = 0; i < NX; i++) {
+        x[0][i] = x_offset[i] + x_scale[i] * s[i];
+        x[1][i] = x_offset[i] + x_scale[i] * within(s[i], i);
+    }
+    h(x[0], u, y);
+    h(x[1], u, near);
+    for (int k = 0; k < NY; k++)
+        y[k] = isfinite(y[k]) ? y[k] : near[k];
+}
+
+/* P = L L^T. Where there is no L, entries that are no numbers spread, and are noticed in the end. Returns the sum of
+   the logarithms of L's diagonal. */
+static double factorise(double P[NX][NX], double L[NX][NX])
+{
+    double sum = 0.0;
     for (int i = 0; i < NX; i++) {
         for (int j = 0; j <= i; j++) {
             L[i][j] = P[i][j];
@@ -139,61 +154,57 @@ static void factorise(double P[NX][NX], double L[NX][NX])
                 L[i][j] -= L[i][k] * L[j][k];
             L[i][j] = i > j ? L[i][j] / L[j][j] : L[i][j] > 0.0 ? sqrt(L[i][j]) : NAN;
         }
-    }
-}
-
-/* Solve P X = B in the place of B. */
-static void solve(double P[NX][NX], double B[NX][NY])
-{
-    double L[NX][NX];
-    factorise(P, L);
-    for (int k = 0; k < NY; k++) {
-        for (int i = 0; i < NX; i++) {
-            for (int j = 0; j < i; j++)
-                B[i][k] -= L[i][j] * B[j][k];
-            B[i][k] /= L[i][i];
-        }
-        for (int i = NX - 1; i >= 0; i--) {
-            for (int j = i + 1; j < NX; j++)
-                B[i][k] -= L[j][i] * B[j][k];
-            B[i][k] /= L[i][i];
-        }
-    }
-}
-
-/* Half the logarithm of P's determinant. */
-static double log_determinant(double P[NX][NX])
-{
-    double L[NX][NX], sum = 0.0;
-    factorise(P, L);
-    for (int i = 0; i < NX; i++)
         sum += log(L[i][i]);
+    }
     return sum;
 }
 
-// if nonlinear
-/* OUTPUT */
-
-/* Outputs of scaled states; of sigma points where they are undefined, those within the bounds. */
-static void output(const double s[NX], const real *u, double y[NY])
+/* X = A^T P^-1 B, or A P^-1 B. */
+static void weigh(double A[NX][NX], int transposed, double P[NX][NX], double B[NX][NY], double X[NX][NY])
 {
-    double x[NX], near[NY];
-    (void)u;
-    for (int i = 0; i < NX; i++)
-        x[i] = x_offset[i] + x_scale[i] * s[i];
-    h(x, NULL, y);
-    for (int i = 0; i < NX; i++)
-        x[i] = x_offset[i] + x_scale[i] * within(s[i], i);
-    h(x, NULL, near);
-    for (int k = 0; k < NY; k++)
-        y[k] = isfinite(y[k]) ? y[k] : near[k];
+    double L[NX][NX], b[NX];
+    factorise(P, L);
+    for (int k = 0; k < NY; k++) {
+        for (int i = 0; i < NX; i++) {
+            b[i] = B[i][k];
+            for (int j = 0; j < i; j++)
+                b[i] -= L[i][j] * b[j];
+            b[i] /= L[i][i];
+        }
+        for (int i = NX - 1; i >= 0; i--) {
+            for (int j = i + 1; j < NX; j++)
+                b[i] -= L[j][i] * b[j];
+            b[i] /= L[i][i];
+        }
+        for (int i = 0; i < NX; i++) {
+            X[i][k] = 0.0;
+            for (int j = 0; j < NX; j++)
+                X[i][k] += (transposed ? A[j][i] : A[i][j]) * b[j];
+        }
+    }
 }
 
-// end nonlinear
+/* Add V w to x, times a sign. */
+static void shift(double x[NX], double sign, double V[NX][NY], const double w[NY])
+{
+    for (int i = 0; i < NX; i++)
+        for (int k = 0; k < NY; k++)
+            x[i] += sign * V[i][k] * w[k];
+}
+
+/* Add V W^T to P, times a sign. */
+static void add(double P[NX][NX], double sign, double V[NX][NY], double W[NX][NY])
+{
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++)
+            for (int k = 0; k < NY; k++)
+                P[i][j] += sign * V[i][k] * W[j][k];
+}
+
 /* What a function makes of a Gaussian, by sigma points: mean (n), covariance (n, n), and that with the states (NX, n).
  */
-static void transform(void (*of)(const double *, const real *, double *), int n, const double x[NX], double P[NX][NX],
-                      const real *u, double *mean, double *S, double *across)
+static void transform(void (*function)(const double *, const real *, double *), int n, const double x[NX],
+                      double P[NX][NX], const real *u, double *mean, double *S, double *across)
 {
     double L[NX][NX], s[NX], to[1 + 2 * NX][NX > NY ? NX : NY];
     factorise(P, L);
@@ -201,12 +212,9 @@ static void transform(void (*of)(const double *, const real *, double *), int n,
         int column = p ? (p - 1) / 2 : NX;
         for (int i = 0; i < NX; i++)
             s[i] = i < column ? x[i] : x[i] + (p % 2 ? FAR : -FAR) * L[i][column];
-        of(s, u, to[p]);
-// if nonlinear
-        for (int i = 0; i < n; i++)
-            if (of == output && !isfinite(to[p][i]))
-                to[p][i] = to[0][i];
-// end nonlinear
+        function(s, u, to[p]);
+        for (int i = 0; i < n && function == measure; i++)
+            to[p][i] = isfinite(to[p][i]) ? to[p][i] : to[0][i];
     }
     for (int i = 0; i < n; i++) {
         mean[i] = MIDDLE * to[0][i];
@@ -215,173 +223,130 @@ static void transform(void (*of)(const double *, const real *, double *), int n,
         for (int p = 0; p <= 2 * NX; p++)
             to[p][i] -= mean[i];
         for (int j = 0; j <= i; j++) {
-            double sum = MIDDLE_SQUARES * to[0][i] * to[0][j];
+            S[i * n + j] = MIDDLE_SQUARES * to[0][i] * to[0][j];
             for (int p = 1; p <= 2 * NX; p++)
-                sum += OTHER * to[p][i] * to[p][j];
-            S[i * n + j] = S[j * n + i] = sum;
+                S[i * n + j] += OTHER * to[p][i] * to[p][j];
+            S[j * n + i] = S[i * n + j];
         }
         for (int k = 0; k < NX; k++) {
             across[k * n + i] = 0.0;
-            for (int column = 0; column <= k; column++)
-                across[k * n + i] += OTHER * FAR * L[k][column] * (to[1 + 2 * column][i] - to[2 + 2 * column][i]);
+            for (int j = 0; j <= k; j++)
+                across[k * n + i] += OTHER * FAR * L[k][j] * (to[1 + 2 * j][i] - to[2 + 2 * j][i]);
         }
     }
 }
 
-/* Condition a prediction on a sample, of which NaN is missing: mean + V white and P - V V^T are what is known then. */
-static void correct(const double mean[NX], double P[NX][NX], const real y[NY], double V[NX][NY], double white[NY],
-                    double expected[NY])
+typedef struct {
+    double x[NX], P[NX][NX], across[NX][NX]; /* mean, covariance, and that with the states before */
+} prediction;
+
+typedef struct {
+    double V[NX][NY], white[NY], expected[NY]; /* x + V white and P - V V^T are what is known then */
+} correction;
+
+static prediction predict(const double x[NX], double P[NX][NX], const real *u)
 {
+    prediction p;
+    transform(move, NX, x, P, u, p.x, p.P[0], p.across[0]);
+    for (int i = 0; i < NX; i++)
+        p.P[i][i] += Q[i];
+    return p;
+}
+
+/* What a sample says, of which NaN is missing. */
+static correction correct(prediction *p, const real y[NY])
+{
+    correction c;
     double S[NY][NY];
-// if linear
-    for (int k = 0; k < NY; k++) {
-        expected[k] = output_mean[k];
-        for (int i = 0; i < NX; i++) {
-            expected[k] += C[k][i] * mean[i];
-            V[i][k] = 0.0;
-            for (int j = 0; j < NX; j++)
-                V[i][k] += P[i][j] * C[k][j];
-        }
-        for (int l = 0; l <= k; l++) {
-            S[k][l] = 0.0;
-            for (int i = 0; i < NX; i++)
-                S[k][l] += C[l][i] * V[i][k];
-        }
-    }
-// end linear
-// if nonlinear
-    transform(output, NY, mean, P, NULL, expected, S[0], V[0]);
-// end nonlinear
+    transform(measure, NY, p->x, p->P, NULL, c.expected, S[0], c.V[0]);
     for (int k = 0; k < NY; k++)
-        white[k] = y[k] - expected[k];
+        c.white[k] = y[k] - c.expected[k];
     for (int k = 0; k < NY; k++) {
         double root = sqrt(S[k][k] + R[k]);
         int missing = isnan(y[k]);
-        white[k] = missing ? 0.0 : white[k] / root;
+        c.white[k] = missing ? 0.0 : c.white[k] / root;
         for (int i = 0; i < NX; i++)
-            V[i][k] = missing ? 0.0 : V[i][k] / root;
+            c.V[i][k] = missing ? 0.0 : c.V[i][k] / root;
         for (int l = k + 1; l < NY && !missing; l++) {
             double share = S[l][k] / root;
-            white[l] -= share * white[k];
+            c.white[l] -= share * c.white[k];
             for (int i = 0; i < NX; i++)
-                V[i][l] -= share * V[i][k];
+                c.V[i][l] -= share * c.V[i][k];
             for (int m = k + 1; m <= l; m++)
                 S[l][m] -= share * S[m][k] / root;
         }
     }
-}
-
-/* Add V W^T to P, times a sign. */
-static void add(double P[NX][NX], double V[NX][NY], double W[NX][NY], double sign)
-{
-    for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++)
-            for (int k = 0; k < NY; k++)
-                P[i][j] += sign * V[i][k] * W[j][k];
+    return c;
 }
 
 /* Predict again, with the motion linearised about where the step began as far as the sample tells. */
-static void relinearise(NAME_observer *observer, const real y[NY], const real *u, double mean[NX], double moved[NX][NX],
-                        double across[NX][NX])
+static void relinearise(NAME_observer *observer, prediction *p, const real y[NY], const real *u)
 {
-    double V[NX][NY], G[NX][NY] = {{0.0}}, D[NX][NY] = {{0.0}}, white[NY], expected[NY], L[NX][NX], total = 0.0;
-    double start[NX], spread[NX][NX], again[NX], S[NX][NX], of_start[NX][NX];
-    correct(mean, moved, y, V, white, expected);
-    solve(moved, V);
-    for (int i = 0; i < NX; i++) {
-        start[i] = observer->x[i];
-        for (int k = 0; k < NY; k++) {
-            for (int j = 0; j < NX; j++)
-                G[i][k] += across[i][j] * V[j][k];
-            start[i] += G[i][k] * white[k];
-        }
-        for (int j = 0; j < NX; j++)
-            spread[i][j] = observer->P[i][j];
-    }
-    add(spread, G, G, -1.0);
-    transform(move, NX, start, spread, u, again, S[0], of_start[0]);
+    correction c = correct(p, y);
+    prediction start, again;
+    double G[NX][NY], D[NX][NY], L[NX][NX], total;
+    weigh(p->across, 0, p->P, c.V, G);
+    memcpy(start.x, observer->x, sizeof start.x);
+    memcpy(start.P, observer->P, sizeof start.P);
+    shift(start.x, 1.0, G, c.white);
+    add(start.P, -1.0, G, G);
+    again = predict(start.x, start.P, u);
+    weigh(again.across, 1, start.P, G, D);
+    shift(again.x, -1.0, D, c.white);
+    add(again.P, 1.0, D, D);
+    add(again.across, 1.0, G, D);
+    total = factorise(again.P, L);
     for (int i = 0; i < NX; i++)
-        for (int k = 0; k < NY; k++)
-            V[i][k] = G[i][k];
-    solve(spread, V);
-    for (int i = 0; i < NX; i++) {
-        for (int k = 0; k < NY; k++) {
-            for (int j = 0; j < NX; j++)
-                D[i][k] += of_start[j][i] * V[j][k];
-            again[i] -= D[i][k] * white[k];
-        }
-        S[i][i] += Q[i];
-    }
-    add(S, D, D, 1.0);
-    add(of_start, G, D, 1.0);
-    factorise(S, L);
-    for (int i = 0; i < NX; i++) {
-        total += again[i];
-        for (int j = 0; j <= i; j++)
-            total += L[i][j];
-    }
-    for (int i = 0; i < NX && isfinite(total); i++) {
-        mean[i] = again[i];
-        for (int j = 0; j < NX; j++) {
-            moved[i][j] = S[i][j];
-            across[i][j] = of_start[i][j];
-        }
-    }
+        total += again.x[i];
+    if (isfinite(total))
+        *p = again;
 }
 
 /* What the innovations tell is forgotten. */
 static void watch_anew(NAME_observer *observer)
 {
     observer->nis = observer->trend_square = 1.0;
-    for (int k = 0; k < NY; k++)
-        observer->trend[k] = 0.0;
+    memset(observer->trend, 0, sizeof observer->trend);
 }
 
-/* Correct a prediction; returns whether estimate and covariance are numbers, and leaves them as they were if not. */
-static int take_in(NAME_observer *observer, double mean[NX], double moved[NX][NX], const real y[NY], double white[NY],
-                   double expected[NY])
+/* Correct a prediction, unless that leaves no numbers. */
+static correction take_in(NAME_observer *observer, prediction *p, const real y[NY])
 {
-    double V[NX][NY], total = 0.0;
-    correct(mean, moved, y, V, white, expected);
-    add(moved, V, V, -1.0);
+    correction c = correct(p, y);
+    double total = 0.0;
+    shift(p->x, 1.0, c.V, c.white);
+    add(p->P, -1.0, c.V, c.V);
     for (int i = 0; i < NX; i++) {
-        for (int k = 0; k < NY; k++)
-            mean[i] += V[i][k] * white[k];
-        total += mean[i];
+        total += p->x[i];
+        p->x[i] = within(p->x[i], i);
         for (int j = 0; j < NX; j++)
-            total += moved[i][j];
+            total += p->P[i][j];
     }
-    for (int i = 0; i < NX && isfinite(total); i++) {
-        observer->x[i] = within(mean[i], i);
-        for (int j = 0; j < NX; j++)
-            observer->P[i][j] = moved[i][j];
+    if (isfinite(total)) {
+        memcpy(observer->x, p->x, sizeof p->x);
+        memcpy(observer->P, p->P, sizeof p->P);
+    } else {
+        observer->nis = INFINITY; /* lost */
     }
-    return isfinite(total);
+    return c;
 }
 
 /* Predict, and take in a sample. What is missing of it is replaced by what was predicted. */
 static void track(NAME_observer *observer, const real y[NY], const real *u, real whole[NY])
 {
-    double mean[NX], moved[NX][NX], across[NX][NX], white[NY], expected[NY], squared = 0.0, raised = 0.0;
-    int count = 0, sound;
-    transform(move, NX, observer->x, observer->P, u, mean, moved[0], across[0]);
-    for (int i = 0; i < NX; i++)
-        moved[i][i] += Q[i];
+    double squared = 0.0, raised = 0.0;
+    int count = 0;
+    prediction p = predict(observer->x, observer->P, u);
     for (int turn = 0; turn < RELINEARISATIONS && observer->seen < WINDOW; turn++)
-        relinearise(observer, y, u, mean, moved, across);
-    sound = take_in(observer, mean, moved, y, white, expected);
-    for (int k = 0; k < NY; k++)
-        whole[k] = !isnan(y[k]) ? y[k] : isfinite(expected[k]) ? (real)expected[k] : observer->y[k];
-    if (!sound) {
-        observer->nis = INFINITY; /* lost */
-        return;
-    }
+        relinearise(observer, &p, y, u);
+    correction c = take_in(observer, &p, y);
     for (int k = 0; k < NY; k++) {
-        if (isnan(y[k]))
+        whole[k] = !isnan(y[k]) ? y[k] : isfinite(c.expected[k]) ? (real)c.expected[k] : observer->y[k];
+        if (isnan(y[k]) || isinf(observer->nis))
             continue;
-        observer->trend[k] += TREND_SHARE * (white[k] - observer->trend[k]);
+        observer->trend[k] += TREND_SHARE * (c.white[k] - observer->trend[k]);
         raised += SQUARE(observer->trend[k]);
-        squared += SQUARE(white[k]);
+        squared += SQUARE(c.white[k]);
         count++;
     }
     if (!count)
@@ -391,20 +356,18 @@ static void track(NAME_observer *observer, const real y[NY], const real *u, real
     if (observer->seen < WINDOW)
         observer->seen++;
     if (observer->trend_square > TREND_LIMIT) { /* innovations agree with one another */
-        double nis = observer->nis;
-        for (int i = 0; i < NX; i++)
-            for (int j = 0; j < NX; j++)
-                observer->P[i][j] *= INFLATION;
-        watch_anew(observer);
-        observer->nis = nis;
+        observer->trend_square = 1.0;
+        memset(observer->trend, 0, sizeof observer->trend);
+        for (int i = 0; i < NX * NX; i++)
+            observer->P[i / NX][i % NX] *= INFLATION;
     }
 }
 
 /* Take T_inv's estimate where it is surer, soon after a reset, or where the filter diverged. */
 static void supervise(NAME_observer *observer)
 {
-    int lost = !(observer->nis <= NIS_LIMIT); /* also where it is no number */
-    double P[NX][NX], age = (double)observer->seen * MACRO_DT; /* what misled the filter may have misled z as well */
+    int lost = !(observer->nis <= LIMIT); /* also where it is no number */
+    double P[NX][NX], L[NX][NX], age = (double)observer->seen * MACRO_DT; /* what misled the filter may have misled z */
     real x_hat[NX];
     if (!lost && observer->seen >= WINDOW)
         return;
@@ -414,14 +377,12 @@ static void supervise(NAME_observer *observer)
     else
 // end free
     TABULATE(driven, age, P);
-    if (!lost && !(log_determinant(P) < log_determinant(observer->P)))
+    if (!lost && !(factorise(P, L) < factorise(observer->P, L)))
         return;
     invert(observer, x_hat);
-    for (int i = 0; i < NX; i++) {
+    for (int i = 0; i < NX; i++)
         observer->x[i] = within((x_hat[i] - x_offset[i]) / x_scale[i], i);
-        for (int j = 0; j < NX; j++)
-            observer->P[i][j] = P[i][j];
-    }
+    memcpy(observer->P, P, sizeof P);
     if (lost)
         watch_anew(observer);
 }
@@ -441,21 +402,19 @@ void NAME_estimate(const NAME_observer *observer, real x_hat[NX])
 void NAME_reset(NAME_observer *observer, const real y[NY])
 {
     observer->age = 0;
-    for (int i = 0; i < SIZE; i++)
-        observer->z[i] = 0.0;
+    memset(observer->z, 0, sizeof observer->z);
     for (int j = 0; j < NY; j++) {
         for (int i = 0; i < NZ; i++)
             observer->z[i] += equilibrium[i][j] * y[j];
         observer->y[j] = y[j];
     }
 // if tracks
-    double mean[NX], moved[NX][NX], white[NY], expected[NY];
-    for (int i = 0; i < NX; i++) {
-        mean[i] = observer->x[i] = start_mean[i];
-        for (int j = 0; j < NX; j++)
-            moved[i][j] = observer->P[i][j] = start_covariance[i][j];
-    }
-    take_in(observer, mean, moved, y, white, expected);
+    prediction first;
+    memcpy(first.x, mean, sizeof first.x);
+    memcpy(first.P, covariance, sizeof first.P);
+    memcpy(observer->x, first.x, sizeof first.x);
+    memcpy(observer->P, first.P, sizeof first.P);
+    take_in(observer, &first, y);
     watch_anew(observer);
     observer->seen = 0;
     supervise(observer);
@@ -468,8 +427,7 @@ static void advance(double *z)
     double next[NZ] = {0.0};
     for (int k = 0; k < TRANSITIONS; k++)
         next[transition_row[k]] += transition[k] * z[transition_column[k]];
-    for (int i = 0; i < NZ; i++)
-        z[i] = next[i];
+    memcpy(z, next, sizeof next);
 }
 
 // if inputs
