@@ -10,24 +10,37 @@ from typing import Any
 import numpy as np
 
 import kkl_gym
+from observers.inverse import InverseMap
 from observers.motion import Motion
-from training.export.c_map import map_constants, map_function, measurement_levels, process_level
 from training.export.c_text import (
     activations,
     array,
-    block,
     comment,
-    defined,
     function,
     network_arrays,
     network_calls,
     number,
     template,
 )
-from training.export.exported import Exported, output_expression, table, tracker_arrays, tracker_numbers
+from training.export.exported import Exported, output_expression, tracker_arrays, tracker_numbers
 
-_LARGER = "#define LARGER(a, b) ((a) > (b) ? (a) : (b))\n"
-_TABULATE = "tabulated(map##_covariance, map##_levels, map##_ROWS, map##_ages, map##_COLUMNS, age, P)"
+_MAP = """\
+static void {map}_map(const {name}_observer *observer, real *x_hat)
+{{
+    real a[{width}], b[{width}];
+    for (int i = 0; i < {modes}; i++) {{
+        double mode = 0.0;
+        for (int j = 0; j < {size}; j++)
+            mode += {map}_whiten[i][j] * (observer->z[j] - {map}_z_offset[j]);
+        a[i] = (real)mode;
+    }}
+{conditions}    {layers}
+    for (int i = 0; i < NX; i++)
+        x_hat[i] = (real)({map}_x_offset[i] + {map}_x_scale[i] * {last}[i]);
+}}
+
+"""
+_AGE = "    a[{at}] = (real)log1p((observer->age * DT < {end} ? observer->age * DT : {end}) / {unit});\n"
 
 
 def c_files(exported: Exported) -> dict[str, str]:
@@ -59,26 +72,23 @@ def c_files(exported: Exported) -> dict[str, str]:
 
 def _heading(exported: Exported) -> dict[str, str]:
     """Words of the header."""
-    artifact, tracks = exported.artifact, exported.artifact.motion is not None
+    artifact = exported.artifact
     finite = (
-        "Where an output is missing, pass NaN: it is predicted. The first sample and inputs must be finite, and the "
-        "compiler must know NaN, as it does without -ffast-math."
-        if tracks
-        else "Samples and inputs must be finite: a NaN stays until the next reset."
+        "Samples and inputs must be finite: a NaN stays until the next reset."
+        if artifact.motion is None
+        else "Where an output is missing, pass NaN: it is predicted. The first sample and inputs must be finite, and "
+        "the compiler must know NaN, as it does without -ffast-math."
     )
-    paragraphs = [
+    levels = []
+    if exported.levels:
+        levels.append(f"measurement noise of standard deviation {', '.join(map(number, exported.levels))}")
+    if exported.needs_process_noise:
+        levels.append(f"process noise of level {number(exported.process_noise)}")
+    text = (
         f"{exported.name}_reset takes in the first sample, {exported.name}_step every later one. {finite} Nothing is "
         "allocated, and observers share constants alone."
-    ]
-    process = process_level(exported)
-    for level in [*measurement_levels(exported), *([process] if process else [])]:
-        value = number(level.value)
-        to = " for T_inv" if tracks and level == process else ""  # the filter takes any level
-        beyond = f"; what is beyond {number(level.end)} counts as that{to}" if np.isfinite(level.end) else ""
-        paragraphs.append(
-            f"{level.macro} is {level.meaning}, {value} unless the compiler is told otherwise, as in "
-            f"-D{level.macro}={value}{beyond}."
-        )
+    )
+    text += f" It assumes {' and '.join(levels)}." * bool(levels)
     return {
         "SYSTEM": comment(artifact.system),
         "SECONDS": number(artifact.filter.dt),
@@ -86,9 +96,7 @@ def _heading(exported: Exported) -> dict[str, str]:
         "SOURCE": comment(exported.source),
         "CHECKSUM": exported.checksum,
         "ESTIMATES": comment(", ".join(exported.estimates)),
-        "PARAGRAPHS": "\n *\n".join(
-            fill(text, 116, initial_indent=" * ", subsequent_indent=" * ") for text in paragraphs
-        ),
+        "PARAGRAPH": fill(text, 116, initial_indent=" * ", subsequent_indent=" * ", break_on_hyphens=False),
         "PRECISION": exported.precision,
         "COUNT_X": str(len(exported.estimates)),
         "COUNT_Y": str(artifact.ny),
@@ -98,59 +106,49 @@ def _heading(exported: Exported) -> dict[str, str]:
 
 
 def _constants(exported: Exported) -> str:
-    """Sizes, levels of noise and arrays."""
-    artifact, linear, macro = exported.artifact, exported.artifact.filter, exported.name.upper()
-    nz, process = len(linear.A), process_level(exported)
-    block_of_z = linear.transition[:nz, :nz]
-    rows, columns = np.nonzero(block_of_z)
-    sizes = {"NX": f"{macro}_NX", "NY": f"{macro}_NY", "NU": f"{macro}_NU", "NZ": nz, "SIZE": linear.size}
-    parts = [defined(sizes | {"TRANSITIONS": len(rows), "LAST_AGE": f"{exported.last_age}ul"})]
-    levels = [*measurement_levels(exported), *([process] if process else [])]
-    parts += [
-        "#define SQUARE(a) ((a) * (a))\n",
-        *(f"\n#ifndef {each.macro}\n#define {each.macro} {number(each.value)}\n#endif\n" for each in levels),
-        "\n/* The filter. */\n",
-        array("double", "transition", block_of_z[rows, columns]),
-        array("unsigned short", "transition_row", rows),
-        array("unsigned short", "transition_column", columns),
-        *(array("double", name, getattr(linear, name)[:nz]) for name in ("early_y", "late_y", "equilibrium")),
-        *([array("double", "held_u", linear.held_u[nz : 2 * nz, 0])] if linear.nu else []),
-        *(map_constants(exported, label, inverse) for label, inverse in exported.maps.items()),
-    ]
-    if artifact.motion is not None:
-        parts.append(_tracker_constants(exported, artifact.motion))
-    return "".join(parts)
-
-
-def _tracker_constants(exported: Exported, motion: Motion) -> str:
-    """Motion, Kalman filter, divergence detection and T_inv's covariance."""
-    artifact, measurement, process = exported.artifact, measurement_levels(exported), process_level(exported)
-    assert process is not None
-    share = "0.0"
-    for each in measurement:
-        share = f"LARGER({share}, {each.cut} / {number(each.end)})"
-    numbers = tracker_numbers(motion, artifact.filter.dt)
-    macros: dict[str, Any] = {name.upper(): value for name, value in numbers.items()}
-    macros |= {"NOISE_SHARE": share, "TABULATE(map, age, P)": _TABULATE, "FAR": (2 * numbers["other"]) ** -0.5}
-    arrays = tracker_arrays(motion)
-    if motion.flow is not None:
-        names = ("linear", "gain", *(["u_scale"] if artifact.nu else []))
-        arrays |= {f"flow_{name}": getattr(motion.flow, name) for name in names}
-    elif motion.equations is not None and (substeps := motion.equations.substeps):
-        macros |= {"SUBSTEPS": substeps, "H": artifact.filter.dt / substeps}
+    """Sizes and arrays."""
+    linear, motion = exported.artifact.filter, exported.artifact.motion
+    nz = len(linear.A)
+    block = linear.transition[:nz, :nz]
+    rows, columns = np.nonzero(block)
+    macros: dict[str, Any] = {name: f"{exported.name.upper()}_{name}" for name in ("NX", "NY", "NU", "DT")}
+    macros |= {"NZ": nz, "SIZE": linear.size, "TRANSITIONS": len(rows), "LAST_AGE": f"{exported.last_age}ul"}
+    arrays = {"transition": block[rows, columns], "transition_row": rows, "transition_column": columns}
+    arrays |= {name: getattr(linear, name)[:nz] for name in ("early_y", "late_y", "equilibrium")}
+    networks = {label: inverse.mlp for label, inverse in exported.maps.items()}
+    if linear.nu:
+        arrays["held_u"] = linear.held_u[nz : 2 * nz, 0]
     for label, inverse in exported.maps.items():
-        levels, ages, covariance = table(inverse, motion.x_scale)
-        macros |= {f"{label}_ROWS": len(levels), f"{label}_COLUMNS": len(ages)}
-        arrays |= {f"{label}_levels": levels, f"{label}_ages": ages, f"{label}_covariance": covariance.ravel()}
-    level = f"LARGER({process.macro}, {number(motion.least_process_noise)})"
-    noise, least = (motion.error, motion.process_noise), motion.least_measurement_noise
-    Q = [f"SQUARE({level} * {number(added)}) + {number(error**2)}" for error, added in zip(*noise, strict=True)]
-    cuts = [each.cut for each in measurement] * (artifact.ny // len(measurement))
-    R = [f"SQUARE(LARGER({cut}, {number(each)}))" for cut, each in zip(cuts, least, strict=True)]
-    parts = ["\n/* The motion, the Kalman filter on it, and T_inv's covariance. */\n", _LARGER, defined(macros)]
-    parts += [array("double", name, values) for name, values in arrays.items()]
-    parts += [block("double", "Q", f"[{len(Q)}]", Q), block("double", "R", f"[{len(R)}]", R)]
-    return "".join(parts) + ("" if motion.flow is None else network_arrays("flow", motion.flow.mlp))
+        own = {name: getattr(inverse, name) for name in ("z_offset", "x_offset", "x_scale")}
+        own["whiten"] = inverse.gain(exported.measurement_noise)[:, None] * inverse.whiten
+        arrays |= {f"{label}_{name}": values for name, values in own.items()}
+    if motion is not None:
+        numbers = tracker_numbers(motion, linear.dt)
+        macros |= {name.upper(): value for name, value in numbers.items()} | {"FAR": (2 * numbers["other"]) ** -0.5}
+        arrays |= _tracker_arrays(exported, motion, numbers["window"])
+        if motion.flow is not None:
+            networks["flow"] = motion.flow.mlp
+        elif motion.equations is not None and (substeps := motion.equations.substeps):
+            macros |= {"SUBSTEPS": substeps, "H": linear.dt / substeps}
+    parts = [f"#define {name} {value}\n" for name, value in macros.items()]
+    parts += [array(name, values) for name, values in arrays.items()]
+    return "".join(parts + [network_arrays(label, mlp) for label, mlp in networks.items()])
+
+
+def _tracker_arrays(exported: Exported, motion: Motion, window: int) -> dict[str, np.ndarray]:
+    """Motion, Kalman filter, and T_inv's covariance at ages in samples up to the window."""
+    dt, levels = exported.artifact.filter.dt, (exported.measurement_noise, exported.process_noise)
+    arrays = tracker_arrays(motion) | dict(zip("QR", motion.variances(*levels), strict=True))
+    if motion.flow is not None:
+        arrays |= {f"flow_{name}": getattr(motion.flow, name) for name in ("linear", "gain")}
+        arrays |= {"flow_u_scale": motion.flow.u_scale} if exported.artifact.nu else {}
+    for label, inverse in exported.maps.items():
+        assert inverse.error_covariance is not None
+        ages = np.append((ages := inverse.error_covariance.ages / dt)[ages < window], window)
+        by_age = inverse.error_covariance.at_level(inverse.share(exported.measurement_noise))
+        covariance = by_age(ages * dt) / np.outer(motion.x_scale, motion.x_scale)
+        arrays |= {f"{label}_ages": ages, f"{label}_covariance": covariance.ravel()}
+    return arrays
 
 
 def _functions(exported: Exported) -> dict[str, Any]:
@@ -164,5 +162,18 @@ def _functions(exported: Exported) -> dict[str, Any]:
             calls = network_calls("flow", motion.flow.mlp)
             words |= dict(zip(("FLOW_WIDTH", "/* LAYERS */", "MOVED"), calls, strict=True))
             networks.append(motion.flow.mlp)
-    maps = "".join(map_function(exported, label, inverse) for label, inverse in exported.maps.items())
+    maps = "".join(_map(exported, label, inverse) for label, inverse in exported.maps.items())
     return words | {"/* FUNCTIONS */\n\n": activations(networks, exported.precision) + maps}
+
+
+def _map(exported: Exported, label: str, inverse: InverseMap) -> str:
+    """T_inv as a function; the levels of noise are constants."""
+    modes, size = inverse.whiten.shape
+    width, layers, last = network_calls(label, inverse.mlp)
+    levels = inverse.noise_features(exported.measurement_noise, exported.process_noise)
+    conditions = [f"    a[{modes + i}] = (real){number(level)};\n" for i, level in enumerate(levels)]
+    if "age" in inverse.features:
+        end, unit = number(inverse.age_max), number(inverse.age_unit)
+        conditions.append(_AGE.format(at=modes + len(levels), end=end, unit=unit))
+    words = {"modes": modes, "size": size, "width": width, "layers": layers, "last": last}
+    return _MAP.format(map=label, name=exported.name, conditions="".join(conditions), **words)

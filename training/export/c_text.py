@@ -3,13 +3,13 @@
 import re
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
+from textwrap import fill
 
 import numpy as np
 
 from observers.expression import Expression
 from observers.network import MLP
 
-_WIDTH = 118  # of lines of numbers
 _POWERS = 8  # up to which an exponent becomes products
 _ACTIVATIONS = {
     "tanh": "h[i] = {tanh}(h[i]);",
@@ -50,36 +50,19 @@ def number(value: float) -> str:
     return repr(float(value))
 
 
-def array(kind: str, name: str, values: np.ndarray) -> str:
-    """A constant array of one or two dimensions; numbers are the shortest that are read back as the same."""
-    if kind == "float":
-        words = [f"{number}f" for number in np.asarray(values, np.float32).astype(str).tolist()]
-    elif kind == "double":
-        words = list(map(repr, np.asarray(values, float).reshape(-1).tolist()))
+def array(name: str, values: np.ndarray) -> str:
+    """A constant array; numbers are the shortest that are read back as the same, and integers unsigned short."""
+    flat = values.reshape(-1)
+    if values.dtype == np.float32:
+        kind, words = "float", [f"{word}f" for word in flat.astype(str).tolist()]
     else:
-        words = list(map(str, values.tolist()))
-    shape = "".join(f"[{length}]" for length in np.shape(values))
-    if np.ndim(values) < 2:
-        return block(kind, name, shape, words)
-    width = np.shape(values)[1]
-    rows = [words[first : first + width] for first in range(0, len(words), width)]
-    return block(kind, name, shape, ["{" + ", ".join(row) + "}" for row in rows])
-
-
-def block(kind: str, name: str, shape: str, words: Sequence[str]) -> str:
-    """A constant array whose entries are expressions of C."""
-    lines, line = [], "   "
-    for word in words:
-        if len(line) + len(word) > _WIDTH and line.strip():
-            lines.append(line)
-            line = "   "
-        line += f" {word},"
-    return "\n".join([f"static const {kind} {name}{shape} = {{", *lines, line, "};", ""])
-
-
-def defined(values: Mapping[str, object]) -> str:
-    """Macros."""
-    return "".join(f"#define {name} {value}\n" for name, value in values.items())
+        kind, words = ("double" if values.dtype == float else "unsigned short"), list(map(repr, flat.tolist()))
+    if values.ndim == 2:
+        rows = (words[first : first + values.shape[1]] for first in range(0, len(words), values.shape[1]))
+        words = ["{" + ", ".join(row) + "}" for row in rows]
+    shape = "".join(f"[{length}]" for length in values.shape)
+    lines = fill(", ".join(words), 118, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False)
+    return f"static const {kind} {name}{shape} = {{\n{lines}\n}};\n"
 
 
 def comment(text: str) -> str:
@@ -88,12 +71,12 @@ def comment(text: str) -> str:
 
 
 def network_arrays(prefix: str, mlp: MLP) -> str:
-    """The weights and biases of a network."""
-    parts = []
-    for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
-        parts.append(array("float", f"{prefix}_weights{i}", weight.reshape(-1)))
-        parts.append(array("float", f"{prefix}_biases{i}", bias))
-    return "".join(parts)
+    """The weights and biases of a network, which are floats in Python, too."""
+    return "".join(
+        array(f"{prefix}_weights{i}", np.asarray(weight, np.float32).reshape(-1))
+        + array(f"{prefix}_biases{i}", np.asarray(bias, np.float32))
+        for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True))
+    )
 
 
 def network_calls(prefix: str, mlp: MLP) -> tuple[int, str, str]:

@@ -96,9 +96,9 @@ class Exported:
         return (float(np.max(self.measurement_noise)),) if told else ()
 
     @property
-    def told_process_noise(self) -> bool:
-        """Whether the maps are told the level of process noise."""
-        return self.artifact.process_noise_max is not None
+    def needs_process_noise(self) -> bool:
+        """Whether the step depends on the level of process noise."""
+        return self.artifact.process_noise_max is not None or self.artifact.motion is not None
 
     @property
     def last_age(self) -> int:
@@ -145,7 +145,7 @@ class Exported:
         }
         if self.levels:
             described["measurement_noise"] = list(self.levels)
-        if self.told_process_noise or self.artifact.motion is not None:
+        if self.needs_process_noise:
             described["process_noise"] = self.process_noise
         return described
 

@@ -37,7 +37,7 @@ def onnx_model(exported: Exported) -> Any:
         "y_next": artifact.ny,
         "age": 1,
         "measurement_noise": levels,
-        "process_noise": int(tracks or exported.told_process_noise),
+        "process_noise": int(exported.needs_process_noise),
     }
     inputs = {name: width for name, width in inputs.items() if width}
     outputs = {"z_next": linear.size, "tracker_next": inputs.get("tracker", 0), "x_hat": len(exported.estimates)}

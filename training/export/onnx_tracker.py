@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.supervision import INFLATION, Supervision
-from observers.tracker import RELINEARISATIONS
 from training.export.exported import tracker_arrays, tracker_numbers
 from training.export.onnx_map import Maps
 from training.export.onnx_nodes import Graph
@@ -35,14 +33,13 @@ class TrackerNodes:
         self._graph, self._artifact, self._given, self._real = graph, artifact, given, real
         self._motion = motion = artifact.require_motion()
         self._begins, self._low_high = begins, motion.scaled_bounds
-        self._watch = Supervision.of(motion, artifact.filter.dt)
+        self._numbers = tracker_numbers(motion, artifact.filter.dt)
         self._factors: dict[str, tuple[list[str], str, str]] = {}
         nx, ny = artifact.nx, artifact.ny
         ends = np.cumsum([0, nx, nx * nx, 1, 1, 1, ny, ny])
         *parts, self.y = (graph.part(given["tracker"], a, b) for a, b in itertools.pairwise(ends))
-        start = ((motion.mean - motion.x_offset) / motion.x_scale)[None]
-        covariance = (motion.covariance / np.outer(motion.x_scale, motion.x_scale)).reshape(1, -1)
-        values = (start, covariance, 1.0, 1.0, 0.0, np.zeros((1, ny)))
+        start = tracker_arrays(motion)
+        values = (start["mean"][None], start["covariance"].reshape(1, -1), 1.0, 1.0, 0.0, np.zeros((1, ny)))
         self._before = [graph("Where", begins, value, part) for value, part in zip(values, parts, strict=True)]
         self._x, self._P = self._before[0], self._matrix(self._before[1])
         self._Q, self._R = self._variances()
@@ -51,8 +48,8 @@ class TrackerNodes:
         """Predict, and take in the new sample: the state after it, and that sample, in which nothing is missing."""
         graph, begins, y, seen = self._graph, self._begins, self._given["y_next"], self._before[4]
         prediction = self._predicted(self._x, self._P)
-        new = graph("And", graph("Less", seen, float(self._watch.window)), graph("Not", begins))
-        for _ in range(RELINEARISATIONS):
+        new = graph("And", graph("Less", seen, float(self._numbers["window"])), graph("Not", begins))
+        for _ in range(self._numbers["relinearisations"]):
             again = self._relinearised(prediction)
             numbers = graph("Add", graph.sum(again[0]), self._factored(again[1])[2])
             prediction = self._chosen(graph("And", new, graph.finite(numbers)), again, prediction)
@@ -67,13 +64,13 @@ class TrackerNodes:
 
     def supervised(self, tracked: list[str], maps: Maps) -> list[str]:
         """Take T_inv's estimate where it is surer, soon after a reset, or where the filter diverged."""
-        graph, motion, watch = self._graph, self._motion, self._watch
+        graph, motion, window = self._graph, self._motion, float(self._numbers["window"])
         x, P, nis, trend_square, seen, trend = tracked
-        lost = graph("Not", graph("LessOrEqual", nis, watch.limit))
-        age = graph("Mul", graph("Min", seen, float(watch.window)), self._artifact.filter.dt)
+        lost = graph("Not", graph("LessOrEqual", nis, self._numbers["limit"]))
+        age = graph("Mul", graph("Min", seen, window), self._artifact.filter.dt)
         theirs = maps.covariance(age, motion.x_scale)
         surer = graph("Less", *(self._factored(self._matrix(each))[2] for each in (theirs, P)))
-        takes = graph("Or", lost, graph("And", graph("Less", seen, float(watch.window)), surer))
+        takes = graph("Or", lost, graph("And", graph("Less", seen, window), surer))
         inverted = graph("Div", graph("Sub", maps.estimate(), motion.x_offset), motion.x_scale)
         return [
             graph("Where", takes, graph.within(inverted, *self._low_high), x),
@@ -93,9 +90,8 @@ class TrackerNodes:
         graph, motion, inverse = self._graph, self._motion, self._artifact.inverse
         level = graph("Max", self._given["process_noise"], motion.least_process_noise)
         added = graph("Mul", level, motion.process_noise)
-        noise = graph(
-            "Min", self._given["measurement_noise"], np.atleast_1d(inverse.measurement_noise_max).astype(float)
-        )
+        end = np.atleast_1d(inverse.measurement_noise_max).astype(float)
+        noise = graph("Min", self._given["measurement_noise"], end)
         noise = graph("Max", noise, motion.least_measurement_noise)
         variances = graph("Add", graph("Mul", added, added), motion.error**2), graph("Mul", noise, noise)
         sizes = motion.nx, self._artifact.ny
@@ -176,7 +172,7 @@ class TrackerNodes:
     def _transformed(self, x: str, P: str, function: Callable[[str, int], str], width: int) -> Prediction:
         """What a function makes of a Gaussian, by sigma points."""
         graph, nx = self._graph, self._motion.nx
-        middle, squares, other = [tracker_numbers(self._motion, self._artifact.filter.dt)[n] for n in ("middle", "middle_squares", "other")]
+        middle, squares, other = (self._numbers[name] for name in ("middle", "middle_squares", "other"))
         far = [graph("Mul", column, math.sqrt(0.5 / other)) for column in self._factored(P)[0]]
         points = [x, *(graph(sign, x, column) for column in far for sign in ("Add", "Sub"))]
         count, at = len(points), graph.joined(*points, axis=0)
@@ -234,23 +230,25 @@ class TrackerNodes:
 
     def _watched(self, x: str, P: str, white: str, sound: str) -> list[str]:
         """The state after a sample; it stays, and the estimate is lost, where that is not finite."""
-        graph, watch, ny, begins = self._graph, self._watch, self._artifact.ny, self._begins
+        graph, numbers, ny, begins = self._graph, self._numbers, self._artifact.ny, self._begins
         x_before, P_before, nis, trend_square, seen, trend = self._before
         there = graph.cast(graph("Not", graph("IsNaN", self._given["y_next"])), np.float64)
         count = graph.sum(there)
         step = graph("Mul", there, graph("Sub", white, trend))
-        trend = graph("Add", trend, graph("Mul", step, watch.trend_share))
+        trend = graph("Add", trend, graph("Mul", step, numbers["trend_share"]))
 
         def averaged(mean: str, values: str, share: float) -> str:
             step = graph("Sub", graph.sum(graph("Mul", values, there)), graph("Mul", count, mean))
             return graph("Add", mean, graph("Mul", step, share / ny))
 
-        nis = averaged(nis, graph("Mul", white, white), watch.share)
-        raised = graph("Mul", graph("Mul", trend, trend), watch.trend_gain)
-        trend_square = averaged(trend_square, raised, watch.trend_square_share)
-        coloured = graph("And", graph("Greater", trend_square, watch.trend_limit), graph("Greater", count, 0.0))
+        nis = averaged(nis, graph("Mul", white, white), numbers["share"])
+        raised = graph("Mul", graph("Mul", trend, trend), numbers["trend_gain"])
+        trend_square = averaged(trend_square, raised, numbers["trend_square_share"])
+        coloured = graph("And", graph("Greater", trend_square, numbers["trend_limit"]), graph("Greater", count, 0.0))
         inflated = graph(
-            "Mul", self._flat(P), graph("Where", graph("And", coloured, graph("Not", begins)), INFLATION, 1.0)
+            "Mul",
+            self._flat(P),
+            graph("Where", graph("And", coloured, graph("Not", begins)), numbers["inflation"], 1.0),
         )
         goes_on = graph("And", sound, graph("Not", begins))
         return [
@@ -270,7 +268,7 @@ class TrackerNodes:
         return mean, P, across
 
     def _shifted(self, x: str, V: str, w: str) -> str:
-        """x + V w, for w (n, ny)."""
+        """Add V w to x, for w (n, ny)."""
         graph = self._graph
         return graph(
             "Add", x, graph("Squeeze", graph("MatMul", V, graph("Unsqueeze", w, np.array([2]))), np.array([2]))

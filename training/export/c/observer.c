@@ -43,33 +43,17 @@ static void invert(const NAME_observer *observer, real *x_hat)
         free_map(observer, x_hat);
     else
 // end free
-    driven_map(observer, x_hat);
+        driven_map(observer, x_hat);
 }
 
 // if tracks
-/* The point before a value among points that rise, and the share of the next point in an interpolation. */
-static int before(double at, const double *points, int n, double *share)
+/* A covariance of T_inv's error in scaled states, at an age in samples up to the last of a table. */
+static void tabulated(const double *table, const double *ages, double age, double P[NX][NX])
 {
-    int i = 0;
-    while (i + 2 < n && at >= points[i + 1])
-        i++;
-    *share = (at - points[i]) / (points[i + 1] - points[i]);
-    *share = *share < 1.0 ? *share : 1.0;
-    return i;
-}
-
-/* A covariance of T_inv's error in scaled states, from a table by level of noise and age. */
-static void tabulated(const double *table, const double *levels, int rows, const double *ages, int columns, double age,
-                      double P[NX][NX])
-{
-    double of_level, of_age;
-    int row = before(NOISE_SHARE, levels, rows, &of_level), column = before(age, ages, columns, &of_age);
-    const double *at = table + (row * columns + column) * NX * NX, *next = at + columns * NX * NX;
-    for (int k = 0; k < NX * NX; k++) {
-        double low = at[k] + of_age * (at[NX * NX + k] - at[k]);
-        double high = next[k] + of_age * (next[NX * NX + k] - next[k]);
-        P[k / NX][k % NX] = low + of_level * (high - low);
-    }
+    for (; age > ages[1]; ages++)
+        table += NX * NX;
+    for (int k = 0; k < NX * NX; k++)
+        P[k / NX][k % NX] = table[k] + (age - ages[0]) / (ages[1] - ages[0]) * (table[NX * NX + k] - table[k]);
 }
 
 /* The bounds of the motion. */
@@ -345,8 +329,8 @@ static void track(NAME_observer *observer, const real y[NY], const real *u, real
         if (isnan(y[k]) || isinf(observer->nis))
             continue;
         observer->trend[k] += TREND_SHARE * (c.white[k] - observer->trend[k]);
-        raised += SQUARE(observer->trend[k]);
-        squared += SQUARE(c.white[k]);
+        raised += observer->trend[k] * observer->trend[k];
+        squared += c.white[k] * c.white[k];
         count++;
     }
     if (!count)
@@ -367,16 +351,17 @@ static void track(NAME_observer *observer, const real y[NY], const real *u, real
 static void supervise(NAME_observer *observer)
 {
     int lost = !(observer->nis <= LIMIT); /* also where it is no number */
-    double P[NX][NX], L[NX][NX], age = (double)observer->seen * MACRO_DT; /* what misled the filter may have misled z */
+    double P[NX][NX], L[NX][NX];
     real x_hat[NX];
     if (!lost && observer->seen >= WINDOW)
         return;
+    /* what misled the filter may have misled z as well: T_inv is as unsure as when it has seen so much, at most */
 // if free
     if (untouched(observer))
-        TABULATE(free, age, P);
+        tabulated(free_covariance, free_ages, (double)observer->seen, P);
     else
 // end free
-    TABULATE(driven, age, P);
+        tabulated(driven_covariance, driven_ages, (double)observer->seen, P);
     if (!lost && !(factorise(P, L) < factorise(observer->P, L)))
         return;
     invert(observer, x_hat);

@@ -10,7 +10,7 @@
 // end inputs
  * x_hat: ESTIMATES
  *
-PARAGRAPHS
+PARAGRAPH
  */
 #ifndef MACRO_H
 #define MACRO_H
