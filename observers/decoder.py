@@ -29,9 +29,7 @@ class Decoders:
     ) -> Self:
         """Return those of an artifact at levels of noise, for some of the maps' outputs."""
         driven, free = (
-            None
-            if inverse is None
-            else Decoder(inverse, outputs, measurement_noise, process_noise, compiled=compiled)
+            None if inverse is None else Decoder(inverse, outputs, measurement_noise, process_noise, compiled=compiled)
             for inverse in (artifact.inverse, artifact.free_inverse)
         )
         assert driven is not None
@@ -77,7 +75,7 @@ class Decoder:
         compiled: bool = False,
     ) -> None:
         error = inverse.error_covariance
-        self._error = None if error is None else error.at_level(inverse.share(measurement_noise))
+        self._error = None if error is None else error.at_level(inverse.shares(measurement_noise)[0])
         self._inverse = inverse = inverse.part(outputs)
         self.size = inverse.whiten.shape[1]
         self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)

@@ -33,8 +33,8 @@ class Factors:
         Levels of measurement noise, rising from 0, in multiples of the largest that the map was trained for.
     ages : ndarray, shape (m,)
         Seconds since reset, rising from 0.
-    factors : ndarray, shape (k, m)
-        The factors.
+    factors : ndarray, shape (2, k, m)
+        The factors without process noise, and at the largest level in training; (1, k, m) are for any level.
 
     Raises
     ------
@@ -48,14 +48,16 @@ class Factors:
 
     def __post_init__(self) -> None:
         sizes = _check_grid(self.levels, self.ages)
-        if self.factors.shape != sizes:
+        if self.factors.ndim != 3 or len(self.factors) not in (1, 2) or self.factors.shape[1:] != sizes:
             raise ArtifactError(f"factors of shape {self.factors.shape} do not fit {sizes[0]} levels, {sizes[1]} ages")
         if not ((self.factors > 0) & (self.factors <= _MAX_FACTOR)).all():
             raise ArtifactError(f"factors must be positive and at most {_MAX_FACTOR:g}, got {shown(self.factors)}")
 
-    def at_level(self, level: float) -> np.ndarray:
-        """Return the factors at a level, in multiples of the largest. Shapes: returns (m,)."""
-        return np.array([np.interp(level, self.levels, column) for column in self.factors.T])
+    def at_levels(self, measurement_noise: float, process_noise: float) -> np.ndarray:
+        """Return the factors at levels in multiples of the largest. Shapes: returns (m,)."""
+        share = min(process_noise, 1.0)
+        table = (1.0 - share) * self.factors[0] + share * self.factors[-1]
+        return np.array([np.interp(measurement_noise, self.levels, column) for column in table.T])
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import numpy as np
 
 from observers.checks import is_finite
 from observers.errors import ArtifactError, check_shapes
-from observers.network import MLP
 from observers.factors import ErrorCovariance
+from observers.network import MLP
 
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
@@ -182,9 +182,12 @@ class InverseMap:
         sigma = np.reshape(measurement_noise, (-1, 1))
         return 1.0 / (1.0 + ((sigma * np.atleast_2d(self.noise_gain)) ** 2).sum(0))
 
-    def share(self, measurement_noise: float | tuple[float, ...]) -> float:
-        """Return a level in multiples of the largest in training, of the noisiest output."""
-        return float(np.max(np.divide(measurement_noise, self.measurement_noise_max)))
+    def shares(
+        self, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0
+    ) -> tuple[float, float]:
+        """Return levels in multiples of the largest in training, of the noisiest output."""
+        largest = np.max(np.divide(measurement_noise, self.measurement_noise_max))
+        return float(largest), process_noise / self.process_noise_max
 
     def noise_features(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> list[float]:
         """Return what the network is told of noise.

@@ -188,7 +188,7 @@ class KKLObserver:
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
 
-        A map that tracks, in place of one that does not, counts all samples since the reset as present.
+        A map that tracks, in place of one that does not, starts its filter at the current sample.
 
         Parameters
         ----------
@@ -219,6 +219,7 @@ class KKLObserver:
                 other._tracker.take_over(self._tracker)
             elif other._tracker is not None:
                 other._tracker.reset(self._y)
+                other._tracker.supervise(self._z, self._age)
             if other._monitor is not None:
                 other._monitor.reset(self._z.shape[:-1])
         vars(self).update(vars(other))

@@ -10,11 +10,10 @@ from observers.artifact import Artifact
 from observers.decoder import Decoders
 from observers.supervision import INFLATION, Supervision
 from observers.thresholds import MANY_ROWS
-from observers.tracker_kernel import TrackerKernel
+from observers.tracker_kernel import RELINEARISATIONS, TrackerKernel
 from observers.unscented import Gaussian, Points, conditioned, factor, transformed
 
 KNOWN = 1e-3  # standard deviation of a known start, in scaled states
-RELINEARISATIONS = 2  # of a step within the first window: with 0 errors without noise rise by 40 to 80 %
 
 
 class Tracker:
@@ -60,7 +59,8 @@ class Tracker:
         self._supervision = Supervision.of(motion, self._dt)
         self._window = self._supervision.window
         self._factor_ages = motion.factors.ages / self._dt
-        self._log_factors = np.log(motion.factors.at_level(artifact.inverse.share(measurement_noise)))
+        shares = artifact.inverse.shares(measurement_noise, process_noise)
+        self._log_factors = np.log(motion.factors.at_levels(*shares))
         self._end = motion.nx + motion.nx**2
         self._batch: tuple[int, ...] = ()
         self._state = np.empty((0, self._end + 3 + len(r)))
@@ -143,7 +143,7 @@ class Tracker:
 
         Returns the predicted outputs, (..., ny), which are not finite where a covariance broke down.
         """
-        n, ny = len(self._state), len(self._R)
+        n, ny = len(self._state), len(self._motion.least_measurement_noise)
         y, u = y.reshape(n, ny), u.reshape(n, u.shape[-1])
         taken = np.ones(n, dtype=bool) if rows is None else rows.flatten()
         machine = self._machine
@@ -245,8 +245,7 @@ class Tracker:
         flat, lost = z.reshape(len(self._state), z.shape[-1])[where], lost[where]
         ages = np.broadcast_to(age, self._batch).ravel()[where]
         learned = np.minimum(self._seen[where], self._window)
-        x = self._decoders(flat, ages * self._dt)
-        P = self._decoders.covariances(flat, learned * self._dt) / self._units
+        x, P = self._inverted(flat, ages * self._dt, learned * self._dt, where)
         taken = lost.copy()
         with np.errstate(invalid="ignore"):
             taken[~lost] = np.linalg.slogdet(P[~lost])[1] < np.linalg.slogdet(self._P[where[~lost]])[1]
@@ -255,9 +254,13 @@ class Tracker:
         self._state = self._state.copy()
         s = self._within((x - self._motion.x_offset) / self._motion.x_scale)
         self._x[where[taken]], self._P[where[taken]] = s[taken], P[taken]
-        lost = where[lost]
-        self._state[lost, self._end : self._end + 2] = 1.0
-        self._state[lost, self._end + 3 :] = 0.0
+        again = where[lost]
+        self._state[again, self._end : self._end + 2] = 1.0
+        self._state[again, self._end + 3 :] = 0.0
+
+    def _inverted(self, z: np.ndarray, age: np.ndarray, learned: np.ndarray, where: np.ndarray) -> Gaussian:
+        """T_inv's estimates of z in some rows and their covariances in scaled states, at ages in seconds."""
+        return self._decoders(z, age), self._decoders.covariances(z, learned) / self._units
 
     def _packed(self, x: np.ndarray, P: np.ndarray, watched: np.ndarray) -> np.ndarray:
         return np.concatenate([x, P.reshape(len(x), x.shape[1] ** 2), watched], axis=1)

@@ -7,29 +7,41 @@ if TYPE_CHECKING:
     from training.config import Config
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
-    from training.guided import GuidedKalmanFilter
     from training.identification.learning import adapt, identify
     from training.observable import Observability, observability
-    from training.pipeline import Result, train
-    from training.presets import preset
+    from training.lessons.calibrate import calibrate
+    from training.lessons.flow import learn_flow
+    from training.lessons.map import Maps, learn_map
+    from training.lessons.run import Run
+    from training.presets import preset, recorded_preset
     from training.rollouts import learn
     from training.rollouts.callback import KKLTrainingCallback
-    from training.teaching.monitor import calibrate
+    from training.sources.recorded import RecordedSource
+    from training.sources.simulated import SimulatedSource
+    from training.sources.source import Source
+    from training.train_observer import Result, train
 
 __all__ = [
     "Config",
-    "GuidedKalmanFilter",
     "KKLTrainingCallback",
+    "Maps",
     "Observability",
+    "RecordedSource",
     "Result",
+    "Run",
+    "SimulatedSource",
+    "Source",
     "adapt",
     "calibrate",
     "errors",
     "identify",
     "learn",
+    "learn_flow",
+    "learn_map",
     "nrmse",
     "observability",
     "preset",
+    "recorded_preset",
     "smape",
     "train",
     "unseen_trajectories",
@@ -37,20 +49,27 @@ __all__ = [
 
 _MODULES = {
     "Config": "config",
-    "GuidedKalmanFilter": "guided",
     "KKLTrainingCallback": "rollouts.callback",
+    "Maps": "lessons.map",
     "Observability": "observable",
-    "Result": "pipeline",
+    "RecordedSource": "sources.recorded",
+    "Result": "train_observer",
+    "Run": "lessons.run",
+    "SimulatedSource": "sources.simulated",
+    "Source": "sources.source",
     "adapt": "identification.learning",
-    "calibrate": "teaching.monitor",
+    "calibrate": "lessons.calibrate",
     "errors": "evaluation.errors",
     "identify": "identification.learning",
     "learn": "rollouts",
+    "learn_flow": "lessons.flow",
+    "learn_map": "lessons.map",
     "nrmse": "evaluation.metrics",
     "observability": "observable",
     "preset": "presets",
+    "recorded_preset": "presets",
     "smape": "evaluation.metrics",
-    "train": "pipeline",
+    "train": "train_observer",
     "unseen_trajectories": "evaluation.errors",
 }
 

@@ -33,7 +33,8 @@ STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attrib
 class Config:
     """A training run; together with the system it determines the artifact.
 
-    The defaults are those of the preset "fast" of input-aware maps.
+    The defaults are those of the preset "fast" of input-aware maps. A source reads what concerns its motions: of
+    simulated ones their number and kinds, of recorded ones what is held out.
 
     Raises
     ------
@@ -52,13 +53,13 @@ class Config:
     positive. A slow pair averages the noise on a component of y that oscillates at its frequency."""
     dt: Positive = 0.01
     """Sampling interval in seconds."""
-    trajectories: Count = 4000
+    trajectories: Count = 500
     """Number of simulated trajectories."""
     duration: Positive = 50.0
     """Length of each trajectory in seconds."""
     samples: Annotated[int, Field(ge=2)] = 200
     """Points recorded along each trajectory."""
-    width: Count = 128
+    width: Count = 20
     """Neurons in each hidden layer."""
     depth: Count = 3
     """Number of hidden layers."""
@@ -72,18 +73,13 @@ class Config:
     """Highest learning rate; after a short warm-up it decays to zero along a cosine."""
     forward_steps: Annotated[int, Field(ge=0)] = 0
     """Batches for the forward map (spinn)."""
-    inverse_steps: Count = 18000
+    inverse_steps: Count = 1500
     """Batches for each inverse map."""
-    random_features: Annotated[int, Field(ge=0)] = 0
-    """Solve for the forward map by least squares with so many random features, 1500 say, instead of training it
-    (spinn); 0 trains it."""
     collocation: Collocation = "motions"
     """Where the forward map's equation is asked to hold, and where x' lies (spinn). motions: along the trajectories,
     from their starts on. box: uniform in X, as in the paper's sec. 8.1."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
     """Most trajectories start in this multiple of the training box X, the others in X (spinn)."""
-    adaptive: bool = False
-    """Whether points at which the equation is violated most are drawn more often (spinn)."""
     solved_output_layer: bool = True
     """Whether the output layer of a trained forward map is solved for by least squares in the end (spinn)."""
     transients: bool = True
@@ -92,9 +88,6 @@ class Config:
     scaling: Scaling = "relative"
     """How states are scaled. relative: in units of their standard deviation, and errors of T_inv count relative to the
     state's size. range: in units of half their range, and all errors count alike. Input-aware maps are relative."""
-    lipschitz_penalty: NotNegative = 0.0
-    """How much a smaller Lipschitz constant of T_inv is worth: this part of the mean square error for each factor of
-    e."""
     physics_weight: NotNegative = 0.1
     """Weight nu of the PDE residual in the forward map's risk (spinn)."""
     inputs: bool = True
@@ -122,6 +115,29 @@ class Config:
     high_noise_emphasis: Positive = 2.0
     """How often samples have high levels of measurement noise, which are harder to learn. 1 draws the level evenly on
     a logarithmic scale over the two decades below measurement_noise_max; higher values draw high levels more often."""
+    windows: Count = 8000
+    """Starts of the filter for each age (recorded motions)."""
+    members: Count = 1
+    """Networks that are fitted from other random numbers and averaged: what one makes up beyond few records, the others
+    do not. They end as one network, as wide as all together."""
+    arbitrary_zero: tuple[str, ...] = ()
+    """Measured signals whose zero is arbitrary, such as angles of encoders that were zeroed anywhere: the map depends
+    on how they change, not on where they are (recorded motions)."""
+    untold_noise: NotNegative = 0.0
+    """Standard deviation of further noise in every sample, over the largest level, of which the map is not informed: it
+    keeps networks from learning the noise of few records by heart."""
+    held_out: Annotated[float, Field(ge=0, lt=1)] = 0.2
+    """Share of the records that is not trained on, on which covariances are calibrated and errors measured; whole
+    records where there are five or more, else the end of each."""
+    tracking: bool = True
+    """Whether the observer tracks (all but spinn): a Kalman filter on the system's equations, or on a learned flow,
+    that T_inv initialises."""
+    flow_steps: Count = 5000
+    """Batches for a flow, which is learned where there are no equations."""
+    runs: Annotated[int, Field(ge=100)] = 400
+    """Simulated motions on which covariances and the monitor's limits are calibrated."""
+    false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    """Probability that a sound motion of twenty seconds, at the pace of the shipped systems, raises an alarm."""
     truncation: Positive = 1e-6
     """Part epsilon of the filter's start that may be left where the forward map's data begins (paper, sec. 5.2)."""
     closed_loop_trajectories: Annotated[int, Field(ge=0)] = 0
@@ -163,17 +179,10 @@ class Config:
                 f"closed_loop_trajectories must be 0 or at least 10, and needs the pipeline 'input-aware' with inputs; "
                 f"got {closed_loop}, {self.pipeline!r}, inputs = {self.inputs}"
             )
-        if (self.pipeline == "spinn") != (self.forward_steps > 0 or self.random_features > 0):
-            raise ValueError(
-                f"pipeline {self.pipeline!r} does not go with forward_steps = {self.forward_steps} and "
-                f"random_features = {self.random_features}"
-            )
-        if self.random_features and self.forward_steps:
-            raise ValueError(
-                f"random_features = {self.random_features} solve for T: forward_steps must be 0 beside them"
-            )
+        if (self.pipeline == "spinn") != (self.forward_steps > 0):
+            raise ValueError(f"pipeline {self.pipeline!r} does not go with forward_steps = {self.forward_steps}")
         if self.pipeline != "spinn":
-            own = ("collocation", "box_factor", "adaptive", "solved_output_layer", "transients", "scaling")
+            own = ("collocation", "box_factor", "solved_output_layer", "transients")
             defaults = {entry.name: entry.default for entry in dataclasses.fields(self)}
             changed = [f"{name} = {getattr(self, name)!r}" for name in own if getattr(self, name) != defaults[name]]
             if changed:
@@ -201,13 +210,13 @@ def read_changes(path: Path) -> dict[str, Any]:
     return _validated(found, str(path))
 
 
-def settings_of(training: Mapping[str, Any]) -> Config:
+def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
     """The configuration behind what an artifact says of its training."""
     known = setting_types()
     found = {name: value for name, value in training.items() if name in known and value is not None}
     if not {"pipeline", "eigenvalues"} <= set(found):
         raise ValueError("the observer does not say how it was trained, so that it cannot be trained again")
-    return Config(**_validated(found, "the observer's training"))
+    return Config(**{**_validated(found, "the observer's training"), **changes})
 
 
 def _validated(settings: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -9,24 +9,14 @@ from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from observers import unscented
 from observers.unscented import Gaussian
+from training.sources.simulated import unknown_start
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
 NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in multiples of the system's default
-STARTS = 10_000  # of which mean and covariance are taken where a system draws its own
-LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
 LEAST_PROCESS_NOISE = 0.005  # that a filter assumes, at the system's pace: a tenth of the environments' default
 
 Corrected = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Means, covariances and normalised innovations squared (n,) of a batch."""
-
-
-def unknown_start(system: System) -> Gaussian:
-    """Mean (nx,) and covariance (nx, nx) of a start uniform in X, or as the system draws it."""
-    low, high = system.box()
-    if type(system).draw_starts is System.draw_starts:
-        return (low + high) / 2, np.diag((high - low) ** 2 / 12)
-    x = system.draw_starts(np.random.default_rng(0), STARTS)
-    return x.mean(0), np.cov(x.T).reshape(system.nx, -1) + np.diag(LEAST_VARIANCE * (high - low) ** 2)
 
 
 def measurement_covariance(
@@ -211,39 +201,3 @@ class UnscentedKalmanFilter(KalmanFilter):
     @property
     def _points(self) -> unscented.Points:
         return unscented.Points(kappa=3.0 - self._system.nx, beta=2.0)
-
-
-class IteratedKalmanFilter(UnscentedKalmanFilter):
-    """A batch of unscented Kalman filters that take each step twice (Kullberg, Skog and Hendeby, 2023).
-
-    Once a sample has corrected the prediction, it also says more of where the step began. The equations are made linear
-    anew over what is left of that uncertainty, by sigma points, and the step is taken again from the same start. That
-    pays where the state is hardly known yet: the equations bend over its whole spread, and little over what is left.
-    Parameters are those of :class:`KalmanFilter`.
-    """
-
-    @np.errstate(over="ignore", invalid="ignore")  # of rows that are lost, which start anew
-    def _moved(self, u: np.ndarray, y: np.ndarray) -> Corrected:
-        Q, move, points = self._Q * self._dt, self._motion(u), self._points
-        x, P, across = unscented.transformed(self.x, self.P, function=move, points=points)
-        P = P + Q
-        known, left, _ = self._updated(x, P, y)
-        back = _solved(P, across.mT).mT  # the gain of a smoother (Rauch, Tung and Striebel, 1965)
-        before = self.x + (back @ (known - x)[..., None])[..., 0]
-        spread = self.P + back @ (left - P) @ back.mT
-        spread = (spread + spread.mT) / 2
-        around, curved, across = unscented.transformed(before, spread, function=move, points=points)
-        A = _solved(spread, across).mT
-        curved = curved - A @ across  # what is not linear, as noise
-        again = around + (A @ (self.x - before)[..., None])[..., 0]
-        covariance = A @ self.P @ A.mT + (curved + curved.mT) / 2 + Q
-        sound = np.isfinite(again).all(-1) & np.isfinite(unscented.factor(covariance)).all((1, 2))
-        x, P = np.where(sound[:, None], again, x), np.where(sound[:, None, None], covariance, P)
-        return self._corrected(x, P, y)
-
-
-def _solved(P: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Solve P X = b, (n, nx, k), for covariances P; NaN where one is none."""
-    root = unscented.factor(P)
-    solved: np.ndarray = np.linalg.solve(root.mT, np.linalg.solve(root, b))
-    return solved

@@ -122,10 +122,10 @@ class KKLEstimator:
         if self._uncertainty and self.estimate != "x":
             raise ValueError(f"uncertainty=True is about x_hat: it needs estimate='x', got {self.estimate!r}")
         if self._uncertainty:
-            artifact.require_spread()
+            artifact.require_covariance()
         if self.estimate == "x" or self._monitor or self._known_start:
             return artifact
-        return dataclasses.replace(artifact, flow=None)
+        return dataclasses.replace(artifact, motion=None)
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
         """The input as far as the map knows it. Shapes: ``u`` (..., nu); returns (..., nu), or None."""

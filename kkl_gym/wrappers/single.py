@@ -52,7 +52,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     and not clipped. With ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit
     the estimates (a faulty sensor, states that the map was not made for).
 
-    With ``estimate="z"`` the network is not evaluated, and nothing tracks (:attr:`observer` holds no flow), unless
+    With ``estimate="z"`` the network is not evaluated, and nothing tracks (the map of :attr:`observer` holds no motion), unless
     there is a monitor or the start is known. There is then no ``x_hat``, and
     :meth:`render` shows no estimate.
 
@@ -109,7 +109,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
-        forward map or flow and ``known_start`` is asked for, or no error bars and ``uncertainty``. It is a ValueError.
+        forward map or motion and ``known_start`` is asked for, or no covariance and ``uncertainty``. It is a ValueError.
 
     Examples
     --------

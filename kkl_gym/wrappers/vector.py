@@ -341,7 +341,7 @@ class KKLVectorObservation(VectorEstimate):
 
 def _check_process_noise(env: gym.vector.VectorEnv, artifact: Artifact) -> None:
     """ValueError if the rows differ in a level of noise that the observer assumes for all of them."""
-    if artifact.process_noise_max is not None or artifact.flow is not None:
+    if artifact.process_noise_max is not None or artifact.motion is not None:
         plant_of(env, "process_noise")
 
 

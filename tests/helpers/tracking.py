@@ -112,9 +112,12 @@ class KalmanFilter:
 
     def step(self, y=None):
         self.x, self.P = self.Phi @ self.x, self.Phi @ self.P @ self.Phi.T + self.Q
-        if y is not None:
-            seen = ~np.isnan(y)
-            H, R = self.H[seen], self.R[np.ix_(seen, seen)]
-            K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + R)
-            self.x, self.P = self.x + K @ (y[seen] - H @ self.x), (np.eye(2) - K @ H) @ self.P
+        return self.x if y is None else self.correct(y)
+
+    def correct(self, y):
+        seen = ~np.isnan(y)
+        H, S = self.H[seen], self.H[seen] @ self.P @ self.H[seen].T + self.R[np.ix_(seen, seen)]
+        K = self.P @ H.T @ np.linalg.inv(S)
+        self.white = np.linalg.solve(np.linalg.cholesky(S), y[seen] - H @ self.x)
+        self.x, self.P = self.x + K @ (y[seen] - H @ self.x), (np.eye(2) - K @ H) @ self.P
         return self.x

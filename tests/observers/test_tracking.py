@@ -1,27 +1,35 @@
 """Observers that track: on a linear system they are a Kalman filter, which T_inv starts and starts again."""
 
 import copy
-import dataclasses
 import functools
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from error_bars import with_error_bars
-from linear_system import C
-from scipy.linalg import solve_discrete_are
-from tracking import DT, PROCESS, STD, KalmanFilter, exact_flow, exact_motion, plain_observer, tracking_observer
+from random_tracking import signals, tracking
+from tracking import (
+    DT,
+    PROCESS,
+    STD,
+    KalmanFilter,
+    exact_motion,
+    linear_motion,
+    of_t_inv,
+    plain_observer,
+    tracking_observer,
+)
 
-from observers import MLP, Artifact, ArtifactError, Expression, Factors, KKLObserver, LinearFilter, unscented
+from observers import ArtifactError, Expression, Factors, KKLObserver, Limits, unscented
+from observers.supervision import INFLATION, Supervision
 
-LEVEL = 0.2
-CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # a network of floats says of a row what it says of it alone, but for rounding
-OLD = 400  # samples: far beyond age_max, where T_inv is asked no more
-replace = dataclasses.replace
+LEVEL, WINDOW = 0.2, 10  # samples within which T_inv is asked
+EXACT = {"rtol": 1e-9, "atol": 1e-11}
+CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # T_inv's network works in float32
 
 
 @functools.cache
-def runs(steps=OLD, n=3, outputs=1):
+def runs(steps=400, n=3, outputs=1):
     """States of the oscillator and their noisy outputs, (steps, n, .)."""
     rng, (Phi, _) = np.random.default_rng(0), exact_motion()
     x = np.empty((steps, n, 2))
@@ -33,107 +41,85 @@ def runs(steps=OLD, n=3, outputs=1):
     return x, y
 
 
-@functools.cache
-def long_run(outputs):
-    observer, (_, y) = (
-        KKLObserver(tracking_observer(np.eye(2)[:outputs]), LEVEL, process_noise=0.0),
-        runs(600, 3, outputs),
-    )
+def settled(**options):
+    """An observer far beyond the first window, and the states and samples that come next."""
+    (x, y), observer = runs(), KKLObserver(tracking_observer(**options), LEVEL, process_noise=0.0)
     observer.reset(y[0])
-    for sample in y[1:OLD]:
+    for sample in y[1:100]:
         observer.step(sample)
-    return observer
+    return observer, x[100:], y[100:].copy()
 
 
-def settled(outputs=1, **options):
-    """An observer that T_inv tells nothing more, and the states and samples that come next."""
-    observer, (x, y) = copy.copy(long_run(outputs)), runs(600, 3, outputs)
-    if options:
-        observer.replace(tracking_observer(**options))
-    return observer, x[OLD:], y[OLD:].copy()
-
-
+@pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("outputs", [1, 2])
-def test_it_is_the_kalman_filter_of_a_linear_system(outputs):
-    """Also where outputs or samples are missing, and from where it is told other levels of noise."""
-    H = np.eye(2)[:outputs]
-    observer, _, y = settled(outputs)
-    Phi, _ = exact_motion()
-    stationary = solve_discrete_are(Phi.T, H.T, PROCESS**2 * np.eye(2), LEVEL**2 * np.eye(outputs))
-    K = stationary @ H.T @ np.linalg.inv(H @ stationary @ H.T + LEVEL**2 * np.eye(outputs))
-    np.testing.assert_allclose(observer.covariance[0], (np.eye(2) - K @ H) @ stationary, rtol=1e-4, atol=1e-9)
-    filters = [KalmanFilter(x, P, LEVEL, H) for x, P in zip(observer.decode(), observer.covariance, strict=True)]
-    for k, sample in enumerate(y[:80]):
+@pytest.mark.parametrize("by", ["equations", "flow"])
+def test_it_is_the_kalman_filter_of_a_linear_system(by, outputs, known):
+    """From the start on, where outputs or samples are missing, and where levels of noise change."""
+    H, (x, y) = np.eye(2)[:outputs], runs(outputs=outputs)
+    y, artifact = y.copy(), of_t_inv(tracking_observer(H, by=by), 2.0)
+    motion, observer = artifact.motion, KKLObserver(artifact, LEVEL, process_noise=0.0)
+    begin = (
+        (x[0], [np.diag((1e-3 * motion.x_scale) ** 2)] * 3) if known else ([motion.mean] * 3, [motion.covariance] * 3)
+    )
+    filters = [KalmanFilter(*each, LEVEL, H) for each in zip(*begin, strict=True)]
+    found = observer.reset(y[0], x[0] if known else None)
+    expected = [each.x if known else each.correct(row) for each, row in zip(filters, y[0], strict=True)]
+    for k in range(1, 80):
+        np.testing.assert_allclose(found, expected, **EXACT)
+        np.testing.assert_allclose(observer.covariance, [each.P for each in filters], **EXACT)
         if outputs > 1:
-            sample[k % 3, k % 2] = np.nan
+            y[k, k % 3, k % 2] = np.nan
         if k == 40:
             observer.measurement_noise, observer.process_noise = 0.5, 3.0
             for each in filters:
                 each.R, each.Q = 0.5**2 * np.eye(outputs), (3.0 * PROCESS) ** 2 * np.eye(2)
-        gone = k % 4 == 1
-        found = observer.step(None if gone else sample)
-        expected = [each.step(None if gone else row) for each, row in zip(filters, sample, strict=True)]
-        np.testing.assert_allclose(found, expected, **CLOSE)
-        np.testing.assert_allclose(observer.covariance, [each.P for each in filters], **CLOSE)
+        missing = k % 4 == 1
+        found = observer.step(None if missing else y[k])
+        expected = [each.step(None if missing else row) for each, row in zip(filters, y[k], strict=True)]
 
 
-def test_t_inv_says_where_to_begin():
-    artifact, (_, y) = tracking_observer(), runs()
-    observer, plain = KKLObserver(artifact, LEVEL, process_noise=0.0), KKLObserver(plain_observer(), LEVEL)
-    np.testing.assert_allclose(observer.reset(y[0]), plain.reset(y[0]))
-    np.testing.assert_allclose(observer.std, np.full((3, 2), STD), rtol=1e-6)
-    for sample in y[1:4]:  # nothing is surer than the filter once it has begun
-        assert not np.allclose(observer.step(sample), plain.step(sample))
+def test_innovations_beyond_their_limits_inflate_the_covariance_or_let_t_inv_take_over():
+    """Of a sensor that drifts, sample by sample by hand."""
+    artifact, (x, y) = tracking_observer(), runs()
+    watch, plain = Supervision.of(artifact.motion, DT), KKLObserver(plain_observer(), LEVEL)
+    observer = KKLObserver(artifact, LEVEL, process_noise=0.0)
+    hand = KalmanFilter(x[0, 0], np.diag((1e-3 * artifact.motion.x_scale) ** 2), LEVEL)
+    observer.reset(y[0, 0], x[0, 0])
+    plain.reset(y[0, 0], x[0, 0])
+    nis, trend, square, happened = 1.0, 0.0, 1.0, []
+    for k in range(1, 400):
+        sample = y[k, 0] + 1e-4 * max(k - 50, 0) ** 2
+        hand.step(sample)
+        nis += watch.share * (hand.white[0] ** 2 - nis)
+        trend += watch.trend_share * (hand.white[0] - trend)
+        square += watch.trend_square_share * (watch.trend_gain * trend**2 - square)
+        observer.step(sample), plain.step(sample)
+        if square > watch.trend_limit:
+            hand.P, trend, square = INFLATION * hand.P, 0.0, 1.0
+            happened.append("inflated")
+        if nis > watch.limit:
+            hand.x, hand.P = plain.decode(), STD**2 * np.eye(2)
+            nis, trend, square = 1.0, 0.0, 1.0
+            happened.append("taken over")
+        np.testing.assert_allclose(observer.decode(), hand.x, **EXACT)
+        np.testing.assert_allclose(observer.covariance, hand.P, **EXACT)
+    assert {*happened} == {"inflated", "taken over"}
 
 
-def test_t_inv_takes_over_where_it_is_surer():
-    sure = tracking_observer()
-    spread = sure.inverse.spread
-    low = MLP(spread.mlp.weights, [spread.mlp.biases[0], np.array([-9.0, -9.0, 0.0])], "tanh")
-    inverse = replace(sure.inverse, spread=replace(spread, mlp=low))
-    observer, (_, y) = KKLObserver(replace(sure, inverse=inverse), LEVEL), runs()
-    plain = KKLObserver(plain_observer(), LEVEL)
-    observer.reset(y[0])
-    plain.reset(y[0])
-    old = round(sure.flow.window / DT)
-    for k in range(1, old + 10):
-        same = np.allclose(observer.step(y[k]), plain.step(y[k]))
-        assert same == (k < old), k
-
-
-class Counted(MLP):
-    """A network that counts how often it is asked."""
-
-    def __init__(self, mlp):
-        super().__init__(mlp.weights, mlp.biases, mlp.activation)
-        self.asked = []
-
-    def __call__(self, inputs):
-        self.asked.append(inputs)
-        return super().__call__(inputs)
-
-
-@pytest.mark.parametrize("batch", [(), (3,)])
-def test_t_inv_is_asked_once_a_sample_within_the_window(batch):
-    artifact = tracking_observer()
-    mlp, window = Counted(artifact.inverse.mlp), round(artifact.flow.window / DT)
-    observer = KKLObserver(replace(artifact, inverse=replace(artifact.inverse, mlp=mlp)), LEVEL)
-    y = np.zeros((*batch, 1))
-    observer.reset(y)
-    for k in range(1, 2 * window):
-        mlp.asked.clear()
-        missing = k == 5
-        observer.step(None if missing else y)
-        asked = len(mlp.asked)
-        _ = observer.covariance
-        if not missing:
-            assert asked == len(mlp.asked) == (k <= window), k
-        else:
-            assert asked == 0
+@pytest.mark.parametrize(("batch", "std"), [((), 1e-3), ((3,), 1e-3), ((3,), 2.0)])
+def test_t_inv_takes_over_within_the_first_window_where_its_determinant_is_smaller(batch, std):
+    artifact, (_, y) = of_t_inv(tracking_observer(), std), runs()
+    observer, plain = (KKLObserver(each, LEVEL) for each in (artifact, of_t_inv(plain_observer(), std)))
+    y = y[:, 0] if batch == () else y
+    for k in range(WINDOW + 5):
+        found, of_t_inv_alone = (each.step(y[k]) if k else each.reset(y[k]) for each in (observer, plain))
+        surer = std < 1.0 and k < WINDOW
+        assert np.allclose(found, of_t_inv_alone) == surer, k
+        assert np.allclose(observer.covariance, plain.covariance) == surer, k
 
 
 def test_errors_are_those_of_the_covariance():
-    x, y = runs(n=100, steps=400)
+    x, y = runs(n=100)
     observer, late = KKLObserver(tracking_observer(), LEVEL, process_noise=0.0), slice(100, None)
     error, variance = [], []
     for k in range(400):
@@ -145,7 +131,7 @@ def test_errors_are_those_of_the_covariance():
 
 def test_a_lost_estimate_is_found_again():
     observer, x, y = settled()
-    sound, window = observer.std.max(), round(observer.artifact.flow.window / DT)
+    sound, window = observer.std.max(), WINDOW
     for k in range(20):
         observer.step(y[k])
         np.testing.assert_allclose(observer.std.max(), sound, rtol=0.01)  # chance does not make it lost
@@ -199,26 +185,53 @@ def test_some_rows_move_and_some_begin_anew():
     np.testing.assert_array_equal(observer.decode(rows), observer.decode()[rows])
     np.testing.assert_array_equal(observer.decode_covariance(rows), observer.covariance[rows])
     moved = observer.decode()
-    observer.restart(y[1][:1], [False, True, False])
-    fresh = KKLObserver(observer.artifact, LEVEL)
-    np.testing.assert_allclose(observer.decode()[1], fresh.reset(y[1][0]))
-    np.testing.assert_allclose(observer.std[1], [STD, STD])
-    np.testing.assert_array_equal(observer.decode()[[0, 2]], moved[[0, 2]])
+    for x0 in (None, np.array([[0.3, 0.2]])):
+        observer.restart(y[1][:1], ~rows, x0)
+        fresh = KKLObserver(observer.artifact, LEVEL, process_noise=0.0)
+        fresh.reset(y[1][:1], x0)
+        for k in range(3):
+            np.testing.assert_allclose(observer.decode()[1:2], fresh.decode(), **EXACT)
+            np.testing.assert_allclose(observer.covariance[1:2], fresh.covariance, **EXACT)
+            np.testing.assert_array_equal(observer.decode()[rows], moved[rows])
+            observer.advance(np.broadcast_to(y[2 + k][:1], (3, 1)), rows=~rows)
+            fresh.step(y[2 + k][:1])
     observer.restart(np.zeros((0, 1)), [False] * 3)
 
 
+@pytest.mark.parametrize("t_is_there", [True, False])
+def test_a_known_start_is_begun_with(t_is_there):
+    artifact = tracking_observer()
+    observer = KKLObserver(artifact if t_is_there else replace(artifact, forward=None), LEVEL)
+    (x, y), first = runs(), [True, False, False]
+    np.testing.assert_allclose(observer.reset(y[0], x[0]), x[0])
+    np.testing.assert_allclose(observer.std, np.tile(1e-3 * artifact.motion.x_scale, (3, 1)))
+    np.testing.assert_allclose(observer.estimate(y[:9], x0=x[0])[0], x[0])
+    observer.step(y[1])
+    observer.measurement_noise = 0.9 * LEVEL
+    observer.restart(y[1][:1], first)
+    assert (observer.std[0] > 0.1).all()
+    assert (observer.std[1:] < 0.1).all()  # T_inv, which is less sure, does not take over
+    observer.restart(y[1][:1], first, x[1][:1])
+    np.testing.assert_allclose(observer.decode()[0], x[1][0])
+    assert (observer.std < 0.1).all()
+
+
 def test_maps_are_replaced_while_it_runs():
-    observer, *_ = settled()
+    observer, x, y = settled()
     x_hat, P = observer.decode(), observer.covariance
-    observer.replace(tracking_observer(x_scale=(1.0, 3.0)))
+    observer.replace(tracking_observer(by="flow", x_scale=(1.0, 3.0)))
     np.testing.assert_allclose(observer.decode(), x_hat)
     np.testing.assert_allclose(observer.covariance, P)
     observer.replace(plain_observer())
+    assert not observer.tracking
     plain = observer.decode()
-    assert not np.allclose(plain, x_hat)
+    observer.replace(of_t_inv(tracking_observer(), 1e-3))
+    np.testing.assert_allclose(observer.decode(), plain)  # it begins with what T_inv says, where that is surer
+    observer.replace(plain_observer())
     observer.replace(tracking_observer())
-    np.testing.assert_allclose(observer.decode(), plain)  # it begins with what T_inv says
-    observer.step(np.zeros((3, 1)))
+    for k in range(50):
+        observer.step(y[k])
+    assert np.abs(observer.decode() - x[49]).max() < 0.3
 
 
 def test_copies_and_pickles_go_on_alike():
@@ -235,113 +248,26 @@ def test_copies_and_pickles_go_on_alike():
     np.testing.assert_array_equal(fresh.decode(), x_hat)
 
 
-@pytest.mark.parametrize("t_is_there", [True, False])
-def test_a_known_start_is_begun_with(t_is_there):
-    artifact = tracking_observer(factors=doubting(0.3))
-    observer = KKLObserver(artifact if t_is_there else replace(artifact, forward=None), LEVEL)
-    (x, y), first = runs(), [True, False, False]
-    np.testing.assert_allclose(observer.reset(y[0], x[0]), x[0])
-    assert (observer.std < 0.01).all()
-    np.testing.assert_allclose(observer.estimate(y[:9], x0=x[0])[0], x[0])
-    observer.step(y[1])
-    assert (copy.copy(observer).std < 0.1).all()
-    observer.measurement_noise = 0.9 * LEVEL
-    assert (observer.std < 0.1).all()
-    observer.restart(y[1][:1], first)
-    assert (observer.std[0] > 0.2).all()
-    assert (observer.std[1:] < 0.1).all()  # T_inv, which is less sure, does not take over
-    observer.restart(y[1][:1], first, x[1][:1])
-    np.testing.assert_allclose(observer.decode()[0], x[1][0])
-    assert (observer.std < 0.1).all()
-    observer.reset(y[0])
-    assert (observer.std > 0.2).all()
-
-
-def doubting(doubt, factor=1.0):
-    """Factors with a doubt, at all levels and ages."""
-    return Factors(np.zeros(1), np.zeros(1), np.full((1, 1), factor), np.full((1, 1), doubt))
-
-
-def test_factors_and_doubts_of_covariances():
-    by_level = Factors(np.array([0.0, 1.0]), np.array([0.0, 10.0]), np.array([[1.0, 1.0], [1.0, 16.0]]))
-    (plain, *_), (wide, *_), (doubts, *_) = settled(), settled(factors=by_level), settled(factors=doubting(0.2, 3.0))
-    # The logarithm is interpolated: age and level 0.2 of 1 give 16 ** (0.2 * 1) beyond the last age.
-    np.testing.assert_allclose(wide.covariance, plain.covariance * 16**0.2, rtol=1e-9)
-    apart = 1.0 - 0.2 * (1.0 - np.eye(2))
-    np.testing.assert_allclose(doubts.covariance, 3.0 * apart * plain.covariance, rtol=1e-9)
-    for other in (wide, doubts):
-        np.testing.assert_allclose(other.decode(), plain.decode(), rtol=1e-12)
-
-
-def test_covariances_are_calibrated_as_those_of_the_samples_that_were_there():
-    ages, values, (_, y) = np.array([0.0, 2.0, 4.0]), np.array([9.0, 3.0, 1.0]), runs(steps=150)
-    artifact = tracking_observer(factors=Factors(np.zeros(1), ages, values[None]))
-    batch, sure, single = (KKLObserver(each, LEVEL) for each in (artifact, tracking_observer(), artifact))
-    y = y.copy()
-    y[3:60, :2] = np.nan  # of two rows in three
-    seen = np.zeros(3)
-    for k, samples in enumerate(y):
-        for observer in (batch, sure):
-            observer.step(samples) if k else observer.reset(samples)
-        missing = np.isnan(samples[:, 0])
-        single.step(None if missing[1] else samples[1]) if k else single.reset(samples[1])
-        seen += bool(k) & ~missing
-        factors = np.exp(np.interp(seen * DT, ages, np.log(values)))
-        np.testing.assert_allclose(batch.covariance, factors[:, None, None] * sure.covariance, rtol=1e-9)
-        np.testing.assert_allclose(single.covariance, batch.covariance[1], **CLOSE)
-
-
-@pytest.mark.parametrize("doubt", [0.1, 1.0])
-def test_soon_after_a_start_t_inv_is_asked_what_errors_there_may_be(doubt):
-    (_, y), artifact = runs(), tracking_observer(factors=doubting(doubt))
-    batch, sure, plain = (KKLObserver(each, LEVEL) for each in (artifact, tracking_observer(), plain_observer()))
-    single, window = KKLObserver(artifact, LEVEL), round(artifact.flow.window / DT)
-    for k in range(window + 5):
-        for observer in (batch, sure, plain):
+def test_covariances_are_multiplied_by_factors_of_level_and_age():
+    """In logarithms between the ages, of the largest level that the map was trained for, which is 1."""
+    ages, values = np.array([0.0, 2.0, 4.0]), np.array([[9.0, 3.0, 1.0], [4.0, 8.0, 2.0]])
+    factors = Factors(np.array([0.0, 2 * LEVEL]), ages, values)
+    (_, y), rows = runs(), np.array([True, False, False])
+    sure, wide = (KKLObserver(tracking_observer(**each), LEVEL) for each in ({}, {"factors": factors}))
+    for k in range(100):
+        for observer in (sure, wide):
             observer.step(y[k]) if k else observer.reset(y[k])
-        single.step(y[k, 1]) if k else single.reset(y[k, 1])
-        apart = plain.decode() - sure.decode()
-        said = plain.covariance + apart[:, :, None] * apart[:, None, :]
-        other = said if k < window else sure.covariance * np.eye(2)
-        np.testing.assert_allclose(batch.covariance, (1 - doubt) * sure.covariance + doubt * other, rtol=1e-9)
-        np.testing.assert_allclose(single.covariance, batch.covariance[1], **CLOSE)
-        np.testing.assert_array_equal(batch.decode_covariance(np.array([True, False, True])), batch.covariance[::2])
-    batch.restart(y[k][:1], [False, True, False])
-    np.testing.assert_allclose(batch.std[1], [STD, STD])
-    np.testing.assert_allclose(batch.covariance[::2], sure.covariance[::2] * (1 - doubt * (1 - np.eye(2))), rtol=1e-9)
-
-
-def test_factors_of_free_motion_hold_until_an_input_acts():
-    one, four = (Factors(np.zeros(1), np.zeros(1), np.full((1, 1), value)) for value in (1.0, 4.0))
-    artifact = tracking_observer(factors=one)
-    linear = LinearFilter(artifact.filter.A, artifact.filter.B, DT, 1)
-    weight = np.insert(artifact.inverse.mlp.weights[0], [3] * 3, 0.0, axis=1)  # which reads nothing of z_u
-    bars = artifact.inverse.spread.mlp
-    spread = replace(artifact.inverse.spread, mlp=MLP([np.zeros((4, 8)), bars.weights[1]], bars.biases, "tanh"))
-    inverse = replace(
-        artifact.inverse,
-        mlp=MLP([weight], [np.zeros(2)], "tanh"),
-        features=("z_y", "z_u", "measurement_noise", "age"),
-        z_offset=np.zeros(6),
-        whiten=np.eye(6),
-        noise_gain=np.zeros(6),
-        spread=spread,
-    )
-    flow = exact_flow(factors=one)
-    driven = replace(artifact, filter=linear, inverse=inverse, flow=replace(flow, free_factors=four))
-    plain = replace(driven, flow=flow)
-    observer, other = (KKLObserver(each, LEVEL) for each in (driven, plain))
-    y = np.zeros((3, 1))
-    observer.reset(y), other.reset(y)
-    for u in ([0.0, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.0]):
-        observer.step(y, np.array(u)[:, None]), other.step(y, np.array(u)[:, None])
-    np.testing.assert_allclose(observer.covariance, other.covariance * np.array([4.0, 1.0, 4.0])[:, None, None])
-    np.testing.assert_array_equal(observer.decode(), other.decode())
+            if k == 50:
+                observer.restart(y[k][:1], rows)
+        age = DT * np.where(rows & (k >= 50), k - 50, k)
+        expected = np.exp(np.interp(age, ages, np.log(values.mean(0))))
+        np.testing.assert_allclose(wide.covariance, expected[:, None, None] * sure.covariance, rtol=1e-9)
+    np.testing.assert_array_equal(wide.decode(), sure.decode())
 
 
 def test_estimates_stay_within_bounds_and_finite():
     artifact = tracking_observer()
-    narrow = replace(artifact, flow=replace(artifact.flow, low=-np.ones(2), high=np.ones(2)))
+    narrow = replace(artifact, motion=replace(artifact.motion, low=-np.ones(2), high=np.ones(2)))
     observer = KKLObserver(narrow, LEVEL)
     observer.reset(np.array([0.0]))
     for y in (1e14, -1e14, 0.0, 5.0, 1e14):
@@ -350,21 +276,34 @@ def test_estimates_stay_within_bounds_and_finite():
         assert np.isfinite(observer.covariance).all()
 
 
-def test_a_flow_may_be_off_by_more_where_the_state_moves_far():
-    """Its covariance is then that of a Kalman filter with as much more process noise, at each sample."""
-    plain, bend = tracking_observer(), np.array([0.4, 0.8])
-    observer = KKLObserver(replace(plain, flow=replace(plain.flow, bend=bend)), LEVEL)
-    observer.reset(np.array([3.0]))
-    for _ in range(13):  # then T_inv is asked no longer
-        observer.step(np.array([3.0]))
-    for _ in range(30):
-        other, x = copy.copy(observer), observer.decode()
-        other.replace(plain)
-        moved = ((other.step(None) - x) / plain.flow.x_scale) ** 2
-        P = other.covariance + np.diag((bend * moved.sum() * plain.flow.x_scale) ** 2)
-        observer.step(None)
-        np.testing.assert_allclose(observer.covariance, P, rtol=1e-6)
-        assert (observer.std > other.std).all()
+@pytest.mark.parametrize("options", [{}, {"outputs": 2, "process": True, "free_inverse": True}], ids=str)
+def test_without_tracking_it_is_the_map_without_a_motion(options):
+    artifact = tracking(**options)
+    bare, (y, u) = replace(artifact, motion=None), signals(artifact, 30, (3,))
+    y[5:9, 1], y[12, :, 0] = np.nan, np.nan
+    one, other = KKLObserver(artifact, 0.1, tracking=False), KKLObserver(bare, 0.1)
+    assert (one.tracking, KKLObserver(artifact).tracking, other.tracking) == (False, True, False)
+    for k in range(30):
+        if k == 20:
+            one.measurement_noise = other.measurement_noise = 0.3
+            one.replace(artifact)
+            one, other = (pickle.loads(pickle.dumps(each)) for each in (one, other))
+        found = [each.step(y[k], u[k]) if k else each.reset(y[k]) for each in (one, other)]
+        np.testing.assert_array_equal(*found)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+    for name in ("estimate", "estimate_covariance"):
+        np.testing.assert_array_equal(*(getattr(each, name)(y, u) for each in (one, other)))
+    with pytest.raises(ArtifactError, match="does not track; kkl-gym train"):
+        KKLObserver(bare, tracking=True)
+    ones = np.ones((2, artifact.ny))
+    limits = Limits(
+        np.array([0.0, 1.0]), ones, 0 * ones, ones, window=0.5, warm_up=5.0, false_alarms=0.01, duration=50.0
+    )
+    with pytest.raises(ValueError, match="leave tracking=False out"):
+        KKLObserver(replace(artifact, limits=limits), monitor=True, tracking=False)
+    for wrong in ("no", 1):
+        with pytest.raises(ValueError, match="tracking must be True or False"):
+            KKLObserver(artifact, tracking=wrong)
 
 
 def test_bad_samples_change_nothing_and_what_is_returned_is_the_callers():
@@ -380,43 +319,18 @@ def test_bad_samples_change_nothing_and_what_is_returned_is_the_callers():
     np.testing.assert_array_equal(observer.covariance, kept[1])
 
 
-def test_files_hold_it(tmp_path):
-    path, artifact = tmp_path / "map.safetensors", tracking_observer(factors=doubting(0.25))
-    artifact.save(path)
-    _, y = runs()
-    again, expected = (KKLObserver(each, LEVEL) for each in (Artifact.read(path), artifact))
-    np.testing.assert_allclose(again.estimate(y[:30]), expected.estimate(y[:30]), rtol=1e-6)
-    np.testing.assert_allclose(again.estimate_covariance(y[:30]), expected.estimate_covariance(y[:30]), rtol=1e-6)
-
-
-def test_what_does_not_fit_is_refused(make_artifact):
-    plain, flow = plain_observer(), tracking_observer().flow
-    with pytest.raises(ArtifactError, match="does not fit an observer of"):
-        replace(plain, flow=exact_flow())  # which has an input
-    with pytest.raises(ArtifactError, match="error bars and the output"):
-        replace(plain, inverse=replace(plain.inverse, spread=None), flow=flow)
-    with pytest.raises(ArtifactError, match="error bars and the output"):
-        replace(plain, C=None, flow=flow)
-    with pytest.raises(ArtifactError, match="by process noise"):
-        replace(plain, flow=replace(flow, factors=Factors(np.zeros(1), np.zeros(1), np.ones((2, 1, 1)))))
-    uncertain = with_error_bars(make_artifact("van_der_pol", estimated=True))
-    with pytest.raises(ArtifactError):
-        replace(uncertain, C=C, flow=replace(exact_flow()))
-    wrong = {
-        "x_scale": [np.zeros(2)], "error": [-np.ones(2)], "low": [np.full(2, 50.0)], "window": [0.0, np.nan, 1e308],
-        "least_process_noise": [1e200], "least_measurement_noise": [np.zeros(1)], "gain": [np.ones(3)],
-        "polynomial": [np.zeros((2, 4)), np.zeros((2, 1)), np.zeros((2, 1081))],  # no 1, 3, 6, 10
-    }  # fmt: skip
-    for name, values in wrong.items():
-        for value in values:
-            with pytest.raises(ArtifactError):
-                replace(flow, **{name: value})
-    with pytest.raises(ArtifactError, match="kkl-gym tracking"):
-        plain.require_flow()
-    ages, ones = np.zeros(1), np.ones((1, 1))
-    for doubt in (-ones, 1.1 * ones, np.nan * ones, np.ones(1)):
-        with pytest.raises(ValueError, match="doubt"):
-            Factors(ages, ages, ones, doubt)
+def test_artifacts_with_a_motion_that_does_not_fit(make_artifact):
+    plain, motion = plain_observer(), linear_motion()
+    for wrong in (linear_motion(nu=1), linear_motion("flow", nu=1), linear_motion(ny=2)):
+        with pytest.raises(ArtifactError, match="does not fit an observer of"):
+            replace(plain, motion=wrong)
+    for lacking in ({"inverse": replace(plain.inverse, error_covariance=None)}, {"C": None}):
+        with pytest.raises(ArtifactError, match="needs T_inv's covariance and the output"):
+            replace(plain, motion=motion, **lacking)
+    with pytest.raises(ArtifactError, match="of one plant, not of a range of k"):
+        replace(plain, motion=motion, parameters={"k": 1.0}, parameter_ranges={"k": (0.9, 1.1)})
+    with pytest.raises(ArtifactError, match="does not track; kkl-gym train"):
+        plain.require_motion()
 
 
 def test_covariances_that_are_none_have_no_factor():

@@ -165,8 +165,6 @@ class Train:
         changes = (read_changes(self.config) if self.config else {}) | self.settings
         if self.size == SMALL:
             changes = {**SMALL_SETTINGS, **changes}
-        if changes.get("random_features"):
-            changes.setdefault("forward_steps", 0)  # what is solved for is not trained
         if self.uncertain:
             named = [name for name, _ in self.uncertain]
             if len({*named}) < len(named):
@@ -231,8 +229,6 @@ def expected(config: Config, found: "Estimate") -> Table:
         size = f"{batches.get(stage, config.inverse_steps):,} batches of {config.batch:,}"
         if stage == "simulating":
             size = f"{config.trajectories:,} trajectories of {config.duration:g} s"
-        elif stage == "solving":
-            size = f"{config.random_features:,} random features"
         table.add_row(stage, size, duration(seconds))
     table.add_section()
     table.add_row("all", "", duration(sum(found.seconds.values())))

@@ -10,7 +10,7 @@ from observers import Artifact, KKLObserver
 from observers.factors import standard_deviations
 from training.evaluation.errors import UnseenTrajectories, kalman_filter, measured
 from training.evaluation.levels import Level
-from training.maps.regions import chi_square, squared_distance
+from training.lessons.calibrate import chi_square, squared_distance
 
 REGIONS = (0.5, 0.9, 0.99)  # parts of the errors that regions should hold
 CHUNK = 200  # trajectories at once: each sample has a matrix
@@ -39,7 +39,7 @@ def coverage(
     spans: tuple[slice, ...] = (slice(None),),
 ) -> list[Coverage]:
     """Judge an observer's error bars on test trajectories; it knows the levels of noise, nothing of another plant."""
-    artifact.require_spread()
+    artifact.require_covariance()
     observer = KKLObserver(artifact, measurement_noise, process_noise=trajectories.process_noise)
     y = measured(system, trajectories, observer.measurement_noise, seed)
 
@@ -83,7 +83,7 @@ def _chunks(n: int) -> list[slice]:
 
 def _followed(observer: KKLObserver, y: np.ndarray, u: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Estimates and covariances along records."""
-    if observer.artifact.flow is None:  # then whole records are quicker than their steps
+    if not observer.tracking:  # then whole records are quicker than their steps
         return observer.estimate(y, u), observer.estimate_covariance(y, u)
     x_hat, covariance = [observer.reset(y[0])], [observer.covariance]
     for k in range(1, len(y)):

@@ -11,7 +11,7 @@ from training.evaluation.errors import UnseenTrajectories, errors, unseen_trajec
 from training.evaluation.levels import show_level
 from training.figures import ESTIMATE, TRUTH, drawing
 from training.maps.smooth import residual
-from training.pipeline import Result
+from training.train_observer import Result
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import noisy_output
 

@@ -18,6 +18,7 @@ class Profile:
 
     eigenvalues: tuple[float, ...] | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    large_settings: Mapping[str, Any] = field(default_factory=dict)
     uncertain_settings: Mapping[str, Any] = field(default_factory=dict)
     spinn_settings: Mapping[str, Any] = field(default_factory=dict)
     controller: Callable[[System], Controller] = linear_quadratic

@@ -1,4 +1,4 @@
-"""Trajectories under a controller that acts on an observer's estimate."""
+"""Pairs under a controller that acts on an observer's estimate."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ from observers import Artifact, KKLObserver
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import ALIKE, draw_process_noise, noisy_output
 from training.trajectories.policy import EXPLORATION
-from training.trajectories.record import Trajectories
+from training.sources.source import Pairs
 
 HOLDS = (1, 5, 10, 20)  # samples for which actions are held
 GROUPS = 50  # of closed-loop trajectories with a noise level and a time for which actions are held in common
 
 
 @dataclass(frozen=True)
-class ClosedLoop(Trajectories):
-    """Trajectories under a controller that acts on an observer's estimate; z holds the noise that the observer saw."""
+class ClosedLoop(Pairs):
+    """Pairs under a controller that acts on an observer's estimate; z holds the noise that the observer saw."""
 
     measurement_noise: np.ndarray
 
@@ -43,7 +43,7 @@ def record_closed_loop(
     The controller never acts on the true state: such inputs would tell the observer, which filters them, what it is to
     find out by itself. For the same reason noise is not added afterwards, but is what the observer and through it the
     controller saw. Groups of trajectories differ in noise level, in how long an action is held, and in the level of
-    process noise if the observer is told it. Trajectories of a group differ in how much is added to an action.
+    process noise if the observer is told it. Pairs of a group differ in how much is added to an action.
     """
     dt = artifact.filter.dt
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))

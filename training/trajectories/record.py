@@ -10,6 +10,7 @@ import numpy as np
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import LinearFilter
+from training.sources.source import Pairs
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise
 from training.trajectories.policy import under_policy
@@ -25,20 +26,6 @@ RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 # to 3.4 % of X's half-width with 4 here, to 3.2 % with 12 and to 3.1 % with none; by an exact EKF to 2.7 %.
 POLICYS_OWN = 12
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
-
-
-@dataclass(frozen=True)
-class Trajectories:
-    """Trajectories of a system, measured without noise, with the filter running beside them from its own start.
-
-    Shapes: ``ages`` (m,), ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
-    """
-
-    ages: np.ndarray
-    x: np.ndarray
-    z: np.ndarray
-    process_noise: np.ndarray
-    nominal: np.ndarray | None = dataclasses.field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -71,7 +58,7 @@ def record(
     rng: np.random.Generator,
     motions: Motions | None = None,
     report: Callable[[float], object] = lambda done: None,
-) -> Trajectories:
+) -> Pairs:
     """Simulate trajectories and run the filter beside them. Shapes: ``ages`` (m,)."""
     motions = motions or Motions(kinds=KINDS)
     if not linear.nu:
@@ -84,7 +71,7 @@ def record(
         zs.append(linear.run(system.output(x), u, ages))
         levels.append(level)
         report(sum(x.shape[1] for x in xs))
-    return Trajectories(ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(levels))
+    return Pairs(ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(levels))
 
 
 def trajectories(
@@ -129,7 +116,7 @@ def _tell(report: Callable[[float], object], there: int, each: float, interval: 
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Trajectories, and which of them stayed within the bounds."""
+    """Pairs, and which of them stayed within the bounds."""
 
     x: np.ndarray
     u: np.ndarray

@@ -14,7 +14,7 @@ from training.maps.networks import Network, tensor
 from training.maps.samplers.batch import Batch
 from training.maps.scaling import StateScale
 from training.trajectories.noise import ALIKE
-from training.trajectories.record import Trajectories
+from training.sources.source import Pairs
 
 MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
 AGE_UNIT = 5  # samples, in the age feature log(1 + t / unit)
@@ -45,7 +45,7 @@ class TrajectorySampler:
 
     def __init__(
         self,
-        data: Trajectories,
+        data: Pairs,
         linear: LinearFilter,
         *,
         measurement_noise_max: float | tuple[float, ...],
@@ -175,7 +175,7 @@ class TrajectorySampler:
         number = (age * (1 + self.LEVELS) + level) * (self.PROCESS_CELLS if self.process_noise_max else 1) + process
         return number * self.kinds_of_plant + nominal
 
-    def nominal_cell(self, data: Trajectories, device: torch.device) -> torch.Tensor:
+    def nominal_cell(self, data: Pairs, device: torch.device) -> torch.Tensor:
         """1 for trajectories of the system's own parameters where these differ, (n,); else 0."""
         nominal = np.zeros(data.x.shape[1]) if data.nominal is None else data.nominal
         return torch.as_tensor(nominal.astype(int), device=device)

@@ -6,10 +6,10 @@ import numpy as np
 
 from observers import LinearFilter
 from training.records import Record
-from training.trajectories.record import Trajectories
+from training.sources.source import Pairs
 
 
-def windows(records: Sequence[Record], linear: LinearFilter, *, ages: np.ndarray, n: int) -> Trajectories:
+def windows(records: Sequence[Record], linear: LinearFilter, *, ages: np.ndarray, n: int) -> Pairs:
     """Pair recorded states with what the filter holds if it was switched on some samples before.
 
     The filter is linear. One that starts at sample k therefore differs from one that has run since the record's
@@ -28,7 +28,7 @@ def windows(records: Sequence[Record], linear: LinearFilter, *, ages: np.ndarray
         owner, sample = owner[chosen], sample[chosen]
         xs.append(taken([record.x for record in records], owner, sample))
         zs.append(restarted(linear, records, z, owner=owner, sample=sample, age=int(age)))
-    return Trajectories(ages, np.stack(xs), np.stack(zs), np.zeros(n))
+    return Pairs(ages, np.stack(xs), np.stack(zs), np.zeros(n))
 
 
 def samples_as_old(records: Sequence[Record], age: int) -> tuple[np.ndarray, np.ndarray]:

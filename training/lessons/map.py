@@ -1,0 +1,229 @@
+"""The lesson of the map: T_inv, with T before it in the paper's way."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from kkl_gym.system import System
+from observers import Artifact, ForwardMap, InverseMap, LinearFilter
+from training.filter_noise import stationary_covariance
+from training.lessons.run import Run
+from training.maps.forward import ForwardProblem, transients, truncation_step
+from training.maps.inverse import InverseProblem
+from training.maps.networks import Network, averaged, on_torch
+from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
+from training.maps.scaling import StateScale
+from training.sources.simulated import SimulatedSource
+from training.sources.source import Pairs, Source
+from training.spectrum import Spectrum
+from training.systems import named_policy
+from training.trajectories.closed_loop import record_closed_loop
+from training.trajectories.record import recording_ages
+
+CLOSED_LOOP_SECONDS = 20.0  # of each motion, at the pace of the shipped systems
+
+
+@dataclass(frozen=True)
+class Maps:
+    """A filter and the maps that were learned for it."""
+
+    filter: LinearFilter
+    inverse: InverseMap
+    free_inverse: InverseMap | None = None
+    forward: ForwardMap | None = None
+
+    def artifact(self, facts: Mapping[str, Any], **made: Any) -> Artifact:
+        """Put them together with what a source says of itself."""
+        parts = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
+        return Artifact(**parts, **facts, **made)
+
+
+def learn_map(source: Source, run: Run) -> Maps:
+    """Learn T_inv along motions of a source, transients and every level of noise included.
+
+    With inputs there are two maps: of driven motion, and of z_y alone for as long as no input has acted. In the paper's
+    way (pipeline "spinn") T is learned first, on motions and on its equation, and z = T(x) replaces the filter's.
+
+    Parameters
+    ----------
+    source : Source
+        Where motions come from.
+    run : Run
+        The training under way, with the configuration.
+
+    Returns
+    -------
+    Maps
+        The filter and its maps.
+
+    Raises
+    ------
+    ValueError
+        If the motions leave the system's bounds, or are too short for the filter.
+    FloatingPointError
+        If the loss is no longer a number.
+    """
+    return _MapLesson(source, run).learned()
+
+
+class _MapLesson:
+    def __init__(self, source: Source, run: Run) -> None:
+        config = run.config
+        self.source, self.run, self.config = source, run, config
+        self.spectrum = Spectrum(config.eigenvalues, config.pairs)
+        self.linear = self.spectrum.filter(source.ny, config.dt, source.nu)
+        simulated = isinstance(source, SimulatedSource)
+        self.free = bool(simulated and source.nu and config.free_inverse and config.policy is None)
+        stages = 1 + self.free + bool(config.closed_loop_trajectories) + (config.pipeline == "spinn")
+        self.share = 1 / stages
+
+    def learned(self) -> Maps:
+        if self.config.pipeline == "spinn":
+            return self._papers()
+        free = None
+        if self.free:
+            unforced = self.spectrum.filter(self.source.ny, self.config.dt)
+            sampler = self._along(self._pairs(unforced, free=True), unforced)
+            free = sampler.inverse_map(self._fit("free", sampler), unforced)
+        sampler = self._along(self._pairs(self.linear), self.linear)
+        networks = [self._fit(name, sampler, i) for i, name in enumerate(self._names())]
+        inverse = sampler.inverse_map(networks[0], self.linear)
+        if len(networks) > 1:
+            inverse = dataclasses.replace(inverse, mlp=averaged(networks))
+        maps = Maps(self.linear, inverse, free)
+        if self.config.closed_loop_trajectories:
+            both = self._closed_loop(sampler, maps)
+            self._minimise("closed-loop", networks[0], both)
+            maps = dataclasses.replace(maps, inverse=both.inverse_map(networks[0], self.linear))
+        return maps
+
+    def _names(self) -> list[str]:
+        count = self.config.members
+        return ["inverse"] if count == 1 else [f"inverse-{i + 1}" for i in range(count)]
+
+    def _pairs(self, linear: LinearFilter, free: bool = False) -> Pairs:
+        name = f"{self.source.name}, free" if free else self.source.name
+        report = self.run.progress.bar(f"motions of {name}", self.config.trajectories)
+        with self.run.timed("motions"):
+            pairs = self.source.pairs(linear, free=free, report=report)
+        report(self.config.trajectories)
+        return pairs
+
+    def _along(self, pairs: Pairs, linear: LinearFilter, error: np.ndarray | None = None) -> TrajectorySampler:
+        """Batches along motions; z may have an error of some covariance beside."""
+        config = self.config
+        if config.untold_noise:
+            levels = config.untold_noise * np.broadcast_to(np.asarray(config.measurement_noise_max), linear.B.shape[1])
+            error = np.einsum("j,jab->ab", levels**2, stationary_covariance(linear))
+        with self.run.progress.phase("preparing batches"):
+            return TrajectorySampler(
+                pairs,
+                linear,
+                measurement_noise_max=config.measurement_noise_max,
+                batch=config.batch,
+                device=self.run.device,
+                noise_free_share=config.noise_free_share,
+                high_noise_emphasis=config.high_noise_emphasis,
+                scaling=config.scaling,
+                error=error,
+                **self.source.sampling(linear),
+            )
+
+    def _fit(self, name: str, sampler: Sampler, member: int = 0) -> Network:
+        """A network that gives x on the sampler's batches."""
+        config, device = self.config, self.run.device
+        inputs, x, *_ = sampler(torch.Generator(device).manual_seed(0))
+        network = Network(
+            inputs.shape[1], x.shape[1], width=config.width, depth=config.depth, activation=config.activation
+        ).to(device)
+        self._minimise(name, network, sampler, seed=config.seed * config.members + member)
+        return network
+
+    def _minimise(self, name: str, network: Network, sampler: Sampler, **settings: Any) -> None:
+        config = self.config
+        problem = InverseProblem(network, sampler, self.run.device)
+        share = self.share / config.members
+        self.run.minimise(name, problem, problem.loss, config.inverse_steps, share=share, **settings)
+
+    def _closed_loop(self, sampler: TrajectorySampler, maps: Maps) -> ClosedLoopSampler:
+        """Batches half from motions of a controller that acts on T_inv's estimate."""
+        config, source = self.config, self._simulated()
+        feedback = source.policy or named_policy(source.system, "controller")
+        steps = min(source.steps, round(CLOSED_LOOP_SECONDS * source.pace / config.dt))
+        driven = record_closed_loop(
+            source.plant,
+            maps.artifact(source.facts()),
+            feedback,
+            n=config.closed_loop_trajectories,
+            steps=steps,
+            ages=recording_ages(steps, config.samples),
+            rng=source.rng,
+            noise_free_share=config.noise_free_share,
+            high_noise_emphasis=config.high_noise_emphasis,
+            process_noise_share=config.process_noise_share,
+            report=self.run.progress.bar("closing the loop", config.closed_loop_trajectories),
+        )
+        return ClosedLoopSampler(sampler, source.known(driven), dt=config.dt, device=self.run.device)
+
+    def _simulated(self) -> SimulatedSource:
+        if not isinstance(self.source, SimulatedSource):
+            raise ValueError(f"pipeline {self.config.pipeline!r} and closed loops need equations to simulate")
+        return self.source
+
+    def _papers(self) -> Maps:
+        """T, trained on motions and on its equation, and T_inv on z = T(x)."""
+        source, config, linear, run = self._simulated(), self.config, self.linear, self.run
+        system = source.system
+        first = truncation_step(
+            system, linear, steps=source.steps, epsilon=config.truncation, box_factor=config.box_factor
+        )
+        settled = source.ages >= first  # the filter's start no longer matters
+        pairs = self._pairs(linear)
+        x = pairs.x.reshape(-1, system.nx)
+        points = x if config.collocation == "motions" else system.draw_starts(source.rng, len(x))
+        forward = self._forward(system, source.rng, pairs, points, settled)
+        run.samples["inverse_samples"] = len(points)
+        with run.progress.phase("T along the motions"):
+            T_x = np.stack([forward(each) for each in pairs.x])
+            z = transients(T_x, pairs.z[0], linear=linear, ages=source.ages)
+        error = (pairs.z - z)[settled].reshape(-1, linear.size)
+        sampler: Sampler
+        if config.transients:
+            sampler = self._along(dataclasses.replace(pairs, z=z), linear, error.T @ error / len(error))
+        else:
+            T = on_torch(forward, run.device)
+            sampler = ForwardMapSampler(
+                T, error, points=points, batch=config.batch, device=run.device, scaling=config.scaling
+            )
+        return Maps(linear, sampler.inverse_map(self._fit("inverse", sampler), linear), forward=forward)
+
+    def _forward(
+        self, system: System, rng: np.random.Generator, pairs: Pairs, points: np.ndarray, settled: np.ndarray
+    ) -> ForwardMap:
+        """T, trained."""
+        config, linear, run = self.config, self.linear, self.run
+        run.samples["forward_samples"] = int(settled.sum()) * config.trajectories + len(points)
+        network = Network(system.nx, linear.size, width=config.width, depth=config.depth, activation=config.activation)
+        problem = ForwardProblem(
+            network,
+            system,
+            linear=linear,
+            pairs=(pairs.x[settled].reshape(-1, system.nx), pairs.z[settled].reshape(-1, linear.size)),
+            points=points,
+            scale=StateScale.of(points, config.scaling),
+            physics_weight=config.physics_weight,
+            batch=config.batch,
+            device=run.device,
+        )
+        run.minimise("forward", problem, problem.loss, config.forward_steps, share=self.share)
+        if config.solved_output_layer:
+            with run.timed("forward"), run.progress.phase("solving for T's output layer", linear.size) as report:
+                problem.solve_output_layer(rng, report)
+        return problem.forward_map()
+
+
+__all__ = ["Maps", "learn_map"]

@@ -1,0 +1,287 @@
+"""Motions of a system that is simulated."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from observers import Artifact, Equations, Factors, LinearFilter, Motion
+from training.config import Config
+from training.jobs import describe
+from training.seeds import Stream, generator
+from training.sources.source import Increments, Pairs, Report, Runs
+from training.systems import named_policy
+from training.trajectories.controllers import Controller
+from training.trajectories.expression import field_expression, output_facts
+from training.trajectories.noise import draw_process_noise
+from training.trajectories.parameters import blind, nominal_share, relative_ranges, uncertain_plant, with_parameters
+from training.trajectories.policy import policy_fingerprint, under_policy
+from training.trajectories.record import Motions, record, recording_ages, trajectories
+from training.trajectories.signals import DRIVEN, KINDS, random_inputs
+
+LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
+BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned
+LEAST_NOISE, LEAST_PROCESS_NOISE = 0.001, 0.0005  # that a tracker assumes, of the usual, and at the system's pace
+WINDOW, RUN = 0.5, 20.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
+SUBSTEPS, INTEGRATION_ERROR = 64, 1e-5  # at most, of scaled states in a sample: far below the process noise assumed
+INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share that judges a flow
+DEVIATIONS = (1e-4, 0.3)  # of these pairs from motions, in standard deviations of the states, log-uniform
+TRIES = 8
+
+
+class SimulatedSource:
+    """Simulated motions of a system, with process noise and random inputs.
+
+    Parameters
+    ----------
+    system : System
+        The equations.
+    config : Config
+        What concerns motions: trajectories, duration, samples, runs, dt, inputs, policy, uncertain parameters, noise,
+        seed.
+
+    Raises
+    ------
+    ValueError
+        If a policy or a parameter that is to be uncertain is unknown.
+    """
+
+    def __init__(self, system: System, config: Config) -> None:
+        self.system, self.config = system, config
+        self.ranges = relative_ranges(system, config.uncertain)
+        self.plant = uncertain_plant(system, self.ranges)
+        self.estimated = tuple(self.ranges) if config.estimate_parameters else ()
+        self.policy = None if config.policy is None else named_policy(system, config.policy)
+        self.name = system.name
+        self.nx, self.ny, self.dt, self.pace = system.nx, system.ny, config.dt, system.pace
+        aware = config.pipeline == "input-aware"
+        self.nu = system.nu if aware and config.inputs else 0
+        self.process_noise_share = config.process_noise_share if aware else 0.0
+        self.process_noise = float(system.process_noise) if self.process_noise_share else 0.0
+        self.steps = max(1, round(config.duration / config.dt))
+        self.ages = recording_ages(self.steps, config.samples)
+        self.rng = generator(Stream.TRAINING, config.seed)  # drawn from in the order of the lessons
+
+    def identity(self) -> dict[str, Any]:
+        """What identifies the source."""
+        system = self.system
+        found = {
+            **describe(system),
+            "process_noise": float(system.process_noise),
+            "scale": [float(one) for one in system.scale],
+        }
+        if self.ranges:
+            found["nominal_share"] = nominal_share(self.ranges)
+        if self.policy:
+            found["policy_actions"] = policy_fingerprint(self.policy, system)
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """Arguments of :class:`observers.Artifact`."""
+        system = self.system
+        return {
+            "system": system.name,
+            "parameters": system.parameters,
+            "measurement_noise": system.measurement_noise,
+            "parameter_ranges": self.ranges,
+            "estimated_parameters": self.estimated,
+            **output_facts(system),
+        }
+
+    def sampling(self, linear: LinearFilter) -> dict[str, Any]:
+        """Arguments of :class:`training.maps.samplers.TrajectorySampler`."""
+        return {
+            "measurement_noise": self.system.measurement_noise,
+            "process_noise_max": self.process_noise,
+            "parameters": len(self.estimated),
+        }
+
+    def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
+        """Motions to train on with a filter beside them; free ones start in part where inputs have led."""
+        config, policy = self.config, self.policy
+        if free:
+            motions = Motions(lead_in_share=LEAD_IN_SHARE, lead_in_input=config.lead_in_input)
+        else:
+            both = self.nu and config.free_inverse and not policy  # then free motions have a map of their own
+            motions = Motions(kinds=DRIVEN if both else KINDS, policy=policy and blind(policy, self.nx))
+        motions = dataclasses.replace(
+            motions, process_noise_share=self.process_noise_share, box_factor=config.box_factor
+        )
+        found = record(
+            self.plant,
+            linear,
+            n=config.trajectories,
+            steps=self.steps,
+            ages=self.ages,
+            rng=self.rng,
+            motions=motions,
+            report=report,
+        )
+        return self.known(found)
+
+    def known(self, pairs: Any) -> Any:
+        """Pairs without the parameters that are not to be estimated, and whether these are the system's own."""
+        nominal = None
+        if self.ranges:
+            own = [self.system.parameters[name] for name in self.ranges]
+            nominal = (pairs.x[0, :, self.nx :] == own).all(-1)
+        return dataclasses.replace(pairs, x=pairs.x[..., : self.nx + len(self.estimated)], nominal=nominal)
+
+    def runs(self, *, report: Report = lambda done: None) -> Runs:
+        """Motions with the system's process noise, and as many without; of each a third from 2X, the others from X."""
+        rng, steps = generator(Stream.CALIBRATION, self.config.seed), round(RUN * self.pace / self.dt)
+        plant, found = with_parameters(self.system, self.ranges), []
+        levels = sorted({0.0, self.process_noise})
+        for i, level in enumerate(levels):
+            x, u, usual = sound_motions(
+                plant,
+                n=self.config.runs // len(levels),
+                steps=steps,
+                dt=self.dt,
+                rng=rng,
+                driven=bool(self.nu),
+                policy=self.policy and blind(self.policy, self.nx),
+                process_noise=level,
+                report=lambda done, i=i: report((i + done) / len(levels)),
+                box_factor=BEYOND,
+            )
+            found.append((x, u, np.full(x.shape[1], level), usual))
+        xs, us, noise, usual = zip(*found, strict=True)
+        x = np.concatenate(xs, 1)
+        u = np.concatenate(us, 1)[..., : self.nu]
+        return Runs(x[..., : self.nx], plant.output(x), u, np.concatenate(noise), np.concatenate(usual))
+
+    def equations(self) -> Equations:
+        """The system's equations as an expression, with as many Runge-Kutta steps as its motions need."""
+        field = field_expression(self.system, inputs=bool(self.nu))
+        if self.system.discrete:
+            return Equations(field, 0)
+        x, u = self._states(4)
+        later = simulate(self.system, x, 1, self.dt, u=u[None] if self.system.nu else None)[-1]
+        inside, scale, substeps = np.isfinite(later).all(-1), self._scale[1], 1
+        while substeps < SUBSTEPS:
+            apart = np.abs(Equations(field, substeps)(x, u, self.dt) - later)[inside] / scale
+            if np.quantile(apart.max(-1), 0.99) <= INTEGRATION_ERROR:
+                break
+            substeps *= 2
+        return Equations(field, substeps)
+
+    def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
+        """States about motions, and where they are a sample later."""
+        rng = generator(Stream.CALIBRATION, self.config.seed, 5)
+        along, u = self._states(300)
+        rows = rng.integers(len(along), size=INCREMENTS)
+        size = np.exp(rng.uniform(*np.log(DEVIATIONS), (INCREMENTS, 1)))
+        low, high = (np.array(bound) for bound in zip(*self.system.bounds, strict=True))
+        x = np.clip(along[rows] + size * self._scale[1] * rng.standard_normal((INCREMENTS, self.nx)), low, high)
+        u = np.where(rng.random((INCREMENTS, 1)) < 0.5, 0.0, u[rows]) if self.nu else np.zeros((INCREMENTS, 0))
+        later = simulate(self.system, x, 1, self.dt, u=u[None] if self.nu else None)[-1]
+        inside = np.isfinite(later).all(-1)
+        found = Increments(x[inside], u[inside], (later - x)[inside])
+        held = round(JUDGED * len(found.x))
+        return found.part(slice(held, None)), found.part(slice(held))
+
+    def judged(self, artifact: Artifact) -> dict[str, Any]:
+        """Nothing: ``kkl-gym evaluate`` measures errors."""
+        return {}
+
+    def motion(self, **how: Any) -> Motion:
+        """The motion of a tracker: by equations, or a flow."""
+        system = self.system
+        if self.ranges:
+            raise ValueError(f"an observer for a range of {', '.join(self.ranges)} cannot track: a motion is of one plant")
+        low, high = (np.array(bound, dtype=float) for bound in zip(*system.bounds, strict=True))
+        offset, scale = self._scale
+        mean, covariance = unknown_start(system)
+        usual = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (self.ny,))
+        least = LEAST_NOISE * np.where(usual > 0, usual, 0.05 * np.array(system.output_range))
+        parts = {
+            "x_offset": offset,
+            "x_scale": scale,
+            "low": low,
+            "high": high,
+            "mean": mean,
+            "covariance": covariance,
+            "error": np.zeros(self.nx),
+            "process_noise": np.array(system.scale) / scale * self.dt / np.sqrt(3),
+            "least_process_noise": LEAST_PROCESS_NOISE / self.pace,
+            "least_measurement_noise": least,
+            "window": WINDOW * self.pace,
+            "factors": Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1))),
+        }
+        return Motion(**parts | how)
+
+    @functools.cached_property
+    def _scale(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and standard deviation of the states along motions from 2X, (nx,) each."""
+        along, _ = self._states(4)
+        scale = along.std(0)
+        return along.mean(0), np.where(scale > 0, scale, 1.0)
+
+    def _states(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """States (n, nx) along short motions from X and 2X, and inputs (n, nu)."""
+        rng, steps = generator(Stream.CALIBRATION, self.config.seed, 6), max(1, round(seconds * self.pace / self.dt))
+        motions = Motions(kinds=KINDS if self.nu else (), box_factor=BEYOND, policy=self.policy)
+        found = trajectories(self.system, n=100, steps=steps, dt=self.dt, rng=rng, motions=motions)
+        every = max(1, steps // 500)
+        x, u = zip(*((x[:-1:every], u[::every]) for x, u, _ in found), strict=True)
+        x, u = np.concatenate(x, 1).reshape(-1, self.nx), np.concatenate(u, 1)
+        if not self.nu:
+            return x, np.zeros((len(x), self.system.nu))
+        return x, u.reshape(-1, self.system.nu)
+
+
+def sound_motions(
+    system: System,
+    *,
+    n: int,
+    steps: int,
+    dt: float,
+    rng: np.random.Generator,
+    driven: bool,
+    policy: Controller | None = None,
+    process_noise: float | None = None,
+    report: Report = lambda done: None,
+    box_factor: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Simulate motions with process noise, every other one under random inputs, every third from a multiple of X.
+
+    Motions that leave the system's bounds are replaced. Under a policy half of them are its own, and in the others it
+    explores. Shapes: returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu), and which start in X, (n,).
+    """
+    level = system.process_noise if process_noise is None else process_noise
+    kept: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    while (missing := n - sum(x.shape[1] for x, *_ in kept)) > 0:
+        if len(kept) == TRIES:
+            raise ValueError(f"most motions of {steps * dt:g} s leave bounds = {system.bounds}: widen them, or shrink X")
+        x0 = system.draw_starts(rng, missing)
+        far = (np.arange(missing) % 3 == 2) & (box_factor > 1)
+        if far.any():
+            x0[far] = system.draw_starts(rng, int(far.sum()), box_factor)
+        w = draw_process_noise(system, level, n=missing, steps=steps, rng=rng)
+        if policy and driven:
+            x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=rng, own=np.arange(missing) % 2 == 1, w=w)
+        else:
+            u = np.zeros((steps, missing, system.nu))
+            if driven:
+                u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt=dt, rng=rng, kinds=DRIVEN)
+            x = simulate(system, x0, steps, dt, u=u, w=w, report=lambda k: report(k / steps))
+        inside = np.isfinite(x[-1]).all(-1)
+        kept.append((x[:, inside], u[:, inside], ~far[inside]))
+    xs, us, usual = zip(*kept, strict=True)
+    return np.concatenate(xs, 1), np.concatenate(us, 1), np.concatenate(usual)
+
+
+def unknown_start(system: System) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (nx,) and covariance (nx, nx) of the states at which motions start."""
+    low, high = system.box()
+    if type(system).draw_starts is System.draw_starts:
+        return (low + high) / 2, np.diag((high - low) ** 2 / 12)
+    x = system.draw_starts(np.random.default_rng(0), 10_000)
+    return x.mean(0), np.cov(x.T).reshape(system.nx, -1) + np.diag(1e-6 * (high - low) ** 2)
+
+
+__all__ = ["SimulatedSource", "sound_motions", "unknown_start"]

@@ -1,0 +1,141 @@
+"""Where motions come from: what every source gives, whichever it is."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from observers import Artifact, Equations, LinearFilter, Motion
+from training.config import Config
+
+Report = Callable[[float], object]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """States and the filter's states beside them, at ages since the filter's start, measured without noise.
+
+    Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
+    """
+
+    ages: np.ndarray
+    x: np.ndarray
+    z: np.ndarray
+    process_noise: np.ndarray
+    nominal: np.ndarray | None = field(default=None, kw_only=True)
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Whole motions, measured without noise; their levels of process noise, at most two; and which start usually.
+
+    Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
+    ``process_noise`` (n,), ``usual`` (n,): True from X, False from beyond.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    u: np.ndarray
+    process_noise: np.ndarray
+    usual: np.ndarray
+
+
+class TooFewRunsError(ValueError):
+    """Too little is held out to calibrate on."""
+
+
+@dataclass(frozen=True)
+class Increments:
+    """States (n, nx), inputs (n, nu), and how states change over a sample, (n, nx)."""
+
+    x: np.ndarray
+    u: np.ndarray
+    change: np.ndarray
+
+    def part(self, rows: slice) -> "Increments":
+        """Some of them."""
+        return replace(self, x=self.x[rows], u=self.u[rows], change=self.change[rows])
+
+
+class Source(Protocol):
+    """Simulated motions of a system, recorded ones, or rollouts of an environment.
+
+    Lessons ask a source for motions and never where these come from. Motions to calibrate on are other ones than those
+    to train on.
+
+    Attributes
+    ----------
+    name : str
+        Of the observer.
+    nx, ny, nu : int
+        Numbers of states, of outputs, and of the inputs that the observer takes.
+    dt : float
+        Sampling interval in seconds.
+    pace : float
+        Seconds in which signals change.
+    process_noise : float
+        Usual level of process noise, of which T_inv is informed; 0 where there is none.
+    config : Config
+        How the observer is learned.
+    """
+
+    name: str
+    config: Config
+
+    @property
+    def nx(self) -> int: ...  # noqa: D102
+
+    @property
+    def ny(self) -> int: ...  # noqa: D102
+
+    @property
+    def nu(self) -> int: ...  # noqa: D102
+
+    @property
+    def dt(self) -> float: ...  # noqa: D102
+
+    @property
+    def pace(self) -> float: ...  # noqa: D102
+
+    @property
+    def process_noise(self) -> float: ...  # noqa: D102
+
+    def identity(self) -> dict[str, Any]:
+        """What identifies the source, for fingerprints and the files of a run."""
+        ...
+
+    def facts(self) -> dict[str, Any]:
+        """What an artifact says of its source: arguments of :class:`observers.Artifact`."""
+        ...
+
+    def sampling(self, linear: LinearFilter) -> dict[str, Any]:
+        """How batches are drawn: arguments of :class:`training.maps.samplers.TrajectorySampler`."""
+        ...
+
+    def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report) -> Pairs:
+        """Motions to train T_inv on, with a filter beside them; ``free`` ones without input."""
+        ...
+
+    def runs(self, *, report: Report) -> Runs:
+        """Motions to calibrate on."""
+        ...
+
+    def equations(self) -> Equations:
+        """The equations of motion; ValueError with the reason where a flow is to be learned in their place."""
+        ...
+
+    def increments(self, *, report: Report) -> tuple[Increments, Increments]:
+        """Pairs of states a sample apart, to learn a flow from and to judge it by."""
+        ...
+
+    def judged(self, artifact: Artifact) -> dict[str, Any]:
+        """Errors on motions that are held out, for the artifact's account of its training."""
+        ...
+
+    def motion(self, **how: Any) -> Motion:
+        """The motion of a tracker, with equations or a flow; ValueError where such an observer cannot track."""
+        ...
+
+
+__all__ = ["Increments", "Pairs", "Report", "Runs", "Source", "TooFewRunsError"]
