@@ -145,7 +145,7 @@ def _tracker_arrays(exported: Exported, motion: Motion, window: int) -> dict[str
     for label, inverse in exported.maps.items():
         assert inverse.error_covariance is not None
         ages = np.append((ages := inverse.error_covariance.ages / dt)[ages < window], window)
-        by_age = inverse.error_covariance.at_level(inverse.share(exported.measurement_noise))
+        by_age = inverse.error_covariance.at_level(inverse.shares(exported.measurement_noise)[0])
         covariance = by_age(ages * dt) / np.outer(motion.x_scale, motion.x_scale)
         arrays |= {f"{label}_ages": ages, f"{label}_covariance": covariance.ravel()}
     return arrays

@@ -99,8 +99,9 @@ class InverseMap {
     this.conditions = [];
     if (this.features.includes("measurement_noise")) this.conditions = this.measurement_noise_unit.map((unit, k) => Math.log1p(measured[k] / unit));
     if (this.features.includes("process_noise")) this.conditions.push(Math.log1p(Math.min(process, this.process_noise_max) / this.process_noise_unit));
-    this.share = Math.max(...measured.map((level, k) => level / (this.measurement_noise_max?.[k] ?? Infinity))); // of the largest
-    if (this.levels) this.byAge = between(this.share, this.levels, this.covariance, this.covariance.length / this.levels.length);
+    const share = Math.max(...measured.map((level, k) => level / (this.measurement_noise_max?.[k] ?? Infinity)));
+    this.shares = [share, process / (this.process_noise_max ?? Infinity)]; // of the largest levels in training
+    if (this.levels) this.byAge = between(share, this.levels, this.covariance, this.covariance.length / this.levels.length);
   }
 
   mean(z, age) {
@@ -161,12 +162,13 @@ class Tracker {
     else this.network = new Network(tensors, "motion.", this.activation);
   }
 
-  /** What is assumed of noise; measured is a level for each output, share that in multiples of the largest. */
-  tell(measured, process, share) {
+  /** What is assumed of noise; measured is a level for each output, shares are levels in multiples of the largest. */
+  tell(measured, process, [share, processShare]) {
     const level = Math.max(process, this.least_process_noise);
     this.Q = this.error.map((error, i) => (level * this.process_noise[i]) ** 2 + error ** 2);
     this.R = measured.map((own, k) => Math.max(own, this.least_measurement_noise[k]) ** 2);
-    this.logFactors = between(share, this.levels, this.factors.flat(), this.ages.length).map(Math.log);
+    const table = between(processShare, [0, 1], this.factors, this.factors.length / 2);
+    this.logFactors = between(share, this.levels, table, this.ages.length).map(Math.log);
   }
 
   /** Begin with the first sample; the map is of z. */
@@ -371,7 +373,7 @@ export class Observer {
       return Math.min(level, this.driven.measurement_noise_max?.[i] ?? Infinity);
     });
     for (const map of [this.driven, this.free]) map?.tell(each, processNoise);
-    this.tracker?.tell(each, processNoise, this.driven.share);
+    this.tracker?.tell(each, processNoise, this.driven.shares);
     const { limits } = this.described;
     this.monitor = limits ? new Monitor(this.tensors, limits, each, this.dt) : null;
   }

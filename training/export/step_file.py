@@ -74,7 +74,8 @@ def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: Inverse
 def _described_motion(tensors: dict[str, np.ndarray], motion: Motion, dt: float) -> dict[str, Any]:
     """Add a motion's arrays; returns what else there is to say of it."""
     arrays = tracker_arrays(motion) | {name: getattr(motion, name) for name in _MOTION_ARRAYS}
-    arrays |= {name: getattr(motion.factors, name) for name in ("levels", "ages", "factors")}
+    arrays |= {name: getattr(motion.factors, name) for name in ("levels", "ages")}
+    arrays["factors"] = motion.factors.factors[[0, -1]].ravel()  # without process noise, and with the most
     described = tracker_numbers(motion, dt) | {"least_process_noise": motion.least_process_noise}
     if motion.equations is not None:
         described |= {"field": motion.equations.field.components, "substeps": motion.equations.substeps}
