@@ -1,6 +1,7 @@
 """A graph under construction, and what several parts of it are made of."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,91 @@ _OPERATIONS |= {"<": "Less", "<=": "LessOrEqual", ">": "Greater", ">=": "Greater
 _OPERATIONS |= {"and": "And", "or": "Or", "not": "Not"}
 
 
+@dataclass(frozen=True)
+class Value:
+    """A value of a graph, with the operators of arrays."""
+
+    graph: "Graph"
+    name: str
+    __array_ufunc__ = None  # so that NumPy's arrays leave operators to values
+
+    def __add__(self, other: Any) -> "Value":
+        return self.graph("Add", self, other)
+
+    def __radd__(self, other: Any) -> "Value":
+        return self.graph("Add", other, self)
+
+    def __sub__(self, other: Any) -> "Value":
+        return self.graph("Sub", self, other)
+
+    def __mul__(self, other: Any) -> "Value":
+        return self.graph("Mul", self, other)
+
+    def __truediv__(self, other: Any) -> "Value":
+        return self.graph("Div", self, other)
+
+    def __matmul__(self, other: Any) -> "Value":
+        return self.graph("MatMul", self, other)
+
+    def __rmatmul__(self, other: Any) -> "Value":
+        return self.graph("MatMul", other, self)
+
+    def __lt__(self, other: Any) -> "Value":
+        return self.graph("Less", self, other)
+
+    def __gt__(self, other: Any) -> "Value":
+        return self.graph("Greater", self, other)
+
+    def __and__(self, other: Any) -> "Value":
+        return self.graph("And", self, other)
+
+    def __or__(self, other: Any) -> "Value":
+        return self.graph("Or", self, other)
+
+    def __invert__(self) -> "Value":
+        return self.graph("Not", self)
+
+    @property
+    def mT(self) -> "Value":
+        """Matrices (n, a, b) transposed."""
+        return self.graph("Transpose", self, perm=[0, 2, 1])
+
+    @property
+    def finite(self) -> "Value":
+        """Whether numbers are neither infinite nor NaN."""
+        return self.graph("Abs", self) < np.inf
+
+    def sum(self, axis: int = 1, keepdims: int = 1) -> "Value":
+        """Sum along an axis."""
+        return self.graph("ReduceSum", self, np.array([axis]), keepdims=keepdims)
+
+    def part(self, first: int, end: int, axis: int = 1) -> "Value":
+        """A range of rows or columns."""
+        return self.graph("Gather", self, np.arange(first, end), axis=axis)
+
+    def shaped(self, *shape: int) -> "Value":
+        """The same numbers in another shape."""
+        return self.graph("Reshape", self, np.array(shape))
+
+    def raised(self, axis: int) -> "Value":
+        """The same with another axis of length 1."""
+        return self.graph("Unsqueeze", self, np.array([axis]))
+
+    def cast(self, kind: Any) -> "Value":
+        """The same as numbers of another type."""
+        from onnx import helper
+
+        return self.graph("Cast", self, to=helper.np_dtype_to_tensor_dtype(np.dtype(kind)))
+
+    def columns(self, count: int) -> "list[Value]":
+        """The columns of (n, count), each (n, 1)."""
+        return [self] if count == 1 else self.graph.several("Split", count, self, axis=1)
+
+    def within(self, low: Any, high: Any) -> "Value":
+        """The same, cut at bounds."""
+        return self.graph("Min", self.graph("Max", self, low), high)
+
+
 class Graph:
     """Nodes and constants, each under a name of its own. Arrays of a step have a row for each observer."""
 
@@ -22,19 +108,19 @@ class Graph:
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
 
-    def __call__(self, operation: str, *inputs: Any, **attributes: Any) -> str:
-        """Add a node of values and constants; returns the name of its output."""
+    def __call__(self, operation: str, *inputs: Any, **attributes: Any) -> Value:
+        """Add a node of values and constants; returns its output."""
         return self.several(operation, 1, *inputs, **attributes)[0]
 
-    def several(self, operation: str, outputs: int, *inputs: Any, **attributes: Any) -> list[str]:
-        """Add a node; returns the names of its outputs."""
+    def several(self, operation: str, outputs: int, *inputs: Any, **attributes: Any) -> list[Value]:
+        """Add a node; returns its outputs."""
         from onnx import helper
 
-        names = [each if isinstance(each, str) else self._constant(each) for each in inputs]
+        names = [each.name if isinstance(each, Value) else self._constant(each) for each in inputs]
         name = f"{operation}_{len(self.nodes)}"
         results = [name] if outputs == 1 else [f"{name}_{i}" for i in range(outputs)]
         self.nodes.append(helper.make_node(operation, names, results, name=name, **attributes))
-        return results
+        return [Value(self, each) for each in results]
 
     def _constant(self, values: Any) -> str:
         from onnx import numpy_helper
@@ -43,72 +129,46 @@ class Graph:
         self.constants.append(numpy_helper.from_array(np.array(values, order="C"), name))
         return name
 
-    def cast(self, value: str, kind: Any) -> str:
-        """The same as numbers of another type."""
-        from onnx import helper
-
-        return self("Cast", value, to=helper.np_dtype_to_tensor_dtype(np.dtype(kind)))
-
-    def named(self, name: str, value: str) -> None:
+    def named(self, name: str, value: Value) -> None:
         """Give a value the name of an output."""
         from onnx import helper
 
-        self.nodes.append(helper.make_node("Identity", [value], [name], name=name))
+        self.nodes.append(helper.make_node("Identity", [value.name], [name], name=name))
 
-    def log1p(self, value: str, *, unit: Any, end: Any) -> str:
-        """log(1 + min(value, end) / unit)."""
-        if np.isfinite(end).all():
-            value = self("Min", value, np.atleast_1d(end).astype(float))
-        return self("Log", self("Add", self("Div", value, np.atleast_1d(unit).astype(float)), 1.0))
+    def where(self, condition: Any, value: Any, other: Any) -> Value:
+        """One value where a condition holds, and another elsewhere."""
+        return self("Where", condition, value, other)
 
-    def columns(self, value: str, count: int) -> list[str]:
-        """The columns of (n, count), each (n, 1)."""
-        return [value] if count == 1 else self.several("Split", count, value, axis=1)
-
-    def joined(self, *columns: str, axis: int = 1) -> str:
+    def joined(self, *columns: Value, axis: int = 1) -> Value:
         """Columns side by side."""
         return self("Concat", *columns, axis=axis)
 
-    def part(self, value: str, first: int, end: int, axis: int = 1) -> str:
-        """A range of rows or columns."""
-        return self("Gather", value, np.arange(first, end), axis=axis)
+    def log1p(self, value: Value, *, unit: Any, end: Any) -> Value:
+        """log(1 + min(value, end) / unit)."""
+        if np.isfinite(end).all():
+            value = self("Min", value, np.atleast_1d(end).astype(float))
+        return self("Log", value / np.atleast_1d(unit).astype(float) + 1.0)
 
-    def within(self, value: str, low: Any, high: Any) -> str:
-        """The same, cut at bounds."""
-        return self("Min", self("Max", value, low), high)
-
-    def finite(self, value: str) -> str:
-        """Whether values are neither infinite nor NaN."""
-        return self("Less", self("Abs", value), np.inf)
-
-    def sum(self, value: str, axis: int = 1, keepdims: int = 1) -> str:
-        """Sum along an axis."""
-        return self("ReduceSum", value, np.array([axis]), keepdims=keepdims)
-
-    def between(self, at: str, points: np.ndarray) -> str:
+    def between(self, at: Value, points: np.ndarray) -> Value:
         """Weights (n, k) of points that rise in an interpolation at values (n, 1): beyond the last it alone counts."""
-        passed = self.within(self("Div", self("Sub", at, points[:-1]), np.diff(points)), 0.0, 1.0)  # of each interval
+        passed = ((at - points[:-1]) / np.diff(points)).within(0.0, 1.0)  # of each interval
         shape = (len(points) - 1, len(points))
-        shifted = self("MatMul", passed, np.eye(*shape, 1) - np.eye(*shape))  # from each to the next
-        return self("Add", shifted, np.eye(1, len(points)))
+        return passed @ (np.eye(*shape, 1) - np.eye(*shape)) + np.eye(1, len(points))  # from each to the next
 
-    def network(self, mlp: MLP, h: str, real: Any) -> str:
+    def network(self, mlp: MLP, h: Value, real: Any) -> Value:
         """What a network makes of its inputs (n, inputs), in doubles; it computes in numbers of type ``real``."""
-        h = self.cast(h, real)
+        h = h.cast(real)
         for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
-            if i:
-                h = self._activated(mlp.activation, h, real)
+            if i and mlp.activation == "silu":
+                half = h * np.full(1, 0.5, real)
+                h = half + half * self("Tanh", half)  # as in observers.network: it cannot overflow
+            elif i:
+                h = self({"tanh": "Tanh", "relu": "Relu"}[mlp.activation], h)
             # The weights are floats in Python, too.
             h = self("Gemm", h, *(np.asarray(values, np.float32).astype(real) for values in (weight, bias)), transB=1)
-        return self.cast(h, np.float64)
+        return h.cast(np.float64)
 
-    def _activated(self, activation: str, h: str, real: Any) -> str:
-        if activation != "silu":
-            return self({"tanh": "Tanh", "relu": "Relu"}[activation], h)
-        half = self("Mul", h, np.full(1, 0.5, real))
-        return self("Add", half, self("Mul", half, self("Tanh", half)))  # as in observers.network: it cannot overflow
-
-    def expression(self, expression: Expression, **columns: Sequence[str]) -> str:
+    def expression(self, expression: Expression, **columns: Sequence[Value]) -> Value:
         """The components, side by side, of columns "x" and "u"; what appears more than once is computed once."""
         values: dict[Any, Any] = {}
 
@@ -117,9 +177,8 @@ class Graph:
                 return part
             if part not in values:
                 name, *arguments = part
-                values[part] = (
-                    columns[name][arguments[0]] if name in columns else self._operated(name, *map(value, arguments))
-                )
+                own = columns[name][arguments[0]] if name in columns else self._operated(name, *map(value, arguments))
+                values[part] = own
             return values[part]
 
         shape = self("Shape", columns["x"][0])
@@ -127,11 +186,10 @@ class Graph:
 
     def _operated(self, name: str, *values: Any) -> Any:
         if name == "tan":
-            return self("Div", self("Sin", *values), self("Cos", *values))
+            return self("Sin", *values) / self("Cos", *values)
         if name == "%":
             rest = self("Mod", *values, fmod=1)
-            other = self("Less", self("Mul", rest, values[1]), 0.0)  # of another sign than NumPy's
-            return self("Add", rest, self("Where", other, values[1], 0.0))
+            return rest + self.where(rest * values[1] < 0.0, values[1], 0.0)  # of the sign that NumPy gives it
         if name not in _OPERATIONS:
             raise ArtifactError(f"ONNX has no {name}, which this observer's equations need: export C or JavaScript")
         first, *others = values

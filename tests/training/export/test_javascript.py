@@ -64,7 +64,7 @@ def test_process_noise_that_t_inv_is_not_told_counts_for_the_filter(tmp_path):
     assert apart(exported, found, in_doubles(other, y[:200], u[:200])) < 1e-9
 
 
-@pytest.mark.parametrize("name", ["lorenz", "van_der_pol-static"])
+@pytest.mark.parametrize("name", ["lorenz", "lorenz-spinn"])
 def test_what_ships_with_its_monitor_and_missing_samples(name, tmp_path):
     exported = Exported.read(name)
     y, u = motion(exported.artifact, 900)

@@ -46,7 +46,7 @@ def test_maps_that_track(index, precision):
 @pytest.mark.parametrize(
     ("name", "precision", "size"),
     [
-        ("van_der_pol-static", "float", {"steps": 600, "length": 200}),
+        ("van_der_pol-spinn", "float", {"steps": 600, "length": 200}),
         ("lorenz", "double", {"steps": 600, "length": 200}),
         *(
             pytest.param(name, precision, {"steps": 34_000}, marks=pytest.mark.slow)
@@ -105,11 +105,11 @@ def test_an_input_that_is_no_number_is_not_taken_for_none(make_artifact, tmp_pat
 
 
 def test_what_is_said_of_it():
-    model = onnx_model(Exported.read("van_der_pol-static"))
+    model = onnx_model(Exported.read("van_der_pol"))
     said = {entry.key: entry.value for entry in model.metadata_props}
-    assert (said["name"], said["system"]) == ("van_der_pol_static", "van_der_pol")
-    assert said["artifact"] == resolve("van_der_pol-static").name
-    assert said["sha256"] == checksum(resolve("van_der_pol-static"), ArtifactError)
+    assert (said["name"], said["system"]) == ("van_der_pol", "van_der_pol")
+    assert said["artifact"] == resolve("van_der_pol").name
+    assert said["sha256"] == checksum(resolve("van_der_pol"), ArtifactError)
     names = ("parameters", "dt", "y", "u", "x_hat", "measurement_noise", "process_noise")
     assert {name: json.loads(said[name]) for name in names} == {
         "parameters": {"mu": 3.0}, "dt": 0.01, "y": ["y"], "u": ["u"], "x_hat": ["x1", "x2"],
