@@ -156,7 +156,7 @@ def output_expression(artifact: Artifact) -> Expression:
         return artifact.h
     assert artifact.C is not None
     return Expression(
-        [["+", 0.0, *(["*", c, ["x", i]] for i, c in enumerate(row) if c)] for row in artifact.C.tolist()]
+        [["+", 0.0, 0.0, *(["*", c, ["x", i]] for i, c in enumerate(row) if c)] for row in artifact.C.tolist()]
     )
 
 

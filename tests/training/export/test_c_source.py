@@ -7,7 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compiled_c import compiled, estimates, fed, microseconds, needs_cc, written
-from exported_steps import MAPS, apart, apart_at_all_levels, exported_of, in_doubles, in_python, mapped, motion, noise, tracked
+from exported_steps import (
+    MAPS,
+    apart,
+    apart_at_all_levels,
+    exported_of,
+    in_doubles,
+    in_python,
+    mapped,
+    motion,
+    noise,
+    tracked,
+)
 from random_tracking import tracking
 from rollout_observers import observer_of
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compiled_c import compiled, estimates, fed, needs_cc
-from exported_steps import apart, doubles, in_doubles, stepped, t_inv, tracked
+from exported_steps import apart, doubles, in_doubles, operated, stepped, t_inv, tracked
 from random_tracking import KINDS
 
 # Breaks the covariance in the midst of a record.
@@ -37,6 +37,12 @@ def test_a_record(index, precision, tolerance, tmp_path):
     exported, y, u, expected = tracked(index)
     found = estimates(compiled(replace(exported, precision=precision), tmp_path), y, u)
     assert apart(exported, found, expected) < tolerance
+
+
+@needs_cc
+def test_equations_of_all_operations(tmp_path):
+    exported, y, u, expected = operated(["atan2", ["u", 0], ["x", 1]])
+    assert apart(exported, estimates(compiled(exported, tmp_path), y, u), expected) < 1e-9
 
 
 @needs_cc

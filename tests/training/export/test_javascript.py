@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from error_bars import with_error_bars
-from exported_steps import MAPS, apart, exported_of, in_doubles, mapped, motion, noise, stepped, tracked
+from exported_steps import MAPS, apart, exported_of, in_doubles, mapped, motion, noise, operated, stepped, tracked
 from random_tracking import KINDS, signals, tracking
 
 from observers import KKLObserver, Limits
@@ -54,6 +54,11 @@ def test_every_kind_of_map(index, tmp_path):
 @pytest.mark.parametrize("index", range(len(KINDS)))
 def test_maps_that_track(index, tmp_path):
     exported, y, u, expected = tracked(index)
+    assert apart(exported, replayed(exported, tmp_path, y, u)["x_hat"], expected) < 1e-9
+
+
+def test_equations_of_all_operations(tmp_path):
+    exported, y, u, expected = operated(["atan2", ["u", 0], ["x", 1]])
     assert apart(exported, replayed(exported, tmp_path, y, u)["x_hat"], expected) < 1e-9
 
 

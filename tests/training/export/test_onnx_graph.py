@@ -5,7 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exported_steps import MAPS, apart, apart_at_all_levels, doubles, exported_of, in_doubles, mapped, stepped, t_inv
+from exported_steps import (
+    MAPS,
+    apart,
+    apart_at_all_levels,
+    doubles,
+    exported_of,
+    in_doubles,
+    mapped,
+    operated,
+    stepped,
+    t_inv,
+)
 from exported_steps import tracked as tracked_record
 from random_tracking import KINDS
 from rollout_observers import observer_of
@@ -41,6 +52,13 @@ def test_maps_that_track(index, precision):
     exported, y, u, expected = tracked_record(index)
     x_hat = Runner(replace(exported, precision=precision)).along(y[:, None], u[:, None])[:, 0]
     assert apart(exported, x_hat, expected) < TOLERANCES[precision]
+
+
+def test_equations_of_all_operations_but_atan2():
+    exported, y, u, expected = operated()
+    assert apart(exported, Runner(exported).along(y[:, None], u[:, None])[:, 0], expected) < 1e-9
+    with pytest.raises(ArtifactError, match="ONNX has no atan2"):
+        onnx_model(operated(["atan2", ["u", 0], ["x", 1]])[0])
 
 
 @pytest.mark.parametrize(
