@@ -58,7 +58,7 @@ class Train:
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
     config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None
-    """Settings that differ from the preset's, as `kkl-gym tune` writes them; options given here come before them."""
+    """JSON file of settings that differ from the preset's; options given here come before them."""
     closed_loop: bool = False
     """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
     (input-aware); takes half as long again. Writes NAME-closed-loop."""
