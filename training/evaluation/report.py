@@ -12,7 +12,7 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.factors import COVERAGE
 from training.config import settings_of
-from training.evaluation.levels import show_level
+from training.evaluation.levels import Level, show_level
 from training.figures import ESTIMATE, TRUTH, drawing
 from training.lessons.calibrate import chi_square, squared_distance
 from training.maps.smooth import residual
@@ -50,7 +50,7 @@ def write_report(path: Path, result: Result, source: Source | System) -> None:
         for column in range(2 if followed else 0):
             assert followed is not None
             axes = [figure.add_subplot(grid[1 + i, 3 * column : 3 * column + 3]) for i in range(states)]
-            followed.draw_estimates(axes, column, state_names(source, artifact))
+            followed.draw_estimates(axes, column, state_names(source, artifact), recorded=artifact.signals is not None)
 
 
 def held_out(source: Source) -> Runs | None:
@@ -76,7 +76,7 @@ class Followed:
 
     def __init__(self, artifact: Artifact, runs: Runs) -> None:
         usual = artifact.measurement_noise
-        self.levels = [0.0, usual] if np.any(usual) else [0.0]
+        self.levels: list[Level] = [0.0, usual] if np.any(usual) else [0.0]
         rng = np.random.default_rng(0)
         self.n, self.process_noise, self.dt = runs.x.shape[1], runs.process_noise, artifact.filter.dt
         self.x = np.concatenate([runs.x] * len(self.levels), axis=1)
@@ -103,38 +103,41 @@ class Followed:
 
     def draw_coverage(self, ax: Any) -> None:
         """Draw by age how many errors lie in regions that should hold 90 % of them."""
-        inside = np.where(np.isnan(self.distances), np.nan, self.distances <= chi_square(COVERAGE, self.x.shape[-1]))
-        spans = np.array_split(np.arange(len(self.ages)), SPANS)
+        edge = chi_square(COVERAGE, self.x.shape[-1])
+        distances = np.ma.masked_invalid(self.distances)
+        spans = np.array_split(np.arange(len(self.ages)), min(SPANS, len(self.ages)))
         for i, level in enumerate(self.levels):
             columns = slice(i * self.n, (i + 1) * self.n)
-            shares = [100 * np.nanmean(inside[span][:, columns]) for span in spans]
+            shares = [100 * (distances[span][:, columns] <= edge).mean() for span in spans]
             ages = [(self.ages[span].mean() + 1) * self.dt for span in spans]
             ax.semilogx(ages, shares, ".-", label=f"measurement noise {show_level(level)}")
         ax.axhline(100 * COVERAGE, color=TRUTH, lw=0.8)
         ax.set(xlabel="seconds since reset", ylabel="%", ylim=(0, 102), title="errors in regions of 90 %")
         ax.legend(loc="lower right")
 
-    def draw_estimates(self, axes: Sequence[Any], column: int, names: Sequence[str]) -> None:
+    def draw_estimates(self, axes: Sequence[Any], column: int, names: Sequence[str], *, recorded: bool) -> None:
         """Draw the states of a run and their estimates; of simulated runs the second half has process noise."""
         level, run = (self.levels[0], 0) if column == 0 else (self.levels[-1], self.n // 2)
         first = self.levels.index(level) * self.n
         t = np.arange(len(self.x)) * self.dt
+        x, x_hat = self.x[:, first + run], self.x_hat[:, first + run]
+        x_hat = np.where(np.isnan(x), np.nan, x_hat)  # recorded runs differ in length
         for ax, i, error in zip(axes, range(len(names)), self._errors(slice(first, first + self.n))):
-            ax.plot(t, self.x[:, first + run, i], color=TRUTH, lw=1.8, label="true")
-            ax.plot(t, self.x_hat[:, first + run, i], "--", color=ESTIMATE, label="estimated")
+            ax.plot(t, x[:, i], color=TRUTH, lw=1.8, label="true")
+            ax.plot(t, x_hat[:, i], "--", color=ESTIMATE, label="estimated")
             ax.set_ylabel(names[i])
             ax.set_title(f"rms error {error:.2g} %", loc="right")
-        axes[0].set_title(
-            f"measurement noise {show_level(level)}, process noise {self.process_noise[run]:g}", loc="left"
-        )
+        noise = f"measurement noise {show_level(level)}, process noise {self.process_noise[run]:g}"
+        axes[0].set_title("as recorded" if recorded else noise, loc="left")
         axes[0].legend(loc="upper right")
         axes[-1].set_xlabel("t in s")
 
     def _errors(self, columns: slice) -> np.ndarray:
         """Root mean square of the errors in the second half of runs, in percent of the states' standard deviations."""
-        late, size = slice(len(self.x) // 2, None), np.nanstd(self.x, axis=(0, 1))
-        error = np.sqrt(np.nanmean((self.x - self.x_hat)[late, columns] ** 2, axis=(0, 1)))
-        return np.asarray(100 * error / np.where(size > 0, size, np.nan))
+        x = np.ma.masked_invalid(self.x)
+        error = (x - self.x_hat)[len(x) // 2 :, columns]
+        ratio = 100 * np.ma.sqrt((error**2).mean((0, 1))) / x.std((0, 1))  # masked where a state does not move
+        return np.asarray(ratio.filled(np.nan))
 
 
 def draw_losses(ax: Any, result: Result) -> None:
