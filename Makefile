@@ -93,7 +93,7 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 	cp $(addprefix runs/benchmark/cpu/,results.csv methods.csv table.md) docs/results/benchmark
 	$(MAKE) figures
 
-SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transients adaptive lipschitz)
+SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transients)
 ABLATION := ablation-spinn $(SPINN) ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
 	default ablation-tuned
 

@@ -52,15 +52,15 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
     assert seen["sampler"].items() >= {**told, "process_noise_max": 0.0}.items()
 
 
-OPTIONS = {"input-aware": {}, "spinn": {"adaptive": True, "lipschitz_penalty": 0.1}}
+PIPELINES = ("input-aware", "spinn")
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """Of each pipeline a configuration, the folder of an uninterrupted run, and its artifact."""
     runs = {}
-    for method, options in OPTIONS.items():
-        config = toy(Oscillator(), method, duration=20.0, inverse_steps=200, **options)
+    for method in PIPELINES:
+        config = toy(Oscillator(), method, duration=20.0, inverse_steps=200)
         folder = tmp_path_factory.mktemp(method)
         runs[method] = config, folder, train(Oscillator(), config, folder, device=CPU).artifact
     return runs
@@ -70,7 +70,7 @@ def same_weights(one, other):
     return all(np.array_equal(a, b) for a, b in zip(one.mlp.weights, other.mlp.weights, strict=True))
 
 
-@pytest.mark.parametrize("method", OPTIONS)
+@pytest.mark.parametrize("method", PIPELINES)
 def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypatch, method, whole):
     config, _, expected = whole[method]
     monkeypatch.setattr(checkpoints, "SECONDS", 0.0)
@@ -170,24 +170,6 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
     error = artifact.forward(x) - x @ M.T
     relative = np.sqrt((error**2).mean() / ((x @ M.T) ** 2).mean())
     assert relative < 1e-3
-
-
-def test_training_on_a_solved_map(tmp_path):
-    sizes = {
-        "random_features": 200,
-        "forward_steps": 0,
-        "box_factor": 1.5,
-        "inverse_steps": 500,
-        "duration": 15.0,
-        "width": 32,
-    }
-    config = toy(Oscillator(), "spinn", **sizes)
-    result = train(Oscillator(), config, tmp_path)
-    assert list(result.losses) == ["inverse"]
-    assert result.artifact.forward.mlp.weights[0].shape == (200, 2)
-    runs = unseen_trajectories(Oscillator(), config.dt, n=20, duration=20.0, seed=0, domain="1.5X")
-    # long after the start, whose last traces in z an inverse of exact T(x) magnifies
-    assert np.median(errors(result.artifact, Oscillator(), runs, measurement_noise=0.0, seed=0, skip=12.0).late) < 5.0
 
 
 def test_the_papers_own_way_is_told_neither_noise_nor_age(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 
 from kkl_gym.envs import KKLEnv
 from kkl_gym.simulate import RATE_STEP, SubstepsError, simulate
-from kkl_gym.system import Box, System
+from kkl_gym.system import Box, System, rate_under
 from training.checking.finding import Finding, Verdict, number, percent
 from training.checking.subject import Motions, Subject
 from training.systems import named_policy
@@ -17,7 +17,6 @@ from training.systems import named_policy
 TOO_LOW, TOO_HIGH = 0.5, 20.0  # rate(x) in multiples of what the Jacobian says
 TIMED = 300  # steps of the environment
 SLOW = 500.0  # microseconds of such a step
-STEEP = 10  # times as many substeps late in motions as is typical
 MANY = 0.5  # share of motions from X that leave the bounds
 FEW = 0.1  # share of motions that run away where wider bounds help
 WIDER = 10.0  # times as wide are the bounds in which motions are followed that leave the declared ones
@@ -37,12 +36,13 @@ def rate(subject: Subject) -> Iterator[Finding]:
     typical, own = system.typical_rate, type(system).rate is not System.rate
     x = np.concatenate([subject.inner, subject.outer])
     with np.errstate(all="ignore"):
-        worst = float(np.nanmax(system.rate_under(subject.everywhere.T, system.u_max)))
-        said = np.broadcast_to(np.asarray(system.rate_under(x.T, system.u_max), dtype=float), len(x))
+        worst = float(np.nanmax(rate_under(system, subject.everywhere.T, system.u_max)))
+        said = np.broadcast_to(np.asarray(rate_under(system, x.T, system.u_max), dtype=float), len(x))
         norm = float(np.nanmedian(System.rate(system, x.T)))
     fastest = np.abs(np.linalg.eigvals(subject.jacobian(x))).max(1)
-    found = f"typically {number(typical)}/s in X, at most {number(worst)}/s within the bounds: "
-    found += f"{_substeps(typical, dt)} and {_substeps(worst, dt)} substeps of dt = {dt:g} s"
+    found = f"typically {number(typical)}/s in X, at most {number(worst)}/s within the bounds"
+    if own:
+        found += f": {_substeps(typical, dt)} and {_substeps(worst, dt)} substeps of dt = {dt:g} s"
     usual, of = (norm, "norm") if own else (float(np.median(fastest)), "fastest eigenvalue")
     if own and (np.median(said) < TOO_LOW * np.median(fastest) or _too_long(said, fastest, dt)):
         found += f". That is too little: the fastest eigenvalue of df/dx is {number(np.median(fastest))}/s at the "
@@ -50,12 +50,8 @@ def rate(subject: Subject) -> Iterator[Finding]:
         advice = f"leave rate(x) out, whose default says {number(norm)}/s at the median, or raise it: substeps, dt and "
         yield Finding("rate", "problem", found, advice + "eigenvalues follow from it")
     elif np.median(said) > TOO_HIGH * usual > 0:
-        found += f". The {of} of df/dx is {number(usual)}/s at the median over 2X: substeps are wasted"
-        advice = "lower rate(x)" if own else "let X's half-widths fit how far each state moves, or override rate(x)"
-        yield Finding("rate", "note", found, advice)
-    elif (late := _late_substeps(subject)) >= STEEP * _substeps(typical, dt):
-        found += f". Motions end where f is steep and takes {number(late)}: simulations run as much longer"
-        advice = "round f off there, such as sqrt(x) near 0 by x / sqrt(abs(x) + c) with a small c, or override rate(x)"
+        found += f". The {of} of df/dx is {number(usual)}/s at the median over 2X"
+        advice = "lower rate(x): substeps are wasted" if own else "let X's half-widths fit how far each state moves"
         yield Finding("rate", "note", found, advice)
     else:
         yield Finding("rate", "ok", found)
@@ -74,7 +70,7 @@ def speed(subject: Subject) -> Iterator[Finding]:
             env.reset()
     each = 1e6 * spent / TIMED
     own = subject.system.discrete or type(subject.system).rate is not System.rate
-    advice = "lower rate(x), or dt" if own else "override rate(x) with a formula: the default differentiates f"
+    advice = "lower rate(x), or dt" if own else "lower dt, or write f in fewer operations"
     slow = each > SLOW
     found = f"a step of one environment takes {each:.0f} µs"
     yield Finding("speed", "note" if slow else "ok", found, advice if slow else "")
@@ -156,14 +152,6 @@ def time_constants(subject: Subject) -> tuple[float, float]:
 
 def _substeps(rate: float, dt: float) -> int:
     return 1 << max(0, int(np.ceil(np.log2(rate * dt / RATE_STEP))))
-
-
-def _late_substeps(subject: Subject) -> float:
-    """Mean over the second half of motions."""
-    if isinstance(subject.motions, SubstepsError):  # the check of the bounds says so
-        return 1.0
-    x = subject.motions.x
-    return float(subject.substeps(x[len(x) // 2 :]).mean())
 
 
 def _too_long(said: np.ndarray, fastest: np.ndarray, dt: float) -> bool:

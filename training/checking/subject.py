@@ -8,7 +8,7 @@ import numpy as np
 from kkl_gym.compiled import SamplingStep, batch_step
 from kkl_gym.equations import input_matrix
 from kkl_gym.simulate import RATE_STEP, SubstepsError, simulate
-from kkl_gym.system import System
+from kkl_gym.system import System, rate_under
 from training.trajectories.controllers import Controller
 from training.trajectories.policy import under_policy
 from training.trajectories.signals import DRIVEN, random_inputs
@@ -149,7 +149,7 @@ class Subject:
     def substeps(self, x: np.ndarray) -> np.ndarray:
         """Substeps (steps,) for ``x`` (steps, n, nx) under the largest input, not rounded, and one at least."""
         with np.errstate(all="ignore"):
-            rate = self.system.rate_under(np.moveaxis(x, -1, 0), self.system.u_max)
+            rate = rate_under(self.system, np.moveaxis(x, -1, 0), self.system.u_max)
             need = np.broadcast_to(rate, x.shape[:-1]) * self.dt / RATE_STEP
         return np.asarray(np.nan_to_num(need, nan=1.0, posinf=1.0).clip(1.0).mean(-1))
 

@@ -143,8 +143,6 @@ class Train:
     def _changes(self) -> dict[str, Any]:
         """The settings that are to differ from the preset's: those of the file, and those of options before them."""
         changes = (read_changes(self.config) if self.config else {}) | self.settings
-        if changes.get("random_features"):
-            changes.setdefault("forward_steps", 0)  # what is solved for is not trained
         if self.uncertain:
             named = [name for name, _ in self.uncertain]
             if len({*named}) < len(named):

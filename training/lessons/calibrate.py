@@ -119,7 +119,8 @@ class _Calibration:
             distances, extremes = self.followed(artifact, report)
         if artifact.motion is not None:
             groups = (~self.noisy, self.noisy) if self.noisy.any() else (~self.noisy,)
-            factors = [[self.by_knot(of_level, group, self.factor) for of_level in distances] for group in groups]
+            usual = self.runs.usual
+            factors = [[self.by_knot(each, usual & group, self.factor) for each in distances] for group in groups]
             table = Factors(np.array(LEVELS), self.knots * artifact.filter.dt, np.array(factors))
             artifact = dataclasses.replace(artifact, motion=dataclasses.replace(artifact.motion, factors=table))
         return dataclasses.replace(artifact, limits=self.limits(extremes)) if monitored else artifact

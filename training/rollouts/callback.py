@@ -2,7 +2,6 @@
 
 import math
 import os
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,16 +22,15 @@ from observers import Artifact, KKLObserver
 from observers.checks import integer, shown
 from observers.replacement import check_replacement
 from training.maps.coordinates import settling_time
-from training.recorded.config import OF_THE_FILTER, OF_THE_MAPS, RecordedConfig, config_of
-from training.recorded.errorbars import learn_recorded_error_bars
-from training.recorded.errors import RecordedErrors, recorded_errors
-from training.recorded.fit import train_recorded
-from training.recorded.tracking import learn_recorded_tracking
+from training.config import Config, settings_of
+from training.presets import OF_THE_FILTER, OF_THE_MAPS
 from training.records import Record
 from training.rollouts.gathering import Gathering
+from training.sources.errors import RecordedErrors, recorded_errors
+from training.sources.recorded import RecordedSource
+from training.train_observer import train
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again
-QUICK_ERROR_BARS, QUICK_FLOW = 1000, 5000  # batches
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ class KKLTrainingCallback(BaseCallback):
     verbose : int, default 0
         Whether refits are printed, as for other callbacks.
     **settings : object
-        Of :class:`training.recorded.config.RecordedConfig`, where they are to differ from those that the observer was
+        Of :class:`training.Config`, where they are to differ from those that the observer was
         learned with; by default one network and 1,000 batches. What makes the filter stays: eigenvalues, dt and inputs.
 
     Attributes
@@ -124,7 +122,7 @@ class KKLTrainingCallback(BaseCallback):
     """
 
     artifact: Artifact
-    _config: RecordedConfig
+    _config: Config
     _level: float | tuple[float, ...]
     _gathering: Gathering
 
@@ -167,16 +165,14 @@ class KKLTrainingCallback(BaseCallback):
     def _init_callback(self) -> None:
         used = _observers(self.training_env)
         artifact = used[0].artifact
-        if artifact.environment is None or artifact.training.get("pipeline") != "recorded":
+        if artifact.environment is None or artifact.signals is None:
             raise ValueError(
                 f"the observer {artifact.system!r} in use was not learned from rollouts, and is not refitted to any; "
                 "learn one by training.learn, or by kkl-gym record and kkl-gym train"
             )
-        config = config_of(artifact, {**QUICK, **self._settings})
-        if artifact.inverse.spread is not None and not config.held_out:
-            raise ValueError(
-                "error bars are calibrated on episodes that are held out: held_out must be positive, got 0"
-            )
+        config = settings_of(artifact.training, **QUICK | self._settings | {"tracking": artifact.motion is not None})
+        if artifact.inverse.error_covariance is not None and not config.held_out:
+            raise ValueError("covariances are calibrated on episodes that are held out: held_out must be positive, got 0")
         for observer in used:
             check_replacement(artifact, observer.artifact)
             level = observer.measurement_noise
@@ -193,7 +189,7 @@ class KKLTrainingCallback(BaseCallback):
             check_replacement(self.artifact, artifact)
         self.artifact, self._config = artifact, config
         # An observer that tracks is judged under the noise that it sees, where outputs are recorded without.
-        seen = self._outputs != "y" and artifact.flow is not None
+        seen = self._outputs != "y" and artifact.motion is not None
         self._level = used[0].measurement_noise if seen else 0.0
 
     def _on_training_start(self) -> None:
@@ -240,21 +236,15 @@ class KKLTrainingCallback(BaseCallback):
         known = _vector_wrapper(self.training_env) is None
         self._gathering.begin(row, inside.reset_infos[row] if known else {}, goes_on=goes_on)
 
-    def _refit(self, train: list[Record], held_out: list[Record]) -> None:
+    def _refit(self, train_on: list[Record], held_out: list[Record]) -> None:
         began, old = time.monotonic(), self.artifact
-        with (
-            torch.random.fork_rng(),
-            tempfile.TemporaryDirectory() as folder,
-        ):  # the agent's random numbers stay its own
-            config = replace(self._config, held_out=0.0)
-            new = train_recorded(train, config, Path(folder) / "refit", name=old.system).artifact
-            try:
-                if old.inverse.spread is not None:
-                    new = learn_recorded_error_bars(new, train, held_out, steps=QUICK_ERROR_BARS)
-                if old.flow is not None:
-                    new = learn_recorded_tracking(replace(new, C=old.C), train, held_out, steps=QUICK_FLOW)
-            except ValueError as error:  # as of too little that is held out so far
-                warnings.warn(f"the observer in use stays: {error}", stacklevel=2)
+        with torch.random.fork_rng():  # the agent's random numbers stay its own
+            source = RecordedSource(train_on, self._config, old.system, held_out=held_out, C=old.C)
+            new = train(source).artifact
+        for what in ("motion", "error_covariance"):
+            here, there = (each if what == "motion" else each.inverse for each in (old, new))
+            if getattr(here, what) is not None and getattr(there, what) is None:
+                warnings.warn(f"the observer in use stays: too little is held out so far for its {what}", stacklevel=2)
                 return
         errors = recorded_errors(new, held_out, measurement_noise=self._level)
         before = _together(recorded_errors(old, held_out, measurement_noise=self._level))

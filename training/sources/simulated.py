@@ -23,7 +23,7 @@ from training.trajectories.record import Motions, record, recording_ages, trajec
 from training.trajectories.signals import DRIVEN, KINDS, random_inputs
 
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
-BEYOND = 2.0  # of X, from which half of the runs for calibration start, and a flow is learned
+BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned
 LEAST_NOISE, LEAST_PROCESS_NOISE = 0.001, 0.0005  # that a tracker assumes, of the usual, and at the system's pace
 WINDOW, RUN = 0.5, 20.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
 SUBSTEPS, INTEGRATION_ERROR = 64, 1e-5  # at most, of scaled states in a sample: far below the process noise assumed
@@ -131,12 +131,12 @@ class SimulatedSource:
         return dataclasses.replace(pairs, x=pairs.x[..., : self.nx + len(self.estimated)], nominal=nominal)
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
-        """Motions with the system's process noise, and as many without; half of each from X and half from 2X."""
+        """Motions with the system's process noise, and as many without; of each a third from 2X, the others from X."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed), round(RUN * self.pace / self.dt)
         plant, found = with_parameters(self.system, self.ranges), []
         levels = sorted({0.0, self.process_noise})
         for i, level in enumerate(levels):
-            x, u = sound_motions(
+            x, u, usual = sound_motions(
                 plant,
                 n=self.config.runs // len(levels),
                 steps=steps,
@@ -148,10 +148,11 @@ class SimulatedSource:
                 report=lambda done, i=i: report((i + done) / len(levels)),
                 box_factor=BEYOND,
             )
-            found.append((x, u, np.full(x.shape[1], level)))
-        xs, us, noise = zip(*found, strict=True)
+            found.append((x, u, np.full(x.shape[1], level), usual))
+        xs, us, noise, usual = zip(*found, strict=True)
         x = np.concatenate(xs, 1)
-        return Runs(x[..., : self.nx], plant.output(x), np.concatenate(us, 1)[..., : self.nu], np.concatenate(noise))
+        u = np.concatenate(us, 1)[..., : self.nu]
+        return Runs(x[..., : self.nx], plant.output(x), u, np.concatenate(noise), np.concatenate(usual))
 
     def equations(self) -> Equations:
         """The system's equations as an expression, with as many Runge-Kutta steps as its motions need."""
@@ -245,20 +246,21 @@ def sound_motions(
     process_noise: float | None = None,
     report: Report = lambda done: None,
     box_factor: float = 1.0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate motions with process noise, every other one under random inputs, half of them from a multiple of X.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Simulate motions with process noise, every other one under random inputs, every third from a multiple of X.
 
     Motions that leave the system's bounds are replaced. Under a policy half of them are its own, and in the others it
-    explores. Shapes: returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
+    explores. Shapes: returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu), and which start in X, (n,).
     """
     level = system.process_noise if process_noise is None else process_noise
-    kept: list[tuple[np.ndarray, np.ndarray]] = []
-    while (missing := n - sum(x.shape[1] for x, _ in kept)) > 0:
+    kept: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    while (missing := n - sum(x.shape[1] for x, *_ in kept)) > 0:
         if len(kept) == TRIES:
             raise ValueError(f"most motions of {steps * dt:g} s leave bounds = {system.bounds}: widen them, or shrink X")
         x0 = system.draw_starts(rng, missing)
-        far = np.arange(missing) % 4 >= 2
-        x0[far] = system.draw_starts(rng, int(far.sum()), box_factor)
+        far = (np.arange(missing) % 3 == 2) & (box_factor > 1)
+        if far.any():
+            x0[far] = system.draw_starts(rng, int(far.sum()), box_factor)
         w = draw_process_noise(system, level, n=missing, steps=steps, rng=rng)
         if policy and driven:
             x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=rng, own=np.arange(missing) % 2 == 1, w=w)
@@ -268,9 +270,9 @@ def sound_motions(
                 u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt=dt, rng=rng, kinds=DRIVEN)
             x = simulate(system, x0, steps, dt, u=u, w=w, report=lambda k: report(k / steps))
         inside = np.isfinite(x[-1]).all(-1)
-        kept.append((x[:, inside], u[:, inside]))
-    xs, us = zip(*kept, strict=True)
-    return np.concatenate(xs, 1), np.concatenate(us, 1)
+        kept.append((x[:, inside], u[:, inside], ~far[inside]))
+    xs, us, usual = zip(*kept, strict=True)
+    return np.concatenate(xs, 1), np.concatenate(us, 1), np.concatenate(usual)
 
 
 def unknown_start(system: System) -> tuple[np.ndarray, np.ndarray]:

@@ -15,16 +15,17 @@ Report = Callable[[float], object]
 
 @dataclass(frozen=True)
 class Runs:
-    """Whole motions, measured without noise, and their levels of process noise, of which there may be two.
+    """Whole motions, measured without noise; their levels of process noise, at most two; and which start usually.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
-    ``process_noise`` (n,).
+    ``process_noise`` (n,), ``usual`` (n,): True from X, False from beyond.
     """
 
     x: np.ndarray
     y: np.ndarray
     u: np.ndarray
     process_noise: np.ndarray
+    usual: np.ndarray
 
 
 class TooFewRunsError(ValueError):

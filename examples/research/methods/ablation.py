@@ -14,14 +14,13 @@ from kkl_gym.system import System
 from observers import Artifact
 from training.config import Pipeline
 from training.evaluation.levels import multiple
-from training.pipeline import train
 from training.presets import preset
 from training.spectrum import papers_spectrum
+from training.train_observer import train
 from training.tuning import Probe, Spectrum
 
 Settings = Mapping[str, Any]
 
-PENALTY = 0.03  # of the mean square error for a factor e in the Lipschitz constant
 NO_NOISE = 0.02  # of the system's own measurement noise: the largest in training of inverses for none
 # One inverse for free and driven motion, with samples drawn alike for all systems.
 TOGETHER: Settings = {
@@ -41,7 +40,6 @@ PAPERS: Settings = {
     "scaling": "range",
     "transients": False,
     "solved_output_layer": False,
-    "adaptive": False,
 }
 # Name, label and the settings of the paper that are the preset's from this step on.
 SPINN_STEPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
@@ -64,7 +62,9 @@ class Ablation(KKLMethod):
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
-        config = within(preset(task.system, self.pipeline, "fast"), task.budget, task.seed)
+        size = "large" if self.pipeline == "input-aware" else "default"
+        changes = {"tracking": False}
+        config = within(preset(task.system, self.pipeline, size=size, changes=changes), task.budget, task.seed)
         config = replace(config, **self.changes(task))
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 
@@ -95,17 +95,7 @@ def _spinn() -> list[Ablation]:
     for name, label, more in SPINN_STEPS:
         given_back += more
         methods.append(Ablation(name, label, _without(given_back), "spinn"))
-    adaptive: Settings = {"adaptive": True}
-    return [
-        *methods,
-        Ablation("ablation-spinn-adaptive", "... adaptive points", lambda task: adaptive, "spinn"),
-        Ablation(
-            "ablation-spinn-lipschitz",
-            "... Lipschitz penalty",
-            lambda task: {**adaptive, "lipschitz_penalty": PENALTY},
-            "spinn",
-        ),
-    ]
+    return methods
 
 
 def _without_noise(task: Task) -> Settings:

@@ -56,7 +56,7 @@ def observer_tasks(
     for way, (compiled, count) in ways.items():
         taken = tuple(each[: count + 1] for each in samples)
         tasks[f"KKL{way}"] = _stepping(KKLObserver(artifact, compiled=compiled), *taken)
-        if artifact.inverse.spread is not None:
+        if artifact.inverse.error_covariance is not None:
             observer = KKLObserver(artifact, compiled=compiled)
             tasks[f"KKL, error bars{way}"] = _stepping(observer, *taken, error_bars=True)
     R = measurement_covariance(system, artifact.measurement_noise)

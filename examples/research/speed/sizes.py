@@ -88,7 +88,7 @@ class Sizes:
 
     def _trained(self, system: System, changes: Mapping[str, Any], out: Path, progress: ProgressBars) -> Artifact:
         """Train an observer, or read an earlier training of the same."""
-        from training.pipeline import train
+        from training.train_observer import train
 
         config = preset(system, "input-aware", "fast", changes=changes)
         progress.say(f"an observer for {system.name} with hidden layers of {config.width}")

@@ -93,7 +93,7 @@ def test_a_linear_system_has_its_numbers():
     subject = Subject(Oscillator(), 0.01, 20.0)
     found = {name: next(THEN[name](subject)).found for name in ("rate", "sampling", "inputs", "bounds")}
     # The norm of ((0, 1), (-1, 0)), whose eigenvalues are +-i.
-    assert found["rate"] == "typically 1.41/s in X, at most 1.41/s within the bounds: 1 and 1 substeps of dt = 0.01 s"
+    assert found["rate"] == "typically 1.41/s in X, at most 1.41/s within the bounds"
     assert (
         "time constants 1 to 1 s (medians over X), of which the fastest spans 100 samples and a motion 20 of"
         in found["sampling"]
@@ -321,30 +321,27 @@ def test_motions_that_need_too_many_substeps(monkeypatch):
 
 def test_steps_that_take_long_and_samples_that_tell_nothing_new(monkeypatch):
     monkeypatch.setattr(dynamics, "SLOW", 0.0)
-    assert "override rate(x) with a formula" in one(Oscillator(), "speed", "note").advice
+    assert "lower dt" in one(Oscillator(), "speed", "note").advice
     assert "lower rate(x)" in one(made(**HIGH), "speed", "note").advice
     monkeypatch.setattr(dynamics, "IDLE", 0.02)
     found = one(Oscillator(), "sampling", "note", duration=10.0)
     assert found.advice == "samples tell hardly anything new: take dt = 0.05 s"
 
 
-@pytest.mark.parametrize(("smooth", "verdict", "seconds"), [(1e-30, "note", 100), (1e-3, "ok", 500)])
-def test_motions_that_come_to_where_f_is_steep(smooth, verdict, seconds, monkeypatch):
+@pytest.mark.parametrize(("smooth", "seconds"), [(1e-30, 100), (1e-3, 500)])
+def test_motions_that_come_to_where_f_is_steep(smooth, seconds, monkeypatch):
     """Two tanks that run empty. Of 1,000 intervals those are followed that 1,000 substeps make, or 200."""
     monkeypatch.setattr("training.checking.subject.STEPS", 1000)
     monkeypatch.setattr("training.checking.subject.MOTIONS", 20)
-    monkeypatch.setattr("training.checking.THEN", {name: THEN[name] for name in ("rate", "bounds")})
+    monkeypatch.setattr("training.checking.THEN", {"bounds": THEN["bounds"]})
     tanks = NO_INPUT | {"X": ((0.05, 0.6), (0.05, 0.6)), "bounds": ((-0.1, 2), (-0.1, 2)), "dt": 0.5, "duration": 500.0}
 
     def f(self, x):
         outflow = [0.0144 * level / sqrt(absolute(level) + smooth) for level in x]
         return -outflow[0], outflow[0] - outflow[1]
 
-    *_, rate, bounds = findings(made(**tanks, f=f), duration=None)
+    *_, bounds = findings(made(**tanks, f=f), duration=None)
     assert bounds.found.startswith(f"all of 20 motions of {seconds} s stay within them")
-    assert rate.verdict == verdict
-    assert ("end where f is steep" in rate.found) == (verdict == "note")
-    assert ("sqrt(abs(x) + c)" in rate.advice) == (verdict == "note")
 
 
 def test_motions_that_are_lost_take_no_substeps():

@@ -54,7 +54,7 @@ def _records():
         (RECORDED.replace("spring.csv", "time.csv"), "time.csv: column time, row 9: time must increase"),
         (RECORDED.replace("spring.csv", "number.csv"), "number.csv: column position, row 4: 'much' is no number"),
         ("train lorenz --forward-steps 5", "pipeline 'input-aware' does not go with forward_steps = 5"),
-        ("train lorenz --adaptive --no-transients", "adaptive = True, transients = False: settings of the pipeline"),
+        ("train lorenz --no-transients", "transients = False: settings of the pipeline"),
         ("train lorenz --config list.json", "list.json must be an object of settings among"),
         ("train lorenz --config binary.json", "binary.json is no JSON"),
         ("train lorenz --config policy.json", "it has .'policy'."),
