@@ -44,7 +44,9 @@ def simulate_faults(
         )
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
     steps = round(duration / dt)
-    x, u = sound_motions(system, n=trajectories, steps=steps, dt=dt, rng=rng, driven=bool(artifact.nu), policy=policy)
+    x, u, _ = sound_motions(
+        system, n=trajectories, steps=steps, dt=dt, rng=rng, driven=bool(artifact.nu), policy=policy
+    )
     clean = system.output(x)
     y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
     counted = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen it

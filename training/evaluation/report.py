@@ -79,6 +79,7 @@ class Followed:
         self.levels: list[Level] = [0.0, usual] if np.any(usual) else [0.0]
         rng = np.random.default_rng(0)
         self.n, self.process_noise, self.dt = runs.x.shape[1], runs.process_noise, artifact.filter.dt
+        self.usual = np.flatnonzero(runs.usual)  # covariances are those of motions from X
         self.x = np.concatenate([runs.x] * len(self.levels), axis=1)
         self.x_hat, steps = np.empty_like(self.x), len(runs.x)
         self.ages = np.unique(np.geomspace(1, steps, SAMPLES).round().astype(int)) - 1
@@ -107,7 +108,7 @@ class Followed:
         distances = np.ma.masked_invalid(self.distances)
         spans = np.array_split(np.arange(len(self.ages)), min(SPANS, len(self.ages)))
         for i, level in enumerate(self.levels):
-            columns = slice(i * self.n, (i + 1) * self.n)
+            columns = i * self.n + self.usual
             shares = [100 * (distances[span][:, columns] <= edge).mean() for span in spans]
             ages = [(self.ages[span].mean() + 1) * self.dt for span in spans]
             ax.semilogx(ages, shares, ".-", label=f"measurement noise {show_level(level)}")
