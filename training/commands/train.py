@@ -225,7 +225,7 @@ def summary(result: "Result") -> list[str]:
         each = ", ".join(f"{name} {error:.3g}" for name, error in errors.items())
         after = artifact.training["held_out_after"]
         lines.append(
-            f"rms error over standard deviation on what was held out: {each} (after {after:.2g} s of transient)"
+            f"rms error over standard deviation on held-out records: {each} (after {after:.2g} s of transient)"
         )
     return lines
 
