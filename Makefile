@@ -86,7 +86,7 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 
 SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transients)
 ABLATION := ablation-spinn $(SPINN) ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
-	default ablation-tuned
+	default
 
 ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumable
 	$(BIN)/python -m examples.research benchmark --budget short --methods $(ABLATION) --out runs/benchmark/ablation

@@ -76,7 +76,6 @@ def test_following_the_page_adds_a_system(tmp_path):
 
     look = root / "runs" / "first-look"
     assert {path.name for path in look.iterdir() if path.is_file()} >= {"fitzhugh_nagumo.safetensors", "report.png"}
-    assert {path.name for path in (look / "tuning").iterdir()} >= {"config.json", "front.csv", "front.png"}
     certificates = {path.name for path in (look / "certificates").iterdir()}
     assert certificates == {"table.md", "fitzhugh_nagumo.json", "fitzhugh_nagumo.png"}
     assert len((look / "faults" / "faults.csv").read_text().splitlines()) == 1 + 8 * 4

@@ -71,7 +71,6 @@ def test_own_system(tmp_path, monkeypatch):
 # What makes each of the commands for a system of one's own a matter of seconds.
 SMALL = {
     "check": "",
-    "tune": "--modes 2 --duration 5",
     "train": "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch 64 --inverse-steps 9 --threads 1",
     "evaluate": "--trajectories 3 --duration 8",
     "certify": "--trajectories 2",
@@ -175,7 +174,7 @@ def test_adaptation(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_from_csv(tmp_path, capsys):
-    sizes = {"seconds": 4.0, "steps": 60, "inverse_steps": 400, "trajectories": 60}
+    sizes = {"seconds": 4.0, "inverse_steps": 400, "trajectories": 60}
     mu, with_estimate, with_state = example("from_csv")(**sizes, out=tmp_path)
     assert abs(mu - 3.3) < 0.4
     assert with_state < with_estimate < 0.3  # 0.38 without control

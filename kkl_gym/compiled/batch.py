@@ -33,7 +33,7 @@ class CompiledBatch:
         """The next states, (nx, n), from states (nx, n), inputs (nu, n) and process noise (nx, n)."""
         out, lost = self._substeps(x, u, w, dt)
         if lost:
-            rows = np.flatnonzero(np.isnan(out[0]))
+            rows = np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x[0]))  # motions that are lost stay so
             out[:, rows] = advance_batch(self.system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out
 

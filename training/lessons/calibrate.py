@@ -96,7 +96,9 @@ class _Calibration:
         self.knots = np.array(sorted({k for k in knots if k < last} | {last}))
         between = np.sqrt(self.knots[1:] * np.maximum(self.knots[:-1], 0.5))
         edges = [0.0, *between.tolist(), float(steps)]
-        self.spans = [np.unique(np.linspace(a, b, PER_AGE).round()).astype(int) for a, b in zip(edges, edges[1:])]
+        counts = [PER_AGE] * len(between) + [4 * PER_AGE]
+        spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts))
+        self.spans = [np.unique(span.round()).astype(int) for span in spans]
         self.ages = np.unique(np.concatenate(self.spans))
         self.informed = "measurement_noise" in artifact.inverse.features
         largest = artifact.inverse.measurement_noise_max

@@ -5,19 +5,16 @@ One series of steps leads from the paper's SPINN to the package's, the other fro
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 from examples.research.methods.base import Configuration, Task
 from examples.research.methods.kkl import KKLMethod, within
-from kkl_gym.system import System
 from observers import Artifact
 from training.config import Pipeline
 from training.evaluation.levels import multiple
 from training.presets import preset
 from training.spectrum import papers_spectrum
 from training.train_observer import train
-from training.tuning import Probe, Spectrum
 
 Settings = Mapping[str, Any]
 
@@ -74,17 +71,6 @@ def papers_modes(task: Task) -> Settings:
     return {"eigenvalues": papers_spectrum(task.system), "pairs": ()}
 
 
-@cache
-def tuned_spectrum(system: System, dt: float, duration: float) -> Spectrum:
-    """Choose modes for a system's own level of noise, as ``kkl-gym tune`` does; each system is tuned once."""
-    return Probe(system, dt, duration).choose(multiple(system, 1.0))[-1].spectrum
-
-
-def _tuned(task: Task) -> Settings:
-    spectrum = tuned_spectrum(task.system, task.budget.dt, task.budget.duration)
-    return {"eigenvalues": spectrum.eigenvalues, "pairs": spectrum.pairs}
-
-
 def _without(given_back: tuple[str, ...]) -> Callable[[Task], Settings]:
     """The paper's settings, without some that are the preset's."""
     return lambda task: {key: value for key, value in {**papers_modes(task), **PAPERS}.items() if key not in given_back}
@@ -111,4 +97,3 @@ INVERSE_METHODS = [
     Ablation("ablation-soap", "... by SOAP", lambda task: TOGETHER, "input-aware"),
     Ablation("ablation-free", "... inverse of free motion", lambda task: {"process_noise_share": 0.0}, "input-aware"),
 ]
-TUNED = Ablation("ablation-tuned", "... tuned spectrum", _tuned, "input-aware")

@@ -43,7 +43,7 @@ class Sizes:
     widths: tuple[int, ...] = (16, 24, 40, 64, 128, 256)
     """Neurons in each hidden layer."""
     config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None
-    """Settings that differ from the preset's, as `kkl-gym tune` writes them."""
+    """JSON file of settings that differ from the preset's."""
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y, for errors under noise."""
     trajectories: int = 100

@@ -10,16 +10,13 @@ from kkl_gym import EquationError
 from kkl_gym.compiled import single_step
 from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.system import System
-from training.checking.finding import Finding, Verdict, number, percent
-from training.checking.subject import Subject, of_bounds, of_X
+from training.diagnosis.finding import Finding, Verdict, number, percent
+from training.diagnosis.subject import POINTS, Subject, of_bounds, of_X
 
 COMPARED = 100  # points of X, and as many of the bounds, at which the kinds of numbers are compared
-COARSE = 1e-3  # of X, from which on the spacing of float32 shows in what agents see
-LEAST_EFFECT = 1e-9  # of an input at its bound, in half-widths of X over 1 / rate
+LEAST_EFFECT = 1e-11  # of an input at its bound within a sampling interval, in half-widths of X
 
-Evaluation = Callable[[Any], list[Any]]
-"""From components of a state to all that the equations say there."""
-
+Evaluation = Callable[[Any], list[Any]]  # from components of a state to all that the equations say there
 COST = {
     "floats": "single environments and observers do not run",
     "arrays": "batches, training and evaluation do not run",
@@ -33,19 +30,10 @@ def declaration(system: System) -> Iterator[Finding]:
     """States, inputs and parameters."""
     bounds = ", ".join(f"{u_max:g}" for u_max in system.u_max)
     values = ", ".join(f"{name} = {value:g}" for name, value in system.parameters.items())
-    found = [
-        f"{system.name}: {_counted(system.nx, 'state')} ({', '.join(system.state_names)})",
-        f"{_counted(system.nu, 'input')} up to {bounds}" if system.nu else "no inputs",
-        f"parameters {values}" if values else "no parameters",
-    ]
-    if system.discrete:
-        found.append(f"steps of {system.dt:g} s of its own")
-    yield Finding("system", "ok", "; ".join(found))
-    for name, (low, high), ends in zip(system.state_names, system.X, system.bounds, strict=True):
-        spacing = float(np.spacing(np.float32(np.abs(ends).max())))
-        if spacing > COARSE * (high - low):
-            told = f"agents see float32, which tells {name} to {spacing:.2g}, {percent(spacing / (high - low))} of X"
-            yield Finding("system", "note", told, "let the state be what it differs by from a value in the middle")
+    found = f"{system.name}: {system.nx} state{'s' * (system.nx > 1)} ({', '.join(system.state_names)}); "
+    found += f"{system.nu} input{'s' * (system.nu > 1)} up to {bounds}; " if system.nu else "no inputs; "
+    found += f"parameters {values}" if values else "no parameters"
+    yield Finding("system", "ok", found + (f"; steps of {system.dt:g} s of its own" if system.discrete else ""))
 
 
 def starts(system: System) -> Iterator[Finding]:
@@ -54,17 +42,12 @@ def starts(system: System) -> Iterator[Finding]:
         return
     low, high = np.array(system.bounds, dtype=float).T
     for factor in (1.0, 2.0):
-        x = system.draw_starts(np.random.default_rng(0), COMPARED, factor)
-        call = f"draw_starts(rng, {COMPARED}, {factor:g})"
+        x, call = of_X(system, COMPARED, factor), f"draw_starts(rng, {COMPARED}, {factor:g})"
         if np.shape(x) != (COMPARED, system.nx):
-            found = f"{call} returns starts of shape {np.shape(x)}"
-            yield Finding("starts", "problem", found, f"return an array of shape ({COMPARED}, {system.nx})")
-            return
-        inside = ((x >= low) & (x <= high)).all(1)
-        if not inside.all():
-            found = f"{percent(1 - inside.mean())} of the starts of {call} lie beyond the bounds"
-            yield Finding("starts", "problem", found, "draw them within the bounds, or widen those")
-            return
+            raise ValueError(f"{call} returns starts of shape {np.shape(x)}; return ({COMPARED}, {system.nx})")
+        if outside := (~((x >= low) & (x <= high)).all(1)).mean():
+            found = f"{percent(outside)} of the starts of {call} lie beyond the bounds"
+            raise ValueError(f"{found}; draw them within the bounds, or widen those")
     yield Finding("starts", "ok", "draw_starts of its own, all within the bounds")
 
 
@@ -85,12 +68,9 @@ def kinds_of_numbers(system: System) -> Iterator[Finding]:
         apart = _apart(expected, values, rate=not system.discrete)
         if apart.any():
             where = np.array2string(x[int(apart.argmax())], separator=", ", precision=4)
-            yield Finding(
-                "equations",
-                "problem",
-                f"on {kind} they do not say what they say on {agreeing[0]}, such as at x = {where}",
-                "let them depend on state, input and parameters alone, and replace `if` by kkl_gym.elementary.where",
-            )
+            found = f"on {kind} they do not say what they say on {agreeing[0]}, such as at x = {where}"
+            advice = "let them depend on state, input and parameters alone; replace `if` by kkl_gym.elementary.where"
+            yield Finding("equations", "problem", found, advice)
             continue
         agreeing.append(kind)
     if agreeing:
@@ -101,65 +81,56 @@ def kinds_of_numbers(system: System) -> Iterator[Finding]:
 
 def machine_code(subject: Subject) -> Iterator[Finding]:
     """Whether batches and single environments run as machine code."""
+    obstacle = subject.step.obstacle
     if importlib.util.find_spec("numba") is None:
         yield Finding("compiled", "note", "Numba is not installed: batches run on NumPy", 'pip install "kkl-gym[fast]"')
-        return
-    obstacle = subject.step.obstacle
-    if obstacle is None:
+    elif subject.system.discrete:
+        yield Finding("compiled", "ok", "nothing to compile: the system is not integrated")
+    elif obstacle is None:
         slow = single_step(subject.system).obstacle
         singly = "and so do single ones" if slow is None else f"single ones take their steps in Python ({slow})"
         yield Finding("compiled", "ok", f"large batches of environments run as machine code, {singly}")
-    elif subject.system.discrete:
-        yield Finding("compiled", "ok", "nothing to compile: the system is not integrated")
     else:
-        yield Finding(
-            "compiled",
-            "note",
-            f"batches run on NumPy, several times slower: {obstacle}",
-            "write the equations in arithmetic and functions of kkl_gym.elementary, if speed matters",
-        )
+        found = f"batches run on NumPy, several times slower: {obstacle}"
+        advice = "write the equations in arithmetic and functions of kkl_gym.elementary, if speed matters"
+        yield Finding("compiled", "note", found, advice)
 
 
 def finite(subject: Subject) -> Iterator[Finding]:
     """Whether f and h are numbers in X, in 2X and within the bounds."""
-    system = subject.system
-    shares = []
-    for name, x in (("X", subject.inner), ("2X", subject.outer), ("the bounds", subject.everywhere)):
+    system, shares, where = subject.system, list[str](), ""
+    for name, x in subject.points.items():
         with np.errstate(all="ignore"):
-            good = np.isfinite(np.concatenate([system.drift(x), system.output(x)], axis=1)).all(1)
-        shares.append((1 - good.mean(), name, x, good))
-    if not any(share for share, *_ in shares):
-        yield Finding("finite", "ok", f"f and h are finite at {3 * len(subject.inner)} points of X, 2X and the bounds")
+            bad = ~np.isfinite(np.concatenate([system.drift(x), system.output(x)], axis=1)).all(1)
+        if bad.any():
+            shares.append(f"{percent(bad.mean())} of {name}")
+            where = where or np.array2string(x[bad][0], separator=", ", precision=4)
+    if not shares:
+        yield Finding("finite", "ok", f"f and h are finite at {POINTS} points each of {', '.join(subject.points)}")
         return
-    *_, x, good = max(shares, key=lambda one: one[0])
-    found = ", ".join(f"{percent(share)} of {name}" for share, name, *_ in shares if share)
-    where = np.array2string(x[~good][0], separator=", ", precision=4)
-    edge = _separating(system, x, good)
-    advice = f"draw the bounds, and X, where the equations hold{edge}, or change the equations"
-    yield Finding("finite", "problem", f"f or h is no finite number in {found}, such as at x = {where}", advice)
+    found = f"f or h is no finite number in {', '.join(shares)}, such as at x = {where}"
+    yield Finding(
+        "finite", "problem", found, "draw the bounds, and X, where the equations hold, or change the equations"
+    )
 
 
 def inputs(subject: Subject) -> Iterator[Finding]:
-    """Whether each input moves something."""
-    system, x = subject.system, subject.inner
-    none = np.zeros((len(x), system.nu))
+    """Whether each input moves something within a sampling interval."""
+    system, x = subject.system, subject.points["X"].T
     for j, u_max in enumerate(system.u_max):
-        full = none.copy()
-        full[:, j] = u_max
-        effect = subject.derivative(x, full) - subject.derivative(x, none)
-        size = np.sqrt(np.nanmean(effect**2, axis=0)) / subject.half
-        name, most = f"input {j + 1}", int(size.argmax())
-        if size[most] <= LEAST_EFFECT * subject.rate:
-            yield Finding(
-                "inputs", "problem", f"{name} moves no state", f"give column {j + 1} of G, or of g(x), its numbers"
-            )
-        else:
-            yield Finding(
-                "inputs",
-                "ok",
-                f"{name} at its bound {u_max:g} moves {system.state_names[most]} by "
-                f"{number(size[most] * subject.half[most])} per second",
-            )
+        ends = []
+        for size in (u_max, 0.0):
+            u = np.zeros((system.nu, POINTS))
+            u[j] = size
+            ends.append(subject.step(x, u, np.zeros_like(x), subject.dt))
+        speed = np.sqrt(np.nanmean((ends[0] - ends[1]) ** 2, axis=1)) / subject.dt
+        most = int((speed / subject.half).argmax())
+        if speed[most] * subject.dt <= LEAST_EFFECT * subject.half[most]:
+            advice = f"give column {j + 1} of G, or of g(x), its numbers"
+            yield Finding("inputs", "problem", f"input {j + 1} moves no state", advice)
+            continue
+        moved = f"{system.state_names[most]} by {number(speed[most])} per second"
+        yield Finding("inputs", "ok", f"input {j + 1} at its bound {u_max:g} moves {moved}")
 
 
 def _everything(system: System) -> Evaluation:
@@ -217,17 +188,3 @@ def _apart(expected: np.ndarray, values: np.ndarray, *, rate: bool) -> np.ndarra
         part = np.full(expected.shape[1], 1e-6)
         part[-1:] = 1e-3 if rate else 1e-6
         return np.asarray((both & (np.abs(expected - values) > part * np.abs(expected) + 1e-9 * size)).any(1))
-
-
-def _separating(system: System, x: np.ndarray, good: np.ndarray) -> str:
-    """Say which value of one state parts good points from bad ones, if one does."""
-    for name, value in zip(system.state_names, x.T, strict=True):
-        if good.any() and value[~good].max() < value[good].min():
-            return f", which is for {name} above {value[good].min():.4g}"
-        if good.any() and value[~good].min() > value[good].max():
-            return f", which is for {name} below {value[good].max():.4g}"
-    return ""
-
-
-def _counted(n: int, what: str) -> str:
-    return f"{n} {what}" + ("" if n == 1 else "s")

@@ -1,24 +1,31 @@
-"""What records with states say of observability: no equations, and nothing is trained."""
+"""What outputs and inputs determine of hidden signals, from records or rollouts: nothing is trained."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from rich.console import Console
 from scipy.spatial import cKDTree
 
 from observers import LinearFilter
 from observers.checks import integer, noise_levels, shown
+from training.diagnosis.signals import DETERMINED, Observability
 from training.evaluation.levels import Level
 from training.filter_noise import noise_covariance, root
 from training.maps.coordinates import coordinates, settling_time, spread
-from training.neighbours import Told, told
-from training.observable.found import DETERMINED, Observability
-from training.recorded.config import recorded_config
-from training.recorded.preparing import FEW, filter_of, split
-from training.recorded.windows import along, restarted, samples_as_old, taken
+from training.neighbours import told
+from training.presets import recorded_preset
+from training.progress import ProgressBars, progress_bars
 from training.records import Record, check_signals, pieces, resampled
+from training.rollouts import Policy, make, policy_of, roll_out
+from training.rollouts.policies import RANDOM
 from training.seeds import Stream, generator
+from training.sources.recorded import FEW, split
+from training.sources.windows import along, restarted, samples_as_old, taken
+from training.spectrum import Spectrum
 
+STEPS = 10_000  # played in an environment, by default
 ASKING, OTHERS = 500, 40_000  # samples at most
 ASKING_SHARE = 0.2  # of the records, whose samples look for neighbours among those of the others
 FEWEST_ASKING = 50  # samples, for a judgement
@@ -27,13 +34,75 @@ NOISE_SHARES = 0.01, 0.1  # of an output's standard deviation, where no level is
 FALLS = 1.25  # error with half of the samples over that with all, beyond which more would tell more
 
 
-def of_records(
-    records: Sequence[Record],
+def observability(
+    env_id: str,
     *,
+    measured: Sequence[str | int],
+    hidden: Sequence[str | int],
+    policy: str | Policy = RANDOM,
+    episodes: int | None = None,
+    steps: int | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
     measurement_noise: Sequence[Level] | None = None,
-    linear: LinearFilter | None = None,
     seed: int = 0,
-    report: Callable[[float], object] = lambda share: None,
+    console: Console | ProgressBars | None = None,
+) -> Observability:
+    """Find which hidden signals of any environment its outputs and actions determine, before an observer is trained.
+
+    Parameters
+    ----------
+    env_id : str
+        As ``gym.make`` takes it.
+    measured, hidden : sequence of str or int
+        What an observer would see, and what it would estimate, as for :func:`training.learn`.
+    policy : str or callable
+        Who acts, see :func:`training.rollouts.policy_of`. What is found holds where it has been.
+    episodes, steps : int, optional
+        How much is played, to whichever is reached first; by default 10,000 steps.
+    env_kwargs : mapping of str to object, optional
+        Arguments of the environment.
+    measurement_noise : sequence of (float or tuple of float), optional
+        Standard deviations on each sample of y, of all outputs or each, beside 0; by default 1 % and 10 % of those of
+        the outputs.
+    seed : int
+        Of the rollouts and of the comparison.
+    console : rich.console.Console or ProgressBars, optional
+        Where progress is shown; by default nowhere.
+
+    Returns
+    -------
+    Observability
+        What was found; ``judgements`` says it in words.
+
+    Raises
+    ------
+    ValueError
+        If an argument makes no sense, or as :func:`training.diagnosis.of_records`.
+    """
+    if episodes is None and steps is None:
+        steps = STEPS
+    if not hidden:
+        raise ValueError("say which signals are hidden, as in hidden=[2]")
+    with (
+        progress_bars(console) as progress,
+        make(env_id, env_kwargs) as env,
+        progress.phase(f"playing {env_id}", steps or episodes or 1) as report,
+    ):
+        rollouts = roll_out(
+            env,
+            policy_of(policy, env),
+            measured=list(map(str, measured)),
+            hidden=list(map(str, hidden)),
+            episodes=episodes,
+            steps=steps,
+            seed=seed,
+            report=report,
+        )
+    return of_records(rollouts.records(), measurement_noise=measurement_noise, seed=seed)
+
+
+def of_records(
+    records: Sequence[Record], *, measurement_noise: Sequence[Level] | None = None, seed: int = 0
 ) -> Observability:
     """Find what recorded outputs and inputs tell of recorded states.
 
@@ -46,23 +115,19 @@ def of_records(
     signals = records[0].signals
     if any(record.x is None for record in records):
         raise ValueError("no hidden states were recorded; name their columns (--hidden)")
-    linear = linear or filter_of(recorded_config(records), signals)
+    config = recorded_preset(records)
+    spectrum = Spectrum(config.eigenvalues, config.pairs)
+    linear = spectrum.filter(len(signals.measured), config.dt, len(signals.inputs))
     records = [resampled(record, linear.dt) for record in records]
     noise = _levels(records, measurement_noise)
     others, asking = (Filtered(pieces(part), linear) for part in split(records, ASKING_SHARE, seed))
     rng = generator(Stream.VALIDATION, seed, 1)
     settled = settling_time(linear) / linear.dt
     last, memory = int(np.ceil(np.log2(settled))), settled / np.log(1e3)  # beyond which it forgets where a window began
-    windows, found = [0, *(2**i for i in range(last + 1))], list[_Compared]()
-    for done, window in enumerate(windows):
-        report(done / len(windows))
-        compared = _compared(
-            asking.samples(window, ASKING),
-            others.samples(window, OTHERS),
-            covariance=noise_covariance(linear, np.array([window]))[0],
-            noise=noise,
-            rng=rng,
-        )
+    windows, found = [0, *(2**i for i in range(last + 1))], list[Compared]()
+    for window in windows:
+        samples = asking.samples(window, ASKING), others.samples(window, OTHERS)
+        compared = compare(*samples, covariance=noise_covariance(linear, np.array([window]))[0], noise=noise, rng=rng)
         if compared is None:
             break
         found.append(compared if window <= memory else replace(compared, change=np.full_like(compared.half, np.nan)))
@@ -71,7 +136,6 @@ def of_records(
             f"{sum(len(record.t) for record in records)} samples in {len(records)} records are too few to say anything "
             f"of {', '.join(signals.hidden)}: record more"
         )
-    errors = np.stack([np.stack([one.left for one in each.levels]) for each in found], 1)
     result = Observability(
         signals.measured,
         signals.inputs if linear.nu else (),
@@ -79,10 +143,8 @@ def of_records(
         dt=linear.dt,
         windows=tuple(windows[: len(found)]),
         noise=noise,
-        errors=errors,
-        predicted=errors.min(1),
+        errors=np.stack([np.stack(each.levels) for each in found], 1),
         changes=np.stack([each.change for each in found]),
-        linear=np.stack([each.levels[0].linear for each in found]),
     )
     halves = np.stack([each.half for each in found])
     return replace(result, warnings=tuple(_warnings(result, halves, records=len(records), windows=windows)))
@@ -138,41 +200,36 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class _Compared:
-    """What a window tells: at each level of noise, and without any of changes, and to who has half of the samples."""
+class Compared:
+    """Errors by level of noise, and without any those of changes, and those with half of the samples."""
 
-    levels: list[Told]
+    levels: list[np.ndarray]
     change: np.ndarray
     half: np.ndarray
 
 
-def _compared(
+def compare(
     asking: Samples, others: Samples, *, covariance: np.ndarray, noise: Sequence[Level], rng: np.random.Generator
-) -> _Compared | None:
-    """Compare samples at all levels of noise; None where there are too few.
-
-    ``covariance`` (ny, size, size) is that of the noise in z for a standard deviation of 1 on each output.
-    """
+) -> Compared | None:
+    """Compare samples at all levels of noise, with its ``covariance`` in z; None where there are too few samples."""
     if len(asking.z) < FEWEST_ASKING or len(others.z) <= FEWEST_OTHERS * others.z.shape[1]:
         return None
     levels = []
     for level in noise:
-        variances = np.broadcast_to(np.square(level), len(covariance))
-        own = np.einsum("j,jab->ab", variances, covariance)
+        own = np.einsum("j,jab->ab", np.broadcast_to(np.square(level), len(covariance)), covariance)
         scaled = coordinates(others.z, own if np.any(level) else covariance.sum(0))
         share = 1 / (1 + scaled.noise_gain**2) if np.any(level) else 1.0  # of signal in each coordinate
         R = root(own).T
         z, others_z = (share * scaled(each.z + rng.standard_normal(each.z.shape) @ R) for each in (asking, others))
         if np.any(level):
-            levels.append(told(z, asking.x, others_z=others_z, others_x=others.x))
+            levels.append(told(z, asking.x, others_z=others_z, others_x=others.x).left)
             continue
-        of_both = [np.hstack([each.x, each.change]) for each in (asking, others)]
-        both = told(z, of_both[0], others_z=others_z, others_x=of_both[1])
-        nx = asking.x.shape[1]
-        change = both.left[nx:]
-        levels.append(Told(both.left[:nx], both.linear[:nx]))
+        of_both, of_others = (np.hstack([each.x, each.change]) for each in (asking, others))
+        both = told(z, of_both, others_z=others_z, others_x=of_others).left
+        left, change = np.split(both, 2)
+        levels.append(left)
         half = told(z, asking.x, others_z=others_z[::2], others_x=others.x[::2]).left
-    return _Compared(levels, change, half)
+    return Compared(levels, change, half)
 
 
 def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows: Sequence[int]) -> Iterator[str]:
@@ -185,7 +242,7 @@ def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows
     if len(found.windows) < len(windows):
         yield (
             f"windows of {windows[len(found.windows)]} steps and more are left out, as too few samples have so many "
-            "before them: record longer episodes, or more"
+            "before them; record longer episodes, or more"
         )
     for i, name in enumerate(found.hidden):
         exact = found.errors[0, :, i]
@@ -193,5 +250,5 @@ def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows
         if exact[best] > DETERMINED and halves[best, i] > FALLS * exact[best]:
             yield (
                 f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * halves[best, i]:.2g} % with "
-                "half of them: with more it will be less"
+                "half of them; record more, with which it will be less"
             )

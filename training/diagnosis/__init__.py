@@ -1,7 +1,6 @@
-"""Whether a system is ready for training, and what to change: what ``kkl-gym check`` prints."""
+"""Can this be observed, and learned? Checks of a system, of recorded data and of an environment, before a training."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from numpy.linalg import LinAlgError
@@ -9,9 +8,12 @@ from numpy.linalg import LinAlgError
 from kkl_gym.simulate import SubstepsError, check_duration, check_interval
 from kkl_gym.system import System
 from observers.checks import check_dt
-from training.checking import dynamics, equations, levels, observability
-from training.checking.finding import Finding, Verdict
-from training.checking.subject import Subject
+from training.diagnosis import equations, levels, motion, outputs
+from training.diagnosis.finding import Finding, Verdict
+from training.diagnosis.records import observability, of_records
+from training.diagnosis.signals import Judgement, Observability
+from training.diagnosis.subject import Subject
+from training.evaluation.levels import Level
 from training.trajectories.controllers import Controller
 
 FIRST: dict[str, Callable[[System], Iterator[Finding]]] = {
@@ -23,16 +25,12 @@ THEN: dict[str, Callable[[Subject], Iterator[Finding]]] = {
     "compiled": equations.machine_code,
     "finite": equations.finite,
     "inputs": equations.inputs,
-    "rate": dynamics.rate,
-    "speed": dynamics.speed,
-    "bounds": dynamics.bounds,
-    "sampling": dynamics.sampling,
+    "bounds": motion.bounds,
+    "rate": motion.rate,
+    "sampling": motion.sampling,
     "output": levels.outputs,
-    "target": levels.target,
     "process noise": levels.process_noise,
-    "spectrum": observability.spectrum,
-    "observability": observability.observability,
-    "spinn": observability.smooth,
+    "observability": outputs.observability,
 }
 
 
@@ -42,7 +40,7 @@ def check(
     dt: float | None = None,
     duration: float | None = None,
     policy: Controller | None = None,
-    spinn: bool = False,
+    measurement_noise: Sequence[Level] | None = None,
 ) -> Iterator[Finding]:
     """Look for what would go wrong with a system in environments, training and evaluation."""
     for name, look in FIRST.items():
@@ -51,30 +49,30 @@ def check(
         if any(finding.verdict == "problem" for finding in findings):
             yield Finding(name, "note", "all other checks are left out", "mend this first")
             return
-    interval = system.dt if dt is None else check_dt(dt)
+    interval, noise = system.dt if dt is None else check_dt(dt), outputs.noise_of(system, measurement_noise)
+    subject = Subject(system, interval, system.duration if duration is None else duration, policy, noise)
     try:
         check_interval(system, interval)
-    except SubstepsError as error:
-        yield Finding("sampling", "problem", *str(error).split(": ", 1))
-        return
-    subject = Subject(system, interval, system.duration if duration is None else duration, policy)
-    check_duration(subject.duration, interval)
-    if duration is None:
-        subject = replace(subject, duration=subject.affordable())
-    for name, look_at in THEN.items():
-        if name != "spinn" or spinn:
+        check_duration(subject.duration, interval)
+        for name, look_at in THEN.items():
             yield from _guarded(name, look_at, subject)
+    except SubstepsError as error:
+        yield _problem("sampling", error)
 
 
 def _guarded(name: str, look: Callable[[Any], Iterator[Finding]], at: System | Subject) -> Iterator[Finding]:
     """What a check says, and what it raises as a problem."""
     try:
         yield from look(at)
-    except SubstepsError as error:
-        found, _, advice = str(error).partition("; ")
-        yield Finding(name, "problem", found, advice)
+    except SubstepsError:
+        raise
     except (ValueError, ArithmeticError, LinAlgError) as error:
-        yield Finding(name, "problem", str(error))
+        yield _problem(name, error)
 
 
-__all__ = ["Finding", "Verdict", "check"]
+def _problem(name: str, error: Exception) -> Finding:
+    found, _, advice = str(error).partition("; ")
+    return Finding(name, "problem", found, advice)
+
+
+__all__ = ["Finding", "Judgement", "Observability", "Verdict", "check", "observability", "of_records"]
