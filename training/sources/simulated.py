@@ -174,7 +174,7 @@ class SimulatedSource:
         rng = generator(Stream.CALIBRATION, self.config.seed, 5)
         along, u = self._states(300)
         rows = rng.integers(len(along), size=INCREMENTS)
-        size = np.exp(rng.uniform(*np.log(DEVIATIONS), (INCREMENTS, 1)))
+        size = np.exp(rng.uniform(np.log(DEVIATIONS[0]), np.log(DEVIATIONS[1]), (INCREMENTS, 1)))
         low, high = (np.array(bound) for bound in zip(*self.system.bounds, strict=True))
         x = np.clip(along[rows] + size * self._scale[1] * rng.standard_normal((INCREMENTS, self.nx)), low, high)
         u = np.where(rng.random((INCREMENTS, 1)) < 0.5, 0.0, u[rows]) if self.nu else np.zeros((INCREMENTS, 0))
