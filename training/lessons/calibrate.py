@@ -2,13 +2,14 @@
 
 import dataclasses
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from scipy.special import gammaincinv
 
 from kkl_gym.system import System
-from observers import Artifact, ErrorCovariance, Factors, InverseMap, KKLObserver, Limits, Motion
+from observers import Artifact, ErrorCovariance, Factors, InverseMap, Limits, Motion
 from observers.factors import COVERAGE
 from training.config import settings_of
 from training.lessons.together import Together, decoders
@@ -17,7 +18,6 @@ from training.sources.simulated import SimulatedSource
 from training.sources.source import Runs, Source, TooFewRunsError
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of measurement noise, in multiples of the largest in training
-LARGEST = 2.0  # for maps that do not depend on the noise, in multiples of the usual
 AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0)  # seconds at the shipped systems' pace
 PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
 FEWEST = 50  # errors from which a covariance or a quantile is taken
@@ -96,12 +96,10 @@ class _Calibration:
         self.knots = np.array(sorted({k for k in knots if k < last} | {last}))
         between = np.sqrt(self.knots[1:] * np.maximum(self.knots[:-1], 0.5))
         edges = [0.0, *between.tolist(), float(steps)]
-        self.spans = [np.unique(np.linspace(a, b, PER_AGE).round()).astype(int) for a, b in zip(edges, edges[1:])]
+        self.spans = [np.unique(np.linspace(a, b, PER_AGE).round()).astype(int) for a, b in pairwise(edges)]
         self.ages = np.unique(np.concatenate(self.spans))
         self.informed = "measurement_noise" in artifact.inverse.features
-        largest = artifact.inverse.measurement_noise_max
-        if not self.informed:
-            largest = LARGEST * np.asarray(artifact.measurement_noise)
+        largest = (artifact.inverse if self.informed else self.source.config).measurement_noise_max
         self.levels = np.multiply.outer(LEVELS, largest)
         self.noisy = self.runs.process_noise > 0  # others are sound without process noise
         rng = np.random.default_rng(0)
@@ -205,7 +203,7 @@ class _Calibration:
         cells = [np.isin(self.ages, span)[:, None] & known for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
         if not enough:
-            raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out (held_out)")
+            raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out")
         found = {i: find(values[cells[i]]) for i in enough}
         return np.array([found[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
