@@ -126,15 +126,15 @@ def motion_of(source: Source, run: Run) -> Motion | None:
     """The motion of a tracker: the source's equations, or else a flow; None where such an observer cannot track."""
     try:
         parts = source.tracking()
-        try:
-            equations = source.equations()
-        except ValueError as error:
-            run.progress.say(f"the tracker moves by a learned flow: {error}")
-            return learn_flow(source, run)
-        return Motion(**parts, equations=equations)
     except ValueError as reason:
         run.progress.say(f"the observer does not track: {reason}")
         return None
+    try:
+        equations = source.equations()
+    except ValueError as error:
+        run.progress.say(f"the tracker moves by a learned flow: {error}")
+        return learn_flow(source, run)
+    return Motion(**parts, equations=equations)
 
 
 def _artifact(maps: Maps, source: Source, run: Run) -> Artifact:

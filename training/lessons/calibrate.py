@@ -73,6 +73,9 @@ def calibrate(
         false_alarms = artifact.training.get("false_alarms", 0.01)
     if not 0 < false_alarms < 1:
         raise ValueError(f"false_alarms must lie between 0 and 1, got {false_alarms!r}")
+    sizes, expected = (source.nx, source.ny, source.nu), (artifact.nx, artifact.ny, artifact.nu)
+    if sizes != expected:
+        raise ValueError(f"a source of {sizes} states, outputs and inputs does not fit an observer of {expected}")
     with progress_bars(console) as progress:
         with progress.phase("motions for calibration") as report:
             runs = source.runs(report=report)
@@ -227,12 +230,14 @@ class _Calibration:
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
     """What a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
 
-    Median and 90 % quantile decide: a few motions that are lost do not. Shapes: ``extremes`` (n, ny); returns (ny,).
+    Median and 90 % quantile decide: a few motions that are lost do not. It is at most ten times the largest extreme, for
+    outputs that stand still in most motions. Shapes: ``extremes`` (n, ny); returns (ny,).
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
     middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)
     at, half, tenth = (-np.log(-np.log1p(-p)) for p in (share, 0.5, 0.1))
-    return np.asarray(np.exp(middle + (upper - middle) * (at - half) / (tenth - half)))
+    beyond = middle + (upper - middle) * (at - half) / (tenth - half)
+    return np.asarray(np.exp(np.minimum(beyond, logs.max(0) + np.log(10.0))))
 
 
 def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Recorded motions: files, data sets, or rollouts of an environment, in which the hidden signals were seen."""
 
+import functools
 import hashlib
 import math
 from collections.abc import Callable, Sequence
@@ -160,6 +161,10 @@ class RecordedSource:
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
         """How states change from each recorded sample to the next, on what is trained on and what is held out."""
+        return self._both_increments
+
+    @functools.cached_property
+    def _both_increments(self) -> tuple[Increments, Increments]:
         return self._increments(self.kept), self._increments(self.held_out)
 
     def _increments(self, records: Sequence[Record]) -> Increments:
@@ -193,6 +198,8 @@ class RecordedSource:
             )
         if not self.held_out:
             raise ValueError("covariances are calibrated on what is held out: held_out must be positive, got 0")
+        _, least = self._output()
+        _ = self._both_increments  # or the reason why there are none
         x = np.concatenate([record.x for record in self.kept if record.x is not None])
         x = x[np.isfinite(x).all(-1)]
         low, high = x.min(0), x.max(0)
@@ -204,7 +211,7 @@ class RecordedSource:
             "covariance": np.atleast_2d(np.cov(x.T)) + np.diag(1e-6 * margin**2),
             "process_noise": np.zeros(self.nx),  # the flow's error stands for all noise
             "least_process_noise": 1.0,
-            "least_measurement_noise": self._output()[1],
+            "least_measurement_noise": least,
             "window": max(WINDOW * self.dt, 0.5 / self.rate),
             "factors": Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1))),
         }

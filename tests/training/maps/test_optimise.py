@@ -11,7 +11,6 @@ import torch.utils.tensorboard
 
 import training.evaluation.errors
 import training.maps.optimise
-import training.pipeline
 import training.trajectories.record
 from observers.storage import UNFINISHED
 from training import checkpoints

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from training.recorded.windows import windows
+from training.sources.windows import windows
 from training.records import Record
 from training.spectrum import Spectrum
 
