@@ -17,8 +17,8 @@ import training
 from kkl_gym import KKLObservation
 from observers import Artifact
 from training.agents.any_environment.task import MeasurementNoise
-from training.sources.errors import recorded_errors
 from training.rollouts import make, roll_out
+from training.sources.errors import recorded_errors
 
 AFTER = 20  # steps, of which errors are left out
 GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # a linear-quadratic regulator of the double pendulum

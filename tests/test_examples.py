@@ -8,10 +8,10 @@ from pathlib import Path
 from types import MappingProxyType
 
 import pytest
+from training.teaching import monitor
 
 from examples.research.__main__ import COMMANDS
 from training.cli import main
-from training.teaching import monitor
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"

@@ -6,7 +6,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ from kkl_gym import KKLObservation, KKLVectorObservation
 from observers import Artifact, KKLObserver
 from observers.checks import integer, shown
 from observers.replacement import check_replacement
-from training.maps.coordinates import settling_time
 from training.config import Config, settings_of
+from training.maps.coordinates import settling_time
 from training.presets import OF_THE_FILTER, OF_THE_MAPS
 from training.records import Record
 from training.rollouts.gathering import Gathering
@@ -55,7 +55,7 @@ class KKLTrainingCallback(BaseCallback):
 
     Estimates are good where the rollouts have been that the observer was learned from. An agent in training goes
     elsewhere, and in a simulator its hidden signals are seen: every step serves the agent and the observer. The
-    environments keep their filters and what these hold. T_inv alone is replaced.
+    environments keep their filters and what these hold; T_inv is replaced, and with it the covariances and the flow.
 
     A refit fits T_inv anew to all episodes that are kept, but for a share that is held out for good. An observer that
     is worse on that share than the one in use is not taken. Refits take place where an algorithm begins to collect:
@@ -90,8 +90,8 @@ class KKLTrainingCallback(BaseCallback):
     verbose : int, default 0
         Whether refits are printed, as for other callbacks.
     **settings : object
-        Of :class:`training.Config`, where they are to differ from those that the observer was
-        learned with; by default one network and 1,000 batches. What makes the filter stays: eigenvalues, dt and inputs.
+        Of :class:`training.Config`, where they are to differ from those that the observer was learned with; by default
+        one network and 1,000 batches. What makes the filter stays: eigenvalues, dt and inputs.
 
     Attributes
     ----------
@@ -225,9 +225,9 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._gathering.steps + self._every
         train, held_out = self._gathering.records()
         memory = settling_time(self.artifact.filter)
-        # Records from before are long enough to learn from, but say nothing of where the agent is now.
-        telling = held_out if self._before and self._config.held_out else train
-        if any(record.duration >= memory for record in telling):
+        # Records from before are long enough to learn from, but not from where the agent is now.
+        needed = (train, held_out) if self._before and self._config.held_out else (train,)
+        if all(any(record.duration >= memory for record in records) for records in needed):
             self._refit(train, held_out)
 
     def _begin(self, row: int, *, goes_on: bool = False) -> None:
@@ -241,19 +241,18 @@ class KKLTrainingCallback(BaseCallback):
         with torch.random.fork_rng():  # the agent's random numbers stay its own
             source = RecordedSource(train_on, self._config, old.system, held_out=held_out, C=old.C)
             new = train(source).artifact
-        for what in ("motion", "error_covariance"):
-            here, there = (each if what == "motion" else each.inverse for each in (old, new))
-            if getattr(here, what) is not None and getattr(there, what) is None:
-                warnings.warn(f"the observer in use stays: too little is held out so far for its {what}", stacklevel=2)
-                return
-        errors = recorded_errors(new, held_out, measurement_noise=self._level)
-        before = _together(recorded_errors(old, held_out, measurement_noise=self._level))
-        after = _together(errors)
+        lost = (old.motion is not None and new.motion is None) or (
+            old.inverse.error_covariance is not None and new.inverse.error_covariance is None
+        )
+        if lost:
+            warnings.warn("the observer in use stays: too little is held out so far to calibrate another", stacklevel=2)
+            return
+        before, after = (
+            _together(recorded_errors(each, held_out, measurement_noise=self._level)) for each in (old, new)
+        )
         taken = not after > before
         if taken:
-            known = {name: error for name, error in errors.relative.items() if math.isfinite(error)}
-            training = {"held_out": self._config.held_out, "held_out_errors": known, "held_out_after": errors.after}
-            self.artifact = replace(new, training={**new.training, **training})
+            self.artifact = new
             self._replace()
         if self._path is not None:
             self.artifact.save(self._path)

@@ -84,7 +84,7 @@ def learn_observer(
     task: HiddenTask, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars
 ) -> Path:
     """Learn an observer from an agent's first steps."""
-    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, **SETTINGS}
+    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, "tracking": False, **SETTINGS}
     if task.measurement_noise:
         spread = np.std(np.concatenate([record.y for record in records]), 0)
         changes["measurement_noise_max"] = tuple(np.maximum(RECORDED_NOISE * spread, HEADROOM * task.measurement_noise))
@@ -94,8 +94,8 @@ def learn_observer(
         fastest = FASTEST_UNDER_NOISE / dt
         slowest = min(max(SLOWEST_UNDER_NOISE / dt, 1.1 * SETTLED / longest), fastest / 2)
         changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, -slowest, -fastest))
-    config = recorded_preset(list(records), {"tracking": False, **changes})
-    artifact = train(RecordedSource(records, config, task.env_id), console=progress).artifact
+    source = RecordedSource(records, recorded_preset(records, changes), task.env_id)
+    artifact = train(source, console=progress).artifact
     path = folder / OBSERVER
     artifact.save(path)
     return path
