@@ -25,8 +25,8 @@ from examples.research.certificates.settled import record_settled
 from examples.research.speed import sizes
 from kkl_gym import SYSTEMS
 from observers import Artifact, load
-from observers.names import resolve
 from observers.factors import standard_deviations
+from observers.names import resolve
 from observers.storage import replacing, write
 from training.agents import picture
 from training.agents.agent import Agent
