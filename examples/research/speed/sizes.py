@@ -32,9 +32,9 @@ TURNS, STEPS, BATCH_STEPS = 7, 1000, 100  # of each observer that is timed
 class Sizes:
     """Train a T_inv of several sizes for a system, and show errors against the time of a step.
 
-    The widths are those of hidden layers; all else is as `kkl-gym train SYSTEM --size large` has it. Errors are medians over
-    unseen motions from X, over all steps. Times are CPU time of one thread: run it with OMP_NUM_THREADS=1, on an idle
-    machine. Observers that are there already are not trained again, so that times can be taken again.
+    The widths are those of hidden layers; all else is as `kkl-gym train SYSTEM --size large` has it. Errors are medians
+    over unseen motions from X, over all steps. Times are CPU time of one thread: run it with OMP_NUM_THREADS=1, on an
+    idle machine. Observers that are there already are not trained again, so that times can be taken again.
 
     Writes OUT/NAME-WIDTH.safetensors, OUT/sizes.csv and OUT/sizes.png.
     """
