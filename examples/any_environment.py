@@ -138,7 +138,6 @@ def main(
             out=folder,
             inverse_steps=batches,
             members=members,
-            tracking=noise > 0,
             measurement_noise_max=2 * noise or None,
         )
         env = KKLObservation(gym.make(env_id), Path(folder) / f"{env_id}.safetensors")
@@ -156,7 +155,11 @@ def main(
         found[label] = max(errors.relative.values())
     if noise:
         print(f"noise {noise:g}: mean return where the controller acts on")
-        for label, observer in (("tracked", artifact), ("T_inv alone", replace(artifact, motion=None)), ("truth", None)):
+        for label, observer in (
+            ("tracked", artifact),
+            ("T_inv alone", replace(artifact, motion=None)),
+            ("truth", None),
+        ):
             found[label] = under_noise(env_id, observer, noise, seed)
     return found
 
