@@ -7,6 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import pytest
+from training.teaching import monitor
 
 from examples.research.__main__ import COMMANDS
 from training.cli import main

@@ -26,8 +26,6 @@ COMMANDS: Commands = {
     "train": ("training.commands.train", "Train"),
     "identify": ("training.commands.identify", "Identify"),
     "adapt": ("training.commands.identify", "Adapt"),
-    "errorbars": ("training.commands.errorbars", "ErrorBars"),
-    "tracking": ("training.commands.tracking", "Tracking"),
     "evaluate": ("training.commands.evaluate", "Evaluate"),
     "agent": ("training.commands.agent", "AgentCommand"),
     "faults": ("training.commands.faults", "Faults"),

@@ -10,7 +10,7 @@ from observers import MLP, Equations, ErrorCovariance, Expression, Factors, Flow
 
 DT, PROCESS, STD = 0.05, 0.02, 0.3  # s, standard deviation that noise of level 1 adds at each sample, that of T_inv
 AGE_MAX = 1.0  # s
-ONE = Factors(np.zeros(1), np.zeros(1), np.ones((1, 1)))
+ONE = Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1)))
 X_OFFSET, X_SCALE, U_SCALE = np.array([0.3, -0.1]), np.array([2.0, 0.5]), 0.5
 
 

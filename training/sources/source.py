@@ -1,29 +1,16 @@
 """Where motions come from: what every source gives, whichever it is."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 
-from observers import Artifact, Equations, LinearFilter, Motion
+from observers import Artifact, Equations, LinearFilter
 from training.config import Config
+from training.trajectories.record import Pairs
 
 Report = Callable[[float], object]
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """States and the filter's states beside them, at ages since the filter's start, measured without noise.
-
-    Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
-    """
-
-    ages: np.ndarray
-    x: np.ndarray
-    z: np.ndarray
-    process_noise: np.ndarray
-    nominal: np.ndarray | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -129,12 +116,12 @@ class Source(Protocol):
         """Pairs of states a sample apart, to learn a flow from and to judge it by."""
         ...
 
-    def judged(self, artifact: Artifact) -> dict[str, Any]:
-        """Errors on motions that are held out, for the artifact's account of its training."""
+    def tracking(self) -> dict[str, Any]:
+        """Arguments of :class:`observers.Motion`, but for equations and flow; ValueError where nothing can track."""
         ...
 
-    def motion(self, **how: Any) -> Motion:
-        """The motion of a tracker, with equations or a flow; ValueError where such an observer cannot track."""
+    def judged(self, artifact: Artifact) -> dict[str, Any]:
+        """Errors on motions that are held out, for the artifact's account of its training."""
         ...
 
 

@@ -11,7 +11,7 @@ from observers import Artifact, KKLObserver
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import ALIKE, draw_process_noise, noisy_output
 from training.trajectories.policy import EXPLORATION
-from training.sources.source import Pairs
+from training.trajectories.record import Pairs
 
 HOLDS = (1, 5, 10, 20)  # samples for which actions are held
 GROUPS = 50  # of closed-loop trajectories with a noise level and a time for which actions are held in common

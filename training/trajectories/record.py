@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import LinearFilter
-from training.sources.source import Pairs
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise
 from training.trajectories.policy import under_policy
@@ -26,6 +25,20 @@ RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 # to 3.4 % of X's half-width with 4 here, to 3.2 % with 12 and to 3.1 % with none; by an exact EKF to 2.7 %.
 POLICYS_OWN = 12
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """States and the filter's states beside them, at ages since the filter's start, measured without noise.
+
+    Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
+    """
+
+    ages: np.ndarray
+    x: np.ndarray
+    z: np.ndarray
+    process_noise: np.ndarray
+    nominal: np.ndarray | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -97,7 +110,7 @@ def trajectories(
         pending += [(row, row < round(motions.lead_in_share * count)) for row in range(count)]
     if n > CHUNK:  # whether they stay within bounds is said before so many have been simulated
         first = _simulated(system, pending[:FIRST], steps=steps, dt=dt, rng=np.random.default_rng(0), motions=motions)
-        _check_share(system, int(first.inside.sum()), len(first.inside), steps * dt)
+        check_share(system, int(first.inside.sum()), len(first.inside), steps * dt)
     while pending:
         rows, pending = pending[:CHUNK], pending[CHUNK:]
         told = partial(_tell, report, n - len(pending) - len(rows), len(rows) / steps)
@@ -105,7 +118,7 @@ def trajectories(
         pending += [row for row, stayed in zip(rows, found.inside) if not stayed]
         tried += len(rows)
         if pending and tried >= FIRST:
-            _check_share(system, n - len(pending), tried, steps * dt)
+            check_share(system, n - len(pending), tried, steps * dt)
         yield found.x[:, found.inside], found.u[:, found.inside], found.level[found.inside]
 
 
@@ -160,7 +173,7 @@ def _simulated(
     return _Chunk(x, u, level, np.isfinite(x[-1]).all(-1))
 
 
-def _check_share(system: System, stayed: int, tried: int, seconds: float) -> None:
+def check_share(system: System, stayed: int, tried: int, seconds: float) -> None:
     """Raise an error if hardly any of the trajectories that were tried stayed within the bounds."""
     if stayed < FEWEST_INSIDE * tried:
         raise ValueError(
