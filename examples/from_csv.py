@@ -56,7 +56,7 @@ def cost(env: kkl_gym.KKLEnv, policy: Policy, *, seconds: float, episodes: int) 
 def main(
     runs: int = 6,
     seconds: float = 10.0,
-    inverse_steps: int = 3000,
+    inverse_steps: int = 1500,
     trajectories: int = 500,
     out: Path = Path("runs/from_csv"),
     seed: int = 0,
@@ -66,7 +66,7 @@ def main(
     Args:
         runs: files that are written; of five or more, one is left out of the fit, for a look at what is predicted.
         seconds: length of each.
-        inverse_steps: batches of the observer's training; `kkl-gym identify` has more, and its observer errs less.
+        inverse_steps: batches of the observer's training.
         trajectories: simulated trajectories of the plant found, to train on.
         out: the run's folder.
         seed: of everything random.

@@ -158,9 +158,7 @@ class InverseMap:
         sigma = np.reshape(measurement_noise, (-1, 1))
         return 1.0 / (1.0 + ((sigma * np.atleast_2d(self.noise_gain)) ** 2).sum(0))
 
-    def shares(
-        self, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0
-    ) -> tuple[float, float]:
+    def shares(self, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0) -> tuple[float, float]:
         """Return levels in multiples of the largest in training, of the noisiest output."""
         largest = np.max(np.divide(measurement_noise, self.measurement_noise_max))
         return float(largest), process_noise / self.process_noise_max

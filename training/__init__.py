@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
     from training.identification.learning import adapt, identify
-    from training.diagnosis import Observability, observability
     from training.lessons.calibrate import calibrate
     from training.lessons.flow import learn_flow
     from training.lessons.map import Maps, learn_map

@@ -86,12 +86,14 @@ def train(
     ------
     ValueError
         If there are checkpoints, but not ``resume`` or not of this configuration, if another process is at work in the
-        folder, or if motions leave the system's bounds.
+        folder, if motions leave the system's bounds, or if a source comes with another configuration than its own.
     FloatingPointError
         If the loss is no longer a number.
     """
     if isinstance(source, System):
         source = SimulatedSource(source, config or preset(source))
+    elif config not in (None, source.config):
+        raise ValueError("a source has a configuration of its own: pass config with a System alone")
     config = source.config
     noise_levels("measurement_noise_max", config.measurement_noise_max, source.ny)
     if config.pipeline == "spinn" and isinstance(source, SimulatedSource):
@@ -107,9 +109,6 @@ def train(
             maps = learn_map(source, run)
             motion = motion_of(source, run) if config.tracking and config.pipeline != "spinn" else None
             artifact = _artifact(maps, source, run)
-            if motion is not None and not artifact.knows_output:
-                run.progress.say("the observer does not track: h(x) cannot be written as an expression")
-                motion = None
             with run.timed("calibrating"):
                 try:
                     artifact = calibrate(artifact, source, motion=motion, console=run.progress)
@@ -126,19 +125,16 @@ def train(
 def motion_of(source: Source, run: Run) -> Motion | None:
     """The motion of a tracker: the source's equations, or else a flow; None where such an observer cannot track."""
     try:
-        equations = source.equations()
-    except ValueError as error:
-        run.progress.say(f"the tracker moves by a learned flow: {error}")
-        try:
-            return learn_flow(source, run)
-        except ValueError as reason:
-            run.progress.say(f"the observer does not track: {reason}")
-            return None
-    try:
-        return source.motion(equations=equations)
+        parts = source.tracking()
     except ValueError as reason:
         run.progress.say(f"the observer does not track: {reason}")
         return None
+    try:
+        equations = source.equations()
+    except ValueError as error:
+        run.progress.say(f"the tracker moves by a learned flow: {error}")
+        return learn_flow(source, run)
+    return Motion(**parts, equations=equations)
 
 
 def _artifact(maps: Maps, source: Source, run: Run) -> Artifact:

@@ -17,7 +17,16 @@ from training.trajectories.record import Motions, record, recording_ages
 from training.trajectories.signals import KINDS
 
 CPU = torch.device("cpu")
-SIZES = {"trajectories": 20, "duration": 5.0, "samples": 40, "width": 16, "depth": 2, "batch": 128}
+SIZES = {
+    "trajectories": 20,
+    "duration": 5.0,
+    "samples": 40,
+    "width": 16,
+    "depth": 2,
+    "batch": 128,
+    "flow_steps": 300,
+    "runs": 100,
+}
 
 
 def toy(system, pipeline="input-aware", **changes):

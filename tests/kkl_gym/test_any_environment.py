@@ -233,7 +233,7 @@ def test_observers_that_do_not_replace(saved):
     with pytest.raises(ArtifactError, match="has environment"):
         envs.replace_observer("van_der_pol")  # whose plants are not asked for
     spinn = KKLObservation(gym.make("KKLVanDerPol-v0"), "van_der_pol-spinn", known_start=True)
-    with pytest.raises(ArtifactError, match="holds no forward map"):
+    with pytest.raises(ArtifactError, match="neither a motion nor T"):
         spinn.replace_observer(replace(spinn.observer.artifact, forward=None))
 
 

@@ -221,7 +221,7 @@ def test_copies_and_pickles_go_on_alike():
 def test_covariances_are_multiplied_by_factors_of_level_and_age():
     """In logarithms between the ages, of the largest level that the map was trained for, which is 1."""
     ages, values = np.array([0.0, 2.0, 4.0]), np.array([[9.0, 3.0, 1.0], [4.0, 8.0, 2.0]])
-    factors = Factors(np.array([0.0, 2 * LEVEL]), ages, values)
+    factors = Factors(np.array([0.0, 2 * LEVEL]), ages, values[None])
     (_, y), rows = runs(), np.array([True, False, False])
     sure, wide = (KKLObserver(tracking_observer(**each), LEVEL) for each in ({}, {"factors": factors}))
     for k in range(100):

@@ -17,10 +17,8 @@ TINY = {"steps": 5, "turns": 1, "num_envs": 4, "vector_steps": 3}
 @pytest.mark.parametrize(
     ("observer", "wrapped", "observers"),
     [
-        ("van_der_pol-static", ["x_hat", "x_hat, error bars"], 1),
-        pytest.param(
-            None, ["x_hat", "x_hat, error bars", "x_hat, small", "x_hat, static"], 3, marks=pytest.mark.research
-        ),
+        ("van_der_pol-large", ["x_hat", "x_hat, error bars"], 1),
+        pytest.param(None, ["x_hat", "x_hat, error bars", "x_hat, large"], 2, marks=pytest.mark.research),
     ],
 )
 def test_speed_of_a_shipped_system(observer, wrapped, observers, capsys):
@@ -44,7 +42,7 @@ def test_the_table_has_the_share_of_the_products_speed_that_a_network_reaches():
         ["KKL", "10.0", "2,000", "50", "100", "50 %"],
         ["EKF", "400.0", "3,000", "", "", ""],
     ]
-    _, operations = limit(observers.load("lorenz").artifact.inverse, 7)
+    _, operations = limit(observers.load("lorenz-large").artifact.inverse, 7)
     assert operations == 2 * 7 * (28 * 128 + 2 * 128 * 128 + 128 * 3)
 
 

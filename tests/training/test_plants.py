@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from small_runs import toy
+from training.teaching import monitor
 
 import kkl_gym
 from examples.research.benchmark.protocol import run
@@ -18,7 +19,6 @@ from training import train
 from training.cli import main
 from training.evaluation.errors import NoStartsError, starts
 from training.kalman import ExtendedKalmanFilter, IteratedKalmanFilter, UnscentedKalmanFilter, unknown_start
-from training.teaching import monitor
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CART_POLE = f"{EXAMPLES / 'cart_pole.py'}:CartPole"

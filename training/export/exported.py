@@ -175,7 +175,7 @@ def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
     mean = (motion.mean - motion.x_offset) / motion.x_scale
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}
-    return scaling | {"low": low, "high": high, "mean": mean, "covariance": covariance}
+    return scaling | {"low": low, "high": high, "start_mean": mean, "start_covariance": covariance}
 
 
 def table(inverse: InverseMap, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

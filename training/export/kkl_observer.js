@@ -11,17 +11,15 @@ export function readTensors(buffer) {
   const length = Number(new DataView(buffer).getBigUint64(0, true));
   const { __metadata__: metadata, ...entries } = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, length)));
   const types = { F32: Float32Array, F64: Float64Array };
-  const tensors = {};
-  for (const [name, { dtype, shape, data_offsets: [begin, end] }] of Object.entries(entries)) {
-    tensors[name] = { data: new types[dtype](buffer.slice(8 + length + begin, 8 + length + end)), shape };
-  }
-  return { tensors, metadata };
+  const tensors = Object.entries(entries).map(([name, { dtype, shape, data_offsets: ends }]) =>
+    [name, { data: new types[dtype](buffer.slice(...ends.map((end) => 8 + length + end))), shape }]);
+  return { tensors: Object.fromEntries(tensors), metadata };
 }
 
 const ACTIVATIONS = {
-  tanh: (h) => h.forEach((value, i) => (h[i] = Math.tanh(value))),
-  silu: (h) => h.forEach((value, i) => (h[i] = 0.5 * value + 0.5 * value * Math.tanh(0.5 * value))), // cannot overflow
-  relu: (h) => h.forEach((value, i) => (h[i] = Math.max(value, 0))),
+  tanh: Math.tanh,
+  silu: (value) => 0.5 * value + 0.5 * value * Math.tanh(0.5 * value), // cannot overflow
+  relu: (value) => Math.max(value, 0),
 };
 
 function dot(a, b) {
@@ -34,21 +32,14 @@ function dot(a, b) {
 const matrix = ({ data, shape: [rows, width] }) =>
   Array.from({ length: rows }, (_, i) => Array.from(data.subarray(i * width, (i + 1) * width)));
 
-class Network {
-  constructor(tensors, prefix, activation) {
-    this.activate = ACTIVATIONS[activation];
-    this.layers = [];
-    for (let i = 0; tensors[`${prefix}${i}.weight`]; i++) {
-      this.layers.push({ rows: matrix(tensors[`${prefix}${i}.weight`]), biases: tensors[`${prefix}${i}.bias`].data });
-    }
+/** A network as a function of its inputs. */
+function network(tensors, prefix, activation) {
+  const layers = [], active = ACTIVATIONS[activation];
+  for (let i = 0; tensors[`${prefix}${i}.weight`]; i++) {
+    layers.push([matrix(tensors[`${prefix}${i}.weight`]), tensors[`${prefix}${i}.bias`].data]);
   }
-
-  run(inputs) {
-    return this.layers.reduce((h, { rows, biases }, depth) => {
-      if (depth) this.activate(h);
-      return rows.map((row, i) => dot(row, h) + biases[i]);
-    }, inputs);
-  }
+  const layer = (h, [rows, biases]) => rows.map((row, i) => dot(row, h) + biases[i]);
+  return (inputs) => layers.reduce((h, each, depth) => layer(depth ? h.map((value) => active(value)) : h, each), inputs);
 }
 
 /** Of rows of numbers at points that rise from 0, that between them at x; beyond the last point, its row. */
@@ -72,16 +63,12 @@ const OPERATIONS = {
 function evaluated(part) {
   if (typeof part === "number") return () => part;
   const [name, ...rest] = part;
-  if (name === "x") return (x) => x[rest[0]];
-  if (name === "u") return (x, u) => u[rest[0]];
+  if (name === "x" || name === "u") return name === "x" ? (x) => x[rest[0]] : (x, u) => u[rest[0]];
   const of = rest.map(evaluated), operation = OPERATIONS[name] ?? Math[name];
   if (name === "where") return (x, u) => (of[0](x, u) ? of[1](x, u) : of[2](x, u));
   if (of.length === 1) return (x, u) => operation(of[0](x, u));
   return of.reduce((a, b) => (x, u) => operation(a(x, u), b(x, u)));
 }
-
-/** All components of an expression. */
-const components = (parts) => ((of) => (x, u) => of.map((each) => each(x, u)))(parts.map(evaluated));
 
 /** T_inv: the filter's state, the age and the levels of noise to an estimate. */
 class InverseMap {
@@ -90,7 +77,7 @@ class InverseMap {
     for (const name of ["z_offset", "x_offset", "x_scale"]) this[name] = tensors[prefix + name].data;
     for (const name of ["whiten", "noise_gain"]) this[name] = matrix(tensors[prefix + name]);
     for (const name of ["levels", "ages", "covariance"]) this[name] = tensors[prefix + name]?.data;
-    this.network = new Network(tensors, prefix, this.activation);
+    this.network = network(tensors, prefix, this.activation);
   }
 
   /** What is assumed of noise; measured is a level for each output, cut at the largest in training. */
@@ -108,7 +95,7 @@ class InverseMap {
     const off = this.z_offset.map((value, j) => z[j] - value);
     const inputs = [...this.whiten.map((row, i) => this.gain[i] * dot(row, off)), ...this.conditions];
     if (this.features.includes("age")) inputs.push(Math.log1p(Math.min(age, this.age_max ?? Infinity) / this.age_unit));
-    return this.network.run(inputs).map((value, i) => this.x_offset[i] + this.x_scale[i] * value);
+    return this.network(inputs).map((value, i) => this.x_offset[i] + this.x_scale[i] * value);
   }
 
   /** The covariance of the estimate's error at an age in seconds; null where there is none. */
@@ -124,6 +111,8 @@ const transposed = (A) => A[0].map((_, j) => A.map((row) => row[j]));
 const added = (P, V, W, sign = 1) => P.map((row, i) => row.map((value, j) => V.reduce((sum, column, k) => sum + sign * column[i] * W[k][j], value)));
 /** x + sign V w. */
 const shifted = (x, V, w, sign = 1) => x.map((value, i) => V.reduce((sum, column, k) => sum + sign * column[i] * w[k], value));
+/** Values, and others where these are not finite. */
+const defined = (values, others) => values.map((value, k) => (Number.isFinite(value) ? value : others[k]));
 const finite = (...arrays) => arrays.flat(2).every(Number.isFinite);
 
 /** L of P = L L^T; NaN where there is none. */
@@ -153,13 +142,12 @@ function solved(P, columns) {
 class Tracker {
   constructor(tensors, described, output) {
     Object.assign(this, described, { output });
-    for (const name in tensors) {
-      const each = tensors[name];
-      if (name.startsWith("motion.")) this[name.slice(7)] = each.shape.length === 2 ? matrix(each) : [...each.data];
+    for (const [name, each] of Object.entries(tensors).filter(([name]) => name.startsWith("motion."))) {
+      this[name.slice(7)] = each.shape.length === 2 ? matrix(each) : [...each.data];
     }
     this.ny = this.least_measurement_noise.length;
-    if (this.field) this.field = components(this.field);
-    else this.network = new Network(tensors, "motion.", this.activation);
+    this.field = this.field?.map(evaluated);
+    if (!this.field) this.network = network(tensors, "motion.", this.activation);
   }
 
   /** What is assumed of noise; measured is a level for each output, shares are levels in multiples of the largest. */
@@ -173,7 +161,7 @@ class Tracker {
 
   /** Begin with the first sample; the map is of z. */
   begin(y, map, z) {
-    [this.x, this.P, this.seen] = [this.mean, this.covariance, 0];
+    [this.x, this.P, this.seen] = [this.start_mean, this.start_covariance, 0];
     this.#watchAnew();
     const { V, white } = this.#corrected(this.x, this.P, y), P = added(this.P, V, V, -1);
     if (finite(white, factor(P))) [this.x, this.P] = [this.#within(shifted(this.x, V, white)), P];
@@ -203,23 +191,17 @@ class Tracker {
   #moved(at, u) {
     const s = this.#within(at);
     if (this.network) {
-      const q = [...s, ...this.u_scale.map((scale, j) => u[j] / scale)], h = this.network.run(q);
+      const q = [...s, ...this.u_scale.map((scale, j) => u[j] / scale)], h = this.network(q);
       return s.map((value, i) => value + dot(this.linear[i], [1, ...q]) + this.gain[i] * h[i]);
     }
-    let x = this.state(s);
-    if (!this.substeps) x = this.field(x, u);
+    const f = (x) => this.field.map((part) => part(x, u));
+    let x = this.substeps ? this.state(s) : f(this.state(s));
     for (let n = 0, h = this.dt / this.substeps; n < this.substeps; n++) {
-      const ahead = (step, k) => this.field(x.map((value, i) => value + step * k[i]), u);
-      const a = this.field(x, u), b = ahead(h / 2, a), c = ahead(h / 2, b), d = ahead(h, c);
+      const ahead = (step, k) => f(x.map((value, i) => value + step * k[i]));
+      const a = f(x), b = ahead(h / 2, a), c = ahead(h / 2, b), d = ahead(h, c);
       x = x.map((value, i) => value + (h / 6) * (a[i] + 2 * (b[i] + c[i]) + d[i]));
     }
     return x.map((value, i) => (value - this.x_offset[i]) / this.x_scale[i]);
-  }
-
-  /** Outputs of scaled states; where they are undefined, those within the bounds. */
-  #measured(s) {
-    const near = this.output(this.state(this.#within(s)));
-    return this.output(this.state(s)).map((value, k) => (Number.isFinite(value) ? value : near[k]));
   }
 
   /** What a function and noise make of a Gaussian, by sigma points: mean, covariance, and that with the states by columns. */
@@ -237,8 +219,10 @@ class Tracker {
 
   /** What a sample says, of which NaN is missing: mean + V white and P - V V^T are what is known then. */
   #corrected(mean, P, y) {
-    const undefinedAs = (first) => (value, k) => (Number.isFinite(value) ? value : first[k]);
-    const [expected, S, V] = this.#transformed(mean, P, this.R, (s, first) => this.#measured(s).map(first ? undefinedAs(first) : (value) => value));
+    const [expected, S, V] = this.#transformed(mean, P, this.R, (s, first) => { // where h is undefined, it is that nearby
+      const h = defined(...[s, this.#within(s)].map((at) => this.output(this.state(at))));
+      return first ? defined(h, first) : h;
+    });
     const white = y.map((value, k) => value - expected[k]);
     for (let k = 0; k < this.ny; k++) {
       const missing = Number.isNaN(y[k]), root = Math.sqrt(S[k][k]);
@@ -270,15 +254,12 @@ class Tracker {
     let prediction = this.#transformed(this.x, this.P, this.Q, (s) => this.#moved(s, u));
     for (let turn = 0; turn < this.relinearisations && this.seen < this.window; turn++) prediction = this.#relinearised(prediction, y, u);
     const { V, white, expected } = this.#corrected(prediction[0], prediction[1], y);
-    const whole = y.map((value, k) => (!Number.isNaN(value) ? value : Number.isFinite(expected[k]) ? expected[k] : before[k]));
+    const whole = defined(y, defined(expected, before));
     const x = shifted(prediction[0], V, white), P = added(prediction[1], V, V, -1);
-    if (!finite(x, P)) {
-      this.nis = Infinity; // lost
-      return whole;
-    }
-    [this.x, this.P] = [this.#within(x), P];
     const there = y.map((value) => Number(!Number.isNaN(value))), count = dot(there, there);
-    if (!count) return whole;
+    if (finite(x, P)) [this.x, this.P] = [this.#within(x), P];
+    else this.nis = Infinity; // lost
+    if (!count || this.nis === Infinity) return whole;
     this.seen++;
     this.trend = this.trend.map((value, k) => value + this.trend_share * there[k] * (white[k] - value));
     const raised = this.trend_gain * dot(there, this.trend.map((value) => value ** 2));
@@ -315,8 +296,7 @@ class Monitor {
       const at = (level, limits) => between(level ** 2, levels.map((each) => each ** 2), limits)[0]; // as variances add up
       return { mean: Math.sqrt(at(noisiest, mean.map((value) => value ** 2))), low: at(own, low), high: at(noisiest, high) };
     });
-    this.share = -Math.expm1(-dt / window);
-    this.silent = Math.round(warmUp / dt);
+    [this.share, this.silent] = [-Math.expm1(-dt / window), Math.round(warmUp / dt)];
     this.sound = this.limits.map(({ low: least }, i) => Math.max(measured[i] ** 2, least));
     this.reset();
   }
@@ -356,26 +336,24 @@ export class Observer {
     this.tensors = tensors;
     this.filter = Object.fromEntries(["transition", "early_y", "late_y", "equilibrium"].map((name) => [name, matrix(tensors[name])]));
     [this.nz, this.ny] = tensors.early_y.shape;
-    this.nu = this.described.u.length;
-    this.dt = this.described.dt;
-    const { h, motion, maps } = this.described, C = tensors.C && matrix(tensors.C);
-    this.output = C ? (x) => C.map((row) => dot(row, x)) : h && components(h);
+    [this.nu, this.dt] = [this.described.u.length, this.described.dt];
+    const { motion, maps } = this.described, h = this.described.h?.map(evaluated), C = tensors.C && matrix(tensors.C);
+    this.output = C ? (x) => C.map((row) => dot(row, x)) : h && ((x) => h.map((part) => part(x)));
     for (const [label, map] of Object.entries(maps)) this[label] = new InverseMap(tensors, `${label}.`, map); // driven, free
     this.tracker = motion ? new Tracker(tensors, { ...motion, dt: this.dt }, this.output) : null;
     this.tell(this.described.measurement_noise ?? 0, this.described.process_noise ?? 0);
   }
 
   /** The levels of noise that are assumed: of all outputs or each, and of the state. The monitor begins anew. */
-  tell(measurementNoise, processNoise = this.processNoise) {
-    this.processNoise = processNoise;
+  tell(measurementNoise = this.measurementNoise, processNoise = this.processNoise) {
+    Object.assign(this, { measurementNoise, processNoise });
     const each = Array.from({ length: this.ny }, (_, i) => {
       const level = Array.isArray(measurementNoise) ? measurementNoise[i] ?? measurementNoise[0] : measurementNoise;
       return Math.min(level, this.driven.measurement_noise_max?.[i] ?? Infinity);
     });
     for (const map of [this.driven, this.free]) map?.tell(each, processNoise);
     this.tracker?.tell(each, processNoise, this.driven.shares);
-    const { limits } = this.described;
-    this.monitor = limits ? new Monitor(this.tensors, limits, each, this.dt) : null;
+    this.monitor = this.described.limits ? new Monitor(this.tensors, this.described.limits, each, this.dt) : null;
   }
 
   /** Forget the past and take in the first sample; returns the estimate. */
@@ -396,14 +374,12 @@ export class Observer {
     if (y !== null && !holds(y, this.ny, true)) throw new Error(`a sample has ${this.ny} outputs, NaN where one is missing, or is null, got ${shown(y)}`);
     if (!holds(u, this.nu)) throw new Error(`an input has ${this.nu} finite entries, got ${shown(u)}`);
     const missing = this.y.map((_, i) => Number.isNaN(y?.[i] ?? NaN));
-    let now = missing.map((gap, i) => (gap ? NaN : y[i]));
-    if (this.tracker) now = this.tracker.advance(now, u, this.y);
+    const there = missing.map((gap, i) => (gap ? NaN : y[i]));
+    let now = there;
+    if (this.tracker) now = this.tracker.advance(there, u, this.y);
     else if (missing.includes(true)) {
       if (!this.output) throw new Error("this map holds no output h(x) to predict with: pass the last sample again");
-      const filled = (xHat) => {
-        const h = this.output(xHat);
-        return now.map((value, i) => (!missing[i] ? value : Number.isFinite(h[i]) ? h[i] : this.y[i]));
-      };
+      const filled = (xHat) => defined(there, defined(this.output(xHat), this.y));
       now = filled(this.#estimated(this.#advanced(filled(this.#estimated()), u), this.age + 1));
     }
     this.z = this.#advanced(now, u);

@@ -40,7 +40,7 @@ class TrackerNodes:
         ends = np.cumsum([0, nx, nx * nx, 1, 1, 1, ny, ny])
         *parts, self.y = (given["tracker"].part(a, b) for a, b in itertools.pairwise(ends))
         start = tracker_arrays(motion)
-        values = (start["mean"][None], start["covariance"].reshape(1, -1), 1.0, 1.0, 0.0, np.zeros((1, ny)))
+        values = (start["start_mean"][None], start["start_covariance"].reshape(1, -1), 1.0, 1.0, 0.0, np.zeros((1, ny)))
         self._before = [graph.where(begins, value, part) for value, part in zip(values, parts, strict=True)]
         self._x, self._P = self._before[0], self._before[1].shaped(-1, nx, nx)
         level = graph("Max", given["process_noise"], motion.least_process_noise) * motion.process_noise

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from kkl_gym.system import System
-from observers import Artifact, ErrorCovariance, Factors, InverseMap, KKLObserver, Limits, Motion
+from observers import Artifact, ErrorCovariance, Factors, InverseMap, Limits, Motion
 from observers.factors import COVERAGE
 from training.config import settings_of
 from training.lessons.together import Together, decoders
@@ -17,7 +17,6 @@ from training.sources.simulated import SimulatedSource
 from training.sources.source import Runs, Source, TooFewRunsError
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of measurement noise, in multiples of the largest in training
-LARGEST = 2.0  # for maps that do not depend on the noise, in multiples of the usual
 AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0)  # seconds at the shipped systems' pace
 PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
 FEWEST = 50  # errors from which a covariance or a quantile is taken
@@ -73,6 +72,9 @@ def calibrate(
         false_alarms = artifact.training.get("false_alarms", 0.01)
     if not 0 < false_alarms < 1:
         raise ValueError(f"false_alarms must lie between 0 and 1, got {false_alarms!r}")
+    sizes, expected = (source.nx, source.ny, source.nu), (artifact.nx, artifact.ny, artifact.nu)
+    if sizes != expected:
+        raise ValueError(f"a source of {sizes} states, outputs and inputs does not fit an observer of {expected}")
     with progress_bars(console) as progress:
         with progress.phase("motions for calibration") as report:
             runs = source.runs(report=report)
@@ -97,13 +99,11 @@ class _Calibration:
         between = np.sqrt(self.knots[1:] * np.maximum(self.knots[:-1], 0.5))
         edges = [0.0, *between.tolist(), float(steps)]
         counts = [PER_AGE] * len(between) + [4 * PER_AGE]
-        spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts))
+        spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts, strict=False))
         self.spans = [np.unique(span.round()).astype(int) for span in spans]
         self.ages = np.unique(np.concatenate(self.spans))
         self.informed = "measurement_noise" in artifact.inverse.features
-        largest = artifact.inverse.measurement_noise_max
-        if not self.informed:
-            largest = LARGEST * np.asarray(artifact.measurement_noise)
+        largest = (artifact.inverse if self.informed else self.source.config).measurement_noise_max
         self.levels = np.multiply.outer(LEVELS, largest)
         self.noisy = self.runs.process_noise > 0  # others are sound without process noise
         rng = np.random.default_rng(0)
@@ -207,7 +207,7 @@ class _Calibration:
         cells = [np.isin(self.ages, span)[:, None] & known for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
         if not enough:
-            raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out (held_out)")
+            raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out")
         found = {i: find(values[cells[i]]) for i in enough}
         return np.array([found[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
@@ -231,12 +231,14 @@ class _Calibration:
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
     """What a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
 
-    Median and 90 % quantile decide: a few motions that are lost do not. Shapes: ``extremes`` (n, ny); returns (ny,).
+    Median and 90 % quantile decide: a few motions that are lost do not. It is at most ten times the largest extreme, for
+    outputs that stand still in most motions. Shapes: ``extremes`` (n, ny); returns (ny,).
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
     middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)
     at, half, tenth = (-np.log(-np.log1p(-p)) for p in (share, 0.5, 0.1))
-    return np.asarray(np.exp(middle + (upper - middle) * (at - half) / (tenth - half)))
+    beyond = middle + (upper - middle) * (at - half) / (tenth - half)
+    return np.asarray(np.exp(np.minimum(beyond, logs.max(0) + np.log(10.0))))
 
 
 def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:

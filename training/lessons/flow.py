@@ -6,6 +6,7 @@ from torch import nn
 
 from observers import Flow, Motion
 from training.lessons.run import Run
+from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
 from training.sources.source import Increments, Source
 
@@ -35,10 +36,10 @@ def learn_flow(source: Source, run: Run) -> Motion:
     ValueError
         If no two samples in a row have all states, or such an observer cannot track.
     """
+    parts = source.tracking()
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
-    offset, scale = learned.x.mean(0), learned.x.std(0)
-    scale = np.where(scale > 0, scale, 1.0)
+    offset, scale = learned.x.mean(0), spread(learned.x)
     u_scale = np.abs(learned.u).max(0, initial=0.0)
     u_scale = np.where(u_scale > 0, u_scale, 1.0)
     problem = FlowProblem(learned, offset, scale, u_scale, run.device)
@@ -50,7 +51,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     missed = np.abs(flow(s, judged.u) - s - judged.change / scale)
     least = LEAST_ERROR * np.sqrt(np.mean((learned.change / scale) ** 2, axis=0))
     error = np.maximum(OF_MEDIAN * np.median(missed, axis=0), least)
-    return source.motion(flow=flow, x_offset=offset, x_scale=scale, error=error)
+    return Motion(**parts | {"flow": flow, "x_offset": offset, "x_scale": scale, "error": error})
 
 
 class FlowProblem:

@@ -17,6 +17,7 @@ from training.maps.inverse import InverseProblem
 from training.maps.networks import Network, averaged, on_torch
 from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
 from training.maps.scaling import StateScale
+from training.seeds import Stream, generator
 from training.sources.simulated import SimulatedSource
 from training.sources.source import Pairs, Source
 from training.spectrum import Spectrum
@@ -78,6 +79,9 @@ class _MapLesson:
         self.linear = self.spectrum.filter(source.ny, config.dt, source.nu)
         simulated = isinstance(source, SimulatedSource)
         self.free = bool(simulated and source.nu and config.free_inverse and config.policy is None)
+        if config.closed_loop_trajectories:  # or the reason why none can be closed, before any work
+            simulated_source = self._simulated()
+            self.feedback = simulated_source.policy or named_policy(simulated_source.system, "controller")
         stages = 1 + self.free + bool(config.closed_loop_trajectories) + (config.pipeline == "spinn")
         self.share = 1 / stages
 
@@ -152,16 +156,15 @@ class _MapLesson:
     def _closed_loop(self, sampler: TrajectorySampler, maps: Maps) -> ClosedLoopSampler:
         """Batches half from motions of a controller that acts on T_inv's estimate."""
         config, source = self.config, self._simulated()
-        feedback = source.policy or named_policy(source.system, "controller")
         steps = min(source.steps, round(CLOSED_LOOP_SECONDS * source.pace / config.dt))
         driven = record_closed_loop(
             source.plant,
             maps.artifact(source.facts()),
-            feedback,
+            self.feedback,
             n=config.closed_loop_trajectories,
             steps=steps,
             ages=recording_ages(steps, config.samples),
-            rng=source.rng,
+            rng=generator(Stream.TRAINING, config.seed, 2),
             noise_free_share=config.noise_free_share,
             high_noise_emphasis=config.high_noise_emphasis,
             process_noise_share=config.process_noise_share,
@@ -182,10 +185,10 @@ class _MapLesson:
             system, linear, steps=source.steps, epsilon=config.truncation, box_factor=config.box_factor
         )
         settled = source.ages >= first  # the filter's start no longer matters
-        pairs = self._pairs(linear)
+        pairs, rng = self._pairs(linear), generator(Stream.TRAINING, config.seed, 3)
         x = pairs.x.reshape(-1, system.nx)
-        points = x if config.collocation == "motions" else system.draw_starts(source.rng, len(x))
-        forward = self._forward(system, source.rng, pairs, points, settled)
+        points = x if config.collocation == "motions" else system.draw_starts(rng, len(x))
+        forward = self._forward(system, rng, pairs, points, settled)
         run.samples["inverse_samples"] = len(points)
         with run.progress.phase("T along the motions"):
             T_x = np.stack([forward(each) for each in pairs.x])

@@ -6,6 +6,7 @@ from typing import Self
 import numpy as np
 
 from training.config import Scaling
+from training.maps.coordinates import STILL
 
 LEAST = 0.1  # of the mean square of a scaled state, added to it: errors of smaller states are not taken relative
 
@@ -28,7 +29,8 @@ class StateScale:
         else:
             low, high = x.min(axes), x.max(axes)
             offset, scale = (low + high) / 2, (high - low) / 2
-        return cls(offset, np.where(scale > 0, scale, 1.0), scaling == "relative", nx)
+        moves = scale > STILL * np.abs(x).max(axes)
+        return cls(offset, np.where(moves, scale, 1.0), scaling == "relative", nx)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Scale states (..., nx)."""

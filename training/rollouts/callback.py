@@ -172,7 +172,9 @@ class KKLTrainingCallback(BaseCallback):
             )
         config = settings_of(artifact.training, **QUICK | self._settings | {"tracking": artifact.motion is not None})
         if artifact.inverse.error_covariance is not None and not config.held_out:
-            raise ValueError("covariances are calibrated on episodes that are held out: held_out must be positive, got 0")
+            raise ValueError(
+                "covariances are calibrated on episodes that are held out: held_out must be positive, got 0"
+            )
         for observer in used:
             check_replacement(artifact, observer.artifact)
             level = observer.measurement_noise

@@ -1,5 +1,6 @@
 """Recorded motions: files, data sets, or rollouts of an environment, in which the hidden signals were seen."""
 
+import functools
 import hashlib
 import math
 from collections.abc import Callable, Sequence
@@ -8,11 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from observers import Artifact, Equations, Factors, LinearFilter, Motion
+from observers import Artifact, Equations, Factors, LinearFilter
 from observers.checks import shown
 from training.config import Config
 from training.maps.coordinates import settling_time
-from training.records import Record, Signals, check_dt, check_memory, check_signals, jitter, median_step, pieces, resampled
+from training.records import (
+    Record,
+    Signals,
+    check_dt,
+    check_memory,
+    check_signals,
+    jitter,
+    median_step,
+    pieces,
+    resampled,
+)
 from training.seeds import Stream, generator
 from training.sources.errors import recorded_errors
 from training.sources.output import linear_output
@@ -81,8 +92,10 @@ class RecordedSource:
         check_memory(records, settling_time(self.linear), lambda text: warn(f"warning: {text}"))
         kept = [resampled(record, config.dt) for record in records]
         if held_out is None:
-            kept, held_out = split(kept, config.held_out, config.seed)
-        self.kept, self.held_out = kept, list(held_out)
+            kept, apart = split(kept, config.held_out, config.seed)
+        else:
+            apart = [resampled(record, config.dt) for record in held_out]
+        self.kept, self.held_out = kept, apart
         self.rate = signal_rate(kept)
         self.pace = 1 / self.rate
 
@@ -103,7 +116,7 @@ class RecordedSource:
         }
         try:
             return found | {"C": self._output()[0]}
-        except ValueError:  # motion() says why
+        except ValueError:  # tracking() says why
             return found
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
@@ -142,7 +155,8 @@ class RecordedSource:
         u = np.zeros((steps, len(first), 0))
         if self.nu:
             u = np.concatenate([np.asarray(piece.u) for piece in whole])[where[:-1]]
-        return Runs(x, np.concatenate([piece.y for piece in whole])[where], u, np.zeros(len(first)), np.ones(len(first), bool))
+        y = np.concatenate([piece.y for piece in whole])[where]
+        return Runs(x, y, u, process_noise=np.zeros(len(first)), usual=np.ones(len(first), dtype=bool))
 
     def equations(self) -> Equations:
         """There are none."""
@@ -150,7 +164,10 @@ class RecordedSource:
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
         """How states change from each recorded sample to the next, on what is trained on and what is held out."""
-        self._require_trackable()
+        return self._both_increments
+
+    @functools.cached_property
+    def _both_increments(self) -> tuple[Increments, Increments]:
         return self._increments(self.kept), self._increments(self.held_out)
 
     def _increments(self, records: Sequence[Record]) -> Increments:
@@ -163,7 +180,7 @@ class RecordedSource:
         known = np.flatnonzero(np.isfinite(x + change).all(-1))
         if not len(known):
             raise ValueError(
-                "no two samples in a row have all hidden signals: record these at each sample, or train with a larger dt"
+                "no two samples in a row have all hidden signals: record them at each sample, or take a larger dt"
             )
         if len(known) > INCREMENTS:
             known = generator(Stream.CALIBRATION, self.config.seed, 11).choice(known, INCREMENTS, replace=False)
@@ -175,26 +192,8 @@ class RecordedSource:
         known = {signal: error for signal, error in found.relative.items() if math.isfinite(error)}
         return {"records": fingerprints(self.records), "held_out_errors": known, "held_out_after": found.after}
 
-    def motion(self, **how: Any) -> Motion:
-        """The motion of a tracker by a flow."""
-        x = np.concatenate([record.x for record in self.kept if record.x is not None])
-        x = x[np.isfinite(x).all(-1)]
-        low, high = x.min(0), x.max(0)
-        margin = np.where(high > low, BEYOND * (high - low), 1.0)
-        parts = {
-            "low": low - margin,
-            "high": high + margin,
-            "mean": x.mean(0),
-            "covariance": np.atleast_2d(np.cov(x.T)) + np.diag(1e-6 * margin**2),
-            "process_noise": np.zeros(self.nx),  # the flow's error stands for all noise
-            "least_process_noise": 1.0,
-            "least_measurement_noise": self._output()[1],
-            "window": max(WINDOW * self.dt, 0.5 / self.rate),
-            "factors": Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1))),
-        }
-        return Motion(**parts | how)
-
-    def _require_trackable(self) -> None:
+    def tracking(self) -> dict[str, Any]:
+        """Arguments of :class:`observers.Motion` beside the flow; ValueError where nothing can track."""
         if self.config.arbitrary_zero:
             raise ValueError(
                 f"a tracker compares {', '.join(self.config.arbitrary_zero)} with what it predicts, and cannot do "
@@ -202,7 +201,23 @@ class RecordedSource:
             )
         if not self.held_out:
             raise ValueError("covariances are calibrated on what is held out: held_out must be positive, got 0")
-        self._output()
+        _, least = self._output()
+        _ = self._both_increments  # or the reason why there are none
+        x = np.concatenate([record.x for record in self.kept if record.x is not None])
+        x = x[np.isfinite(x).all(-1)]
+        low, high = x.min(0), x.max(0)
+        margin = np.where(high > low, BEYOND * (high - low), 1.0)
+        return {
+            "low": low - margin,
+            "high": high + margin,
+            "mean": x.mean(0),
+            "covariance": np.atleast_2d(np.cov(x.T)) + np.diag(1e-6 * margin**2),
+            "process_noise": np.zeros(self.nx),  # the flow's error stands for all noise
+            "least_process_noise": 1.0,
+            "least_measurement_noise": least,
+            "window": max(WINDOW * self.dt, 0.5 / self.rate),
+            "factors": Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1))),
+        }
 
     def _output(self) -> tuple[np.ndarray, np.ndarray]:
         return linear_output(self.kept, self.C)

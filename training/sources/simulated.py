@@ -8,18 +8,20 @@ import numpy as np
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
-from observers import Artifact, Equations, Factors, LinearFilter, Motion
+from observers import Artifact, Equations, Factors, LinearFilter
 from training.config import Config
 from training.jobs import describe
+from training.maps.coordinates import spread
 from training.seeds import Stream, generator
 from training.sources.source import Increments, Pairs, Report, Runs
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
-from training.trajectories.expression import field_expression, output_facts
+from training.trajectories.derivatives import output_matrix
+from training.trajectories.expression import field_expression, output_expression, output_facts
 from training.trajectories.noise import draw_process_noise
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, uncertain_plant, with_parameters
 from training.trajectories.policy import policy_fingerprint, under_policy
-from training.trajectories.record import Motions, record, recording_ages, trajectories
+from training.trajectories.record import FIRST, Motions, check_share, record, recording_ages, trajectories
 from training.trajectories.signals import DRIVEN, KINDS, random_inputs
 
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
@@ -29,7 +31,7 @@ WINDOW, RUN = 0.5, 20.0  # seconds at the pace of the shipped systems: of a trac
 SUBSTEPS, INTEGRATION_ERROR = 64, 1e-5  # at most, of scaled states in a sample: far below the process noise assumed
 INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share that judges a flow
 DEVIATIONS = (1e-4, 0.3)  # of these pairs from motions, in standard deviations of the states, log-uniform
-TRIES = 8
+AT_ONCE = 20  # motions at least that are simulated where some left the bounds
 
 
 class SimulatedSource:
@@ -63,7 +65,6 @@ class SimulatedSource:
         self.process_noise = float(system.process_noise) if self.process_noise_share else 0.0
         self.steps = max(1, round(config.duration / config.dt))
         self.ages = recording_ages(self.steps, config.samples)
-        self.rng = generator(Stream.TRAINING, config.seed)  # drawn from in the order of the lessons
 
     def identity(self) -> dict[str, Any]:
         """What identifies the source."""
@@ -116,7 +117,7 @@ class SimulatedSource:
             n=config.trajectories,
             steps=self.steps,
             ages=self.ages,
-            rng=self.rng,
+            rng=generator(Stream.TRAINING, config.seed, *([1] if free else [])),
             motions=motions,
             report=report,
         )
@@ -132,10 +133,14 @@ class SimulatedSource:
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
         """Motions with the system's process noise, and as many without; of each a third from 2X, the others from X."""
-        rng, steps = generator(Stream.CALIBRATION, self.config.seed), round(RUN * self.pace / self.dt)
-        plant, found = with_parameters(self.system, self.ranges), []
+        rng, steps = generator(Stream.CALIBRATION, self.config.seed), max(1, round(RUN * self.pace / self.dt))
+        plant, found = with_parameters(self.system, self.ranges), list[tuple[np.ndarray, ...]]()
         levels = sorted({0.0, self.process_noise})
-        for i, level in enumerate(levels):
+
+        def part(done: float) -> None:
+            report((len(found) + done) / len(levels))
+
+        for level in levels:
             x, u, usual = sound_motions(
                 plant,
                 n=self.config.runs // len(levels),
@@ -145,7 +150,7 @@ class SimulatedSource:
                 driven=bool(self.nu),
                 policy=self.policy and blind(self.policy, self.nx),
                 process_noise=level,
-                report=lambda done, i=i: report((i + done) / len(levels)),
+                report=part,
                 box_factor=BEYOND,
             )
             found.append((x, u, np.full(x.shape[1], level), usual))
@@ -161,21 +166,24 @@ class SimulatedSource:
             return Equations(field, 0)
         x, u = self._states(4)
         later = simulate(self.system, x, 1, self.dt, u=u[None] if self.system.nu else None)[-1]
-        inside, scale, substeps = np.isfinite(later).all(-1), self._scale[1], 1
-        while substeps < SUBSTEPS:
-            apart = np.abs(Equations(field, substeps)(x, u, self.dt) - later)[inside] / scale
-            if np.quantile(apart.max(-1), 0.99) <= INTEGRATION_ERROR:
-                break
+        inside, substeps = np.isfinite(later).all(-1), 1
+        while substeps <= SUBSTEPS:
+            equations = Equations(field, substeps)
+            apart = np.abs(equations(x, u, self.dt) - later)[inside] / self._scale[1]
+            off = np.quantile(apart.max(-1), 0.99)
+            if off <= INTEGRATION_ERROR:
+                return equations
             substeps *= 2
-        return Equations(field, substeps)
+        raise ValueError(f"{SUBSTEPS} Runge-Kutta steps in each {self.dt:g} s are off by {off:.2g} standard deviations")
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
         """States about motions, and where they are a sample later."""
         rng = generator(Stream.CALIBRATION, self.config.seed, 5)
         along, u = self._states(300)
         rows = rng.integers(len(along), size=INCREMENTS)
-        size = np.exp(rng.uniform(np.log(DEVIATIONS[0]), np.log(DEVIATIONS[1]), (INCREMENTS, 1)))
-        low, high = (np.array(bound) for bound in zip(*self.system.bounds, strict=True))
+        smallest, largest = np.log(DEVIATIONS)
+        size = np.exp(rng.uniform(smallest, largest, (INCREMENTS, 1)))
+        low, high = np.array(self.system.bounds, dtype=float).T
         x = np.clip(along[rows] + size * self._scale[1] * rng.standard_normal((INCREMENTS, self.nx)), low, high)
         u = np.where(rng.random((INCREMENTS, 1)) < 0.5, 0.0, u[rows]) if self.nu else np.zeros((INCREMENTS, 0))
         later = simulate(self.system, x, 1, self.dt, u=u[None] if self.nu else None)[-1]
@@ -188,17 +196,19 @@ class SimulatedSource:
         """Nothing: ``kkl-gym evaluate`` measures errors."""
         return {}
 
-    def motion(self, **how: Any) -> Motion:
-        """The motion of a tracker: by equations, or a flow."""
+    def tracking(self) -> dict[str, Any]:
+        """Arguments of :class:`observers.Motion` beside equations or flow; ValueError where nothing can track."""
         system = self.system
         if self.ranges:
-            raise ValueError(f"an observer for a range of {', '.join(self.ranges)} cannot track: a motion is of one plant")
-        low, high = (np.array(bound, dtype=float) for bound in zip(*system.bounds, strict=True))
+            raise ValueError(f"a motion is of one plant, not of a range of {', '.join(self.ranges)}")
+        if output_matrix(system) is None:
+            output_expression(system)  # or the reason why there is none
+        low, high = np.array(system.bounds, dtype=float).T
         offset, scale = self._scale
         mean, covariance = unknown_start(system)
         usual = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (self.ny,))
         least = LEAST_NOISE * np.where(usual > 0, usual, 0.05 * np.array(system.output_range))
-        parts = {
+        return {
             "x_offset": offset,
             "x_scale": scale,
             "low": low,
@@ -212,14 +222,12 @@ class SimulatedSource:
             "window": WINDOW * self.pace,
             "factors": Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1))),
         }
-        return Motion(**parts | how)
 
     @functools.cached_property
     def _scale(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation of the states along motions from 2X, (nx,) each."""
         along, _ = self._states(4)
-        scale = along.std(0)
-        return along.mean(0), np.where(scale > 0, scale, 1.0)
+        return along.mean(0), spread(along)
 
     def _states(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """States (n, nx) along short motions from X and 2X, and inputs (n, nu)."""
@@ -254,25 +262,28 @@ def sound_motions(
     """
     level = system.process_noise if process_noise is None else process_noise
     kept: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    while (missing := n - sum(x.shape[1] for x, *_ in kept)) > 0:
-        if len(kept) == TRIES:
-            raise ValueError(f"most motions of {steps * dt:g} s leave bounds = {system.bounds}: widen them, or shrink X")
-        x0 = system.draw_starts(rng, missing)
-        far = (np.arange(missing) % 3 == 2) & (box_factor > 1)
+    tried = stayed = 0
+    while stayed < n:
+        count = max(n - stayed, AT_ONCE)
+        x0 = system.draw_starts(rng, count)
+        far = (np.arange(count) % 3 == 2) & (box_factor > 1)
         if far.any():
             x0[far] = system.draw_starts(rng, int(far.sum()), box_factor)
-        w = draw_process_noise(system, level, n=missing, steps=steps, rng=rng)
+        w = draw_process_noise(system, level, n=count, steps=steps, rng=rng)
         if policy and driven:
-            x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=rng, own=np.arange(missing) % 2 == 1, w=w)
+            x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=rng, own=np.arange(count) % 2 == 1, w=w)
         else:
-            u = np.zeros((steps, missing, system.nu))
+            u = np.zeros((steps, count, system.nu))
             if driven:
-                u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt=dt, rng=rng, kinds=DRIVEN)
+                u[:, ::2] = random_inputs(system, len(range(0, count, 2)), steps, dt=dt, rng=rng, kinds=DRIVEN)
             x = simulate(system, x0, steps, dt, u=u, w=w, report=lambda k: report(k / steps))
         inside = np.isfinite(x[-1]).all(-1)
         kept.append((x[:, inside], u[:, inside], ~far[inside]))
+        tried, stayed = tried + count, stayed + int(inside.sum())
+        if tried >= FIRST:
+            check_share(system, stayed, tried, steps * dt)
     xs, us, usual = zip(*kept, strict=True)
-    return np.concatenate(xs, 1), np.concatenate(us, 1), np.concatenate(usual)
+    return np.concatenate(xs, 1)[:, :n], np.concatenate(us, 1)[:, :n], np.concatenate(usual)[:n]
 
 
 def unknown_start(system: System) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from observers import Artifact, Equations, LinearFilter, Motion
+from observers import Artifact, Equations, LinearFilter
 from training.config import Config
 from training.trajectories.record import Pairs
 
@@ -116,12 +116,12 @@ class Source(Protocol):
         """Pairs of states a sample apart, to learn a flow from and to judge it by."""
         ...
 
-    def judged(self, artifact: Artifact) -> dict[str, Any]:
-        """Errors on motions that are held out, for the artifact's account of its training."""
+    def tracking(self) -> dict[str, Any]:
+        """Arguments of :class:`observers.Motion`, but for equations and flow; ValueError where nothing can track."""
         ...
 
-    def motion(self, **how: Any) -> Motion:
-        """The motion of a tracker, with equations or a flow; ValueError where such an observer cannot track."""
+    def judged(self, artifact: Artifact) -> dict[str, Any]:
+        """Errors on motions that are held out, for the artifact's account of its training."""
         ...
 
 

@@ -13,8 +13,8 @@ PROFILE = Profile(
     eigenvalues=evenly_spaced(15, -0.4, -20.0),
     # Slower modes have a rougher T; more of them average more of the noise.
     spinn_settings={"eigenvalues": evenly_spaced(11, -4.0, -16.0), "noise_free_share": 0.2, "high_noise_emphasis": 4.5},
-    # Its phase is the hardest of all to tell from noise: more samples at high noise help there. No input within its bound
-    # leads the oscillator out of X, so stronger ones do.
+    # Noise hides its phase most of all: more samples at high noise help. No input within its bound leads the oscillator
+    # out of X, so stronger ones do.
     settings={"lead_in_input": 4.0, "noise_free_share": 0.05, "high_noise_emphasis": 4.0},
     # Of a T_inv that stands alone. Slow complex modes at frequencies of y average its noise.
     large_settings={

@@ -48,8 +48,8 @@ def field_expression(system: System, *, inputs: bool = True) -> Expression:
         u = list(u) if inputs else [0.0] * nu
         if system.discrete:
             return list(components(system.step, x, u))
-        rows = input_matrix(system, x) if nu else [()] * len(x)
-        return [fi + sum(gij * uj for gij, uj in zip(row, u, strict=True)) for fi, row in zip(system.f(x), rows)]
+        f, rows = components(system.f, x), input_matrix(system, x) if nu else [()] * len(x)
+        return [fi + sum(gij * uj for gij, uj in zip(row, u, strict=True)) for fi, row in zip(f, rows)]
 
     def evaluated(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         values = traced(x.T, u.T)

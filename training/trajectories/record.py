@@ -110,7 +110,7 @@ def trajectories(
         pending += [(row, row < round(motions.lead_in_share * count)) for row in range(count)]
     if n > CHUNK:  # whether they stay within bounds is said before so many have been simulated
         first = _simulated(system, pending[:FIRST], steps=steps, dt=dt, rng=np.random.default_rng(0), motions=motions)
-        _check_share(system, int(first.inside.sum()), len(first.inside), steps * dt)
+        check_share(system, int(first.inside.sum()), len(first.inside), steps * dt)
     while pending:
         rows, pending = pending[:CHUNK], pending[CHUNK:]
         told = partial(_tell, report, n - len(pending) - len(rows), len(rows) / steps)
@@ -118,7 +118,7 @@ def trajectories(
         pending += [row for row, stayed in zip(rows, found.inside) if not stayed]
         tried += len(rows)
         if pending and tried >= FIRST:
-            _check_share(system, n - len(pending), tried, steps * dt)
+            check_share(system, n - len(pending), tried, steps * dt)
         yield found.x[:, found.inside], found.u[:, found.inside], found.level[found.inside]
 
 
@@ -173,7 +173,7 @@ def _simulated(
     return _Chunk(x, u, level, np.isfinite(x[-1]).all(-1))
 
 
-def _check_share(system: System, stayed: int, tried: int, seconds: float) -> None:
+def check_share(system: System, stayed: int, tried: int, seconds: float) -> None:
     """Raise an error if hardly any of the trajectories that were tried stayed within the bounds."""
     if stayed < FEWEST_INSIDE * tried:
         raise ValueError(

@@ -43,9 +43,10 @@ class KKLMethod(Method[Artifact]):
 
 
 def within(config: Config, budget: Budget, seed: int) -> Config:
-    """Give a configuration of the package the benchmark's data, networks and limit of CPU time."""
+    """Give a configuration of the package the benchmark's data, networks and limit of CPU time, without tracking."""
     return replace(
         config,
+        tracking=False,
         dt=budget.dt,
         trajectories=budget.trajectories,
         duration=budget.duration,
@@ -74,8 +75,7 @@ class Default(KKLMethod):
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
-        changes = {"tracking": False}
-        config = within(preset(task.system, size="large", changes=changes), task.budget, task.seed)
+        config = within(preset(task.system, size="large"), task.budget, task.seed)
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 
 
@@ -115,8 +115,7 @@ class ShippedLarge(Shipped):
 
     def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
         """T_inv of the large map, without a model."""
-        level = trained.inverse.within(measurement_noise)
-        return KKLObserver(trained, level, process_noise=0.0, tracking=False)
+        return super().observer(replace(trained, motion=None), system, dt, measurement_noise)
 
 
 class SPINN(KKLMethod):
@@ -136,7 +135,7 @@ class SPINN(KKLMethod):
         """The package's pipeline."""
         fastest, slowest = configuration["spectrum"]
         changes = {"eigenvalues": spectrum(task.system, fastest, slowest), "pairs": (), "box_factor": 1.0}
-        config = within(preset(task.system, "spinn", "fast", changes=changes), task.budget, task.seed)
+        config = within(preset(task.system, "spinn", changes=changes), task.budget, task.seed)
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 
 

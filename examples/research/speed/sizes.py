@@ -30,11 +30,11 @@ TURNS, STEPS, BATCH_STEPS = 7, 1000, 100  # of each observer that is timed
 
 @dataclass(frozen=True)
 class Sizes:
-    """Train observers of several sizes for a system, and show their errors against the time of a step.
+    """Train a T_inv of several sizes for a system, and show errors against the time of a step.
 
-    The widths are those of hidden layers; all else is as `kkl-gym train SYSTEM` has it. Errors are medians over unseen
-    motions from X, over all steps. Times are CPU time of one thread: run it with OMP_NUM_THREADS=1, on an idle machine.
-    Observers that are there already are not trained again, so that times can be taken again.
+    The widths are those of hidden layers; all else is as `kkl-gym train SYSTEM --size large` has it. Errors are medians
+    over unseen motions from X, over all steps. Times are CPU time of one thread: run it with OMP_NUM_THREADS=1, on an
+    idle machine. Observers that are there already are not trained again, so that times can be taken again.
 
     Writes OUT/NAME-WIDTH.safetensors, OUT/sizes.csv and OUT/sizes.png.
     """
@@ -90,7 +90,7 @@ class Sizes:
         """Train an observer, or read an earlier training of the same."""
         from training.train_observer import train
 
-        config = preset(system, "input-aware", "fast", changes=changes)
+        config = preset(system, size="large", changes={"tracking": False, **changes})
         progress.say(f"an observer for {system.name} with hidden layers of {config.width}")
         artifact = train(system, config, out / f"{config.width}", resume=True, console=progress).artifact
         artifact.save(out / f"{system.name}-{config.width}.safetensors")

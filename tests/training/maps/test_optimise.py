@@ -15,7 +15,6 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 import training.evaluation.errors
 import training.maps.optimise
-import training.pipeline
 import training.trajectories.record
 from kkl_gym import VanDerPol, get_system
 from observers.storage import UNFINISHED

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from small_runs import closed_loop, open_loop, toy, untrained
 
-import training.pipeline
 from kkl_gym import VanDerPol
 from observers import KKLObserver
 from training import train

@@ -293,13 +293,14 @@ static void watch_anew(NAME_observer *observer)
     memset(observer->trend, 0, sizeof observer->trend);
 }
 
-/* Correct a prediction, unless that leaves no numbers. */
-static correction take_in(NAME_observer *observer, prediction *p, const real y[NY])
+/* Correct a prediction, unless that leaves no numbers; at the start, unless it leaves no factor. */
+static correction take_in(NAME_observer *observer, prediction *p, const real y[NY], int starts)
 {
     correction c = correct(p, y);
-    double total = 0.0;
+    double L[NX][NX], total;
     shift(p->x, 1.0, c.V, c.white);
     add(p->P, -1.0, c.V, c.V);
+    total = starts ? factorise(p->P, L) : 0.0;
     for (int i = 0; i < NX; i++) {
         total += p->x[i];
         p->x[i] = within(p->x[i], i);
@@ -323,7 +324,7 @@ static void track(NAME_observer *observer, const real y[NY], const real *u, real
     prediction p = predict(observer->x, observer->P, u);
     for (int turn = 0; turn < RELINEARISATIONS && observer->seen < WINDOW; turn++)
         relinearise(observer, &p, y, u);
-    correction c = take_in(observer, &p, y);
+    correction c = take_in(observer, &p, y, 0);
     for (int k = 0; k < NY; k++) {
         whole[k] = !isnan(y[k]) ? y[k] : isfinite(c.expected[k]) ? (real)c.expected[k] : observer->y[k];
         if (isnan(y[k]) || isinf(observer->nis))
@@ -394,12 +395,12 @@ void NAME_reset(NAME_observer *observer, const real y[NY])
         observer->y[j] = y[j];
     }
 // if tracks
-    prediction first;
-    memcpy(first.x, mean, sizeof first.x);
-    memcpy(first.P, covariance, sizeof first.P);
-    memcpy(observer->x, first.x, sizeof first.x);
-    memcpy(observer->P, first.P, sizeof first.P);
-    take_in(observer, &first, y);
+    prediction start;
+    memcpy(start.x, start_mean, sizeof start.x);
+    memcpy(start.P, start_covariance, sizeof start.P);
+    memcpy(observer->x, start.x, sizeof start.x);
+    memcpy(observer->P, start.P, sizeof start.P);
+    take_in(observer, &start, y, 1);
     watch_anew(observer);
     observer->seen = 0;
     supervise(observer);

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 import torch
 from recorded_runs import SIGNALS, SMALL, swing
-
-from observers import Artifact, KKLObserver
-from training.maps.networks import Network, averaged
 from training.recorded.config import recorded_config, signal_rate
 from training.recorded.errors import recorded_errors
 from training.recorded.fit import train_recorded
 from training.recorded.preparing import split
+
+from observers import Artifact, KKLObserver
+from training.maps.networks import Network, averaged
 from training.records import Record, resampled
 
 

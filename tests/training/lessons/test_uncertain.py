@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+import training.pipeline
 from small_runs import CPU, toy
 
-import training.pipeline
 from kkl_gym import VanDerPol
 from kkl_gym.system import System
 from training import calibrate, errors, train, unseen_trajectories
