@@ -7,7 +7,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 import pytest
-from training.teaching import monitor
 
 from examples.research.__main__ import COMMANDS
 from training.cli import main

@@ -47,7 +47,7 @@ def test_the_table_has_the_share_of_the_products_speed_that_a_network_reaches():
 
 
 def test_sizes_trains_each_width_once(tmp_path):
-    settings = {"trajectories": 20, "duration": 5.0, "samples": 20, "inverse_steps": 5, "batch": 64}
+    settings = {"trajectories": 20, "duration": 5.0, "samples": 20, "inverse_steps": 5, "batch": 64, "runs": 100}
     (tmp_path / "tiny.json").write_text(json.dumps(settings))
     how = {"config": tmp_path / "tiny.json", "trajectories": 2, "num_envs": 4, "out": tmp_path / "out"}
     frame = Sizes("van_der_pol", widths=(4,), **how).run(Console(quiet=True))

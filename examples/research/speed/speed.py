@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -103,7 +103,7 @@ class Speed:
                 artifact = Artifact.read(resolve(name))
                 tasks = observer_tasks(artifact, one.system, rows=None, steps=self.steps)
                 batch = observer_tasks(artifact, one.system, rows=n, steps=vector_steps)
-                many = KKLObserver(replace(artifact, flow=None))  # for its network, T_inv
+                many = KKLObserver(artifact, tracking=False)  # for its network, T_inv
                 many.reset(np.zeros((n, artifact.ny)))
                 many.step(np.zeros((n, artifact.ny)), np.full((n, artifact.nu), 1e-3))
                 products, operations = limit(artifact.inverse, n)
