@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from training.sources.windows import windows
 from training.records import Record
+from training.sources.windows import windows
 from training.spectrum import Spectrum
 
 DT = 0.05
