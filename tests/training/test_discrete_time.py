@@ -1,6 +1,6 @@
 """Systems in discrete time, from their environment to a trained observer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -79,7 +79,12 @@ def test_an_observer_of_a_map_is_trained_and_follows_it(tmp_path):
     config = toy(system, trajectories=200, inverse_steps=600, width=32, process_noise_share=0.0, **duration)
     runs = unseen_trajectories(system, 1.0, n=20, duration=100.0, seed=0, driven=True)
     artifact = train(system, config, tmp_path).artifact
-    assert np.median(errors(artifact, system, runs, measurement_noise=0.0, seed=0).late) < 3.0
+    alone = replace(artifact, motion=None)
+    assert np.median(errors(alone, system, runs, measurement_noise=0.0, seed=0).late) < 3.0
+    assert np.median(errors(artifact, system, runs, measurement_noise=0.01, seed=0).late) < 1.0
+    assert artifact.motion.equations.substeps == 0
+    x, u = runs.x[:-1], runs.u
+    np.testing.assert_allclose(artifact.motion.step(x, u, 1.0), runs.x[1:], atol=1e-12)
     artifact.save(tmp_path / "henon.safetensors")
     still = kkl_gym.KKLEnv(system, process_noise=0.0, measurement_noise=0.0)
     env = kkl_gym.KKLObservation(still, str(tmp_path / "henon.safetensors"))

@@ -15,11 +15,11 @@ from examples.research.benchmark.protocol import run
 from kkl_gym import get_system
 from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance, simulate
-from training.kalman import ExtendedKalmanFilter, IteratedKalmanFilter, UnscentedKalmanFilter, unknown_start
+from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter, unknown_start
 from training.trajectories.derivatives import jacobian
 
 
-@pytest.fixture(params=[ExtendedKalmanFilter, UnscentedKalmanFilter, IteratedKalmanFilter])
+@pytest.fixture(params=[ExtendedKalmanFilter, UnscentedKalmanFilter])
 def filters(request):
     return request.param
 
@@ -144,40 +144,18 @@ def test_a_filter_that_leaves_the_bounds_starts_anew_without_the_others(filters)
     assert abs(x_hat[-1, 0, 0] - 0.5) < 0.2
 
 
-@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, IteratedKalmanFilter])
 @pytest.mark.parametrize("P", [np.diag([1.0, -1e-3]), np.full((2, 2), np.nan)])
-def test_a_ukf_whose_covariance_is_none_starts_anew_without_the_others(kind, P):
-    observer, untouched = of_van_der_pol(kind), of_van_der_pol(kind)
+def test_a_ukf_whose_covariance_is_none_starts_anew_without_the_others(P):
+    observer, untouched = (of_van_der_pol(UnscentedKalmanFilter) for _ in range(2))
     y = np.array([[0.7], [-0.4]])
     for one in (observer, untouched):
         one.reset(y)
     observer.P[0] = P
     found, expected = observer.step(y), untouched.step(y)
-    fresh = of_van_der_pol(kind).reset(y)
+    fresh = of_van_der_pol(UnscentedKalmanFilter).reset(y)
     np.testing.assert_allclose(found, [fresh[0], expected[1]], rtol=1e-12)
     assert np.isfinite(observer.P).all()
     assert np.abs(fresh[0] - expected[0]).max() > 1e-3
-
-
-def test_a_step_that_is_taken_twice_is_nearer_to_what_bayes_has_it():
-    """Means given two exact outputs, beside those of all states on a fine grid that could have brought them."""
-    system, dt, noise = get_system("van_der_pol"), 0.1, 0.002
-    (y0, rate), spread = (0.5, np.linspace(-2, 2, 9)), 0.6
-    start = np.array([y0, 0.0]), np.diag([noise**2, spread**2])
-    later = simulate(system, np.column_stack([np.full(9, y0), rate]), 1, dt)[1]
-    y = np.stack([np.full((9, 1), y0), later[:, :1]])
-    grid = np.linspace(-3, 3, 60_001)
-    moved = simulate(system, np.column_stack([np.full(len(grid), y0), grid]), 1, dt)[1]
-    exact = np.empty((9, 2))
-    for i in range(9):
-        log = -0.5 * ((moved[:, 0] - y[1, i, 0]) / noise) ** 2 - 0.5 * (grid / spread) ** 2
-        weights = np.exp(log - log.max())
-        exact[i] = weights @ moved / weights.sum()
-    off = {}
-    for kind in (UnscentedKalmanFilter, IteratedKalmanFilter):
-        found = run(kind(system, dt, Q=np.zeros((2, 2)), R=noise**2 * np.eye(1), start=start), y)[1]
-        off[kind] = np.abs(found - exact)[:, 1].max()
-    assert off[IteratedKalmanFilter] < 0.2 * off[UnscentedKalmanFilter]
 
 
 def test_innovations_are_as_large_as_expected_where_the_model_holds(filters):

@@ -1,22 +1,22 @@
 """Trainings for plants whose parameters are known roughly."""
 
+import io
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import ClassVar
 
 import numpy as np
 import pytest
-import training.pipeline
+from rich.console import Console
 from small_runs import CPU, toy
 
+import training.lessons.map
 from kkl_gym import VanDerPol
 from kkl_gym.system import System
-from training import calibrate, errors, train, unseen_trajectories
+from training import SimulatedSource, calibrate, errors, train, unseen_trajectories
 from training.config import Config
 from training.evaluation.parameters import parameter_errors
-from training.trajectories.record import record
+from training.spectrum import Spectrum
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,6 @@ class Spring(System):
         return (x[0],)
 
 
-class ReachedError(Exception):
-    """Raised where a test has seen enough of a training."""
-
-
 @cache
 def trained(**uncertain):
     """An observer of free motion, for one plant or many."""
@@ -52,8 +48,7 @@ def trained(**uncertain):
     own = {"inputs": False, "trajectories": 200, "duration": 15.0, "inverse_steps": 1200, "width": 24}
     own |= {"uncertain": uncertain, "estimate_parameters": True} if uncertain else {}
     config = toy(system, eigenvalues=(-0.4, -0.8, -1.6, -3.2, -6.4), **own)
-    with TemporaryDirectory() as folder:
-        return train(system, config, Path(folder), device=CPU).artifact
+    return train(system, config, device=CPU).artifact
 
 
 def test_an_observer_for_uncertain_plants_holds_on_another():
@@ -79,29 +74,18 @@ def test_it_identifies_the_plant_while_it_runs():
     assert clean < noisy < 0.5 * drawn
 
 
-def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate(monkeypatch, tmp_path):
-    seen = {}
-
-    def spy_record(plant, *arguments, **named):
-        seen["plant"] = plant
-        return record(plant, *arguments, **named)
-
-    def spy_sampler(data, *arguments, **named):
-        seen["x"], seen["parameters"], seen["nominal"] = data.x, named["parameters"], data.nominal
-        raise ReachedError
-
-    monkeypatch.setattr(training.pipeline, "record", spy_record)
-    monkeypatch.setattr(training.pipeline, "TrajectorySampler", spy_sampler)
+def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate():
     config = toy(VanDerPol(), uncertain={"mu": 0.1}, trajectories=60, duration=1.0)
     for estimated in (False, True):
-        with pytest.raises(ReachedError):
-            train(VanDerPol(), replace(config, estimate_parameters=estimated), tmp_path / str(estimated), device=CPU)
-        assert seen["plant"].state_names == ("x1", "x2", "mu")
-        assert seen["x"].shape[-1] == 2 + estimated
-        assert seen["parameters"] == estimated
-    mu = seen["x"][..., 2]
-    np.testing.assert_array_equal(seen["nominal"], mu[0] == 3)
-    assert 0.4 < seen["nominal"].mean() < 0.9
+        source = SimulatedSource(VanDerPol(), replace(config, estimate_parameters=estimated))
+        linear = Spectrum(config.eigenvalues).filter(1, config.dt, 1)
+        pairs = source.pairs(linear)
+        assert source.plant.state_names == ("x1", "x2", "mu")
+        assert pairs.x.shape[-1] == 2 + estimated
+        assert source.sampling(linear)["parameters"] == estimated
+    mu = pairs.x[..., 2]
+    np.testing.assert_array_equal(pairs.nominal, mu[0] == 3)
+    assert 0.4 < pairs.nominal.mean() < 0.9
     np.testing.assert_allclose(mu, np.broadcast_to(mu[0], mu.shape), rtol=1e-9)
     assert 2.7 <= mu.min() < 2.8 < 3.2 < mu.max() <= 3.3
 
@@ -119,8 +103,8 @@ def test_in_closed_loop_the_plant_is_uncertain_and_the_controller_nominal(monkey
         seen["data"] = original(plant, artifact, noted, **named)
         return seen["data"]
 
-    original = training.pipeline.record_closed_loop
-    monkeypatch.setattr(training.pipeline, "record_closed_loop", spy)
+    original = training.lessons.map.record_closed_loop
+    monkeypatch.setattr(training.lessons.map, "record_closed_loop", spy)
     few = {"closed_loop_trajectories": 12, "inverse_steps": 3, "duration": 2.0, "free_inverse": False}
     config = toy(VanDerPol(), uncertain={"all": 0.1}, estimate_parameters=True, **few)
     found = train(VanDerPol(), config, tmp_path, device=CPU).artifact
@@ -136,11 +120,21 @@ def test_under_a_policy_it_sees_the_states_alone(tmp_path):
     assert train(VanDerPol(), config, tmp_path, device=CPU).artifact.nx == 2
 
 
+def test_it_does_not_track_and_says_why():
+    said = Console(file=io.StringIO(), width=200)
+    config = toy(Spring(), uncertain={"stiffness": 0.3}, duration=1.0, inverse_steps=2, inputs=False)
+    artifact = train(Spring(), config, device=CPU, console=said).artifact
+    assert "does not track: a motion is of one plant, not of a range of stiffness" in said.file.getvalue()
+    assert artifact.motion is None
+    assert artifact.inverse.error_covariance.nx == 2
+
+
 def test_limits_of_a_monitor_hold_for_every_plant_of_the_range():
-    artifact = trained()
-    how = {"false_alarms": 0.2, "duration": 30.0, "seed": 0}
-    one = calibrate(artifact, Spring(), **how).limits
-    many = calibrate(replace(artifact, parameter_ranges={"stiffness": (3.2, 4.8)}), Spring(), **how).limits
+    alone = replace(trained(), motion=None)
+    one, many = (
+        calibrate(alone, SimulatedSource(Spring(), toy(Spring(), inputs=False, uncertain=uncertain))).limits
+        for uncertain in ({}, {"stiffness": 0.2})
+    )
     assert (many.mean[0] > 1.5 * one.mean[0]).all()
 
 

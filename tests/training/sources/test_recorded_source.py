@@ -1,3 +1,6 @@
+"""Observers from records of a plant whose best observer is known: a mass on a spring."""
+
+import io
 import json
 from dataclasses import replace
 
@@ -5,68 +8,188 @@ import numpy as np
 import pytest
 import torch
 from recorded_runs import SIGNALS, SMALL, swing
-from training.recorded.config import recorded_config, signal_rate
-from training.recorded.errors import recorded_errors
-from training.recorded.fit import train_recorded
-from training.recorded.preparing import split
+from rich.console import Console
+from scipy.linalg import solve_discrete_are
 
 from observers import Artifact, KKLObserver
+from training import RecordedSource, recorded_preset, train
+from training.lessons.calibrate import chi_square, squared_distance
 from training.maps.networks import Network, averaged
 from training.records import Record, resampled
+from training.sources.errors import recorded_errors
+from training.sources.output import linear_output
+from training.sources.recorded import check_plant, signal_rate, split
+
+CPU, NOISE, DT = torch.device("cpu"), 0.1, 0.05
+A = np.array([[np.cos(DT), np.sin(DT)], [-np.sin(DT), np.cos(DT)]])
 
 
-def trained(records, folder, **changes):
-    config = recorded_config(records, {**SMALL, **changes})
-    return train_recorded(records, config, folder, name="spring", device=torch.device("cpu"))
+def both(seed, n=600):
+    """A run of which the position is both measured and among what is to be estimated."""
+    run = swing(seed, n=n)
+    return replace(run, x=np.hstack([run.y, run.x]), signals=replace(run.signals, hidden=("position", "speed")))
 
 
-def test_an_observer_from_recorded_states(tmp_path):
+def trained(records, folder=None, *, resume=False, **changes):
+    """The result, and what was said on the way."""
+    said = Console(file=io.StringIO(), width=400)
+    source = RecordedSource(records, recorded_preset(records, {**SMALL, "flow_steps": 300, **changes}), "spring")
+    return train(source, folder=folder, resume=resume, device=CPU, console=said), said.file.getvalue()
+
+
+@pytest.fixture(scope="module")
+def tracking(tmp_path_factory):
+    """An observer that tracks, as read from a file."""
+    path = tmp_path_factory.mktemp("spring") / "spring.safetensors"
+    result, said = trained([both(seed) for seed in range(10)], measurement_noise_max=2 * NOISE)
+    assert "the tracker moves by a learned flow: records have no equations" in said
+    assert "does not track" not in said
+    assert list(result.losses) == ["inverse", "flow"]
+    result.artifact.save(path)
+    return Artifact.read(path)
+
+
+def estimated(artifact, *, n=40, level=NOISE):
+    """Errors (steps, n, 2) on new runs with noise, and the observer's covariances."""
+    runs, rng = [both(seed) for seed in range(100, 100 + n)], np.random.default_rng(0)
+    x, y, u = (np.stack([getattr(run, name) for run in runs], 1) for name in "xyu")
+    y = y + level * rng.standard_normal(y.shape)
+    observer = KKLObserver(artifact, level)
+    errors, covariances = [observer.reset(y[0]) - x[0]], [observer.covariance]
+    for k in range(1, len(x)):
+        errors.append(observer.step(y[k], u[k - 1]) - x[k])
+        covariances.append(observer.covariance)
+    return np.array(errors), np.array(covariances)
+
+
+def test_it_tracks_nearly_as_well_as_the_kalman_filter(tracking):
+    """The plant is linear, and what the flow is off by is small: the Kalman filter with its noise is the best."""
+    C = np.array([[1.0, 0.0]])
+    np.testing.assert_allclose(tracking.C, C, atol=1e-5)
+    before, after = (
+        np.sqrt(np.mean(estimated(each)[0][200:] ** 2, (0, 1))) for each in (replace(tracking, motion=None), tracking)
+    )
+    Q = np.diag((tracking.motion.error * tracking.motion.x_scale) ** 2)
+    P = solve_discrete_are(A.T, C.T, Q, [[NOISE**2]])
+    K = P @ C.T / (C @ P @ C.T + NOISE**2)
+    best = np.sqrt(np.diag(P - K @ C @ P))
+    assert (after < 0.8 * before).all()
+    assert (after < 1.3 * best).all()
+
+
+def test_regions_hold_what_they_should_on_new_records(tracking):
+    for level in (NOISE, 2 * NOISE):
+        for artifact in (tracking, replace(tracking, motion=None)):
+            errors, covariances = estimated(artifact, level=level)
+            inside = squared_distance(errors[:200], covariances[:200]) < chi_square(0.9, 2)
+            assert 0.83 < np.mean(inside) < 0.97
+
+
+def test_signals_that_are_not_among_the_hidden_ones_cannot_be_tracked(tmp_path):
     records = [swing(seed, jitter=0.1) for seed in range(6)]
-    result = trained(records, tmp_path, untold_noise=0.01)
-    assert len(result.held_out) == 1
-    assert result.errors.relative["speed"] < 0.2  # held out; the derivative of a driven position
-    result.artifact.save(tmp_path / "spring.safetensors")
-    artifact = Artifact.read(tmp_path / "spring.safetensors")
-    assert artifact.signals == {"measured": ["position"], "inputs": ["force"], "hidden": ["speed"]}
-    assert artifact.training["held_out_errors"] == pytest.approx(result.errors.relative)
-    new = resampled(swing(100), artifact.filter.dt)
-    x_hat = KKLObserver(artifact).estimate(new.y, new.u)
-    late = slice(200, None)
-    assert np.sqrt(np.mean((x_hat - new.x)[late] ** 2)) < 0.2 * new.x.std()
+    result, said = trained(records, untold_noise=0.01)
+    assert "does not track: position cannot be told as a sum of speed without an offset" in said
+    artifact = result.artifact
+    assert (artifact.motion, artifact.limits, list(result.losses)) == (None, None, ["inverse"])
+    assert artifact.inverse.error_covariance is not None
+    assert artifact.training["held_out_errors"]["speed"] < 0.2  # the derivative of a driven position
+    artifact.save(tmp_path / "spring.safetensors")
+    read = Artifact.read(tmp_path / "spring.safetensors")
+    assert read.signals == {"measured": ["position"], "inputs": ["force"], "hidden": ["speed"]}
+    new = resampled(swing(100), read.filter.dt)
+    x_hat = KKLObserver(read).estimate(new.y, new.u)
+    assert np.sqrt(np.mean((x_hat - new.x)[200:] ** 2)) < 0.2 * new.x.std()
     with pytest.raises(ValueError, match=r"recorded states: speed from position and force, every 0.05 s.*environment"):
-        artifact.check("spring", {}, dt=0.05, ny=1, nu=1)
+        read.check("spring", {}, dt=0.05, ny=1, nu=1)
+
+
+def test_without_enough_that_is_held_out_there_are_no_covariances():
+    records = [both(seed, n=300) for seed in range(3)]
+    for share, reason in ((0.0, "held_out must be positive, got 0"), (0.03, "what was held out has 24 samples with")):
+        result, said = trained(records, held_out=share, inverse_steps=20, flow_steps=20)
+        assert "does not track: " in said
+        assert reason in said
+        artifact = result.artifact
+        assert (artifact.motion, artifact.inverse.error_covariance) == (None, None)
+        assert artifact.C is not None
 
 
 def test_resuming_makes_the_same_observer(tmp_path):
-    records, options = [swing(seed) for seed in range(3)], {"members": 2, "inverse_steps": 20, "held_out": 0.0}
-    first = trained(records, tmp_path, **options)
-    assert first.held_out == []
+    records, options = [both(seed) for seed in range(3)], {"members": 2, "inverse_steps": 20, "flow_steps": 20}
+    first, _ = trained(records, tmp_path, **options)
     (tmp_path / "inverse-2.checkpoint.pt").unlink()
     with pytest.raises(ValueError, match="holds the checkpoints of a run"):
         trained(records, tmp_path, **options)
-    config = recorded_config(records, {**SMALL, **options})
-    again = train_recorded(records, config, tmp_path, name="spring", resume=True, device=torch.device("cpu"))
-    for a, b in zip(first.artifact.inverse.mlp.weights, again.artifact.inverse.mlp.weights):
+    again, _ = trained(records, tmp_path, resume=True, **options)
+    for a, b in zip(first.artifact.inverse.mlp.weights, again.artifact.inverse.mlp.weights, strict=True):
         np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(first.artifact.motion.factors.factors, again.artifact.motion.factors.factors)
     with pytest.raises(ValueError, match=r"a run of another configuration: .*records = "):
-        train_recorded([*records[:2], swing(7)], config, tmp_path, name="spring", resume=True)
+        trained([*records[:2], both(7)], tmp_path, resume=True, **options)
 
 
-def test_estimates_do_not_hang_on_an_arbitrary_zero(tmp_path):
-    records, new = [swing(seed) for seed in range(3)], resampled(swing(100), 0.05)
-    artifact = trained(records, tmp_path / "a", inverse_steps=20, arbitrary_zero=("position",)).artifact
-    here, there = (KKLObserver(artifact).estimate(new.y + offset, new.u) for offset in (0.0, 100.0))
+def test_estimates_do_not_hang_on_an_arbitrary_zero():
+    records, new = [both(seed) for seed in range(3)], resampled(swing(100), DT)
+    result, said = trained(records, inverse_steps=20, arbitrary_zero=("position",))
+    assert (
+        "compares position with what it predicts, and cannot do without the zero: train without arbitrary_zero" in said
+    )
+    here, there = (KKLObserver(result.artifact).estimate(new.y + offset, new.u) for offset in (0.0, 100.0))
     np.testing.assert_allclose(here, there, atol=1e-3 * new.x.std())
     assert here[-1] != pytest.approx(here[-50])  # it does move
     with pytest.raises(ValueError, match=r"arbitrary_zero names 'angle'; measured are position"):
-        trained(records, tmp_path / "b", arbitrary_zero=("angle",))
+        trained(records, arbitrary_zero=("angle",))
 
 
-def test_without_states_or_with_short_records(tmp_path):
+def test_increments_are_between_samples_that_are_known():
+    run = both(3)
+    x, y = run.x.copy(), run.y.copy()
+    x[10], y[20] = np.nan, np.nan
+    records = [replace(run, x=x, y=y), both(4)]
+    found, _ = RecordedSource(records, recorded_preset(records), "a", held_out=[both(5)]).increments()
+    known = [k for k in range(599) if k not in (9, 10, 19, 20)]  # around a gap of outputs records are cut
+    np.testing.assert_allclose(found.x[:595], run.x[known])
+    np.testing.assert_allclose(found.change[:595], np.diff(run.x, axis=0)[known], atol=1e-12)
+    np.testing.assert_allclose(found.u[:595], run.u[known])
+    sparse = [replace(each, x=np.where(np.arange(600)[:, None] % 2, each.x, np.nan)) for each in records]
+    with pytest.raises(ValueError, match="no two samples in a row have all hidden signals"):
+        RecordedSource(sparse, recorded_preset(sparse), "a").tracking()
+
+
+def test_what_is_held_out_by_hand_comes_on_the_same_grid():
+    records = [both(seed) for seed in range(3)]
+    finer = replace(swing(9, n=1200, dt=DT / 2), x=np.zeros((1200, 2)), signals=records[0].signals)
+    source = RecordedSource(records, recorded_preset(records), "a", held_out=[finer])
+    assert source.dt == pytest.approx(DT)
+    assert np.diff(source.held_out[0].t) == pytest.approx(DT)
+
+
+def test_outputs_are_sums_of_states_or_an_error():
+    rng, run = np.random.default_rng(0), both(0)
+    for noise, off in ((0.01, 2e-3), (0.3, 0.05)):
+        noisy = replace(run, y=run.y + noise * rng.standard_normal(run.y.shape))
+        noisy.y[5] = 1e3 if noise == 0.3 else noisy.y[5]  # one sample is wrong
+        C, least = linear_output([noisy])
+        np.testing.assert_allclose(C, [[1.0, 0.0]], atol=off)
+        assert least == pytest.approx(noise, rel=0.1)
+    for other in (run.y**2, run.y + 3.0, rng.standard_normal(run.y.shape)):
+        with pytest.raises(ValueError, match=r"position cannot be told as a sum of position, speed"):
+            linear_output([replace(run, y=other)])
+    early = np.arange(600)[:, None] < 300
+    apart = replace(run, x=np.where(early, run.x, np.nan), y=np.where(early, np.nan, run.y))
+    with pytest.raises(ValueError, match=r"no sample has all measured and all hidden signals"):
+        linear_output([apart])
+
+
+def test_records_that_no_observer_can_be_learned_from(tracking):
     with pytest.raises(ValueError, match=r"no hidden states were recorded; name their columns \(--hidden\)"):
-        trained([replace(swing(0), x=None, signals=replace(SIGNALS, hidden=()))], tmp_path)
+        trained([replace(swing(0), x=None, signals=replace(SIGNALS, hidden=()))])
     with pytest.raises(ValueError, match=r"run0.csv: column time, row 40: .* filter remembers .* faster eigenvalues"):
-        trained([swing(0, n=40)], tmp_path)
+        trained([swing(0, n=40)])
+    with pytest.raises(ValueError, match=r"hidden are speed, but the observer's position, speed"):
+        check_plant(tracking, swing(0))
+    with pytest.raises(ValueError, match=r"no hidden states were recorded"):
+        check_plant(tracking, replace(both(0), x=None))
 
 
 def test_the_mean_of_networks_is_a_network():
@@ -93,42 +216,39 @@ def test_the_rate_of_signals_is_their_angular_frequency():
     t = 0.01 * np.arange(5000)
     record = Record("a", t, np.sin(3 * t)[:, None], x=np.stack([np.cos(3 * t), 5 + np.sin(3 * t)], -1))
     assert signal_rate([record]) == pytest.approx(3.0, rel=1e-2)
-    config = recorded_config([record])
+    config = recorded_preset([record])
     assert config.dt == pytest.approx(0.01)
     assert config.eigenvalues[0] == pytest.approx(-0.45, rel=1e-2)
     assert config.eigenvalues[-1] == pytest.approx(-30, rel=1e-2)
     assert config.measurement_noise_max == pytest.approx(0.1 / 2**0.5, rel=1e-2)
-    assert recorded_config([record], {"dt": 0.05, "seed": 3}).eigenvalues[-1] == -10.0
+    assert recorded_preset([record], {"dt": 0.05, "seed": 3}).eigenvalues[-1] == -10.0
     assert json.dumps(config.eigenvalues)
 
 
-def test_signals_that_stand_still_in_each_record(tmp_path):
+def test_signals_that_stand_still_in_each_record():
     """They do not slow the filter down, and have no relative error."""
     signals = replace(SIGNALS, measured=("position", "target"), hidden=("speed", "mass"))
     records = []
     for seed in range(6):
         run, ones = swing(seed), np.full((600, 1), 0.1 * (seed + 1))
         records.append(replace(run, y=np.hstack([run.y, ones]), x=np.hstack([run.x, ones]), signals=signals))
-    alone = recorded_config([swing(seed) for seed in range(6)], SMALL)
-    config = recorded_config(records, SMALL)
-    assert config.eigenvalues == alone.eigenvalues
-    errors = trained(records, tmp_path).errors.relative
-    assert errors["speed"] < 0.3
-    assert np.isnan(errors["mass"])
+    alone = recorded_preset([swing(seed) for seed in range(6)], SMALL)
+    assert recorded_preset(records, SMALL).eigenvalues == alone.eigenvalues
+    found = trained(records)[0].artifact.training["held_out_errors"]
+    assert found["speed"] < 0.3
+    assert set(found) == {"speed"}
     kept = replace(SIGNALS, measured=("target",), hidden=("mass",))
     still = [replace(record, y=record.y[:, 1:], x=record.x[:, 1:], signals=kept) for record in records]
     with pytest.raises(ValueError, match=r"run0\.csv: no signal moves, nor in any other record"):
         signal_rate(still)
 
 
-def test_errors_are_relative_and_leave_the_transient_out(tmp_path):
-    records = [swing(seed, n=300) for seed in range(2)]
-    artifact = trained(records, tmp_path, inverse_steps=20).artifact
-    record = resampled(records[0], 0.05)
-    x_hat = KKLObserver(artifact).estimate(record.y, record.u)
-    expected = np.sqrt(np.mean((x_hat - record.x)[100:] ** 2)) / record.x[100:].std()
-    found = recorded_errors(artifact, [record], after=5.0)
-    assert found.relative == pytest.approx({"speed": expected})
+def test_errors_are_relative_and_leave_the_transient_out(tracking):
+    record = resampled(both(0, n=300), DT)
+    x_hat = KKLObserver(tracking, 0.0).estimate(record.y, record.u)
+    expected = np.sqrt(np.mean((x_hat - record.x)[100:] ** 2, 0)) / record.x[100:].std(0)
+    found = recorded_errors(tracking, [record], after=5.0)
+    assert found.relative == pytest.approx(dict(zip(("position", "speed"), expected)))
     assert found.seconds == pytest.approx(10.0)
-    assert str(found) == f"speed {expected:.3g} (10 s, after 5 s of transient)"
-    assert np.isnan(recorded_errors(artifact, [record], after=100.0).relative["speed"])
+    assert str(found).endswith(f", speed {expected[1]:.3g} (10 s, after 5 s of transient)")
+    assert np.isnan(recorded_errors(tracking, [record], after=100.0).relative["speed"])

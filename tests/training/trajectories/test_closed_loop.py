@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from small_runs import closed_loop, open_loop, toy, untrained
+from small_runs import closed_loop, open_loop, untrained
 
 from kkl_gym import VanDerPol
 from observers import KKLObserver
-from training import train
 from training.trajectories.closed_loop import record_closed_loop
 
 
@@ -57,16 +56,3 @@ def test_how_often_there_is_each_noise_level(noise_free_share, high_noise_emphas
         process_noise_share, abs=0.15 * (process_noise_share % 1 > 0)
     )
     assert data.process_noise.max() <= VanDerPol.process_noise
-
-
-def test_the_shares_of_a_run_reach_its_closed_loop(monkeypatch, tmp_path):
-    told = []
-
-    def spy(*arguments, **named):
-        told.append({name: value for name, value in named.items() if name.endswith(("_share", "_emphasis"))})
-        return record_closed_loop(*arguments, **named)
-
-    monkeypatch.setattr(training.pipeline, "record_closed_loop", spy)
-    shares = {"noise_free_share": 0.35, "high_noise_emphasis": 1.5, "process_noise_share": 0.25}
-    train(VanDerPol(), toy(VanDerPol(), closed_loop_trajectories=10, inverse_steps=2, duration=1.0, **shares), tmp_path)
-    assert told == [shares]

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 from linear_system import Autonomous
-from small_runs import toy
 from unstable_system import Falling
 
 from kkl_gym.simulate import simulate
-from training import train
 from training.systems import controller, named_policy
 from training.trajectories.policy import under_policy
 from training.trajectories.record import POLICYS_OWN, Motions, trajectories
@@ -62,27 +60,6 @@ def test_an_unstable_plant_is_held_by_a_policy_alone():
     (x, u, level), *_ = found
     np.testing.assert_array_equal((u == exact(x)).all((0, 2)), np.arange(x.shape[1]) % POLICYS_OWN == 0)
     assert level.any()
-
-
-def test_an_observer_is_trained_under_a_policy_and_says_so(tmp_path):
-    config = toy(SYSTEM, policy="controller", inverse_steps=20)
-    result = train(SYSTEM, config, tmp_path)
-    assert list(result.losses) == ["inverse"]
-    assert result.artifact.free_inverse is None
-    assert result.artifact.training["policy"] == "controller"
-
-
-def test_a_run_is_not_resumed_under_a_changed_policy(tmp_path):
-    script = tmp_path / "mine.py"
-    text = "import numpy as np\ndef hold(x):\n    return np.clip(-{} * x[:, :1] - 0.5 * x[:, 1:], -1, 1)\n"
-    script.write_text(text.format(2.0))
-    config = toy(SYSTEM, policy=f"{script}:hold", inverse_steps=20)
-    train(SYSTEM, config, tmp_path / "run")
-    script = tmp_path / "other" / "mine.py"
-    script.parent.mkdir()
-    script.write_text(text.format(3.0))
-    with pytest.raises(ValueError, match="policy_actions"):
-        train(SYSTEM, toy(SYSTEM, policy=f"{script}:hold", inverse_steps=20), tmp_path / "run", resume=True)
 
 
 @pytest.mark.parametrize(
