@@ -105,14 +105,14 @@ class _Calibration:
         self.informed = "measurement_noise" in artifact.inverse.features
         largest = (artifact.inverse if self.informed else self.source.config).measurement_noise_max
         self.levels = np.multiply.outer(LEVELS, largest)
-        self.noisy = self.runs.process_noise > 0  # others are sound without process noise
+        self.noisy = self.runs.process_noise > 0
         rng = np.random.default_rng(0)
         shape = (len(LEVELS), *self.runs.y.shape)
         self.y = self.runs.y + self.levels.reshape(len(LEVELS), 1, 1, -1) * rng.standard_normal(shape)
 
     def calibrated(self) -> Artifact:
         artifact = dataclasses.replace(self.artifact, motion=None, limits=None)
-        monitored = artifact.knows_output and isinstance(self.source, SimulatedSource)
+        monitored = artifact.knows_output and self.runs.sound
         if self.informed:
             artifact = dataclasses.replace(self.with_covariances(artifact), motion=self.motion)
         if artifact.motion is None and not monitored:

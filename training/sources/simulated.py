@@ -157,7 +157,7 @@ class SimulatedSource:
         xs, us, noise, usual = zip(*found, strict=True)
         x = np.concatenate(xs, 1)
         u = np.concatenate(us, 1)[..., : self.nu]
-        return Runs(x[..., : self.nx], plant.output(x), u, np.concatenate(noise), np.concatenate(usual))
+        return Runs(x[..., : self.nx], plant.output(x), u, np.concatenate(noise), np.concatenate(usual), sound=True)
 
     def equations(self) -> Equations:
         """The system's equations as an expression, with as many Runge-Kutta steps as its motions need."""

@@ -15,7 +15,7 @@ Report = Callable[[float], object]
 
 @dataclass(frozen=True)
 class Runs:
-    """Whole motions, measured without noise; their levels of process noise, at most two; and which start usually.
+    """Whole motions, measured without noise; their levels of process noise, at most two; which start usually; and whether the plant is sound.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
     ``process_noise`` (n,), ``usual`` (n,): True from X, False from beyond.
@@ -26,6 +26,7 @@ class Runs:
     u: np.ndarray
     process_noise: np.ndarray
     usual: np.ndarray
+    sound: bool = False
 
 
 class TooFewRunsError(ValueError):
