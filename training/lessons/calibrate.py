@@ -231,7 +231,7 @@ class _Calibration:
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
     """What a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
 
-    Median and 90 % quantile decide: a few motions that are lost do not. It is at most ten times the largest extreme, for
+    Median and 90 % quantile decide, not a few motions that are lost. It is at most ten times the largest extreme, for
     outputs that stand still in most motions. Shapes: ``extremes`` (n, ny); returns (ny,).
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))

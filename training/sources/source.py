@@ -15,7 +15,9 @@ Report = Callable[[float], object]
 
 @dataclass(frozen=True)
 class Runs:
-    """Whole motions, measured without noise; their levels of process noise, at most two; which start usually; and whether the plant is sound.
+    """Whole motions, measured without noise.
+
+    There are two levels of process noise at most. Usual motions start in X; a sound plant has no faults.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
     ``process_noise`` (n,), ``usual`` (n,): True from X, False from beyond.

@@ -12,7 +12,7 @@ from examples.research.methods.kkl import KKLMethod, within
 from observers import Artifact
 from training.config import Pipeline
 from training.evaluation.levels import multiple
-from training.presets import preset
+from training.presets import Size, preset
 from training.spectrum import papers_spectrum
 from training.train_observer import train
 
@@ -59,7 +59,7 @@ class Ablation(KKLMethod):
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
-        size = "large" if self.pipeline == "input-aware" else "default"
+        size: Size = "large" if self.pipeline == "input-aware" else "default"
         config = within(preset(task.system, self.pipeline, size=size), task.budget, task.seed)
         config = replace(config, **self.changes(task))
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
