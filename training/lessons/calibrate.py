@@ -49,7 +49,7 @@ def calibrate(
     motion : Motion, optional
         By which it is to track; by default the one that it has, if any.
     false_alarms : float, optional
-        Probability that a sound motion of twenty seconds, at the pace of the shipped systems, exceeds a limit; by
+        Probability that a sound motion of twelve seconds, at the pace of the shipped systems, exceeds a limit; by
         default that of its training.
     console : rich.console.Console or ProgressBars, optional
         Where progress is shown.

@@ -27,7 +27,7 @@ from training.trajectories.signals import DRIVEN, KINDS, random_inputs
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned
 LEAST_NOISE, LEAST_PROCESS_NOISE = 0.001, 0.0005  # that a tracker assumes, of the usual, and at the system's pace
-WINDOW, RUN = 0.5, 20.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
+WINDOW, RUN = 0.5, 12.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
 SUBSTEPS, INTEGRATION_ERROR = 64, 1e-5  # at most, of scaled states in a sample: far below the process noise assumed
 INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share that judges a flow
 DEVIATIONS = (1e-4, 0.3)  # of these pairs from motions, in standard deviations of the states, log-uniform
