@@ -59,8 +59,7 @@ class Ablation(KKLMethod):
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
-        size = "large" if self.pipeline == "input-aware" else "default"
-        config = within(preset(task.system, self.pipeline, size=size), task.budget, task.seed)
+        config = within(preset(task.system, self.pipeline, size="large"), task.budget, task.seed)
         config = replace(config, **self.changes(task))
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 

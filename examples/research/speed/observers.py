@@ -10,7 +10,8 @@ from kkl_gym.simulate import advance, simulate
 from kkl_gym.system import System
 from observers import Artifact, InverseMap, KKLObserver
 from observers.compiled import available
-from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity, unknown_start
+from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
+from training.sources.simulated import unknown_start
 from training.trajectories.derivatives import jacobian
 
 BATCHES = 10  # of one step each, by filters that take one sample at a time
