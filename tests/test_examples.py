@@ -111,7 +111,7 @@ def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
         done.add(do(line))
     assert done == set(SMALL)
     printed = capsys.readouterr().out
-    for written in ("config.json", "pendulum.safetensors", "table.md", "faults.csv", "agent.safetensors", "scores.png"):
+    for written in ("pendulum.safetensors", "table.md", "faults.csv", "agent.safetensors", "scores.png"):
         assert written in printed
     path = "runs/pendulum/pendulum.safetensors"
     with pytest.raises(SystemExit, match="--system"):

@@ -32,8 +32,7 @@ class CompiledBatch:
     def __call__(self, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
         """The next states, (nx, n), from states (nx, n), inputs (nu, n) and process noise (nx, n)."""
         out, lost = self._substeps(x, u, w, dt)
-        if lost:
-            rows = np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x[0]))  # motions that are lost stay so
+        if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):  # motions that ended stay so
             out[:, rows] = advance_batch(self.system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out
 

@@ -11,8 +11,8 @@ from examples.research.methods.chunks import Chunks, error, noise_feature, varyi
 from kkl_gym.simulate import SubstepsError, advance_batch
 from kkl_gym.system import System
 from training.evaluation.levels import Level
-from training.sources.simulated import unknown_start
 from training.maps.pde import on_tensors
+from training.sources.simulated import unknown_start
 
 ROWS = 64
 LEARNING_RATE = 5e-3

@@ -210,12 +210,6 @@ def test_what_is_wrong_is_said_before_anything_is_played(tmp_path, monkeypatch, 
         training.learn("Pendulum-v1", **wanted)
 
 
-def test_learns_without_writing(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    training.learn("Pendulum-v1", measured=[0, 1], hidden=[2], steps=400, **TINY)
-    assert not list(tmp_path.iterdir())
-
-
 def test_rollouts_that_were_handed_out_stay_as_they_are():
     env = gym.make("CartPole-v1")
     recorder = Recorder(env, measured=["0"], hidden=["1"])

@@ -29,16 +29,18 @@ def agent(path, n, steps):
     return PPO("MlpPolicy", env, seed=0, n_steps=steps, batch_size=n * steps, n_epochs=1, device="cpu")
 
 
-def test_it_tracks_where_what_is_measured_is_hidden_too(path):
+def test_it_tracks_where_what_is_measured_is_hidden_too(path, tmp_path, monkeypatch):
     np.testing.assert_allclose(Artifact.read(path).C, np.eye(2, 3), atol=1e-6)
     env = KKLObservation(gym.make("Pendulum-v1"), path, measurement_noise=0.05, uncertainty=True)
     obs, info = env.reset(seed=0)
     assert obs.shape == (2 + 3 + 3,)  # y, x_hat, and standard deviations
     np.testing.assert_allclose(obs[5:], np.sqrt(np.diag(info["x_cov"])), rtol=1e-6)
+    monkeypatch.chdir(tmp_path)
     for options in ({"hidden": [0, 2]}, {"hidden": [0, 1, 2], "tracking": False}):
         alone = training.learn(**LEARN | options)
         assert alone.motion is None
         assert alone.inverse.error_covariance is not None
+    assert not list(tmp_path.iterdir())  # nothing is written without a folder
 
 
 def test_a_start_that_is_known(path):
