@@ -8,11 +8,11 @@ if TYPE_CHECKING:
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
     from training.identification.learning import adapt, identify
-    from training.observable import Observability, observability
     from training.lessons.calibrate import calibrate
     from training.lessons.flow import learn_flow
     from training.lessons.map import Maps, learn_map
     from training.lessons.run import Run
+    from training.observable import Observability, observability
     from training.presets import preset, recorded_preset
     from training.rollouts import learn
     from training.rollouts.callback import KKLTrainingCallback
