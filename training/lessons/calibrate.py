@@ -230,8 +230,8 @@ class _Calibration:
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
     """What a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
 
-    Median and 90 % quantile decide: a few motions that are lost do not. It is at most ten times the largest extreme, for
-    outputs that stand still in most motions. Shapes: ``extremes`` (n, ny); returns (ny,).
+    Median and 90 % quantile decide: a few motions that are lost do not. Some outputs stand still in most motions: it is
+    at most ten times the largest extreme. Shapes: ``extremes`` (n, ny); returns (ny,).
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
     middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)

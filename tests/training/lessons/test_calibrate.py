@@ -94,7 +94,7 @@ def test_regions_hold_what_they_should_on_other_runs(tracking, quiet, alone):
     for level in (0.1, 0.7):
         spans = (slice(20, 22), slice(100, None))
         early, late = coverage(artifact, system, runs, measurement_noise=level, seed=7, spans=spans)
-        assert late.joint[1] == pytest.approx(0.9, abs=0.03)
+        assert late.joint[1] == pytest.approx(0.9, abs=0.05 if alone else 0.03)
         # Of 600, three standard deviations are 0.037. Beyond X, where T_inv's covariance counts too, starts are worse.
         assert 0.85 < early.joint[1] < (0.97 if alone else 0.95)
         np.testing.assert_allclose(late.joint, REGIONS, atol=0.07)

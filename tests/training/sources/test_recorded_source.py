@@ -149,7 +149,7 @@ def test_increments_are_between_samples_that_are_known():
     np.testing.assert_allclose(found.x[: len(known)], run.x[known], atol=1e-9)
     np.testing.assert_allclose(found.change[: len(known)], np.diff(run.x, axis=0)[known], atol=1e-9)
     np.testing.assert_allclose(found.u[: len(known)], run.u[known], atol=1e-9)
-    sparse = [replace(each, x=np.where(np.arange(600)[:, None] % 2, each.x, np.nan)) for each in records]
+    sparse = [replace(each, x=np.where(np.arange(600)[:, None] % 8, np.nan, each.x)) for each in records]
     with pytest.raises(ValueError, match="no two samples in a row have all hidden signals"):
         RecordedSource(sparse, recorded_preset(sparse), "a").tracking()
 
