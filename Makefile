@@ -4,8 +4,7 @@ VERSION := $(filter-out 3,$(patsubst python%,%,$(notdir $(PYTHON))))
 VENV := .venv$(if $(VERSION),-$(VERSION))
 BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
-STATIC := $(SYSTEMS:%=%-static)
-SMALL := $(SYSTEMS:%=%-small)
+LARGE := $(SYSTEMS:%=%-large)
 
 .PHONY: demo install test test-coverage guard test-slow test-research test-long test-browser lint format maps results figures benchmark ablation \
 	certificates agents environments speed sizes clients docs clean help
@@ -48,40 +47,32 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Into runs/; with error bars into runs/errorbars, which ship as NAME-static, and those that also track, which ship as
-# NAME and NAME-small, into runs/tracking. What ships lies in observers/maps.
+# Into runs/. What ships lies in observers/maps: NAME, NAME-large and NAME-spinn.
 # One thread each, with which the same machine makes the same numbers to the last bit.
-maps: $(SYSTEMS:%=maps-%)  ## train the shipped maps again, two hours, or one with make -j 2 maps; resumable
+maps: $(SYSTEMS:%=maps-%)  ## train the shipped maps again, an hour, or one with make -j 2 maps; resumable
 
 maps-%: $(VENV)/ready
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym train $* --resume
-	OMP_NUM_THREADS=1 $(BIN)/kkl-gym errorbars runs/$*/$*.safetensors
-	OMP_NUM_THREADS=1 $(BIN)/kkl-gym tracking runs/errorbars/$*.safetensors
-	OMP_NUM_THREADS=1 $(BIN)/kkl-gym train $* --size small --resume
-	OMP_NUM_THREADS=1 $(BIN)/kkl-gym errorbars runs/$*-small/$*-small.safetensors
-	OMP_NUM_THREADS=1 $(BIN)/kkl-gym tracking runs/errorbars/$*-small.safetensors --size small
+	OMP_NUM_THREADS=1 $(BIN)/kkl-gym train $* --size large --resume
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym train $* --pipeline spinn --resume
 
+# T_inv alone is that of NAME-large, without tracking.
 results: $(VENV)/ready  ## the accuracy in the README and in docs/
-	$(BIN)/kkl-gym evaluate $(STATIC) $(SYSTEMS:%=%-spinn) --csv docs/results/accuracy.csv
-	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system-static $$system-spinn --measurement-noise 0.05 0.1 0.2 1 \
-		--csv docs/results/noise_levels/$$system.csv || exit 1; done
-	for map in $(STATIC); do $(BIN)/kkl-gym evaluate $$map --calibration --ekf \
+	$(BIN)/kkl-gym evaluate $(LARGE) $(SYSTEMS:%=%-spinn) --no-tracking --csv docs/results/accuracy.csv
+	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system-large $$system-spinn --no-tracking \
+		--measurement-noise 0.05 0.1 0.2 1 --csv docs/results/noise_levels/$$system.csv || exit 1; done
+	mkdir -p docs/results/error_bars docs/results/tracking
+	for map in $(LARGE); do $(BIN)/kkl-gym evaluate $$map --no-tracking --calibration --ekf \
 		--csv runs/error_bars/$$map.csv || exit 1; done
-	mkdir -p docs/results/error_bars
-	cp $(STATIC:%=runs/error_bars/%.csv) docs/results/error_bars
-	$(BIN)/kkl-gym evaluate $(SMALL) --csv docs/results/accuracy-small.csv
-	mkdir -p docs/results/tracking
+	cp $(LARGE:%=runs/error_bars/%.csv) docs/results/error_bars
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --measurement-noise 0 0.1 0.5 1 --ekf --csv docs/results/tracking/accuracy.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --process-noise 0.05 --csv docs/results/tracking/process-noise.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/tracking/plant-error.csv
-	for map in $(SYSTEMS) $(SMALL); do $(BIN)/kkl-gym evaluate $$map --calibration \
-		--csv runs/error_bars/$$map.csv || exit 1; done
-	for map in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$map --calibration --trajectories 400 \
-		--csv runs/error_bars/$$map-400.csv || exit 1; done
-	cp $(SYSTEMS:%=runs/error_bars/%.csv) $(SMALL:%=runs/error_bars/%.csv) runs/error_bars/*-400.csv docs/results/tracking
-	$(BIN)/kkl-gym evaluate $(STATIC) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
-	$(BIN)/kkl-gym evaluate $(STATIC) --plant-error 0.1 --csv docs/results/plant-error.csv
+	for map in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$map --calibration --csv runs/error_bars/$$map.csv || exit 1; \
+		$(BIN)/kkl-gym evaluate $$map --calibration --trajectories 400 --csv runs/error_bars/$$map-400.csv || exit 1; done
+	cp $(SYSTEMS:%=runs/error_bars/%.csv) runs/error_bars/*-400.csv docs/results/tracking
+	$(BIN)/kkl-gym evaluate $(LARGE) --no-tracking --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
+	$(BIN)/kkl-gym evaluate $(LARGE) --no-tracking --plant-error 0.1 --csv docs/results/plant-error.csv
 	$(MAKE) figures
 
 figures: $(VENV)/ready  ## the pictures of the pages, light and dark, from the files in docs/results, two minutes
@@ -93,9 +84,9 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 	cp $(addprefix runs/benchmark/cpu/,results.csv methods.csv table.md) docs/results/benchmark
 	$(MAKE) figures
 
-SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transients adaptive lipschitz)
+SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transients)
 ABLATION := ablation-spinn $(SPINN) ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
-	default ablation-tuned
+	default
 
 ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumable
 	$(BIN)/python -m examples.research benchmark --budget short --methods $(ABLATION) --out runs/benchmark/ablation
@@ -103,7 +94,7 @@ ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumabl
 	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md) docs/results/ablation
 	$(MAKE) figures
 
-CERTIFIED := $(STATIC) $(SYSTEMS:%=%-spinn)
+CERTIFIED := $(LARGE) $(SYSTEMS:%=%-spinn)
 
 certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 	$(BIN)/python -m examples.research certify $(CERTIFIED)

@@ -76,7 +76,7 @@ def main(
     x = simulate(plant, plant.draw_starts(rng, records), steps, plant.dt)
     y = plant.output(x) + noise * rng.standard_normal((steps + 1, records, plant.ny))
     t = np.arange(steps + 1) * plant.dt
-    shipped, folder = Artifact.read(resolve(f"{system}-static")), out or Path("runs") / f"{system}-adapted"
+    shipped, folder = Artifact.read(resolve(system)), out or Path("runs") / f"{system}-adapted"
     sizes = {"inverse_steps": inverse_steps, "trajectories": trajectories}
     settings = {name: size for name, size in sizes.items() if size is not None}
     began = time.process_time()

@@ -17,8 +17,8 @@ import training
 from kkl_gym import KKLObservation
 from observers import Artifact
 from training.agents.any_environment.task import MeasurementNoise
-from training.recorded.errors import recorded_errors
 from training.rollouts import make, roll_out
+from training.sources.errors import recorded_errors
 
 AFTER = 20  # steps, of which errors are left out
 GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # a linear-quadratic regulator of the double pendulum
@@ -96,7 +96,7 @@ def under_noise(env_id: str, artifact: Artifact | None, noise: float, seed: int,
             if terminated or truncated:
                 break
         returns.append(total)
-    shown = "truth:" if artifact is None else "estimates:" if artifact.flow else "estimates of T_inv alone:"
+    shown = "truth:" if artifact is None else "estimates:" if artifact.motion else "estimates of T_inv alone:"
     print(f"  {shown} {np.mean(returns):.1f}")
     if apart:
         print("    rms errors", ", ".join(f"{error:.3g}" for error in np.sqrt(np.mean(np.square(apart), 0))))
@@ -138,7 +138,6 @@ def main(
             out=folder,
             inverse_steps=batches,
             members=members,
-            tracking=noise > 0,
             measurement_noise_max=2 * noise or None,
         )
         env = KKLObservation(gym.make(env_id), Path(folder) / f"{env_id}.safetensors")
@@ -156,7 +155,11 @@ def main(
         found[label] = max(errors.relative.values())
     if noise:
         print(f"noise {noise:g}: mean return where the controller acts on")
-        for label, observer in (("tracked", artifact), ("T_inv alone", replace(artifact, flow=None)), ("truth", None)):
+        for label, observer in (
+            ("tracked", artifact),
+            ("T_inv alone", replace(artifact, motion=None)),
+            ("truth", None),
+        ):
             found[label] = under_noise(env_id, observer, noise, seed)
     return found
 

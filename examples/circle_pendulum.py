@@ -55,17 +55,17 @@ class CirclePendulum(kkl_gym.System):
         return x[0], x[1]
 
 
-def main(inverse_steps: int = 3000, trajectories: int = 500, out: Path = Path("runs/circle_pendulum")) -> np.ndarray:
+def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/circle_pendulum")) -> np.ndarray:
     """Train, wrap and swing up; returns the estimate's rms errors in multiples of X's half-widths.
 
     Args:
-        inverse_steps: batches of training; the preset has more, and its observer errs less.
-        trajectories: simulated trajectories to train on; of these too the preset has more.
+        inverse_steps: batches of training.
+        trajectories: simulated trajectories to train on.
         out: the run's folder.
     """
     system = CirclePendulum()
     sizes = {"inverse_steps": inverse_steps, "trajectories": trajectories, "duration": 10.0}
-    config = preset(system, "input-aware", "fast", changes=sizes)
+    config = preset(system, changes=sizes)
     path = out / "circle_pendulum.safetensors"
     train(system, config, out, resume=True, console=Console()).artifact.save(path)
 

@@ -56,8 +56,7 @@ def cost(env: kkl_gym.KKLEnv, policy: Policy, *, seconds: float, episodes: int) 
 def main(
     runs: int = 6,
     seconds: float = 10.0,
-    steps: int = 300,
-    inverse_steps: int = 3000,
+    inverse_steps: int = 1500,
     trajectories: int = 500,
     out: Path = Path("runs/from_csv"),
     seed: int = 0,
@@ -67,8 +66,7 @@ def main(
     Args:
         runs: files that are written; of five or more, one is left out of the fit, for a look at what is predicted.
         seconds: length of each.
-        steps: batches of the network that finds first guesses.
-        inverse_steps: batches of the observer's training; `kkl-gym identify` has more, and its observer errs less.
+        inverse_steps: batches of the observer's training.
         trajectories: simulated trajectories of the plant found, to train on.
         out: the run's folder.
         seed: of everything random.
@@ -93,7 +91,6 @@ def main(
             "duration": 20.0,
             "free_inverse": False,  # a second map, for motion without input, which the loop has not
         },
-        steps=steps,
         seed=seed,
         resume=True,
         console=Console(),

@@ -93,7 +93,7 @@ def main(
     took = time.monotonic() - began
 
     unseen = unseen_trajectories(plant, plant.dt, n=50, duration=30.0, seed=seed)
-    observers = (learned.result.artifact, Artifact.read(resolve(f"{system}-static")))  # neither tracks
+    observers = (learned.result.artifact, Artifact.read(resolve(system)))
     smape, of_default = (
         float(np.median(errors(one, plant, unseen, measurement_noise=noise, seed=seed, skip=TRANSIENT).late))
         for one in observers

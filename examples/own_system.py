@@ -19,7 +19,6 @@ from rich.console import Console
 import kkl_gym
 from kkl_gym.elementary import sin
 from training import errors, preset, train, unseen_trajectories
-from training.config import override
 
 
 @dataclass(frozen=True)
@@ -46,12 +45,12 @@ class Pendulum(kkl_gym.System):
         return (x[0],)
 
 
-def main(inverse_steps: int = 3000, trajectories: int = 500, out: Path = Path("runs/pendulum")) -> float:
+def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/pendulum")) -> float:
     """Train, wrap and evaluate; returns the median SMAPE without noise, in percent.
 
     Args:
-        inverse_steps: batches of training; the preset has more, and its observer errs less.
-        trajectories: simulated trajectories to train on; of these too the preset has more.
+        inverse_steps: batches of training.
+        trajectories: simulated trajectories to train on.
         out: the run's folder.
     """
     system = Pendulum()
@@ -61,7 +60,7 @@ def main(inverse_steps: int = 3000, trajectories: int = 500, out: Path = Path("r
         "duration": 20.0,
         "measurement_noise_max": 0.5,
     }
-    config = override(preset(system, "input-aware", "fast"), sizes)
+    config = preset(system, changes=sizes)
     artifact = train(system, config, out, resume=True, console=Console()).artifact
     path = out / "pendulum.safetensors"
     artifact.save(path)

@@ -46,10 +46,11 @@ from training.identification.shooting import shoot
 from training.identification.windows import windows
 from training.kalman import ExtendedKalmanFilter
 from training.markdown import table
-from training.recorded.config import recorded_config
-from training.recorded.errors import estimates
-from training.recorded.fit import train_recorded
+from training.presets import recorded_preset
 from training.records import Record, Signals, read_records, resampled
+from training.sources.errors import estimates
+from training.sources.recorded import RecordedSource
+from training.train_observer import train
 
 SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))
 MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # what these signals are multiplied with in the mirror
@@ -206,8 +207,8 @@ def trained(records: Sequence[Record], settings: dict, out: Path) -> Artifact:
     """An observer from records and their mirror images."""
     mirrored = [replace(r, name=f"{r.name}, mirrored", y=-r.y, x=r.x * MIRRORED) for r in records]
     both = [*records, *mirrored]
-    config = recorded_config(both, settings)
-    return train_recorded(both, config, out, name="qube", resume=True, console=Console()).artifact
+    source = RecordedSource(both, recorded_preset(both, {"tracking": False, **settings}), "qube")
+    return train(source, folder=out, resume=True, console=Console()).artifact
 
 
 def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> dict[str, list[np.ndarray]]:

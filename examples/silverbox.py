@@ -20,7 +20,7 @@ import kkl_gym
 from kkl_gym.simulate import advance
 from training.figures import ALARM, RIVAL, drawing
 from training.identification import estimate_parameters
-from training.identification.motions import Shooting, settled
+from training.identification.motions import Problem, Shooting
 from training.identification.windows import windows
 from training.progress import LOG, progress_bars
 from training.records import Record
@@ -108,9 +108,8 @@ def simulated(system: Silverbox, record: Record) -> np.ndarray:
     """Outputs (n,) of a motion that sees inputs alone; its start is the one that fits the first samples best."""
     theta = np.array([system.parameters[name] for name in LIMITS])
     first = {(0, 0): np.array([record.y[0, 0], 0.0])}
-    x = settled(Shooting(system, DT, LIMITS, np.ones(len(theta))), theta, windows([record], first, FREE - 1))[
-        0
-    ].tolist()
+    shooting = Shooting(system, DT, LIMITS, np.ones(len(theta)))
+    x = Problem(shooting, windows([record], first, FREE - 1)).settled(theta).x0[0].tolist()
     y = [x[0]]
     for u in record.u[:-1].tolist():
         x = advance(system, x, u, (0.0, 0.0), DT)
@@ -118,26 +117,23 @@ def simulated(system: Silverbox, record: Record) -> np.ndarray:
     return np.array(y)
 
 
-def main(
-    path: Annotated[Path, tyro.conf.Positional], steps: int = 100, out: Path = Path("runs/silverbox"), seed: int = 0
-) -> list[float]:
+def main(path: Annotated[Path, tyro.conf.Positional], out: Path = Path("runs/silverbox"), seed: int = 0) -> list[float]:
     """Identify, simulate the tests, print a table and draw a figure.
 
     Returns the errors in mV rms on the multisine's test quarter, the arrow, and the arrow without extrapolation.
 
     Args:
         path: SNLS80mV.csv, or the folder that holds it.
-        steps: batches of the network that finds first guesses.
         out: the run's folder.
-        seed: of the network, the only thing that is random.
+        seed: of the random starts.
     """
     data, console = read(path), Console()
     out.mkdir(parents=True, exist_ok=True)
     begins = np.linspace(TRAINING[0], TRAINING[1] - LENGTH, RECORDS).astype(int)
     records = [part(data, begin, begin + LENGTH) for begin in begins]
     with progress_bars(console, out / LOG) as progress:
-        found = estimate_parameters(Silverbox(), LIMITS, records, out, progress=progress, steps=steps, seed=seed)
-        for line in found.told():
+        found = estimate_parameters(Silverbox(), LIMITS, records, progress=progress, seed=seed)
+        for line in found.summary():
             progress.say(line)
 
     tests = {"multisine": part(data, *MULTISINE), "arrow": part(data, *ARROW)}

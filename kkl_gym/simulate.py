@@ -1,29 +1,35 @@
-"""Fixed-step simulation: a sixth-order Runge–Kutta method with as many substeps as the state asks for.
+"""Simulation of sampling intervals by a sixth-order Runge–Kutta method, in 1, 2, 4, ... substeps of one length.
 
-The same method, and the same substeps, twice: written out for single states on Python floats (:func:`advance`), and
-on whole arrays for batches (:func:`advance_batch`). They agree to rounding, 1e-13 of the state in each step.
+An estimate of the error says how many, or the system's own ``rate(x)``. The same method, and the same substeps, twice:
+written out for single states on Python floats (:func:`advance`), and on whole arrays for batches
+(:func:`advance_batch`). They agree to rounding, 1e-13 of the state in each step.
 """
 
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from kkl_gym.equations import blame
-from kkl_gym.system import Components, System, dot
+from kkl_gym.system import Components, System, dot, rate_under
 from observers.checks import check_dt
 
-# rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
-# motion's size from anywhere in twice its training box (tests/kkl_gym/test_simulate.py); it is half of that.
+# rate * substep stays below this where a system has a formula for its rate. Chosen so that every shipped system keeps
+# the error of 10 s below 1e-5 of the motion's size from anywhere in twice its training box
+# (tests/kkl_gym/test_simulate.py); it is half of that.
 RATE_STEP = 0.4
 # A millionth less, so that rates which rounding takes to either side of a power of two get the same substeps.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
-MOST_EQUAL = 1 << 10  # substeps of one length; beyond, their length follows the rate
-REPORTED = 50  # intervals between two reports
+# Largest estimate of a substep's error, in half-widths of X. The error itself is smaller by a thousand there. With
+# TOLERANCE, stiff systems and the shipped ones without their formulas keep the same 1e-5. ROUGH is for systems with a
+# formula, which is overruled only where it fails, as when something ignites: a hundred times what the shipped reach.
+TOLERANCE, ROUGH = 3e-6, 0.1
+ATTEMPTS = 3  # at substeps of one length; afterwards, and beyond MOST_EQUAL of them, their length follows the error
+MOST_EQUAL = 1 << 10
 MAX_SUBSTEPS = 1 << 16
-GROWTH = 8  # of the need for substeps within one interval, from which on it is done again with lengths that follow it
+REPORTED = 50  # intervals between two reports
 
 # Butcher's explicit sixth-order method with seven stages (J. C. Butcher, Numerical Methods for Ordinary Differential
 # Equations, sec. 31). Order four needs four times as many evaluations for the same error on Lorenz.
@@ -37,8 +43,13 @@ STAGES = (
     (9 / 44, -9 / 11, 63 / 44, 18 / 11, 0, -16 / 11),
 )
 WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
+# An estimate of the error, of order h^5 when multiplied by h: the difference of the two slopes halfway. Where the
+# derivative depends on time alone it is zero, so that a little of the fourth divided difference over the interval is
+# added, which is (1, 0, -9, -9, 16, 0, 1).
+ERROR = (1 / 256, 0, -9 / 256, -9 / 256, 16 / 256 - 1, 1, 1 / 256)
 # Of the state, of a constant slope and of the slopes of the stages before.
 _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
+_ERROR = np.array(ERROR)
 
 VectorField = Callable[[Any], Any]
 Feedback = Callable[[int, np.ndarray], np.ndarray]
@@ -52,8 +63,11 @@ class SubstepsError(ValueError):
 
 
 @functools.cache
-def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, int], tuple[Any, ...]]:
-    """The Runge–Kutta step of ``STAGES`` and ``WEIGHTS`` for ``nx`` components, written out and compiled.
+def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, float, int, Components], tuple[Any, float]]:
+    """The Runge–Kutta steps of ``STAGES`` and ``WEIGHTS`` for ``nx`` components, written out and compiled.
+
+    Of f, x, constants that are added to f, the length h and number n of steps, and one over the tolerances, (nx,), it
+    makes the state after them and the largest estimate of a step's error, in tolerances and squared.
 
     Written out (as :mod:`dataclasses` writes ``__init__``) it is several times as fast as loops over stages and
     components.
@@ -67,7 +81,8 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, 
         return f"x{i}" + "".join(f" + c{row}_{j} * k{j}_{i}" for j, c in enumerate(coefficients) if c)
 
     rows = (*STAGES, WEIGHTS)
-    lines = ["def integrate(f, x, d, h, n):", f"    {unpacked('x')} = x", f"    {unpacked('d')} = d"]
+    lines = ["def integrate(f, x, d, h, n, s):", "    error = 0.0"]
+    lines += [f"    {unpacked(letter)} = {letter}" for letter in "xds"]
     lines += [f"    c{row}_{j} = h * {c!r}" for row, cs in enumerate(rows) for j, c in enumerate(cs) if c]
     lines += ["    for _ in range(n):"]
     for row, coefficients in enumerate(STAGES):
@@ -75,7 +90,12 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, 
         lines += [f"        {unpacked(f'k{row}_')} = f(({at}))"]
         lines += [f"        k{row}_{i} = k{row}_{i} + d{i}" for i in components]
     lines += [f"        x{i} = {moved(i, len(STAGES), WEIGHTS)}" for i in components]
-    lines += [f"    return {unpacked('x')}"]
+    for i in components:
+        weighted = " + ".join(f"{c!r} * k{j}_{i}" for j, c in enumerate(ERROR) if c)
+        lines += [f"        e{i} = h * s{i} * ({weighted})"]
+    lines += ["        e = " + " + ".join(f"e{i} * e{i}" for i in components)]
+    lines += ["        if not e <= error:", "            error = e"]  # where it is no number, too
+    lines += [f"    return ({unpacked('x')}), error"]
     namespace: dict[str, Any] = {}
     exec("\n".join(lines), namespace)
     return namespace["integrate"]
@@ -97,27 +117,40 @@ def forced(system: System, u: Components, w: Components) -> tuple[VectorField, C
     return field, w
 
 
+def _per_tolerance(kind: type[System], tolerance: float | None = None) -> tuple[float, ...]:
+    if tolerance is None:
+        tolerance = TOLERANCE if kind.rate is System.rate else ROUGH
+    return tuple(2.0 / (high - low) / tolerance for low, high in kind.X)
+
+
+per_tolerance: Callable[..., tuple[float, ...]] = functools.lru_cache(maxsize=256)(_per_tolerance)
+"""One over the tolerance of each state's error, (nx,), of a class of systems; kept, as every step asks."""
+
+
 def advance(system: System, x: Components, u: Components, w: Components, dt: float) -> Components:
     """One sampling interval from a single state, on Python floats."""
-    end: Components = (math.nan,) * len(x)
     try:
         try:
             if system.discrete:
                 return [xi + wi * dt for xi, wi in zip(system.step(x, u), w, strict=True)]
-            need = system.rate_under(x, u) * dt * PER_RATE
-            if need <= MOST_EQUAL:
+            kind = type(system)
+            need = 1.0 if kind.rate is System.rate else system.rate(x) * dt * PER_RATE
+            field, d = forced(system, u, w)
+            for _ in range(ATTEMPTS):
+                if not need <= MOST_EQUAL:
+                    break
                 n = 1
                 while n < need:
                     n *= 2
-                field, d = forced(system, u, w)
-                end = runge_kutta(len(x))(field, x, d, dt / n, n)
-                if system.rate_under(end, u) * dt * PER_RATE <= GROWTH * n:
-                    return end
+                end, error = runge_kutta(len(x))(field, x, d, dt / n, n, per_tolerance(kind))
+                if error <= 1.0:
+                    return cast(Components, end)
+                need = n * error**0.1  # as the square of h^5 falls
         except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
             found = _on_arrays(system, x, u, w, dt)
             if found is not None:
                 return found
-        return followed(system, x, u, w, dt=dt, end=end)
+        return followed(system, x, u, w, dt=dt, end=(math.nan,) * len(x))
     except SubstepsError:
         raise
     except Exception as error:
@@ -132,49 +165,57 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
     """
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
-        found: list[float] = _advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
+        found: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
     except Exception:
         return None
     return found if np.isfinite(found).all() else None
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
-    """One sampling interval with substeps whose length follows the rate, as long as the motion stays within bounds.
+    """One sampling interval with substeps whose length follows the error, as long as the motion stays within bounds.
 
     For motions that change faster and faster within the interval, as when something ignites, and to make sure of an
     escape: steps that were too long at the end may have led out of the bounds by themselves.
     """
     if system.discrete:
         return end
-    left, field, d = dt, *forced(system, u, w)
+    left, h, field, d = dt, dt, *forced(system, u, w)
+    step, units = runge_kutta(len(x)), per_tolerance(type(system), TOLERANCE)
     try:
         for _ in range(MAX_SUBSTEPS):
             if not all(low <= xi <= high for xi, (low, high) in zip(x, system.bounds, strict=True)):
                 return end
             if left <= 0.0:
                 return x
-            rate = system.rate_under(x, u)
-            if not math.isfinite(rate):
+            h = min(h, left)
+            moved, error = step(field, x, d, h, 1, units)
+            if error <= 1.0:
+                x = moved
+                left -= h
+            elif h < 1e-15 * dt:  # there is no number at all
                 return end
-            h = left if rate * left <= RATE_STEP else RATE_STEP / rate
-            x = runge_kutta(len(x))(field, x, d, h, 1)
-            left -= h
+            h *= 0.9 * max(1e-6, min(1e8, error)) ** -0.1
     except ArithmeticError:
         return end
     except Exception as error:
         blame(error, system, x, u)
         raise
     raise SubstepsError(
-        f"{system.name} changes at a rate of {rate:.4g}/s at x = {[float(xi) for xi in x]}: {MAX_SUBSTEPS} substeps "
-        f"are not enough for dt = {dt:g} s, of which {left:.2g} s are left; take a smaller dt, tighten the bounds, or "
-        "override rate(x) if it says too much"
+        f"{MAX_SUBSTEPS} substeps are not enough for dt = {dt:g} s of {system.name}, of which {left:.2g} s are left at "
+        f"x = {[float(xi) for xi in x]}: take a smaller dt, or tighten the bounds"
     )
 
 
 def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
     """One sampling interval from states (nx, n), each with the substeps that :func:`advance` would take."""
     try:
-        return _advance_batch(system, x, u, w, dt)
+        if system.discrete:
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                moved = system.step(x, u)
+                return np.array([np.broadcast_to(xi, x.shape[1:]) for xi in moved], dtype=float) + w * dt
+        out, lost = equal_substeps(system, x, u, w, dt)
+        rows = np.flatnonzero(np.isnan(out[0])) if lost else np.arange(0)
+        return followed_rows(system, x, u, w, dt=dt, end=out, rows=rows)
     except SubstepsError:
         raise
     except Exception as error:
@@ -182,35 +223,46 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
         raise
 
 
-def _advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
+def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
+    """The ends (nx, n) of substeps of one length for each row, NaN where these do not do, and whether any do not."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        if system.discrete:
-            moved = system.step(x, u)
-            return np.array([np.broadcast_to(xi, x.shape[1:]) for xi in moved], dtype=float) + w * dt
-        out, again = equal_substeps(system, x, u, w, dt)
-    return followed_rows(system, x, u, w, dt=dt, end=out, rows=np.flatnonzero(again))
-
-
-def equal_substeps(
-    system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The ends (nx, n) of a sampling interval in substeps of one length for each row, and which to do again, (n,)."""
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        need = np.broadcast_to(system.rate_under(x, u) * dt * PER_RATE, x.shape[1:])
-        if (need <= 1).all():
-            substeps: Any = 1
-            out = _step_batch(system, x, u, w, dt)
+        need: Any = 1.0 if type(system).rate is System.rate else system.rate(x) * dt * PER_RATE
+        if np.all(need <= 1):
+            substeps = np.ones(x.shape[1], int)
+            out, error = _step_batch(system, x, u, w, dt)
         else:
-            mantissa, exponent = np.frexp(np.where(need <= MOST_EQUAL, np.maximum(need, 1), 1))
-            substeps = 1 << (exponent - (mantissa == 0.5))  # the power of two that is not less than need
-            h = dt / substeps
-            out = _step_batch(system, x, u, w, h)
-            for k in range(2, substeps.max() + 1):
-                rows = np.flatnonzero(substeps >= k)
-                out[:, rows] = _step_batch(system, out[:, rows], u[:, rows], w[:, rows], h[rows])
-        end = np.broadcast_to(system.rate_under(out, u) * dt * PER_RATE, x.shape[1:])
-        out[:, ~(need <= MOST_EQUAL)] = np.nan
-        return out, ~((end <= GROWTH * substeps) & (need <= MOST_EQUAL))
+            substeps = _powers(np.broadcast_to(need, x.shape[1:]))
+            out, error = _substeps(system, x, u, w, dt / np.maximum(substeps, 1), substeps)
+            error[substeps == 0] = np.nan
+        for _ in range(1, ATTEMPTS):
+            rows = np.flatnonzero(error > 1)
+            if not len(rows):
+                break
+            substeps[rows], error[rows] = _powers(substeps[rows] * error[rows] ** 0.1), np.nan
+            rows = rows[substeps[rows] > 0]
+            n = substeps[rows]
+            out[:, rows], error[rows] = _substeps(system, x[:, rows], u[:, rows], w[:, rows], dt / n, n)
+    lost = ~(error <= 1)
+    out[:, lost] = np.nan
+    return out, bool(lost.any())
+
+
+def _powers(need: np.ndarray) -> np.ndarray:
+    """The least power of two that is not less than what is needed, or 0 beyond MOST_EQUAL. Shapes: (n,) to (n,)."""
+    mantissa, exponent = np.frexp(np.where(need <= MOST_EQUAL, np.maximum(need, 1), 1))
+    return np.where(need <= MOST_EQUAL, 1 << (exponent - (mantissa == 0.5)), 0)
+
+
+def _substeps(
+    system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: np.ndarray, n: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The ends (nx, m) of as many substeps n (m,) of length h (m,), one at least, and the largest of their errors."""
+    out, error = _step_batch(system, x, u, w, h)
+    for k in range(2, n.max(initial=1) + 1):
+        rows = np.flatnonzero(n >= k)
+        out[:, rows], of_step = _step_batch(system, out[:, rows], u[:, rows], w[:, rows], h[rows])
+        error[rows] = np.maximum(error[rows], of_step)
+    return out, error
 
 
 def followed_rows(
@@ -226,8 +278,8 @@ def followed_rows(
     return end
 
 
-def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> np.ndarray:
-    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,).
+def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> tuple[np.ndarray, np.ndarray]:
+    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,), and the squares of its errors, (n,).
 
     Few, large operations, because each call of numpy costs as much as its work on a thousand numbers: a stage is one
     product of its coefficients with x, d and the slopes so far.
@@ -243,7 +295,11 @@ def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: 
         for out, fi in zip(slope, field(at), strict=True):
             np.multiply(fi, h, out=out)
         at = (_ROWS[stage] @ flat[: 2 + stage]).reshape(x.shape)
-    return at
+    square: Any = 0.0
+    for error, unit in zip((_ERROR @ flat[2:]).reshape(x.shape), per_tolerance(type(system)), strict=True):
+        error *= unit
+        square = square + error * error
+    return at, square
 
 
 def simulate(
@@ -299,7 +355,7 @@ def check_duration(duration: float, dt: float) -> None:
 def check_interval(system: System, dt: float) -> None:
     """Raise an error if a sampling interval does not suit a system at all."""
     if not system.discrete:
-        rate = float(system.rate_under(tuple(np.mean(system.X, axis=1).tolist()), system.u_max))
+        rate = float(rate_under(system, tuple(np.mean(system.X, axis=1).tolist()), system.u_max))
         if rate * dt * PER_RATE > MAX_SUBSTEPS:
             raise SubstepsError(
                 f"{system.name} changes at a rate of {rate:.4g}/s in the middle of X, for which dt = {dt:g} s would "

@@ -15,7 +15,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from kkl_gym.declarations import complete
-from kkl_gym.elementary import minimum
 from kkl_gym.equations import components, rate_at
 from kkl_gym.loading import load_class
 from observers.checks import is_finite, mapping, shown
@@ -182,7 +181,7 @@ class System:
 
     @property
     def typical_rate(self) -> float:
-        """Median of :meth:`rate_under` over a thousand starts and the largest input, in 1/s; ValueError if it is 0."""
+        """Median rate of f(x) + g(x) u over a thousand starts and the largest input, in 1/s; ValueError if it is 0."""
         return _typical_rate(self)
 
     def f(self, x: Components) -> Components:
@@ -321,11 +320,11 @@ class System:
         return on_states(self.f, x)
 
     def rate(self, x: Components) -> Any:
-        """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the substeps follow.
+        """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the default ``dt`` follows.
 
         The default differentiates f numerically, with each state in units of X's half-width, so that it does not depend
-        on the user's units. Where g depends on the state it is added how fast g(x) u changes (:meth:`rate_under`).
-        Override it with a formula where single steps must be fast; that then stands for both, at the largest input.
+        on the user's units. An estimate of the error then says how many substeps an interval takes. A formula in its
+        place says so itself, as where f jumps: a substep lasts 0.4 / rate at most.
 
         Parameters
         ----------
@@ -338,33 +337,6 @@ class System:
             The rate in 1/s.
         """
         return slope(self.f, x, self.X)
-
-    def rate_under(self, x: Components, u: Components) -> Any:
-        """How fast f(x) + g(x) u changes under a held input, in 1/s.
-
-        It is :meth:`rate` where g is constant, and where that is overridden.
-
-        Parameters
-        ----------
-        x : sequence of length nx
-            Components of the state.
-        u : sequence of length nu
-            Input.
-
-        Returns
-        -------
-        float, or of the kind that the components of ``x`` are
-            The rate in 1/s; the sum of both parts' where g depends on the state.
-        """
-        rate = self.rate(x)
-        if type(self).g is System.g or type(self).rate is not System.rate:
-            return rate
-
-        def driven(x: Components) -> list[Any]:
-            return [dot(row, u) for row in self.g(x)]
-
-        # The lesser of both sides: of a jump, as of a valve that closes, one side is as steep as there are digits.
-        return rate + minimum(slope(driven, x, self.X), slope(driven, x, self.X, -1))
 
     def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the training box, or of a multiple of it about ``X_centre``, cut at the bounds.
@@ -436,30 +408,29 @@ def dot(row: Iterable[Any], u: Components) -> Any:
     return total
 
 
-def difference_steps(X: Box) -> list[tuple[float, float]]:
-    """For each state a millionth of X's half-width, and how far it is moved to differentiate numerically.
-
-    That is as much, or more where X lies so far from zero that floats would hardly tell it.
-    """
-    units = [5e-7 * (high - low) for low, high in X]
-    return [(unit, max(unit, 2e-8 * max(map(abs, box)))) for unit, box in zip(units, X, strict=True)]
-
-
-def slope(field: Callable[[Any], Components], x: Components, X: Box, side: int = 1) -> Any:
+def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
     """A norm of a vector field's derivative, differentiated numerically, with states in units of X's half-widths."""
-    steps = difference_steps(X)
-    fx = field(x)
-    total = 0.0
-    for j, (own, step) in enumerate(steps):
-        moved, far = field([*x[:j], x[j] + side * step, *x[j + 1 :]]), step / own
-        total = total + sum(((b - a) / (unit * far)) ** 2 for a, b, (unit, _) in zip(fx, moved, steps, strict=True))
+    units = [5e-7 * (high - low) for low, high in X]  # a millionth of the half-widths
+    fx, total = field(x), 0.0
+    for j, unit in enumerate(units):
+        step = max(unit, 2e-8 * max(map(abs, X[j])))  # more where X lies so far from zero that floats hardly tell it
+        moved = field([*x[:j], x[j] + step, *x[j + 1 :]])
+        ratios = ((b - a) / other * (unit / step) for a, b, other in zip(fx, moved, units, strict=True))
+        total = total + sum(ratio**2 for ratio in ratios)
     return total**0.5
+
+
+def rate_under(system: System, x: Components, u: Components) -> Any:
+    """How fast f(x) + g(x) u changes under a held input, in 1/s; its rate if g is constant, or that is a formula."""
+    if type(system).g is System.g or type(system).rate is not System.rate:
+        return system.rate(x)
+    return slope(lambda x: [fi + dot(row, u) for fi, row in zip(system.f(x), system.g(x), strict=True)], x, system.X)
 
 
 def typical_rate(system: System, starts: np.ndarray) -> float:
     """Median over some starts of how fast f changes. Shapes: ``starts`` (n, nx)."""
     rate_at(system, starts.T)  # or say what is wrong with it
-    rate = float(np.median(np.broadcast_to(system.rate_under(starts.T, system.u_max), len(starts))))
+    rate = float(np.median(np.broadcast_to(rate_under(system, starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:
         raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
     return rate

@@ -200,8 +200,8 @@ class Artifact:
                 raise ArtifactError(f"the signals {role} must be {count}, got {shown(names)}")
 
     def _check_environment(self, environment: Mapping[str, Any]) -> None:
-        of = isinstance(environment, Mapping) and set(environment) == {"id", "kwargs"}
-        if not of or not isinstance(environment["id"], str) or not isinstance(environment["kwargs"], Mapping):
+        whole = isinstance(environment, Mapping) and set(environment) == {"id", "kwargs"}
+        if not whole or not isinstance(environment["id"], str) or not isinstance(environment["kwargs"], Mapping):
             raise ArtifactError(f"environment must be an id and kwargs, got {shown(environment)}")
         if self.signals is None:
             raise ArtifactError(f"an observer for the environment {environment['id']} must name its signals")
@@ -249,22 +249,9 @@ class Artifact:
         return self.C is not None or self.h is not None
 
     def output(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate the output h(x).
+        """Return h(x); NaN or infinite where h is not defined. Shapes: ``x`` (..., nx); returns (..., ny).
 
-        Parameters
-        ----------
-        x : ndarray, shape (..., nx)
-            States.
-
-        Returns
-        -------
-        ndarray, shape (..., ny)
-            Outputs without noise; NaN or infinite where h is not defined, such as the root of a negative number.
-
-        Raises
-        ------
-        ArtifactError
-            If the artifact holds no h.
+        Raises ArtifactError if the artifact holds no h.
         """
         if self.C is not None:
             return x @ self.C.T
@@ -273,25 +260,7 @@ class Artifact:
         return self.h(x)
 
     def residual(self, y: np.ndarray, x_hat: np.ndarray) -> np.ndarray:
-        """Compare samples with estimates.
-
-        Parameters
-        ----------
-        y : ndarray, shape (..., ny)
-            Samples.
-        x_hat : ndarray, shape (..., nx)
-            Estimates.
-
-        Returns
-        -------
-        ndarray, shape (..., ny)
-            y - h(x_hat); 0, as if they fitted, where h is not defined.
-
-        Raises
-        ------
-        ArtifactError
-            As :meth:`output`.
-        """
+        """Return y - h(x_hat); 0, as if they fitted, where h is not defined. Shapes and error as :meth:`output`."""
         apart = y - self.output(x_hat)
         return apart if self.C is not None else np.where(np.isfinite(apart), apart, 0.0)
 

@@ -8,7 +8,7 @@ import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ class CompiledNetwork:
     """A multilayer perceptron. Shapes: ``bias`` (outputs,)."""
 
     def __init__(self, layers: Layers, activation: str) -> None:
-        network_kernels(activation)  # or say now that there is no Numba
+        _activate(activation)  # or say now that there is no Numba
         self._layers, self.activation, self.bias = layers, activation, layers[-1][1]
         widths = [len(layers[0][0]), *(len(bias) for _, bias in layers)]
         self.outputs, self.widths, self._most = widths[-1], np.array(widths), max(widths)
@@ -38,12 +38,6 @@ class CompiledNetwork:
         row = -(-(self._most + UNROLLED) // _LINE) * _LINE
         self.between = _aligned(np.zeros(3 * row, np.float32)).reshape(3, row)  # no kernel lets another thread in
         self._spare: list[np.ndarray] = []  # what batches take, and put back: BLAS does let others in
-
-    def single(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate for one sample. Shapes: ``x`` (inputs,); returns (outputs,)."""
-        out = np.empty(self.outputs, np.float32)
-        network_kernels(self.activation).single(x, self.packed, self.widths, self.between, out)
-        return out
 
     def batch(self, x: np.ndarray) -> np.ndarray:
         """Evaluate for many samples. Shapes: ``x`` (n, inputs); returns (n, outputs)."""
@@ -62,7 +56,7 @@ class CompiledNetwork:
     def piece(self, h: np.ndarray, memory: np.ndarray, out: np.ndarray) -> None:
         """Evaluate for the rows of a piece, (rows, inputs), all but the last biases, into ``out`` (rows, outputs)."""
         *hidden, (last, _) = self._layers
-        activate, rows = network_kernels(self.activation).activate, len(h)
+        activate, rows = _activate(self.activation), len(h)
         for i, ((weight, bias), tile) in enumerate(zip(hidden, self._tiles)):
             flat = memory[i % 2, : rows * len(bias)]
             h = np.matmul(h, weight, out=flat.reshape(rows, len(bias)))
@@ -106,7 +100,11 @@ class CompiledDecoder:
         x_scale: np.ndarray,
     ) -> None:
         self._network = CompiledNetwork(layers[1:], activation)
-        self._first = first_layer(layers[0], whiten=whiten, offset=offset, conditions=conditions, age=age)
+        weight, bias = (part.astype(float) for part in layers[0])
+        modes, given = len(offset), len(offset) + len(conditions)
+        of_age = np.zeros_like(bias) if age is None else weight[given]
+        bias = bias + offset @ weight[:modes] + np.array(conditions, dtype=float) @ weight[modes:given]
+        self._first = np.vstack([bias, of_age, whiten @ weight[:modes]])  # (2 + size, outputs)
         self._age_unit, self._age_max = age or (1.0, 0.0)
         self._sums = np.empty(self._first.shape[1])
         self._units = np.array([x_offset, x_scale], dtype=float)
@@ -132,7 +130,7 @@ class CompiledDecoder:
     def batch(self, z: np.ndarray, age: float | np.ndarray) -> np.ndarray:
         """Estimate for many samples. Shapes: ``z`` (n, size), ``age`` (n,); returns (n, nx)."""
         network, n, width = self._network, len(z), len(self._sums)
-        kernels = batch_kernels(network.activation)
+        enter, finish = _batch_kernels(network.activation)
         ages = np.full(n, np.log1p(np.minimum(age, self._age_max) / self._age_unit))  # to Numba, of one type
         x_hat = np.empty((n, network.outputs))
         pieces = network.pieces(n)
@@ -144,9 +142,9 @@ class CompiledDecoder:
                 rows = here.stop - here.start
                 np.matmul(z[here], self._first[2:], out=sums[:rows])
                 entered = memory[1, : rows * width].reshape(rows, width)  # which is free until the second layer
-                kernels.enter(sums, self._first, ages[here], entered)
+                enter(sums, self._first, ages[here], entered)
                 network.piece(entered, memory, out[:rows])
-                kernels.finish(out, network.bias, self._units, x_hat[here])
+                finish(out, network.bias, self._units, x_hat[here])
         return x_hat
 
 
@@ -157,22 +155,6 @@ def available() -> bool:
     except ImportError:
         return False
     return True
-
-
-def first_layer(
-    layer: tuple[np.ndarray, np.ndarray],
-    *,
-    whiten: np.ndarray,
-    offset: np.ndarray,
-    conditions: Sequence[float],
-    age: tuple[float, float] | None,
-) -> np.ndarray:
-    """A network's first layer on the filter's state, in float64. Shapes: returns (2 + size, outputs)."""
-    weight, bias = (part.astype(float) for part in layer)
-    modes, given = len(offset), len(offset) + len(conditions)
-    first = np.vstack([bias, np.zeros_like(bias) if age is None else weight[given], whiten @ weight[:modes]])
-    first[0] += offset @ weight[:modes] + np.array(conditions, dtype=float) @ weight[modes:given]
-    return first
 
 
 def _aligned(values: np.ndarray) -> np.ndarray:
@@ -189,29 +171,9 @@ def _padded(weight: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def entering_kernel() -> Callable[..., None]:
-    """What :func:`first_layer` makes of a filter's state and an age, before the activation."""
-
-    @fast_part
-    def enter(first: np.ndarray, age: float, z: np.ndarray, sums: np.ndarray) -> None:
-        width, size = len(sums), len(z)
-        for j in range(width):
-            sums[j] = first[0, j] + age * first[1, j]
-        for i in range(0, size - 1, 2):
-            a, b = z[i], z[i + 1]
-            for j in range(width):
-                sums[j] += a * first[i + 2, j] + b * first[i + 3, j]
-        if size % 2:
-            for j in range(width):
-                sums[j] += z[size - 1] * first[size + 1, j]
-
-    return enter
-
-
-@functools.cache
 def _decode(activation: str) -> Callable[..., None]:
     """The first layer on z and age, and the network behind it, for one sample."""
-    active, evaluate, enter = active_kernel(activation), single_network(activation), entering_kernel()
+    active, evaluate = _active(activation), single_network(activation)
 
     @fast_kernel
     def decode(
@@ -227,8 +189,17 @@ def _decode(activation: str) -> Callable[..., None]:
         age: float,
         out: np.ndarray,
     ) -> None:
-        width, entered, found = len(sums), between[0], between[2]
-        enter(first, math.log1p(min(age, age_max) / age_unit), z, sums)
+        width, size, entered, found = len(sums), len(z), between[0], between[2]
+        age = math.log1p(min(age, age_max) / age_unit)
+        for j in range(width):
+            sums[j] = first[0, j] + age * first[1, j]
+        for i in range(0, size - 1, 2):
+            a, b = z[i], z[i + 1]
+            for j in range(width):
+                sums[j] += a * first[i + 2, j] + b * first[i + 3, j]
+        if size % 2:
+            for j in range(width):
+                sums[j] += z[size - 1] * first[size + 1, j]
         for j in range(width):
             entered[j] = active(np.float32(sums[j]))
         evaluate(entered[:width], packed, widths, between, found[: len(out)])
@@ -238,24 +209,10 @@ def _decode(activation: str) -> Callable[..., None]:
     return decode
 
 
-class BatchKernels(NamedTuple):
-    """What follows the first layer's matrix product, and what follows the last one's."""
-
-    enter: Any
-    finish: Any
-
-
-class NetworkKernels(NamedTuple):
-    """Bias and activation of a batch's layer in place, and a whole network for one sample."""
-
-    activate: Any
-    single: Any
-
-
 @functools.cache
-def batch_kernels(activation: str) -> BatchKernels:
+def _batch_kernels(activation: str) -> tuple[Any, Any]:
     """What follows the first layer's matrix product, and what follows the last one's, for the rows of a piece."""
-    active = active_kernel(activation)
+    active = _active(activation)
 
     @fast_kernel
     def enter(sums: np.ndarray, first: np.ndarray, ages: np.ndarray, entered: np.ndarray) -> None:
@@ -271,19 +228,19 @@ def batch_kernels(activation: str) -> BatchKernels:
             for j in range(len(bias)):
                 out[row, j] = units[0, j] + units[1, j] * (h[row, j] + bias[j])
 
-    return BatchKernels(enter, finish)
+    return enter, finish
 
 
 @functools.cache
-def active_kernel(activation: str) -> Any:
+def _active(activation: str) -> Any:
     """An activation of one number in float32."""
     return fast_part(_ACTIVATIONS[activation]())
 
 
 @functools.cache
-def network_kernels(activation: str) -> NetworkKernels:
-    """For an activation: bias and activation of a batch's layer in place, and a whole network for one sample."""
-    active = active_kernel(activation)
+def _activate(activation: str) -> Any:
+    """Bias and activation of a batch's layer in place."""
+    active = _active(activation)
 
     @fast_kernel
     def activate(h: np.ndarray, tile: np.ndarray) -> None:
@@ -292,13 +249,13 @@ def network_kernels(activation: str) -> NetworkKernels:
             for j in range(len(part)):
                 part[j] = active(part[j] + tile[j])
 
-    return NetworkKernels(activate, fast_kernel(single_network(activation)))
+    return activate
 
 
 @functools.cache
 def single_network(activation: str) -> Callable[..., None]:
     """A whole network for one sample."""
-    active = active_kernel(activation)
+    active = _active(activation)
 
     @fast_part
     def evaluate(x: np.ndarray, packed: np.ndarray, widths: np.ndarray, between: np.ndarray, out: np.ndarray) -> None:

@@ -1,7 +1,7 @@
 """From the filter's state to T_inv's estimate, and to the covariance of its error, at given levels of noise."""
 
 import functools
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -12,28 +12,12 @@ from observers.thresholds import MANY_ROWS
 
 
 class Decoders:
-    """T_inv of driven motion and, where there is one, that of free motion; each row is decoded by the one it needs."""
+    """T_inv of driven and of free motion, some of their outputs; each row is decoded by the one that it needs."""
 
-    def __init__(self, driven: "Decoder", free: "Decoder | None") -> None:
-        self._driven, self._free = driven, free
-
-    @classmethod
-    def of(
-        cls,
-        artifact: Artifact,
-        outputs: slice,
-        *,
-        measurement_noise: float | tuple[float, ...],
-        process_noise: float,
-        compiled: bool = False,
-    ) -> Self:
-        """Return those of an artifact at levels of noise, for some of the maps' outputs."""
-        driven, free = (
-            None if inverse is None else Decoder(inverse, outputs, measurement_noise, process_noise, compiled=compiled)
-            for inverse in (artifact.inverse, artifact.free_inverse)
-        )
-        assert driven is not None
-        return cls(driven, free)
+    def __init__(self, artifact: Artifact, outputs: slice, **options: Any) -> None:
+        free = artifact.free_inverse
+        self._driven = Decoder(artifact.inverse, outputs, **options)
+        self._free = None if free is None else Decoder(free, outputs, **options)
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the estimates, (..., nx), of filter states (..., size) at ages in seconds."""
@@ -69,9 +53,9 @@ class Decoder:
         self,
         inverse: InverseMap,
         outputs: slice,
+        *,
         measurement_noise: float | tuple[float, ...],
         process_noise: float,
-        *,
         compiled: bool = False,
     ) -> None:
         error = inverse.error_covariance

@@ -90,13 +90,7 @@ class ErrorCovariance:
         shape = self.covariance.shape
         if len(shape) != 4 or shape[:2] != sizes or shape[2] != shape[3] or not shape[2]:
             raise ArtifactError(f"covariances of shape {shape} do not fit {sizes[0]} levels and {sizes[1]} ages")
-        variances = np.diagonal(self.covariance, axis1=-2, axis2=-1)
-        if not (variances > 0).all():
-            raise ArtifactError("a covariance must be positive definite")
-        scale = np.sqrt(variances)
-        correlation = self.covariance / (scale[..., :, None] * scale[..., None, :])
-        if not np.allclose(correlation, correlation.mT) or not (np.linalg.eigvalsh(correlation) > 0).all():
-            raise ArtifactError("a covariance must be positive definite")
+        check_positive_definite(self.covariance)
 
     @property
     def nx(self) -> int:
@@ -129,9 +123,27 @@ class CovarianceByAge:
         return np.asarray((1 - share) * self._covariance[i - 1] + share * self._covariance[i])
 
 
+def check_positive_definite(covariance: np.ndarray) -> None:
+    """Raise ArtifactError unless covariances (..., n, n) are positive definite, whatever the units of the states."""
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+    if (variances > 0).all():
+        scale = np.sqrt(variances)
+        correlation = covariance / (scale[..., :, None] * scale[..., None, :])
+        if np.allclose(correlation, correlation.mT) and (np.linalg.eigvalsh(correlation) > 0).all():
+            return
+    raise ArtifactError(f"a covariance must be positive definite, got {shown(covariance)}")
+
+
 def standard_deviations(covariance: np.ndarray) -> np.ndarray:
     """Return the standard deviations (..., nx) of covariances (..., nx, nx)."""
     return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
-__all__ = ["COVERAGE", "CovarianceByAge", "ErrorCovariance", "Factors", "standard_deviations"]
+__all__ = [
+    "COVERAGE",
+    "CovarianceByAge",
+    "ErrorCovariance",
+    "Factors",
+    "check_positive_definite",
+    "standard_deviations",
+]

@@ -115,17 +115,9 @@ class LinearFilter:
         return float(np.abs(np.linalg.eigvals(self.A).real).min())
 
     def start(self, y0: np.ndarray) -> np.ndarray:
-        """Return the state that a constant output would have led to: z_y = -A^-1 B y0, z_u = 0.
+        """Return the state that a constant output leads to: z_y = -A^-1 B y0, z_u = 0.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (..., ny)
-            The output.
-
-        Returns
-        -------
-        ndarray, shape (..., size)
-            The state.
+        Shapes: ``y0`` (..., ny); returns (..., size).
         """
         return y0 @ self.equilibrium.T
 
@@ -134,26 +126,8 @@ class LinearFilter:
 
         A batch (n, size) of many rows goes through Numba where it is installed, which rounds a little differently.
 
-        Parameters
-        ----------
-        z : ndarray, shape (..., size)
-            The state.
-        y : ndarray, shape (..., ny)
-            The output at the same time.
-        u : ndarray, shape (..., nu)
-            The input held until the next sample.
-        y_next : ndarray, shape (..., ny)
-            The output at the next sample.
-
-        Returns
-        -------
-        ndarray, shape (..., size)
-            The state at the next sample.
-
-        Raises
-        ------
-        ValueError
-            If the shapes do not go together.
+        Shapes: ``z`` (..., size), ``y`` (..., ny) at the same time, ``u`` (..., nu) held until the next sample,
+        ``y_next`` (..., ny) there; returns (..., size). Raises ValueError if they do not go together.
         """
         if z.ndim == 2 and len(z) >= MANY_ROWS and self._sparse is not None:
             return self._sparse(z, y, u, y_next)
@@ -164,21 +138,9 @@ class LinearFilter:
         return self.advance(z, y, u, y_next) if self._sparse is None else self._sparse.single(z, y, u, y_next)
 
     def run(self, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
-        """Return the states at some samples of a record.
+        """Return the states at samples ``ages`` (m,) of a record, counted from its start, without repetition.
 
-        Parameters
-        ----------
-        y : ndarray, shape (steps + 1, n, ny)
-            Outputs.
-        u : ndarray, shape (steps, n, nu)
-            Inputs, each held after the output of its row.
-        ages : ndarray of int, shape (m,)
-            Samples since the start, from 0 to ``steps``, without repetition.
-
-        Returns
-        -------
-        ndarray, shape (m, n, size)
-            States.
+        Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), held after the output of its row; returns (m, n, size).
         """
         z = self.start(y[0])
         out = np.empty((len(ages), *z.shape))

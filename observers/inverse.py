@@ -132,40 +132,16 @@ class InverseMap:
         return value
 
     def part(self, outputs: slice) -> "InverseMap":
-        """Return the same map with some of its outputs alone.
-
-        Parameters
-        ----------
-        outputs : slice
-            Which of them.
-
-        Returns
-        -------
-        InverseMap
-            One that shares its arrays with this; this one if all are meant.
-        """
+        """Return the map with some of its outputs alone, and no covariance; itself if all are meant."""
         if range(self.mlp.outputs)[outputs] == range(self.mlp.outputs):
             return self
         x_offset, x_scale = self.x_offset[outputs], self.x_scale[outputs]
         return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, error_covariance=None)
 
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        """Cut levels of measurement noise at the largest that the map is told.
+        """Return levels of measurement noise, cut at the largest in training; a float if all are the same.
 
-        Parameters
-        ----------
-        measurement_noise : float or tuple of float, length ny
-            Standard deviations of the noise, of all outputs or each.
-
-        Returns
-        -------
-        float or tuple of float, length ny
-            The levels, those beyond the range at its end; a float if all are the same.
-
-        Raises
-        ------
-        ValueError
-            If the levels differ and the map is told one for all outputs.
+        Raises ValueError if the levels of several outputs differ and the map takes one for all of them.
         """
         if isinstance(measurement_noise, tuple) and self.noise_gain.ndim == 1 and self.noise_gain.any():
             raise ValueError(
@@ -182,28 +158,13 @@ class InverseMap:
         sigma = np.reshape(measurement_noise, (-1, 1))
         return 1.0 / (1.0 + ((sigma * np.atleast_2d(self.noise_gain)) ** 2).sum(0))
 
-    def shares(
-        self, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0
-    ) -> tuple[float, float]:
+    def shares(self, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0) -> tuple[float, float]:
         """Return levels in multiples of the largest in training, of the noisiest output."""
         largest = np.max(np.divide(measurement_noise, self.measurement_noise_max))
         return float(largest), process_noise / self.process_noise_max
 
     def noise_features(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> list[float]:
-        """Return what the network is told of noise.
-
-        Parameters
-        ----------
-        measurement_noise : float or tuple of float, length ny
-            Standard deviations, of all outputs or each.
-        process_noise : float
-            Level in multiples of the system's scale per second.
-
-        Returns
-        -------
-        list of float
-            What there is of the features, in order.
-        """
+        """Return the network's inputs for levels of noise, in the order of the features."""
         told = []
         if "measurement_noise" in self.features:
             told += np.atleast_1d(np.log1p(np.divide(measurement_noise, self.measurement_noise_unit))).tolist()

@@ -80,20 +80,8 @@ class Limits:
         Where some outputs are noisier than others, relative to the last levels, their noise reaches the estimate and so
         the residuals of all. The upper limits are then those at the noisiest output's part of the last levels.
 
-        Parameters
-        ----------
-        level : float or tuple of float, length ny
-            Standard deviation of the measurement noise, of all outputs or each.
-
-        Returns
-        -------
-        mean, low, high : ndarray, shape (ny,)
-            Limits, interpolated as variances add up.
-
-        Raises
-        ------
-        ValueError
-            If the level is no number, negative or beyond the last one.
+        Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each, interpolated as
+        variances add up. Raises ValueError if the level is not a number, negative or beyond the last one.
         """
         ny = self.mean.shape[1]
         level = noise_levels("the noise level", level, ny)
@@ -142,38 +130,18 @@ class Monitor:
         self._sound = np.maximum(np.square(level), self._limits[1])  # where the running mean square begins
 
     def reset(self, batch: tuple[int, ...]) -> None:
-        """Begin anew.
-
-        Parameters
-        ----------
-        batch : tuple of int
-            Shape (...,) of the batch from here on.
-        """
+        """Begin anew, with a batch of a shape (...,)."""
         ny = len(self._sound)
         self._mean = np.zeros((*batch, ny))
         self._square = np.broadcast_to(self._sound, (*batch, ny)).copy()
         self._age = np.zeros(batch, dtype=int)
 
     def restart(self, rows: np.ndarray) -> None:
-        """Begin anew in some rows.
-
-        Parameters
-        ----------
-        rows : ndarray of bool, shape (...,)
-            The rows.
-        """
+        """Begin anew in some rows. Shapes: ``rows`` (...,), of bool."""
         self._mean[rows], self._square[rows], self._age[rows] = 0.0, self._sound, 0
 
     def update(self, residual: np.ndarray, seen: np.ndarray | None = None) -> None:
-        """Take in residuals y - h(x_hat).
-
-        Parameters
-        ----------
-        residual : ndarray, shape (..., ny)
-            The residuals.
-        seen : ndarray of bool, shape (..., ny) or (..., 1), optional
-            The residuals that count; by default all.
-        """
+        """Take in residuals y - h(x_hat), (..., ny), of which ``seen`` ones, (..., ny) or (..., 1), or all count."""
         share = self._share if seen is None else self._share * seen
         self._mean += share * (residual - self._mean)
         self._square += share * (residual**2 - self._square)

@@ -7,7 +7,7 @@ import numpy as np
 from observers.checks import is_finite
 from observers.errors import ArtifactError, check_shapes
 from observers.expression import Expression
-from observers.factors import Factors
+from observers.factors import Factors, check_positive_definite
 from observers.network import MLP
 
 _MAX_LEVEL = 1e30  # of a process noise or a window: its square stays finite
@@ -170,8 +170,7 @@ class Motion:
         for name in ("error", "process_noise"):
             if not (getattr(self, name) >= 0).all():
                 raise ArtifactError(f"{name} of a motion must not be negative, got {getattr(self, name)}")
-        if not np.allclose(self.covariance, self.covariance.T) or np.linalg.eigvalsh(self.covariance)[0] <= 0:
-            raise ArtifactError(f"the covariance of a motion must be positive definite, got {self.covariance}")
+        check_positive_definite(self.covariance)
         if not (self.low < self.high).all():
             raise ArtifactError(f"bounds of a motion must go from low to high, got {self.low} and {self.high}")
         for name in ("least_process_noise", "window"):

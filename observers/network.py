@@ -94,10 +94,6 @@ class MLP:
         *biases, bias = self.biases
         return MLP([*weights, last[outputs]], [*biases, bias[outputs]], self.activation)
 
-    def behind(self) -> "MLP":
-        """The same network from what comes out of its first layer."""
-        return MLP(self.weights[1:], self.biases[1:], self.activation)
-
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Evaluate the network.
 

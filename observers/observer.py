@@ -13,13 +13,13 @@ from observers.decoder import Decoders
 from observers.factors import standard_deviations
 from observers.monitor import Monitor
 from observers.replacement import check_replacement
-from observers.replay import along, filled, replayed
+from observers.replay import RecordEstimates, filled
 from observers.samples import check_arguments, check_output, first_state, held_input
 from observers.thresholds import SOON
 from observers.tracker import Tracker
 
 
-class KKLObserver:
+class KKLObserver(RecordEstimates):
     """z' = A z + B y, x_hat = T_inv(z): a causal state estimate from sampled outputs (paper, sec. 3.2).
 
     ``x_hat_0 = reset(y_0)``, then ``x_hat_k+1 = step(y_k+1, u_k)`` with u_k the input held over [t_k, t_k+1].
@@ -52,9 +52,8 @@ class KKLObserver:
         motion.
     compiled : bool, optional
         Whether single samples run compiled by Numba (the extra ``fast``), several times as fast; compilation takes
-        seconds, once. True compiles here, such as before a loop in real time,
-        and after unpickling. False uses NumPy. None uses NumPy until a :meth:`reset` after 1,000 samples. The two agree
-        to rounding. Batches of 128 rows or more always use Numba where it is installed.
+        seconds, once. True compiles here and after unpickling, False uses NumPy, None uses NumPy until a :meth:`reset`
+        after 1,000 samples. The two agree to rounding. Batches of 128 rows or more use Numba where it is installed.
 
     Raises
     ------
@@ -78,7 +77,7 @@ class KKLObserver:
     ) -> None:
         check_arguments(artifact, monitor, compiled, tracking)
         self.artifact = artifact
-        self._monitored, self._tracking = bool(monitor), tracking
+        self._monitored, self._tracking = bool(monitor), None if tracking is None else bool(tracking)
         self._compile, self._compiled = compiled, bool(compiled)
         self._samples = 0  # single ones
         self._z: np.ndarray | None = None
@@ -134,12 +133,14 @@ class KKLObserver:
 
     def _set_levels(self) -> None:
         """Make maps and tracker for the levels of noise."""
-        nx = self.artifact.nx
-        self._states = self._decoders(slice(nx))
-        self._parameters = self._decoders(slice(nx, None)) if self.artifact.estimated_parameters else None
-        before, self._tracker = self._tracker, self._new_tracker()
-        if before is not None and self._tracker is not None and self._z is not None:
-            self._tracker.take_over(before)
+        artifact, levels = self.artifact, self._levels
+        self._states = Decoders(artifact, slice(artifact.nx), **levels)
+        self._parameters: Decoders | None = None  # made where they are asked for
+        before, self._tracker = self._tracker, None
+        if artifact.motion is not None and self._tracking is not False:
+            self._tracker = Tracker(artifact, self._states, **levels)
+            if before is not None and self._z is not None:
+                self._tracker.take_over(before)
 
     @property
     def _levels(self) -> dict[str, Any]:
@@ -148,15 +149,6 @@ class KKLObserver:
             "process_noise": self._process_noise,
             "compiled": self._compiled,
         }
-
-    def _new_tracker(self) -> Tracker | None:
-        if self.artifact.motion is None or self._tracking is False:
-            return None
-        return Tracker(self.artifact, self._states, **self._levels)
-
-    def _decoders(self, outputs: slice) -> Decoders:
-        """The maps, or some of their outputs, at the levels of noise."""
-        return Decoders.of(self.artifact, outputs, **self._levels)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -167,11 +159,9 @@ class KKLObserver:
 
     def _warm_up(self) -> None:
         """Make the machine code for single samples now, by a sample that is forgotten."""
-        linear = self.artifact.filter
-        y, z = np.zeros(self.artifact.ny), np.zeros(linear.size)
-        u = np.zeros(linear.nu)
-        self._states(linear.advance_single(z, y, u, y), 0.0)
-        tracker = self._new_tracker()
+        linear, tracker = self.artifact.filter, copy.copy(self._tracker)
+        y, u = np.zeros(self.artifact.ny), np.zeros(linear.nu)
+        self._states(linear.advance_single(np.zeros(linear.size), y, u, y), 0.0)
         if tracker is not None:
             tracker.reset(y)
             tracker.advance(y, u)
@@ -179,10 +169,8 @@ class KKLObserver:
     def __copy__(self) -> "KKLObserver":
         """Another that stands where this one does, and goes its own way: what is changed in place is copied too."""
         other = object.__new__(type(self))
-        vars(other).update(vars(self))
-        other._monitor = copy.deepcopy(self._monitor)
-        if self._tracker is not None:
-            other._tracker = other._new_tracker() if self._z is None else self._tracker.copied()
+        mine = {"_monitor": copy.deepcopy(self._monitor), "_tracker": copy.copy(self._tracker)}
+        vars(other).update(vars(self) | mine)
         return other
 
     def replace(self, artifact: Artifact) -> None:
@@ -204,14 +192,7 @@ class KKLObserver:
             observer is then as it was.
         """
         check_replacement(self.artifact, artifact)
-        other = KKLObserver(
-            artifact,
-            self._measurement_noise,
-            process_noise=self._process_noise,
-            monitor=self._monitored,
-            tracking=self._tracking,
-            compiled=self._compiled or self._compile,
-        )
+        other = self._twin(artifact, monitor=self._monitored)
         other._compile, other._samples = self._compile, self._samples
         if self._z is not None:
             other._z, other._y, other._age = self._z, self._y, self._age
@@ -227,9 +208,7 @@ class KKLObserver:
     @property
     def z(self) -> np.ndarray:
         """The filter's state [z_y, z_u], a copy of shape (..., nz * (1 + nu)); raises RuntimeError before reset."""
-        if self._z is None:
-            raise RuntimeError("call reset(y0) before the observer is used")
-        return self._z.copy()
+        return self._moment(None)[0].copy()
 
     def reset(self, y0: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
         """Forget the past and take in the first sample.
@@ -246,7 +225,7 @@ class KKLObserver:
         Returns
         -------
         ndarray, shape (..., nx)
-            The first estimate: T_inv(z_0), or x0 where the observer tracks and x0 is given.
+            The first estimate: T_inv(z_0), or that of the tracker, which is x0 where it is given.
 
         Raises
         ------
@@ -296,10 +275,8 @@ class KKLObserver:
 
         Raises
         ------
-        RuntimeError
-            Before :meth:`reset`.
-        ValueError
-            If the artifact holds no T.
+        RuntimeError, ValueError
+            Before :meth:`reset`; if the artifact holds no T.
         """
         z, T = self.z, self.artifact.require_forward()
         apart = (T(self.decode()) - z[..., : len(T.z_scale)]) / T.z_scale
@@ -327,13 +304,10 @@ class KKLObserver:
         y0, x0 = real_array("y", y0), None if x0 is None else real_array("x0", x0)
         check_output(self.artifact, y0, (int(rows.sum()),), first=True)
         z[rows], age = first_state(self.artifact, y0, x0)
+        self._z, self._y, self._x_hat = z, self._y.copy(), None
+        self._y[rows], self._age = y0, np.where(rows, age, self._age)
         if self._tracker is not None:
             self._tracker.restart(rows, y0, x0)
-        self._z, self._y = z, self._y.copy()
-        self._y[rows] = y0
-        self._age = np.where(rows, age, self._age)
-        self._x_hat = None
-        if self._tracker is not None:
             self._tracker.supervise(z, self._age, rows)
         if self._monitor is not None:
             self._monitor.restart(rows)
@@ -405,14 +379,9 @@ class KKLObserver:
             y = filled(self.artifact, self._states, y, gaps, u, z=self._z, before=self._y, age=self._age)
         advance = linear.advance_single if self._compiled and not batch else linear.advance
         z = advance(self._z, self._y, u, y)
-        if rows is None:
-            self._z, self._y, self._age = z, y, self._age + 1
-        else:
-            kept = self._z.copy()
-            kept[rows] = z[rows]
-            self._z, self._y = kept, np.where(rows[..., None], y, self._y)
-            self._age = self._age + rows
-        self._x_hat = None
+        if rows is not None:
+            z, y = np.where(rows[..., None], z, self._z), np.where(rows[..., None], y, self._y)
+        self._z, self._y, self._age, self._x_hat = z, y, self._age + (1 if rows is None else rows), None
         if tracker is not None:
             tracker.supervise(self._z, self._age, rows)
         if self._monitor is not None and not missing:
@@ -440,14 +409,10 @@ class KKLObserver:
         ValueError, RuntimeError
             If ``rows`` does not fit the batch; before :meth:`reset`.
         """
-        if self._tracker is not None:
-            if self._z is None:
-                raise RuntimeError("call reset(y0) before the observer is used")
-            x_hat = self._tracker.estimate
-            return x_hat if rows is None else x_hat[bool_array("rows", rows, self._z.shape[:-1])]
         z, age = self._moment(rows)
-        if self._x_hat is not None:
-            return self._x_hat.copy() if rows is None else self._x_hat[rows]
+        x_hat = self._x_hat if self._tracker is None else self._tracker.estimate
+        if x_hat is not None:
+            return x_hat.copy() if rows is None else x_hat[rows]
         return self._states(z, age)
 
     @property
@@ -500,17 +465,17 @@ class KKLObserver:
         ndarray, shape (..., nx, nx) or (number of True in rows, nx, nx)
             As :attr:`covariance`, which also raises the same.
         """
+        z, age = self._moment(rows)
         if self._tracker is not None:
-            z, _ = self._moment(None)
             covariance = self._tracker.covariance(self._age)
-            return covariance if rows is None else covariance[bool_array("rows", rows, z.shape[:-1])]
+            return covariance if rows is None else covariance[rows]
         self.artifact.require_covariance()
-        return self._states.covariances(*self._moment(rows))
+        return self._states.covariances(z, age)
 
-    def _twin(self) -> "KKLObserver":
-        """Another of the same artifact, levels of noise and compilation, without a monitor."""
-        compiled = self._compiled or self._compile
-        return KKLObserver(self.artifact, **self._levels | {"compiled": compiled, "tracking": self._tracking})
+    def _twin(self, artifact: Artifact, *, monitor: bool = False) -> "KKLObserver":
+        """Another with the same levels of noise, tracking and compilation."""
+        options = self._levels | {"compiled": self._compiled or self._compile, "tracking": self._tracking}
+        return KKLObserver(artifact, monitor=monitor, **options)
 
     def _moment(self, rows: np.ndarray | None) -> tuple[np.ndarray, Any]:
         """The filter's state and its age in seconds, of some rows."""
@@ -523,82 +488,12 @@ class KKLObserver:
         return z, age * self.artifact.filter.dt
 
     def _identifier(self) -> Decoders:
-        if self._parameters is None:
+        artifact = self.artifact
+        if not artifact.estimated_parameters:
             raise ValueError(
-                f"this observer for {self.artifact.system!r} estimates no parameters: train one that does "
+                f"this observer for {artifact.system!r} estimates no parameters: train one that does "
                 "with kkl-gym train --uncertain all=0.1 --estimate-parameters"
             )
+        if self._parameters is None:
+            self._parameters = Decoders(artifact, slice(artifact.nx, None), **self._levels)
         return self._parameters
-
-    def estimate(self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None) -> np.ndarray:
-        """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
-
-        The observer's own state is left as it was.
-
-        Parameters
-        ----------
-        y : array_like, shape (steps, ..., ny)
-            Outputs; the first row is y_0. Later ones are NaN where they are missing.
-        u : array_like, shape (steps - 1, ..., nu), optional
-            The input held after each row but the last, by default zero. A last row more is ignored.
-        x0 : array_like, shape (..., nx), optional
-            The state at y_0, where it is known, as for :meth:`reset`.
-
-        Returns
-        -------
-        ndarray, shape (steps, ..., nx)
-            Estimates.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`reset` and :meth:`step`.
-        """
-        if self._tracker is not None:
-            return replayed(self._twin(), y, u, x0, of=KKLObserver.decode)
-        return along(self.artifact, self._states, y, u, of=self._states, x0=x0)
-
-    def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Estimate the system's uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
-
-        Parameters
-        ----------
-        y, u
-            As for :meth:`estimate`.
-
-        Returns
-        -------
-        ndarray, shape (steps, ..., number)
-            Estimates.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`estimate`, and if the artifact estimates no parameters.
-        """
-        return along(self.artifact, self._states, y, u, of=self._identifier())
-
-    def estimate_covariance(
-        self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Covariances of the errors of what :meth:`estimate` returns.
-
-        Parameters
-        ----------
-        y, u, x0
-            As for :meth:`estimate`.
-
-        Returns
-        -------
-        ndarray, shape (steps, ..., nx, nx)
-            What :attr:`covariance` would be at each sample.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`estimate`, and if the artifact holds no covariance.
-        """
-        self.artifact.require_covariance()
-        if self._tracker is not None:
-            return replayed(self._twin(), y, u, x0, of=KKLObserver.decode_covariance)
-        return along(self.artifact, self._states, y, u, of=self._states.covariances, x0=x0)

@@ -69,17 +69,96 @@ def along(
     return np.concatenate(parts)
 
 
-def replayed(
-    observer: Any, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, *, of: Callable[[Any], np.ndarray]
-) -> np.ndarray:
-    """A property of a KKLObserver at each sample of a record, through which it is run."""
-    y, u, gaps = checked_record(observer.artifact, y, u)
-    observer.reset(y[0], x0)
-    first = of(observer)
-    out = np.empty((len(y), *first.shape))
-    out[0] = first
-    for k in range(1, len(y)):
-        missing = gaps is not None and gaps[k].all()
-        observer.advance(None if missing else y[k], None if u is None else u[k - 1])
-        out[k] = of(observer)
-    return out
+class RecordEstimates:
+    """The methods of :class:`observers.KKLObserver` that go along whole records, and leave its own state as it is."""
+
+    artifact: Artifact
+    _states: Decoders
+    _tracker: Any
+    _identifier: Any
+    _twin: Any
+
+    def estimate(self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None) -> np.ndarray:
+        """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
+
+        The observer's own state is left as it was.
+
+        Parameters
+        ----------
+        y : array_like, shape (steps, ..., ny)
+            Outputs; the first row is y_0. Later ones are NaN where they are missing.
+        u : array_like, shape (steps - 1, ..., nu), optional
+            The input held after each row but the last, by default zero. A last row more is ignored.
+        x0 : array_like, shape (..., nx), optional
+            The state at y_0, where it is known, as for :meth:`reset`.
+
+        Returns
+        -------
+        ndarray, shape (steps, ..., nx)
+            Estimates.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`reset` and :meth:`step`.
+        """
+        return self._along(y, u, x0, "decode", of=self._states)
+
+    def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Estimate the system's uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
+
+        Parameters
+        ----------
+        y, u
+            As for :meth:`estimate`.
+
+        Returns
+        -------
+        ndarray, shape (steps, ..., number)
+            Estimates.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`estimate`, and if the artifact estimates no parameters.
+        """
+        return along(self.artifact, self._states, y, u, of=self._identifier())
+
+    def estimate_covariance(
+        self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Covariances of the errors of what :meth:`estimate` returns.
+
+        Parameters
+        ----------
+        y, u, x0
+            As for :meth:`estimate`.
+
+        Returns
+        -------
+        ndarray, shape (steps, ..., nx, nx)
+            What :attr:`covariance` would be at each sample.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`estimate`, and if the artifact holds no covariance.
+        """
+        self.artifact.require_covariance()
+        return self._along(y, u, x0, "decode_covariance", of=self._states.covariances)
+
+    def _along(self, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, method: str, *, of: Any) -> np.ndarray:
+        """What a method returns at each sample: step by step where the observer tracks, else of T_inv at once."""
+        if self._tracker is None:
+            return along(self.artifact, self._states, y, u, of=of, x0=x0)
+        observer = self._twin(self.artifact)
+        y, u, gaps = checked_record(observer.artifact, y, u)
+        observer.reset(y[0], x0)
+        first = getattr(observer, method)()
+        out = np.empty((len(y), *first.shape))
+        out[0] = first
+        for k in range(1, len(y)):
+            missing = gaps is not None and gaps[k].all()
+            observer.advance(None if missing else y[k], None if u is None else u[k - 1])
+            out[k] = getattr(observer, method)()
+        return out

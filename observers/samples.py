@@ -21,7 +21,7 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tr
         )
     if tracking is not None and flag("tracking", tracking):
         artifact.require_motion()
-    if monitor and tracking is False and artifact.motion is not None:
+    elif tracking is not None and monitor and artifact.motion is not None:
         raise ValueError("the limits of this artifact are those of the observer that tracks: leave tracking=False out")
     if compiled is not None and flag("compiled", compiled) and not available():
         raise ImportError("compiled=True needs Numba: pip install kkl-gym[fast], or leave compiled out")

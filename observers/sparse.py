@@ -11,7 +11,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from observers.machine import kernel, part
+from observers.machine import kernel
 
 
 class SparseUpdate:
@@ -56,10 +56,8 @@ def without_zeros(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray
 
 
 @cache
-def single_update() -> Callable[..., None]:
-    """The step of one sample: (gains, places, mixing, z, y, u, y_next, z_next), the last of which is written."""
-
-    @part(fastmath=False)  # said aloud, or it would be as in the first kernel that calls it
+def _single_kernel() -> Callable[..., None]:
+    @kernel(fastmath=False)
     def update(
         gains: np.ndarray,
         places: np.ndarray,
@@ -82,11 +80,6 @@ def single_update() -> Callable[..., None]:
             z_next[places[0, k]] += mixing[k] * z[places[1, k]]
 
     return update
-
-
-@cache
-def _single_kernel() -> Callable[..., None]:
-    return kernel(fastmath=False)(single_update())
 
 
 @cache

@@ -11,10 +11,11 @@ from typing import Self
 
 from observers.motion import Motion
 
-# Limits are the normal distribution's quantile for 1e-5. Running means are more skewed than what their limits are taken
-# of, so that chance exceeds these more often: of the mean square of innovations up to five times as often, most where
-# windows are short, and of that of their trend up to some twenty times. To inflate a covariance in vain costs little.
-_BEYOND_CHANCE = 4.265
+# Normal quantiles of the limits: to start again in vain costs the estimate, to inflate a covariance in vain little. The
+# running means are more skewed than the chi-square distribution that the limits assume: chance exceeds the second some
+# twenty times as often as it says.
+_DIVERGED = 6.0  # 1e-9, of the NIS
+_COLOURED = 4.265  # 1e-5, of the mean square of the innovations' running mean
 _TREND = 0.25  # windows over which innovations are averaged to see whether they agree
 _LONG = 4.0  # windows over which the square of that is averaged
 INFLATION = 10.0  # of the covariance where innovations are not white
@@ -40,10 +41,10 @@ class Supervision:
         return cls(
             window,
             share,
-            _largest_mean_square(ny * (2 - share) / share),
+            _limit(ny * (2 - share) / share, _DIVERGED),
             trend_share,
             long_share,
-            _largest_mean_square(ny * (2 - long_share) / long_share * (1 - memory) / (1 + memory)),
+            _limit(ny * (2 - long_share) / long_share * (1 - memory) / (1 + memory), _COLOURED),
         )
 
     @property
@@ -52,10 +53,10 @@ class Supervision:
         return (2 - self.trend_share) / self.trend_share
 
 
-def _largest_mean_square(freedom: float) -> float:
-    """Of as many standard normal numbers, beyond chance: by Wilson and Hilferty's cube root of chi-square."""
+def _limit(freedom: float, quantile: float) -> float:
+    """A quantile of the mean square of so many standard normal numbers, by Wilson and Hilferty's approximation."""
     spread = 2 / (9 * freedom)
-    return float((1 - spread + _BEYOND_CHANCE * math.sqrt(spread)) ** 3)
+    return float((1 - spread + quantile * math.sqrt(spread)) ** 3)
 
 
 __all__ = ["INFLATION", "Supervision"]

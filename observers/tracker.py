@@ -121,13 +121,8 @@ class Tracker:
         self._state = self._state.copy()
         self._state[rows.ravel()] = begun._state
 
-    def copied(self) -> "Tracker":
-        """Return another tracker in the same state."""
-        other = copy.copy(self)
-        other._state = self._state.copy()
-        return other
-
     def __copy__(self) -> "Tracker":
+        """Another in the same state, which no method changes in place, with the same machine code."""
         other = object.__new__(type(self))
         vars(other).update(vars(self))
         return other
@@ -171,8 +166,7 @@ class Tracker:
         moved = moved + self._Q
         new = self._seen < self._window
         for _ in range(RELINEARISATIONS if new.any() else 0):
-            known, left, _, _ = self._corrected(mean, moved, y)
-            again = self._relinearised(x, P, mean, moved, across, known, left, move)
+            again = self._relinearised(x, P, (mean, moved, across), self._corrected(mean, moved, y)[:2], move)
             sound = new & np.isfinite(again[0]).all(-1) & np.isfinite(factor(again[1])).all((1, 2))
             mean, moved = np.where(sound[:, None], again[0], mean), np.where(sound[:, None, None], again[1], moved)
             across = np.where(sound[:, None, None], again[2], across)
@@ -184,18 +178,15 @@ class Tracker:
         self,
         x: np.ndarray,
         P: np.ndarray,
-        mean: np.ndarray,
-        moved: np.ndarray,
-        across: np.ndarray,
-        known: np.ndarray,
-        left: np.ndarray,
+        predicted: tuple[np.ndarray, ...],
+        corrected: tuple[np.ndarray, ...],
         move: Any,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Predict again, with the motion linearised about the smoothed start of the step.
 
-        Shapes: ``mean``, ``moved`` and ``across`` are the prediction and its covariance with the start, ``known`` and
-        ``left`` the correction of that; returns another prediction, its covariance, and that with the start.
+        A prediction is a mean, its covariance, and that with the start of the step.
         """
+        (mean, moved, across), (known, left) = predicted, corrected
         gain = _solved(moved, across.mT).mT  # of a smoother (Rauch, Tung and Striebel, 1965)
         start = x + (gain @ (known - mean)[..., None])[..., 0]
         spread = P + gain @ (left - moved) @ gain.mT
@@ -271,8 +262,8 @@ class Tracker:
 
         y = output(s)
         if s.ndim == 3 and not np.isfinite(y).all():  # sigma points may lie where h is undefined
-            for nearer in (self._within(s), s.mean(0, keepdims=True)):
-                y = np.where(np.isfinite(y), y, output(nearer))
+            y = np.where(np.isfinite(y), y, output(self._within(s)))
+            y = np.where(np.isfinite(y), y, y[0])
         return y
 
     def _within(self, s: np.ndarray) -> np.ndarray:

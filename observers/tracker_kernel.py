@@ -53,14 +53,12 @@ class TrackerKernel:
         except ValueError as error:
             raise ImportError(str(error)) from None
         C = output.ravel() if isinstance(output, np.ndarray) else np.zeros(1)
-        watched = np.array(
-            [watch.share, watch.trend_share, watch.trend_square_share, watch.trend_gain, watch.trend_limit]
-        )
+        shares = watch.share, watch.trend_share, watch.trend_square_share
+        watched = np.array([*shares, watch.trend_gain, watch.trend_limit])
         states = np.column_stack([low, high, q, motion.x_offset, motion.x_scale])
+        model = states, numbers, packed, widths, C, r
         self._ny = ny
-        self._advance = functools.partial(
-            _advance(nx, nu, ny, move, measure), states, r, watched, watch.window, numbers, packed, widths, C
-        )
+        self._advance = functools.partial(_advance(nx, nu, ny, move, measure), model, watched, watch.window)
 
     def advance(self, state: np.ndarray, u: np.ndarray, y: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Predict and correct in some rows; returns the predicted outputs, (n, ny)."""
@@ -84,8 +82,8 @@ def _equations(nx: int, nu: int, substeps: int, expression: Expression) -> Any:
     field = _function("field", expression)
 
     @_part
-    def move(s: np.ndarray, u: np.ndarray, states: np.ndarray, numbers: Any, packed: Any, widths: Any, k: Any) -> None:
-        x, at, h = k[0], k[1], numbers[0]
+    def move(s: np.ndarray, u: np.ndarray, model: Any, k: np.ndarray) -> None:
+        states, x, at, h = model[0], k[0], k[1], model[1][0]
         for i in range(nx):
             x[i] = states[i, 3] + states[i, 4] * s[i]
         if substeps == 0:
@@ -117,9 +115,9 @@ def _flow(nx: int, nu: int, activation: str) -> Any:
     evaluate, columns, spare = single_network(activation), 1 + nx + nu, UNROLLED
 
     @_part
-    def move(s: np.ndarray, u: np.ndarray, states: np.ndarray, numbers: Any, packed: Any, widths: Any, k: Any) -> None:
-        memory = np.empty((5, widths.max() + spare), np.float32)
-        q = k[0]
+    def move(s: np.ndarray, u: np.ndarray, model: Any, k: np.ndarray) -> None:
+        _, numbers, packed, widths, _, _ = model
+        memory, q = np.empty((5, widths.max() + spare), np.float32), k[0]
         for i in range(nx):
             q[i] = s[i]
         for j in range(nu):
@@ -229,29 +227,16 @@ def _advance(nx: int, nu: int, ny: int, move: Any, measure: Any) -> Any:
                 across[i, j] = total
 
     @_part
-    def predict(
-        x: np.ndarray,
-        P: np.ndarray,
-        u: np.ndarray,
-        states: np.ndarray,
-        numbers: np.ndarray,
-        packed: np.ndarray,
-        widths: np.ndarray,
-        memory: np.ndarray,
-        mean: np.ndarray,
-        S: np.ndarray,
-        across: np.ndarray,
-        L: np.ndarray,
-        at: np.ndarray,
-        to: np.ndarray,
-    ) -> None:
+    def predict(x: np.ndarray, P: np.ndarray, u: np.ndarray, model: Any, memory: Any, moved: Any, work: Any) -> None:
+        """Mean and covariance a sample later, and the covariance with the state before, into ``moved``."""
+        states, (mean, S, across), (L, at, to) = model[0], moved, work
         spread_out(x, P, L, at)
         for p in range(points):
             for i in range(nx):
                 s = at[p, i]
                 s = states[i, 0] if s < states[i, 0] else s
                 to[p, i] = states[i, 1] if s > states[i, 1] else s
-            move(to[p], u, states, numbers, packed, widths, memory)
+            move(to[p], u, model, memory)
         moments(x, at, to, mean, S, across, nx)
 
     @_part
@@ -260,21 +245,14 @@ def _advance(nx: int, nu: int, ny: int, move: Any, measure: Any) -> Any:
         P: np.ndarray,
         y: np.ndarray,
         u: np.ndarray,
-        states: np.ndarray,
-        r: np.ndarray,
-        C: np.ndarray,
-        known: np.ndarray,
-        left: np.ndarray,
-        white: np.ndarray,
-        expected: np.ndarray,
-        L: np.ndarray,
-        at: np.ndarray,
-        to: np.ndarray,
-        S: np.ndarray,
-        across: np.ndarray,
-        R: np.ndarray,
+        model: Any,
+        corrected: Any,
+        of_output: Any,
+        work: Any,
     ) -> None:
         """Condition a prediction on a sample, of which NaN is missing."""
+        states, _, _, _, C, r = model
+        (known, left, white), (expected, S, across, R), (L, at, to) = corrected, of_output, work
         spread_out(x, P, L, at)
         for p in range(points):
             for i in range(nx):
@@ -323,41 +301,27 @@ def _advance(nx: int, nu: int, ny: int, move: Any, measure: Any) -> Any:
 
     @_kernel
     def advance(
-        states: np.ndarray,
-        r: np.ndarray,
-        watched: np.ndarray,
-        window: int,
-        numbers: np.ndarray,
-        packed: np.ndarray,
-        widths: np.ndarray,
-        C: np.ndarray,
-        u: np.ndarray,
-        y: np.ndarray,
-        rows: np.ndarray,
-        state: np.ndarray,
-        expected: np.ndarray,
+        model: Any, watched: np.ndarray, window: int, u: Any, y: Any, rows: np.ndarray, state: Any, expected: Any
     ) -> None:
+        states = model[0]
         square = np.empty((11, nx, nx))
         P, moved, left, L, spread, A, again, across, of_start, gain, other_left = square
         flat = np.empty((6, nx))
         x, mean, known, start, around, column = flat
         at, to = np.empty((points, nx)), np.empty((points, nx + ny))
-        S, R, of_output, white = np.empty((ny, ny)), np.empty((ny, ny)), np.empty((nx, ny)), np.empty(ny)
-        memory = np.empty((6, nx + nu))
+        S, R, crossed, white = np.empty((ny, ny)), np.empty((ny, ny)), np.empty((nx, ny)), np.empty(ny)
+        memory, work, corrected = np.empty((6, nx + nu)), (L, at, to), (known, left, white)
         for row in range(len(state)):
-            now = state[row]
+            now, of_output = state[row], (expected[row], S, crossed, R)
             for i in range(nx):
                 x[i] = now[i]
                 for j in range(nx):
                     P[i, j] = now[nx + nx * i + j]
-            predict(x, P, u[row], states, numbers, packed, widths, memory, mean, moved, across, L, at, to)
+            predict(x, P, u[row], model, memory, (mean, moved, across), work)
             for i in range(nx):
                 moved[i, i] += states[i, 2]
             for _ in range(times if now[end + 2] < window else 0):
-                correct(
-                    mean, moved, y[row], u[row], states, r, C, known, left, white, expected[row], L, at, to, S,
-                    of_output, R,
-                )  # fmt: skip
+                correct(mean, moved, y[row], u[row], model, corrected, of_output, work)
                 factorise(moved, L, nx)
                 for i in range(nx):
                     for j in range(nx):
@@ -378,9 +342,7 @@ def _advance(nx: int, nu: int, ny: int, move: Any, measure: Any) -> Any:
                 for i in range(nx):
                     for j in range(i):
                         spread[i, j] = spread[j, i] = 0.5 * (spread[i, j] + spread[j, i])
-                predict(
-                    start, spread, u[row], states, numbers, packed, widths, memory, around, again, of_start, L, at, to
-                )
+                predict(start, spread, u[row], model, memory, (around, again, of_start), work)
                 factorise(spread, L, nx)
                 for j in range(nx):
                     for i in range(nx):
@@ -416,9 +378,7 @@ def _advance(nx: int, nu: int, ny: int, move: Any, measure: Any) -> Any:
                         mean[i] = known[i]
                         for j in range(nx):
                             moved[i, j], across[j, i] = left[i, j], gain[i, j]
-            correct(
-                mean, moved, y[row], u[row], states, r, C, known, left, white, expected[row], L, at, to, S, of_output, R
-            )
+            correct(mean, moved, y[row], u[row], model, corrected, of_output, work)
             total = 0.0
             for i in range(nx):
                 total += known[i]

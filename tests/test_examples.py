@@ -3,7 +3,6 @@
 import re
 import runpy
 import shutil
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -11,7 +10,6 @@ import pytest
 
 from examples.research.__main__ import COMMANDS
 from training.cli import main
-from training.teaching import monitor
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
@@ -63,16 +61,14 @@ def test_any_environment_agent(capsys):
     assert "refitted the observer at step 1024" in capsys.readouterr().out
 
 
-def test_own_system(tmp_path, monkeypatch):
-    monkeypatch.setattr(monitor, "calibrate", partial(monitor.calibrate, duration=6.0))
+def test_own_system(tmp_path):
     assert example("own_system")(inverse_steps=100, trajectories=30, out=tmp_path) < 40.0
 
 
 # What makes each of the commands for a system of one's own a matter of seconds.
 SMALL = {
     "check": "",
-    "tune": "--modes 2 --duration 5",
-    "train": "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch 64 --inverse-steps 9 --threads 1",
+    "train": "--trajectories 20 --duration 5 --samples 20 --width 4 --batch 64 --inverse-steps 9 --runs 100",
     "evaluate": "--trajectories 3 --duration 8",
     "certify": "--trajectories 2",
     "faults": "--trajectories 4 --duration 6",
@@ -109,7 +105,6 @@ def test_the_system_on_the_page_is_that_of_the_example():
 def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
     shutil.copytree(EXAMPLES, tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(monitor, "calibrate", partial(monitor.calibrate, duration=6.0))
     own, agent, registered = re.findall(r"```python\n(.*?)```", USED, re.DOTALL)
     done = set()
     for line in "".join(re.findall(r"```sh\n(.*?)```", TRAINED + USED, re.DOTALL)).splitlines():
@@ -145,7 +140,7 @@ def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (commands,) = re.findall(r"```sh\n(.*?)```", OTHER_PLANTS, re.DOTALL)
     for line in commands.splitlines():
-        do(line, {"train": ["--no-monitor"], "evaluate": ["--measurement-noise", "0"]})
+        do(line, {"evaluate": ["--measurement-noise", "0"]})
     with pytest.raises(SystemExit, match="--policy"):
         main(["evaluate", "runs/balance/cart_pole.safetensors", "--system", "examples/cart_pole.py:CartPole"])
     assert "wrote runs/balance/cart_pole.safetensors" in capsys.readouterr().out.replace("\n", " ")
@@ -169,13 +164,13 @@ def test_adaptation(tmp_path, capsys):
     sizes = {"records": 6, "seconds": 12.0, "inverse_steps": 40, "trajectories": 40}
     found = example("adaptation")("van_der_pol", noise=0.1, **sizes, out=tmp_path)
     assert abs(found.parameters["mu"]) < 1.0  # from 9 % off
-    assert found.shipped < min(found.adapted, found.trained)  # which are hardly trained here
+    assert found.trained < found.adapted < found.shipped
     assert "% off" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_from_csv(tmp_path, capsys):
-    sizes = {"seconds": 4.0, "steps": 60, "inverse_steps": 400, "trajectories": 60}
+    sizes = {"seconds": 4.0, "inverse_steps": 400, "trajectories": 60}
     mu, with_estimate, with_state = example("from_csv")(**sizes, out=tmp_path)
     assert abs(mu - 3.3) < 0.4
     assert with_state < with_estimate < 0.3  # 0.38 without control

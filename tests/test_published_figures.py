@@ -77,7 +77,6 @@ CONDITIONS = [
     ("plant 10 % off, noise 0.5, all steps", "plant-error", "smape", ("X", False, 0.5)),
 ]
 SPINN = [*CONDITIONS[:3], *CONDITIONS[4:6]]
-SPEED = [CONDITIONS[0], CONDITIONS[1], CONDITIONS[7]]
 OF_STATIC = {"accuracy": "accuracy", "process-noise": "accuracy-process-noise", "plant-error": "plant-error"}
 ACCURACY = "docs/results/accuracy.md"
 
@@ -88,8 +87,6 @@ ACCURACY = "docs/results/accuracy.md"
         (ACCURACY, "default", CONDITIONS, "", "tracking/{}".format),
         (ACCURACY, "T_inv alone", CONDITIONS, "-static", OF_STATIC.get),
         (ACCURACY, "SPINN", SPINN, "-spinn", str),
-        ("docs/guides/speed.md", "default", SPEED, "", "tracking/{}".format),
-        ("docs/guides/speed.md", "small", SPEED, "-small", "{}-small".format),
     ],
 )
 def test_errors_of_what_ships(where, label, conditions, suffix, file):
@@ -131,7 +128,7 @@ def test_the_page_on_error_bars():
             assert row(f"{label}, {span}", cells) in page("docs/results/error_bars.md")
             if (label, span) == ("observer, starts in X", "after 5 s"):
                 title = "starts in X, all levels of noise, T_inv alone"
-                assert row(title, cells) in page("docs/guides/error_bars.md")
+                assert row(title, cells) in page("docs/guides/tracking.md")
 
 
 def calibration(system, starts, driven, span):

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from training.config import Config
+    from training.diagnosis import Observability, observability
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
     from training.identification.learning import adapt, identify
@@ -51,7 +52,7 @@ _MODULES = {
     "Config": "config",
     "KKLTrainingCallback": "rollouts.callback",
     "Maps": "lessons.map",
-    "Observability": "observable",
+    "Observability": "diagnosis",
     "RecordedSource": "sources.recorded",
     "Result": "train_observer",
     "Run": "lessons.run",
@@ -65,7 +66,7 @@ _MODULES = {
     "learn_flow": "lessons.flow",
     "learn_map": "lessons.map",
     "nrmse": "evaluation.metrics",
-    "observability": "observable",
+    "observability": "diagnosis",
     "preset": "presets",
     "recorded_preset": "presets",
     "smape": "evaluation.metrics",

@@ -22,16 +22,12 @@ Commands = Mapping[str, tuple[str, str]]
 
 COMMANDS: Commands = {
     "check": ("training.commands.check", "Check"),
-    "observability": ("training.commands.observability", "ObservabilityCommand"),
     "record": ("training.commands.record", "RecordCommand"),
     "train": ("training.commands.train", "Train"),
     "identify": ("training.commands.identify", "Identify"),
     "adapt": ("training.commands.identify", "Adapt"),
-    "errorbars": ("training.commands.errorbars", "ErrorBars"),
-    "tracking": ("training.commands.tracking", "Tracking"),
     "evaluate": ("training.commands.evaluate", "Evaluate"),
     "agent": ("training.commands.agent", "AgentCommand"),
-    "tune": ("training.commands.tune", "Tune"),
     "faults": ("training.commands.faults", "Faults"),
     "maps": ("training.commands.maps", "Maps"),
     "export": ("training.commands.export", "ExportCommand"),

@@ -75,16 +75,11 @@ class Config:
     """Batches for the forward map (spinn)."""
     inverse_steps: Count = 1500
     """Batches for each inverse map."""
-    random_features: Annotated[int, Field(ge=0)] = 0
-    """Solve for the forward map by least squares with so many random features, 1500 say, instead of training it
-    (spinn); 0 trains it."""
     collocation: Collocation = "motions"
     """Where the forward map's equation is asked to hold, and where x' lies (spinn). motions: along the trajectories,
     from their starts on. box: uniform in X, as in the paper's sec. 8.1."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
     """Most trajectories start in this multiple of the training box X, the others in X (spinn)."""
-    adaptive: bool = False
-    """Whether points at which the equation is violated most are drawn more often (spinn)."""
     solved_output_layer: bool = True
     """Whether the output layer of a trained forward map is solved for by least squares in the end (spinn)."""
     transients: bool = True
@@ -93,9 +88,6 @@ class Config:
     scaling: Scaling = "relative"
     """How states are scaled. relative: in units of their standard deviation, and errors of T_inv count relative to the
     state's size. range: in units of half their range, and all errors count alike. Input-aware maps are relative."""
-    lipschitz_penalty: NotNegative = 0.0
-    """How much a smaller Lipschitz constant of T_inv is worth: this part of the mean square error for each factor of
-    e."""
     physics_weight: NotNegative = 0.1
     """Weight nu of the PDE residual in the forward map's risk (spinn)."""
     inputs: bool = True
@@ -145,7 +137,7 @@ class Config:
     runs: Annotated[int, Field(ge=100)] = 400
     """Simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability that a sound motion of twenty seconds, at the pace of the shipped systems, raises an alarm."""
+    """Probability that a sound motion of twelve seconds, at the pace of the shipped systems, raises an alarm."""
     truncation: Positive = 1e-6
     """Part epsilon of the filter's start that may be left where the forward map's data begins (paper, sec. 5.2)."""
     closed_loop_trajectories: Annotated[int, Field(ge=0)] = 0
@@ -187,17 +179,10 @@ class Config:
                 f"closed_loop_trajectories must be 0 or at least 10, and needs the pipeline 'input-aware' with inputs; "
                 f"got {closed_loop}, {self.pipeline!r}, inputs = {self.inputs}"
             )
-        if (self.pipeline == "spinn") != (self.forward_steps > 0 or self.random_features > 0):
-            raise ValueError(
-                f"pipeline {self.pipeline!r} does not go with forward_steps = {self.forward_steps} and "
-                f"random_features = {self.random_features}"
-            )
-        if self.random_features and self.forward_steps:
-            raise ValueError(
-                f"random_features = {self.random_features} solve for T: forward_steps must be 0 beside them"
-            )
+        if (self.pipeline == "spinn") != (self.forward_steps > 0):
+            raise ValueError(f"pipeline {self.pipeline!r} does not go with forward_steps = {self.forward_steps}")
         if self.pipeline != "spinn":
-            own = ("collocation", "box_factor", "adaptive", "solved_output_layer", "transients")
+            own = ("collocation", "box_factor", "solved_output_layer", "transients")
             defaults = {entry.name: entry.default for entry in dataclasses.fields(self)}
             changed = [f"{name} = {getattr(self, name)!r}" for name in own if getattr(self, name) != defaults[name]]
             if changed:

@@ -48,6 +48,14 @@ RECORDED: dict[str, Any] = {
     "scaling": "range",  # errors count by their own size, not the state's
 }
 
+# Settings with which maps of records may be fitted again, beside the same filter.
+OF_THE_MAPS = (
+    "samples", "windows", "width", "depth", "activation", "optimiser", "batch", "learning_rate", "inverse_steps",
+    "members", "noise_free_share", "high_noise_emphasis", "untold_noise", "measurement_noise_max", "held_out",
+    "flow_steps", "cpu_seconds", "seed",
+)  # fmt: skip
+OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")
+
 
 def preset(
     system: System,
@@ -124,7 +132,8 @@ def preset(
             transients=False,
         )
         return override(config, changes)
-    chosen = {**sizes, **LARGE, "box_factor": 2.0, "forward_steps": 10_000, "noise_free_share": 0.35}
+    batches = {"forward_steps": 6_000, "inverse_steps": 12_000}
+    chosen = {**sizes, **LARGE, **batches, "box_factor": 2.0, "noise_free_share": 0.35}
     settings = dict(profile(system).spinn_settings)
     if "eigenvalues" in settings:
         settings["eigenvalues"] = _rounded(settings["eigenvalues"])

@@ -10,7 +10,7 @@ class Stream(IntEnum):
 
     TRAINING = 1
     EVALUATION = 2
-    VALIDATION = 3  # on which the benchmark and ``kkl-gym tune --check`` choose
+    VALIDATION = 3  # on which the benchmark chooses
     CERTIFICATE = 4
     CALIBRATION = 5
     FAULTS = 6

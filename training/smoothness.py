@@ -32,11 +32,9 @@ FASTEST_MODE = 0.5  # bound of |fast end| * dt
 
 @dataclass(frozen=True)
 class Smoothness:
-    """What the z of neighbouring states say of T. Shapes: ``roughness`` (ny * modes,), ``exponent`` (ny * modes,)."""
+    """What the z of neighbouring states say of T. Shape: ``exponent`` (ny * modes,)."""
 
     spectrum: Spectrum
-    distance: float
-    roughness: np.ndarray
     exponent: np.ndarray
 
     @property
@@ -91,20 +89,19 @@ def _compared(system: System, spectrum: Spectrum, *, x: np.ndarray, z: np.ndarra
     least = AT_REST * (high - low) / 2
     too_few = known.sum() < FEWEST_STATES or not asking.any() or others.sum() < FAR
     if too_few or (x[known].std(0) <= least).all():
-        return Smoothness(spectrum, np.nan, *np.full((2, z.shape[-1]), np.nan))
+        return Smoothness(spectrum, np.full(z.shape[-1], np.nan))
     x = x / np.maximum(x[known].std(0), least)
     z_scale = z[known].std(0)
     z = z / np.where(z_scale > 0, z_scale, 1.0)
     distances, rows = scipy.spatial.cKDTree(x[:, ASKING:][others]).query(x[:, :ASKING][asking], k=[1, FAR])
     differences = z[:, ASKING:][others][rows] - z[:, :ASKING][asking][:, None]
-    near, roughness = np.sqrt((distances[:, 0] ** 2).mean() / system.nx), np.sqrt((differences[:, 0] ** 2).mean(0))
     # By the distance to the far neighbour, so that few states far from all others do not outweigh the rest.
     reach = np.maximum(distances[:, 1:], np.finfo(float).tiny)
     closer = np.sqrt(((distances[:, :1] / reach) ** 2).mean(0))
     first, last = np.sqrt(((differences / reach[..., None]) ** 2).mean(0))
     with np.errstate(divide="ignore", invalid="ignore"):
         exponent = np.where(last > 0, np.log(first / last) / np.log(closer), 1.0)  # of a constant output: 1
-    return Smoothness(spectrum, float(near), roughness, exponent)
+    return Smoothness(spectrum, exponent)
 
 
 def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spectrum]:

@@ -28,9 +28,6 @@ class Spectrum:
         above = [complex(a, w) for a, w in self.pairs]
         return np.array([*map(complex, self.eigenvalues), *above, *np.conj(above)])
 
-    def __add__(self, other: "Spectrum") -> "Spectrum":
-        return Spectrum(self.eigenvalues + other.eigenvalues, self.pairs + other.pairs)
-
     @property
     def A(self) -> np.ndarray:
         """A for one output, (modes, modes): real eigenvalues on the diagonal, then a block [[a, w], [-w, a]] a pair."""

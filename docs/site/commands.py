@@ -16,9 +16,9 @@ PAGE = Path(__file__).resolve().parents[1] / "reference" / "commands.md"
 BEGINNING = """\
 # Commands
 
-`kkl-gym COMMAND --help` prints the same. Where `--preset` or `--pipeline` makes a difference, a default names each:
-"fast 128, paper 512" is 128 for `--preset fast` and 512 for `--preset paper`. In parentheses follow the systems that
-have a value of their own. What has no dashes is written in its place.
+`kkl-gym COMMAND --help` prints the same. Where `--preset`, `--pipeline` or `--data` makes a difference, a default names
+each: "fast 20, paper 512" is 20 for `--preset fast` and 512 for `--preset paper`. In parentheses follow the systems
+that have a value of their own. What has no dashes is written in its place.
 
 Commands that compare observers and agents are no part of the package. In a clone, `python -m examples.research --help`
 lists them.

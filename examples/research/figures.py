@@ -25,8 +25,8 @@ from examples.research.certificates.settled import record_settled
 from examples.research.speed import sizes
 from kkl_gym import SYSTEMS
 from observers import Artifact, load
-from observers.names import resolve
 from observers.factors import standard_deviations
+from observers.names import resolve
 from observers.storage import replacing, write
 from training.agents import picture
 from training.agents.agent import Agent
@@ -39,7 +39,7 @@ from training.evaluation.errors import estimates as estimates_of
 from training.evaluation.errors import kalman_estimates, unseen_trajectories
 from training.evaluation.metrics import percentage_error
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
-from training.maps.regions import chi_square
+from training.lessons.calibrate import chi_square
 from training.seeds import agent_evaluation_seed
 from training.systems import ControlTask
 
@@ -159,14 +159,14 @@ def noise_levels() -> Draw:
             for ax, name in zip(axes, SYSTEMS, strict=True):
                 for observer, line, color, label in (
                     (name, "o-", ESTIMATE, "default maps"),
-                    (f"{name}-static", "o:", ESTIMATE, "T_inv alone"),
+                    (f"{name}-large", "o:", ESTIMATE, "T_inv alone"),
                     (f"{name}-spinn", "o-", TARGET, "SPINN"),
                 ):
                     ax.plot(medians[observer], line, color=color, label=label)
                 for (method, label), marker in zip(RIVALS.items(), ("x", "+", "^"), strict=True):
                     if (name, method) in others.index:
                         ax.plot(others[name, method], marker, ms=6, mfc="none", color=RIVAL, label=label)
-                levels = medians[f"{name}-static"].index
+                levels = medians[f"{name}-large"].index
                 ax.set_xscale("symlog", linthresh=levels[1], linscale=0.4)
                 ax.set_xticks(levels, [f"{level:g}" for level in levels], fontsize="small")
                 ax.minorticks_off()
@@ -223,7 +223,7 @@ def errors_over_time(**sizes: Any) -> Draw:
 
 def tracking(**sizes: Any) -> Draw:
     """Median errors at each step at noise 0.5, of T_inv alone, of tracking and of a Kalman filter."""
-    errors = errors_of_runs(["-static", ""], LEVELS[-1], **sizes)
+    errors = errors_of_runs(["-large", ""], LEVELS[-1], **sizes)
 
     def draw(path: Path) -> None:
         labels = "T_inv alone", "tracking", EKF
@@ -272,7 +272,7 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
         lambda path: sizes.draw(path, *map(pd.read_csv, sorted((RESULTS / "sizes").glob("*.csv"))))
     ),
     "results/error_bars/van_der_pol.png": lambda: partial(
-        coverage.draw, rows=pd.read_csv(RESULTS / "error_bars" / "van_der_pol-static.csv")
+        coverage.draw, rows=pd.read_csv(RESULTS / "error_bars" / "van_der_pol-large.csv")
     ),
 }
 

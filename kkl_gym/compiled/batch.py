@@ -14,7 +14,7 @@ import numpy as np
 
 from kkl_gym.compiled.step import Advance, SamplingStep, shared_step, trial_states
 from kkl_gym.equations import components, input_matrix, rate_at
-from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance_batch, equal_substeps, runge_kutta
+from kkl_gym.simulate import ATTEMPTS, MOST_EQUAL, PER_RATE, advance_batch, equal_substeps, per_tolerance, runge_kutta
 from kkl_gym.system import System
 
 MAX_OPERATIONS = 400  # of f + g u; beyond, such as for a network as f, compiling takes many seconds
@@ -33,7 +33,7 @@ class CompiledBatch:
         """The next states, (nx, n), from states (nx, n), inputs (nu, n) and process noise (nx, n)."""
         out, lost = self._substeps(x, u, w, dt)
         if lost:
-            rows = np.flatnonzero(np.isnan(out[0]))
+            rows = np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x[0]))  # motions that are lost stay so
             out[:, rows] = advance_batch(self.system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out
 
@@ -49,7 +49,7 @@ class CompiledBatch:
         for points in trial_states(system, _TRIALS, np.random.default_rng(0)):
             rng, n = np.random.default_rng(0), len(points)
             at = points.T, u_max * rng.uniform(-1, 1, (nu, n)), scale * rng.uniform(-1, 1, (nx, n)), system.dt
-            found, expected = self._substeps(*at)[0], self._in_numpy(*at)[0]
+            found, expected = self._substeps(*at)[0], equal_substeps(system, *at)[0]
             expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan  # what escapes may be either
             if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
                 raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
@@ -60,13 +60,8 @@ class CompiledBatch:
         try:
             lost = self.kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
         except ArithmeticError:  # negative powers of zero, which Numba raises even so
-            return self._in_numpy(x, u, w, dt)
+            return equal_substeps(self.system, x, u, w, dt)
         return out, lost
-
-    def _in_numpy(self, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
-        out, again = equal_substeps(self.system, x, u, w, dt)
-        out[:, again] = np.nan
-        return out, bool(again.any())
 
 
 def batch_step(system: System) -> SamplingStep[np.ndarray]:
@@ -114,17 +109,17 @@ def compiled_step(system: System) -> CompiledBatch:
         raise ValueError(f"{system.name}: the equations take too long to compile")
     # The input is held: a part of the state whose derivative is zero.
     field = sympy.lambdify([(*x, *u)], (*forced, *[sympy.Float(0)] * nu), "math", cse=True)
-    rate_at(system, x)  # or say what is wrong with it
-    rate = sympy.sympify(system.rate_under(x, u)).replace(_is_root, lambda power: sympy.sqrt(power.base))
     namespace: dict[str, Any] = {
         "field": inlined(field),
-        "rate": inlined(sympy.lambdify([(*x, *u)], rate, "math", cse=True)),
         "integrate": inlined(runge_kutta(nx + nu)),
         "inf": math.inf,
         "nan": math.nan,
         "np": np,
     }
-    exec("\n".join(_kernel_lines(nx, nu)), namespace)
+    if rated := type(system).rate is not System.rate:
+        rate = sympy.sympify(rate_at(system, x)).replace(_is_root, lambda power: sympy.sqrt(power.base))
+        namespace["rate"] = inlined(sympy.lambdify([x], rate, "math", cse=True))
+    exec("\n".join(_kernel_lines(system, rated=rated)), namespace)
     found = CompiledBatch(system, compiled(namespace["kernel"]))
     found.check()  # compiles, or says why not
     return found
@@ -135,7 +130,7 @@ def _is_root(expression: Any) -> bool:
     return bool(expression.is_Pow and expression.exp == 0.5)
 
 
-def _kernel_lines(nx: int, nu: int) -> list[str]:
+def _kernel_lines(system: System, *, rated: bool) -> list[str]:
     """Python of the kernel: substeps of one length for each row, in groups of rows that need as many.
 
     Components and lanes are written out, and lie in one array at distances that the compiler knows. That is what lets
@@ -148,44 +143,47 @@ def _kernel_lines(nx: int, nu: int) -> list[str]:
     def tupled(values: list[str]) -> str:
         return "(" + "".join(f"{value}, " for value in values) + ")"
 
+    nx, nu = system.nx, system.nu
     held = [*[f"x[{i}, row]" for i in range(nx)], *[f"u[{i}, row]" for i in range(nu)]]
     held += [f"w[{i}, row]" for i in range(nx)]
-    lanes = [lane(i) for i in range(len(held) + 2)]
-    states, noise, substeps, length = lanes[:nx], lanes[nx + nu : -2], lanes[-2], lanes[-1]
-    moved = f"integrate(field, {tupled(lanes[: nx + nu])}, {tupled(noise + ['0.0'] * nu)}, {length}, 1)"
+    lanes = [lane(i) for i in range(len(held) + 3)]
+    states, noise, (substeps, length, error) = lanes[:nx], lanes[nx + nu : -3], lanes[-3:]
+    need = f"rate({tupled(held[:nx])}) * dt * {PER_RATE!r}" if rated else "1.0"
+    given = f"{tupled(lanes[: nx + nu])}, {tupled(noise + ['0.0'] * nu)}"
+    units = per_tolerance(type(system)) + (0.0,) * nu
     return [
         "def kernel(x, u, w, dt, out):",
         f"    n, s = x.shape[1], np.empty({len(lanes) * _LANES})",
-        "    needs, order, counts = np.empty(n), np.empty(n, np.int64), np.empty(n)",
+        "    needs, order, counts, left = np.empty(n), np.empty(n, np.int64), np.empty(n), n",
+        "    out[:] = nan",
         "    for row in range(n):",
-        f"        needs[row] = rate({tupled(held[: nx + nu])}) * dt * {PER_RATE!r}",
-        "    found, least, most = 0, -inf, 1.0",
-        f"    while found < n and most <= {MOST_EQUAL}:",
-        "        for row in range(n):",
-        "            if least < needs[row] <= most:",
-        "                order[found], counts[found] = row, most",
-        "                found += 1",
-        "        least, most = most, 2.0 * most",
-        "    lost = found < n",
-        "    if lost:",
-        "        out[:] = nan",
-        f"    for first in range(0, found, {_LANES}):",
-        f"        for j in range({_LANES}):",
-        "            at = min(first + j, found - 1)  # lanes that are left over do the last row again",
-        f"            row, {substeps}, {length} = order[at], counts[at], dt / counts[at]",
-        *[f"            {lanes[i]} = {value}" for i, value in enumerate(held)],
-        "        for done in range(int(counts[at])):",
+        f"        needs[row] = {need}",
+        f"    for attempt in range({ATTEMPTS}):",
+        "        found, least, most = 0, -inf, 1.0",
+        f"        while found < left and most <= {MOST_EQUAL}:",
+        "            for row in range(n):",
+        "                if least < needs[row] <= most:",
+        "                    order[found], counts[found] = row, most",
+        "                    found += 1",
+        "            least, most = most, 2.0 * most",
+        f"        for first in range(0, found, {_LANES}):",
         f"            for j in range({_LANES}):",
-        f"                end, unfinished = {moved}, done < {substeps}",
-        *[f"                {value} = end[{i}] if unfinished else {value}" for i, value in enumerate(states)],
-        f"        for j in range({_LANES}):",
-        f"            {length} = rate({tupled(lanes[: nx + nu])}) * dt * {PER_RATE!r}",
-        f"        for j in range(min({_LANES}, found - first)):",
-        "            row = order[first + j]",
-        f"            if {length} <= {GROWTH} * {substeps}:",
-        *[f"                out[{i}, row] = {value}" for i, value in enumerate(states)],
-        "            else:",
-        "                out[:, row] = nan",
-        "                lost = True",
-        "    return lost",
+        "                at = min(first + j, found - 1)  # lanes that are left over do the last row again",
+        f"                row, {substeps}, {length}, {error} = order[at], counts[at], dt / counts[at], 0.0",
+        *[f"                {lanes[i]} = {value}" for i, value in enumerate(held)],
+        "            for done in range(int(counts[at])):",
+        f"                for j in range({_LANES}):",
+        f"                    end, e = integrate(field, {given}, {length}, 1, {units!r})",
+        f"                    unfinished = done < {substeps}",
+        f"                    {error} = {error} if e <= {error} or not unfinished else e",
+        *[f"                    {value} = end[{i}] if unfinished else {value}" for i, value in enumerate(states)],
+        f"            for j in range(min({_LANES}, found - first)):",
+        "                row = order[first + j]",
+        f"                if {error} <= 1.0:",
+        *[f"                    out[{i}, row] = {value}" for i, value in enumerate(states)],
+        "                    needs[row] = nan",
+        "                    left -= 1",
+        "                else:",
+        f"                    needs[row] = {substeps} * {error} ** 0.1",
+        "    return left > 0",
     ]

@@ -19,8 +19,8 @@ import numpy as np
 from kkl_gym import elementary
 from kkl_gym.compiled.reading import Read
 from kkl_gym.compiled.step import Advance, SamplingStep, shared_step, trial_states
-from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance, runge_kutta
-from kkl_gym.system import Components, System, difference_steps
+from kkl_gym.simulate import ATTEMPTS, MOST_EQUAL, PER_RATE, advance, per_tolerance, runge_kutta
+from kkl_gym.system import Components, System, rate_under
 
 _TRIALS = 200  # states of each kind at which both are compared
 _MOST_SUBSTEPS = 64  # of a state that is compared: Python would take long for more
@@ -51,25 +51,12 @@ def compiled_step(system: System) -> Advance[Components]:
     for name in ("f",) if constant else ("f", "g"):
         function = getattr(type(system), name)
         namespace[name], namespace[f"{name}_self"] = compiled(function), _checked(system, name).stand_in()
-    own_rate = type(system).rate is not System.rate
-    if not own_rate:
-        exec("\n".join(_slope_lines("rate_alone", "f(f_self, {})", system)), namespace)
-    else:
-        namespace["rate_of"], namespace["rate_self"] = compiled(type(system).rate), _checked(system, "rate").stand_in()
-        exec("def rate_alone(x, u):\n    return rate_of(rate_self, x)", namespace)
+    if rated := type(system).rate is not System.rate:
+        namespace["rate"], namespace["rate_self"] = compiled(type(system).rate), _checked(system, "rate").stand_in()
     exec("\n".join(_field_lines(nx, nu, constant=constant)), namespace)
-    if not constant:
-        namespace["driven"] = compiled(namespace["driven"])
-    if constant or own_rate:
-        namespace["rate"] = namespace["rate_alone"]
-    else:
-        for side, name in ((1, "above"), (-1, "below")):
-            exec("\n".join(_slope_lines(name, "driven({}, u)", system, side)), namespace)
-        exec("def rate(x, u):\n    return rate_alone(x, u) + min(above(x, u), below(x, u))", namespace)
-        namespace |= {name: compiled(namespace[name]) for name in ("above", "below", "rate_alone")}
-    namespace |= {name: compiled(namespace[name]) for name in ("field", "rate")}
+    namespace["field"] = compiled(namespace["field"])
     namespace["integrate"] = compiled(runge_kutta(nx if constant else nx + nu))
-    exec("\n".join(_kernel_lines(system, constant=constant)), namespace)
+    exec("\n".join(_kernel_lines(system, constant=constant, rated=rated)), namespace)
     # Of floats alone: a bound of the input that is written as an integer must not compile it again.
     kernel = compiled((numba.float64,) * (nx + nu + nx + 1))(namespace["kernel"])
 
@@ -87,7 +74,7 @@ def compiled_step(system: System) -> Advance[Components]:
         for x in map(tuple, np.concatenate(trial_states(system, _TRIALS, rng)).tolist()):
             u, w = (u_max * rng.uniform(-1, 1, nu)).tolist(), (scale * rng.uniform(-1, 1, nx)).tolist()
             try:
-                if not system.rate_under(x, u) * system.dt * PER_RATE <= _MOST_SUBSTEPS:
+                if not rate_under(system, x, u) * system.dt * PER_RATE <= _MOST_SUBSTEPS:
                     continue
                 end = kernel(*x, *u, *w, system.dt)
             except Exception:  # Python takes the step
@@ -138,11 +125,8 @@ def _field_lines(nx: int, nu: int, *, constant: bool) -> list[str]:
     if constant:
         return ["def field(x):", "    return f(f_self, x)"]
     state, held = ("(" + "".join(f"x[{i}], " for i in these) + ")" for these in (range(nx), range(nx, nx + nu)))
-    driven = ["def driven(x, u):", "    gx = g(g_self, x)"]
-    driven += ["    return " + "".join(_dot(f"gx[{i}]", nu) + ", " for i in range(nx))]
-    field = ["def field(x):", f"    x, u = {state}, {held}", "    fx, gu = f(f_self, x), driven(x, u)"]
-    field += ["    return " + "".join(f"fx[{i}] + gu[{i}], " for i in range(nx)) + "0.0, " * nu]
-    return driven + field
+    field = ["def field(x):", f"    x, u = {state}, {held}", "    fx, gx = f(f_self, x), g(g_self, x)"]
+    return [*field, "    return " + "".join(f"fx[{i}] + {_dot(f'gx[{i}]', nu)}, " for i in range(nx)) + "0.0, " * nu]
 
 
 def _dot(row: str, nu: int) -> str:
@@ -150,42 +134,31 @@ def _dot(row: str, nu: int) -> str:
     return "(0.0" + "".join(f" + {row}[{j}] * u[{j}]" for j in range(nu)) + ")"
 
 
-def _slope_lines(name: str, field: str, system: System, side: int = 1) -> list[str]:
-    """Python of :func:`kkl_gym.system.slope` of a vector field, written out."""
-    steps = difference_steps(system.X)
-    lines = [f"def {name}(x, u):", f"    fx, total = {field.format('x')}, 0.0"]
-    for j, (own, step) in enumerate(steps):
-        moved = "".join(f"x[{i}] + {side * step!r}, " if i == j else f"x[{i}], " for i in range(system.nx))
-        lines += [f"    fm, part = {field.format(f'({moved})')}, 0.0"]
-        for i, (unit, _) in enumerate(steps):
-            lines += [f"    part += ((fm[{i}] - fx[{i}]) / {unit * (step / own)!r}) ** 2"]
-        lines += ["    total += part"]
-    return [*lines, "    return total ** 0.5"]
-
-
-def _kernel_lines(system: System, *, constant: bool) -> list[str]:
+def _kernel_lines(system: System, *, constant: bool, rated: bool) -> list[str]:
     """Python of the step: substeps of one length, NaN where these do not do."""
     nx, nu = system.nx, system.nu
     x, u, w = ([f"{letter}{i}" for i in range(n)] for letter, n in (("x", nx), ("u", nu), ("w", nx)))
-    start, held, d = list(x), "".join(f"{ui}, " for ui in u), list(w)
+    start, d, units = list(x), list(w), per_tolerance(type(system))
     if not constant:
-        start, d = [*x, *u], [*w, *["0.0"] * nu]
+        start, d, units = [*x, *u], [*w, *["0.0"] * nu], units + (0.0,) * nu
     elif nu == 1:
         d = [f"{float(gi)!r} * u0 + {wi}" for (gi,), wi in zip(system.G, w, strict=True)]
     elif nu:
         d = [f"{wi} + {_dot(f'({row!r})', nu)}" for row, wi in zip(system.G, w, strict=True)]
+    need = f"rate(rate_self, ({', '.join(x)},)) * dt * {PER_RATE!r}" if rated else "1.0"
     return [
         f"def kernel({', '.join([*x, *u, *w, 'dt'])}):",
-        f"    u = ({held})",
-        f"    need = rate(({', '.join(x)},), u) * dt * {PER_RATE!r}",
-        f"    if need <= {MOST_EQUAL}:",
+        f"    u, need = ({''.join(f'{ui}, ' for ui in u)}), {need}",
+        f"    for attempt in range({ATTEMPTS}):",
+        f"        if not need <= {MOST_EQUAL}:",
+        "            break",
         "        n = 1",
         "        while n < need:",
         "            n *= 2",
-        f"        end = integrate(field, ({', '.join(start)},), ({', '.join(d)},), dt / n, n)",
-        f"        x = ({''.join(f'end[{i}], ' for i in range(nx))})",
-        f"        if rate(x, u) * dt * {PER_RATE!r} <= {GROWTH} * n:",
-        "            return x",
+        f"        end, error = integrate(field, ({', '.join(start)},), ({', '.join(d)},), dt / n, n, {units!r})",
+        "        if error <= 1.0:",
+        f"            return ({''.join(f'end[{i}], ' for i in range(nx))})",
+        "        need = n * error**0.1",
         f"    return ({'nan, ' * nx})",
     ]
 

@@ -13,8 +13,8 @@ from kkl_gym.plant import Plant
 from kkl_gym.rows import clipped
 from observers import Artifact, KKLObserver, LinearFilter, shipped
 from observers.checks import choice, flag
-from observers.names import resolve
 from observers.factors import standard_deviations
+from observers.names import resolve
 
 
 class Estimator(Protocol):

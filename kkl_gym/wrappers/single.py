@@ -52,9 +52,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     and not clipped. With ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit
     the estimates (a faulty sensor, states that the map was not made for).
 
-    With ``estimate="z"`` the network is not evaluated, and nothing tracks (the map of :attr:`observer` holds no motion), unless
-    there is a monitor or the start is known. There is then no ``x_hat``, and
-    :meth:`render` shows no estimate.
+    With ``estimate="z"`` the network is not evaluated, and nothing tracks (the map of :attr:`observer` holds no
+    motion), unless there is a monitor or the start is known. There is then no ``x_hat``, and :meth:`render` shows no
+    estimate.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
     ``training.learn``). That one sees the signals of the observation that its file names, and the actions. The
@@ -86,8 +86,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Maps that track can use it, as the default ones, and those with a forward map T, ``observer="SYSTEM-spinn"``.
     uncertainty : bool
         Whether the observation is [x_hat, std], with the standard deviation of each state's error behind the estimate.
-        ``info`` gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). It needs a map with error bars, which
-        ``kkl-gym errorbars`` makes.
+        ``info`` gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). It needs a map with a covariance,
+        as ``kkl-gym train`` makes them.
     compiled : bool, optional
         Whether Numba runs the observer's steps, as :class:`observers.KKLObserver` has it. None compiles them at a reset
         after a thousand samples; from there on estimates are rounded in another way. True or False make what is seen
@@ -109,7 +109,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
-        forward map or motion and ``known_start`` is asked for, or no covariance and ``uncertainty``. It is a ValueError.
+        forward map or motion and ``known_start`` is asked for, or no covariance and ``uncertainty``: a ValueError.
 
     Examples
     --------

@@ -34,16 +34,16 @@ TIMED = """
 #include <time.h>
 #include "NAME.h"
 
-static NAME_real y[STEPS][NY], u[STEPS][NU + 1], x_hat[WIDTH];
+static NAME_real y[STEPS][OUTPUTS], u[STEPS][INPUTS + 1], x_hat[WIDTH];
 
 int main(void)
 {
     NAME_observer observer;
     double value, sum = 0.0;
     for (int k = 0; k < STEPS; k++) {
-        for (int i = 0; i < NU && scanf("%lf", &value) == 1; i++)
+        for (int i = 0; i < INPUTS && scanf("%lf", &value) == 1; i++)
             u[k][i] = (NAME_real)value;
-        for (int i = 0; i < NY && scanf("%lf", &value) == 1; i++)
+        for (int i = 0; i < OUTPUTS && scanf("%lf", &value) == 1; i++)
             y[k][i] = (NAME_real)value;
     }
     clock_t began = clock();
@@ -63,7 +63,7 @@ int main(void)
 def microseconds(exported, folder, y, u, turns=20):
     """The processor time of a step in C, along a record and many times over, and the sum of the first estimates."""
     nu = u.shape[-1]
-    sizes = {"STEPS": len(y), "TURNS": turns, "NY": y.shape[-1], "NU": nu, "WIDTH": len(exported.estimates)}
+    sizes = {"STEPS": len(y), "TURNS": turns, "OUTPUTS": y.shape[-1], "INPUTS": nu, "WIDTH": len(exported.estimates)}
     text = TIMED.replace("NAME", exported.name).replace("GIVEN", "u[k]," if nu else "")
     (folder / "timed.c").write_text(text, encoding="utf-8")
     told = [f"-D{name}={size}" for name, size in sizes.items()]

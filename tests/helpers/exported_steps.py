@@ -15,7 +15,7 @@ from random_tracking import KINDS, OFF, of_floats, tracking
 
 import kkl_gym
 from kkl_gym.simulate import simulate
-from observers import MLP, Artifact, KKLObserver, decoder
+from observers import MLP, Artifact, Expression, KKLObserver, decoder
 from observers.names import resolve
 from training.export import Exported
 
@@ -71,11 +71,41 @@ def tracked(index):
     return exported, y, u, np.array(expected)
 
 
+X, V = ["x", 0], ["x", 1]
+OPERATIONS = [
+    *([name, X] for name in ("sin", "cos", "tanh", "sign", "floor", "abs")),
+    ["tan", ["*", 0.1, X]],
+    ["exp", ["*", -1.0, ["abs", X]]],
+    ["log", ["+", 1.0, ["abs", X]]],
+    ["sqrt", ["abs", V]],
+    ["%", X, -0.7],
+    ["%", V, 0.6],
+    ["**", X, 3.0],
+    ["**", ["abs", X], 1.3],
+    ["**", ["+", 2.0, ["abs", V]], -2.0],
+    ["minimum", X, V, 0.3],
+    ["maximum", X, V, -0.3],
+    ["where", ["and", ["<", X, V], ["not", [">=", X, 0.5]]], X, ["u", 0]],
+    ["where", ["or", ["<=", X, V], [">", X, 0.5], ["<", V, 0.0]], 1.0, V],
+]
+
+
+def operated(*others):
+    """An observer that tracks by all operations of expressions, a record, and estimates."""
+    artifact = tracking(by="discrete")
+    steps = ["*", 0.002, ["+", *OPERATIONS, *others]]
+    field = Expression([["+", ["*", 0.95, X], steps], ["+", ["*", 0.95, V], ["*", 0.05, X], steps]])
+    equations = replace(artifact.motion.equations, field=field)
+    exported = _in_doubles(replace(artifact, motion=replace(artifact.motion, equations=equations)))
+    y, u = of_floats(exported.artifact, 150)
+    return exported, y, u, in_doubles(exported, y, u)
+
+
 def t_inv(observer):
-    """What T_inv alone says of the filter's state of an observer that tracks, within the flow's bounds."""
-    alone, flow = copy.copy(observer), observer.artifact.flow
-    alone.replace(replace(observer.artifact, flow=None))
-    return np.clip(alone.decode(), flow.low, flow.high)
+    """What T_inv alone says of the filter's state of an observer that tracks, within the bounds of the motion."""
+    alone, motion = copy.copy(observer), observer.artifact.motion
+    alone.replace(replace(observer.artifact, motion=None))
+    return np.clip(alone.decode(), motion.low, motion.high)
 
 
 def noise(artifact, steps, rows=()):
@@ -149,7 +179,7 @@ def in_python(exported, y, u):
     artifact = exported.artifact
     if exported.precision == "double":
         return in_doubles(exported, y, u)
-    if artifact.flow is not None:
+    if artifact.motion is not None:
         return np.array([observer.decode() for observer in stepped(exported, y, u)])
     if artifact.estimated_parameters:  # one map says both
         artifact = replace(artifact, parameter_ranges={}, estimated_parameters=())

@@ -65,6 +65,7 @@ def tracking(by="equations", outputs=1, inputs=True, nonlinear=False, surer=0.0,
     moved = (
         {"flow": a_flow(nx, nu)} if by == "flow" else {"equations": an_equation(nx, nu, dt, discrete=by == "discrete")}
     )
+    factors = np.array([[[2.0, 1.0], [1.5, 0.7]], [[2.5, 1.5], [1.0, 0.9]]])[: 1 + bool(artifact.process_noise_max)]
     root = rng.normal(size=(nx, nx))
     motion = Motion(
         **moved,
@@ -79,7 +80,7 @@ def tracking(by="equations", outputs=1, inputs=True, nonlinear=False, surer=0.0,
         least_process_noise=0.1,
         least_measurement_noise=np.full(outputs, 0.02),
         window=0.2,
-        factors=Factors(np.array([0.0, 0.5]), np.array([0.0, 1.0]), np.array([[2.0, 1.0], [1.5, 0.7]])),
+        factors=Factors(np.array([0.0, 0.5]), np.array([0.0, 1.0]), factors),
     )
     C = rng.normal(size=(outputs, nx))
     h = [

@@ -7,9 +7,9 @@ import numpy as np
 from observers import MLP, Artifact, InverseMap, LinearFilter
 
 
-def observer_of(env_id, measured, hidden, inputs, *, dt=1.0, kwargs=None):
+def observer_of(env_id, measured, hidden, inputs, *, dt=1.0, kwargs=None, rates=(0.3, 1.0, 3.0)):
     """A whole observer; nothing of it but the signals fits the environment."""
-    rng, rates = np.random.default_rng(0), np.array([0.3, 1.0, 3.0]) / dt
+    rng, rates = np.random.default_rng(0), np.array(rates) / dt
     ny = len(measured)
     A, B = -np.diag(np.tile(rates, ny)), np.kron(np.eye(ny), rates[:, None])
     linear = LinearFilter(A, B, dt, len(inputs))

@@ -1,6 +1,8 @@
 """Settings with which agents in any environment, and their observers, are learned in no time, and badly."""
 
 from training.agents.any_environment import learning, observing
+from training.lessons import calibrate
+from training.sources import recorded
 
 NET = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [8]}, "n_timesteps": 64}
 PPO = {**NET, "n_envs": 2, "n_steps": 16, "batch_size": 16}
@@ -24,3 +26,5 @@ def make_small(monkeypatch):
 
     monkeypatch.setattr(learning, "settings_of", settings_of)
     monkeypatch.setattr(observing, "SETTINGS", OBSERVERS)
+    monkeypatch.setattr(recorded, "FEWEST", 2)
+    monkeypatch.setattr(calibrate, "FEWEST", 2)

@@ -108,7 +108,7 @@ def test_other_environments_are_refused(saved):
         KKLObservation(gym.make("CartPole-v1"))
     with pytest.raises(ValueError, match=r"needs a gymnasium\.Env"):
         KKLObservation("CartPole-v1")
-    with pytest.raises(ArtifactError, match="holds no flow; kkl-gym tracking"):
+    with pytest.raises(ArtifactError, match="neither a motion nor T"):
         KKLObservation(gym.make("Pendulum-v1"), saved(PENDULUM()), known_start=True)
 
 
@@ -233,7 +233,7 @@ def test_observers_that_do_not_replace(saved):
     with pytest.raises(ArtifactError, match="has environment"):
         envs.replace_observer("van_der_pol")  # whose plants are not asked for
     spinn = KKLObservation(gym.make("KKLVanDerPol-v0"), "van_der_pol-spinn", known_start=True)
-    with pytest.raises(ArtifactError, match="holds no forward map"):
+    with pytest.raises(ArtifactError, match="neither a motion nor T"):
         spinn.replace_observer(replace(spinn.observer.artifact, forward=None))
 
 

@@ -349,3 +349,11 @@ def test_a_vector_that_is_given_another_system_takes_its_equations():
     (_, reward, *_, info), (_, expected, *_, there) = (env.step(np.zeros((200, 0))) for env in (one, other))
     np.testing.assert_array_equal(info["x"], there["x"])
     np.testing.assert_array_equal(reward, expected)
+
+
+def test_motions_that_ended_are_not_taken_again_in_numpy(monkeypatch):
+    pytest.importorskip("numba")
+    step = batch_step(get_system("lorenz"))
+    monkeypatch.setattr("kkl_gym.compiled.batch.advance_batch", None)
+    x = np.array([[1.0, np.nan], [1.0, np.nan], [20.0, np.nan]])
+    np.testing.assert_array_equal(np.isfinite(step(x, np.zeros((1, 2)), np.zeros((3, 2)), 0.01)), np.isfinite(x))

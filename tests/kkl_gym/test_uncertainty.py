@@ -5,15 +5,17 @@ import numpy as np
 import pytest
 from error_bars import with_error_bars
 from gymnasium.utils.env_checker import check_env
+from random_artifacts import random_artifact
+from random_tracking import tracking
 
 from kkl_gym import KKLObservation, KKLVectorObservation
 from observers import ArtifactError
 
 
-@pytest.fixture(scope="module")
-def path(make_artifact, tmp_path_factory):
+@pytest.fixture(scope="module", params=[random_artifact, tracking], ids=["static", "tracking"])
+def path(request, tmp_path_factory):
     file = tmp_path_factory.mktemp("maps") / "map.safetensors"
-    with_error_bars(make_artifact("van_der_pol", dt=0.01, free_inverse=True, process=True)).save(file)
+    with_error_bars(request.param(system="van_der_pol", free_inverse=True, process=True)).save(file)
     return str(file)
 
 
@@ -57,12 +59,12 @@ def test_vector_is_single(path, mode):
 def test_where_there_is_none(path, saved):
     plain = saved(system="van_der_pol", dt=0.01)
     env = gym.make("KKLVanDerPol-v0")
-    with pytest.raises(ArtifactError, match="no error bars"):
+    with pytest.raises(ArtifactError, match="no covariance"):
         KKLObservation(env, plain, uncertainty=True)
     with pytest.raises(ValueError, match="estimate='x'"):
         KKLObservation(env, path, uncertainty=True, estimate="z")
     with pytest.raises(ValueError, match="uncertainty must be True or False"):
         KKLObservation(env, path, uncertainty="no")
-    with pytest.raises(ArtifactError, match="no error bars"):
+    with pytest.raises(ArtifactError, match="no covariance"):
         KKLObservation(env, path, uncertainty=True).replace_observer(plain)
     assert "x_cov" not in KKLObservation(env, path).reset(seed=0)[1]

@@ -87,12 +87,13 @@ def test_a_known_start_is_used_at_every_reset_and_no_other_state(estimate, saved
             assert np.array_equal(info["z"], bare.z)
 
 
-def test_known_starts_need_a_map_with_T(saved):
-    with pytest.raises(ArtifactError, match=r"'lorenz' can begin at no known state: .* SYSTEM-spinn"):
-        KKLObservation(KKLEnv("lorenz"), "lorenz-static", known_start=True)
+def test_known_starts_need_a_map_with_a_motion_or_T(saved):
+    plain = saved(system="lorenz")
+    with pytest.raises(ArtifactError, match=r"'lorenz' can begin at no known state"):
+        KKLObservation(KKLEnv("lorenz"), plain, known_start=True)
     with pytest.raises(ArtifactError, match="no known state"):
-        KKLVectorObservation(KKLVectorEnv("lorenz", 2), "lorenz-static", known_start=True)
-    assert KKLObservation(KKLEnv("lorenz"), known_start=True).observer.artifact.flow is not None
+        KKLVectorObservation(KKLVectorEnv("lorenz", 2), plain, known_start=True)
+    assert KKLObservation(KKLEnv("lorenz"), known_start=True).observer.artifact.motion is not None
     assert KKLObservation(KKLEnv("lorenz"), "lorenz-spinn", known_start=True).observer.artifact.forward is not None
 
 
@@ -100,7 +101,7 @@ def test_where_z_is_shown_it_does_not_track():
     def tracks(**options):
         env = KKLObservation(KKLEnv("lorenz"), **options)
         env.reset(seed=0)
-        return env.observer.artifact.flow is not None
+        return env.observer.artifact.motion is not None
 
     assert tracks()
     assert not tracks(estimate="z")

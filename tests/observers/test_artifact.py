@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from error_bars import with_error_bars
+from random_tracking import KINDS as TRACKING
 from random_tracking import tracking
 from safetensors import safe_open
 from safetensors_bytes import with_arrays
@@ -97,8 +98,7 @@ def test_round_trip(options, make_artifact, tmp_path):
     lambda a: dataclasses.replace(a, h=Expression([["*", 2.0, ["sin", ["x", 0]]]]), measurement_noise=0.2),
     lambda a: dataclasses.replace(a, **RECORDED),
     lambda a: dataclasses.replace(a, parameter_ranges={"mu": (2.0, 4.0)}),
-    lambda a: tracking(),
-    lambda a: tracking(outputs=2, process=True, free_inverse=True, bend=0.5),
+    *(lambda a, kind=kind: tracking(**kind) for kind in TRACKING),
 ])  # fmt: skip
 def test_round_trip_of_what_need_not_be_there(more, make_artifact, tmp_path):
     artifact = more(make_artifact())
@@ -168,17 +168,18 @@ def paths(described, begin=()):
             yield from paths(value, (*begin, key))
 
 
-def test_nothing_stands_in_for_what_a_file_lacks(tmp_path):
+@pytest.mark.parametrize("by", ["equations", "flow"])
+def test_nothing_stands_in_for_what_a_file_lacks(by, tmp_path):
     """A unit or a factor that is missing would change estimates."""
     path = tmp_path / "map.safetensors"
-    tracking(outputs=2, process=True, free_inverse=True).save(path)
+    tracking(by, outputs=2, process=True, free_inverse=True).save(path)
     whole, (tensors, meta) = path.read_bytes(), contents(path)
     for name in tensors:
         rewrite(path, lambda tensors, meta, name=name: tensors.pop(name))
         with raises_naming(path):
             Artifact.read(path)
         path.write_bytes(whole)
-    for key in set(paths(meta)) - {("flow",), ("free_inverse",)}:  # which need not be there as a whole
+    for key in set(paths(meta)) - {("motion",), ("free_inverse",)}:  # which need not be there as a whole
         path.write_bytes(with_arrays(tensors, "kkl-gym", without(meta, key)))
         with raises_naming(path):
             Artifact.read(path)
@@ -270,7 +271,7 @@ def test_maps_must_fit_the_one_of_driven_motion(make_artifact):
         (artifact, dataclasses.replace(free, measurement_noise_max=2.0), "differ in states, or in noise"),
         (artifact, plain.free_inverse, "told of process noise"),
         (artifact, dataclasses.replace(free, process_noise_max=0.3), "told of process noise"),
-        (artifact, with_error_bars(artifact).free_inverse, "one has error bars"),
+        (artifact, with_error_bars(artifact).free_inverse, "one has a covariance"),
     ):
         with pytest.raises(ArtifactError, match=words):
             dataclasses.replace(whole, free_inverse=other)

@@ -35,15 +35,16 @@ def test_covariances_are_interpolated_and_stay_beyond_the_last():
         np.testing.assert_array_equal(single.at_level(9.0)(age), np.broadcast_to(np.eye(2), (*np.shape(age), 2, 2)))
 
 
-def test_factors_are_interpolated_by_level():
-    values = np.random.default_rng(0).uniform(0.5, 2.0, (3, 3))
+def test_factors_are_interpolated_by_levels_of_both_noises():
+    values = np.random.default_rng(0).uniform(0.5, 2.0, (2, 3, 3))
     factors = Factors(LEVELS, AGES, values)
-    np.testing.assert_allclose(factors.at_level(0.65), (values[1] + values[2]) / 2)
-    np.testing.assert_array_equal(factors.at_level(5.0), values[2])
+    np.testing.assert_allclose(factors.at_levels(0.65, 0.5), values[:, 1:].mean((0, 1)))
+    np.testing.assert_array_equal(factors.at_levels(5.0, 7.0), values[1, 2])
+    np.testing.assert_array_equal(Factors(LEVELS, AGES, values[:1]).at_levels(5.0, 0.7), values[0, 2])
 
 
 def test_grids_and_values_that_do_not_fit():
-    error, factors = covariances(2), Factors(LEVELS, AGES, np.ones((3, 3)))
+    error, factors = covariances(2), Factors(LEVELS, AGES, np.ones((1, 3, 3)))
     for whole in (error, factors):
         for name in ("levels", "ages"):
             for wrong in ([0.0, 1.0, 1.0], [0.1, 0.3, 1.0], [0.0, 0.3, np.nan], [0.0, 0.3, np.inf], [], [[0.0]]):
@@ -53,7 +54,7 @@ def test_grids_and_values_that_do_not_fit():
                 dataclasses.replace(whole, **{name: np.zeros(1)})
     for wrong in (0.0, -1.0, np.nan, 1e13):
         with pytest.raises(ArtifactError, match="factors must be positive and at most"):
-            Factors(LEVELS, AGES, np.full((3, 3), wrong))
+            Factors(LEVELS, AGES, np.full((1, 3, 3), wrong))
     for wrong in ([[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]], np.zeros((2, 2)), np.full((2, 2), np.nan)):
         values = error.covariance.copy()
         values[1, 2] = wrong
@@ -69,7 +70,7 @@ def test_single_and_batch_are_those_of_the_map_in_use(make_artifact, options):
     y, u = rng.normal(size=(9, 6, artifact.ny)), rng.normal(size=(8, 6, artifact.nu))
     u[:, :3] = 0.0  # three rows of free motion beside three of driven motion
     batch, singles = KKLObserver(artifact, 0.2), [KKLObserver(artifact, 0.2) for _ in range(6)]
-    share = artifact.inverse.share(0.2)
+    share, _ = artifact.inverse.shares(0.2)
     for k in range(9):
         batch.step(y[k], u[k - 1]) if k else batch.reset(y[k])
         for i, single in enumerate(singles):

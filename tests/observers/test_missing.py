@@ -8,9 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_system import TwoOutputs, exact_observer
+from random_artifacts import random_artifact
+from random_tracking import tracking
 
 from kkl_gym.simulate import simulate
-from observers import Expression, KKLObserver, Limits, Monitor, load
+from observers import Expression, KKLObserver, Limits, Monitor
 
 DT, STEPS = 0.05, 400
 C, H = np.eye(2), Expression([["x", 0], ["x", 1]])
@@ -105,22 +107,25 @@ def test_only_rows_with_gaps_are_filled_and_only_rows_that_are_told_to_step():
     assert not np.array_equal(observer.z[1], other.z[1])
 
 
-@pytest.mark.parametrize("name", ["van_der_pol", "van_der_pol-static"])
-def test_of_one_output_samples_of_rows_and_of_records_may_be_missing(name):
+@pytest.mark.parametrize("make", [tracking, random_artifact])
+def test_of_one_output_samples_of_rows_and_of_records_may_be_missing(make):
+    def fresh():
+        return KKLObserver(make())
+
     rng = np.random.default_rng(3)
     y, u = rng.normal(size=(40, 2, 1)), rng.normal(size=(39, 2, 1))
     y[10:15, 1] = math.nan
-    batch, single = load(name), load(name)
+    batch, single = fresh(), fresh()
     x_hat = np.array([batch.reset(y[0]), *(batch.step(*row) for row in zip(y[1:], u, strict=True))])
     rows = zip(y[1:, 1], u[:, 1], strict=True)
     alone = [single.reset(y[0, 1]), *(single.step(None if np.isnan(sample) else sample, held) for sample, held in rows)]
     np.testing.assert_allclose(x_hat[:, 1], alone, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(load(name).estimate(y, u), x_hat, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(load(name).estimate(y[:, 1], u[:, 1]), alone, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(fresh().estimate(y, u), x_hat, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(fresh().estimate(y[:, 1], u[:, 1]), alone, rtol=0, atol=1e-4)
     with pytest.raises(ValueError, match=r"a missing sample is step\(None, u\)"):
         single.step([math.nan], [0.0])
     with pytest.raises(ValueError, match="the first sample must be whole"):
-        load(name).estimate(y[12:], u[12:])
+        fresh().estimate(y[12:], u[12:])
 
 
 def test_what_is_neither_there_nor_missing():
@@ -143,7 +148,7 @@ def test_what_is_neither_there_nor_missing():
 
 
 def test_what_is_wrong_in_a_record_is_named_by_its_place():
-    single, several = load("van_der_pol-static"), KKLObserver(exact())
+    single, several = KKLObserver(random_artifact()), KKLObserver(exact())
     y, u, rows = np.zeros((10, 1)), np.zeros((10, 1)), np.zeros((10, 4, 2))
     u[9] = math.nan  # after the last sample, which is ignored
     single.estimate(y, u)

@@ -76,7 +76,7 @@ def test_variances_have_floors():
     *(({name: -np.ones(2)}, f"{name} of a motion must not be negative") for name in ("error", "process_noise")),
     ({"least_measurement_noise": np.ones((1, 1))}, "least_measurement_noise must have shape"),
     ({"covariance": np.ones(2)}, "covariance"),
-    *(({"covariance": np.array(wrong)}, "covariance of a motion must be positive definite")
+    *(({"covariance": np.array(wrong)}, "a covariance must be positive definite, got")
       for wrong in ([[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]])),
     ({"low": np.full(2, 50.0)}, "bounds of a motion must go from low to high"),
     *(({name: wrong}, f"{name} of a motion must be positive and at most")
@@ -87,11 +87,17 @@ def test_motions_that_do_not_fit(changes, words):
         replace(linear_motion(), **changes)
 
 
+def test_covariances_may_be_in_any_units():
+    units = np.array([1e-12, 1e12])
+    covariance = linear_motion().covariance * np.outer(units, units)
+    assert replace(linear_motion(), covariance=covariance).covariance is covariance
+
+
 def test_steps_that_do_not_fit():
     for wrong in (-1, 1025, 1.0, True, None):
         with pytest.raises(ArtifactError, match=f"substeps must be an integer from 0 to 1024, got {wrong}"):
             replace(exact_equations(), substeps=wrong)
     for name, wrong in (("linear", np.zeros((2, 3))), ("gain", np.ones(3)), ("u_scale", np.ones(2)),
                         ("u_scale", np.zeros(1)), ("u_scale", np.ones((1, 1)))):  # fmt: skip
-        with pytest.raises(ArtifactError, match="flow|shape|fit"):
+        with pytest.raises(ArtifactError, match=r"flow|shape|fit"):
             replace(exact_flow(nu=1), **{name: wrong})

@@ -117,7 +117,6 @@ def test_what_is_usual_is_assumed_where_nothing_is_said(make_artifact, tmp_path)
         assert load(path, 0.25).measurement_noise == 0.25
     narrow = dataclasses.replace(make_artifact().inverse, measurement_noise_max=0.1)
     assert dataclasses.replace(make_artifact(), inverse=narrow).measurement_noise == 0.1
-    assert load("lorenz").measurement_noise == 0.5
     for wrong in (-0.1, "0.5", (0.1, 0.2), True):
         with pytest.raises(ValueError, match="measurement_noise"):
             dataclasses.replace(make_artifact(), measurement_noise=wrong)

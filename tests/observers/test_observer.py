@@ -340,5 +340,6 @@ def test_load_passes_its_settings_on(saved, make_artifact):
             ("measurement_noise", "POSITIONAL_OR_KEYWORD", None),
             ("process_noise", "KEYWORD_ONLY", None),
             ("monitor", "KEYWORD_ONLY", False),
+            ("tracking", "KEYWORD_ONLY", None),
             ("compiled", "KEYWORD_ONLY", None),
         ]

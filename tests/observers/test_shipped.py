@@ -61,7 +61,7 @@ def test_small_maps_are_small_and_nearly_as_good(name):
             sum(weight.size for weight in getattr(one.artifact, inverse).mlp.weights) for one in (small, large)
         ]
         assert multiplications[0] / multiplications[1] < 0.1
-    assert len(small.artifact.flow.mlp.weights[0]) <= 8
+    assert len(small.artifact.motion.flow.mlp.weights[0]) <= 8
     rng = np.random.default_rng(0)
     x = simulate(system, rng.uniform(*system.box(), (20, system.nx)), 1000, 0.01)
     y = system.output(x)

@@ -15,7 +15,7 @@ LEVEL = 0.2
 
 
 def supervision(window, ny=1):
-    """Of a flow of which nothing else matters here."""
+    """Of a motion of which nothing else matters here."""
     return Supervision.of(SimpleNamespace(window=window * DT, least_measurement_noise=np.zeros(ny)), DT)
 
 
@@ -51,8 +51,8 @@ def followed(off, steps, told_again=False):
     """Errors and standard deviations, (steps, 2), of an estimate that is off and holds that for impossible."""
     (Phi, _), rng = exact_motion(), np.random.default_rng(3)
     artifact = tracking_observer()
-    flow = replace(artifact.flow, window=2.5, process_noise=1e-3 * artifact.flow.process_noise)
-    observer = KKLObserver(replace(artifact, flow=flow), LEVEL, process_noise=0.0)
+    motion = replace(artifact.motion, window=2.5, process_noise=1e-3 * artifact.motion.process_noise)
+    observer = KKLObserver(replace(artifact, motion=motion), LEVEL, process_noise=0.0)
     x, found = np.array([0.4, -0.3]), []
     observer.reset(C @ x, x0=x + off)
     for _ in range(steps):
@@ -86,7 +86,7 @@ def test_noise_that_is_not_white_is_told_as_the_white_noise_that_is_as_bad():
     """As docs/guides/tracking.md has it: the filter then keeps what it knows, and says how far it is off."""
     (Phi, _), rng, rho = exact_motion(), np.random.default_rng(7), 0.8
     artifact = tracking_observer()
-    artifact = replace(artifact, flow=replace(artifact.flow, process_noise=0.1 * artifact.flow.process_noise))
+    artifact = replace(artifact, motion=replace(artifact.motion, process_noise=0.1 * artifact.motion.process_noise))
     as_bad = LEVEL * np.sqrt((1 + rho) / (1 - rho))
     observers = [KKLObserver(artifact, level, process_noise=0.0) for level in (LEVEL, as_bad)]
     x, noise = rng.uniform(-1, 1, (50, 2)), LEVEL * rng.standard_normal((50, 1))

@@ -118,32 +118,6 @@ def test_t_inv_takes_over_within_the_first_window_where_its_determinant_is_small
         assert np.allclose(observer.covariance, plain.covariance) == surer, k
 
 
-def test_errors_are_those_of_the_covariance():
-    x, y = runs(n=100)
-    observer, late = KKLObserver(tracking_observer(), LEVEL, process_noise=0.0), slice(100, None)
-    error, variance = [], []
-    for k in range(400):
-        x_hat = observer.step(y[k]) if k else observer.reset(y[k])
-        error.append(x_hat - x[k])
-        variance.append(observer.std**2)
-    np.testing.assert_allclose(np.square(error[late]).mean((0, 1)), np.mean(variance[late], axis=(0, 1)), rtol=0.1)
-
-
-def test_a_lost_estimate_is_found_again():
-    observer, x, y = settled()
-    sound, window = observer.std.max(), WINDOW
-    for k in range(20):
-        observer.step(y[k])
-        np.testing.assert_allclose(observer.std.max(), sound, rtol=0.01)  # chance does not make it lost
-    (Phi, _), away, widest = exact_motion(), np.array([3.0, -2.0]), np.zeros(3)
-    for k in range(20, 20 + 8 * window):
-        moved, away = x[k] + away, Phi @ away
-        found = observer.step(y[k] + (moved - x[k])[:, :1])
-        widest = np.maximum(widest, observer.std.max(-1))
-    assert (widest >= 0.98 * STD).all()  # T_inv said it, and the jump has misled z, so that what it said was inflated
-    assert np.abs(found - moved).max() < 0.3
-
-
 def test_an_output_that_is_undefined_where_it_is_expected_loses_the_tracker():
     """x1 of the oscillator, written so that it is defined beyond -2 alone, after a start that is said to be there."""
     h = Expression([["+", ["**", ["sqrt", ["+", ["x", 0], 2.0]], 2.0], -2.0]])
@@ -202,18 +176,14 @@ def test_some_rows_move_and_some_begin_anew():
 def test_a_known_start_is_begun_with(t_is_there):
     artifact = tracking_observer()
     observer = KKLObserver(artifact if t_is_there else replace(artifact, forward=None), LEVEL)
-    (x, y), first = runs(), [True, False, False]
+    (x, y), sure = runs(), np.tile(1e-3 * artifact.motion.x_scale, (3, 1))
     np.testing.assert_allclose(observer.reset(y[0], x[0]), x[0])
-    np.testing.assert_allclose(observer.std, np.tile(1e-3 * artifact.motion.x_scale, (3, 1)))
+    np.testing.assert_allclose(observer.std, sure)
     np.testing.assert_allclose(observer.estimate(y[:9], x0=x[0])[0], x[0])
-    observer.step(y[1])
     observer.measurement_noise = 0.9 * LEVEL
-    observer.restart(y[1][:1], first)
+    observer.restart(y[1][:1], [True, False, False])
     assert (observer.std[0] > 0.1).all()
-    assert (observer.std[1:] < 0.1).all()  # T_inv, which is less sure, does not take over
-    observer.restart(y[1][:1], first, x[1][:1])
-    np.testing.assert_allclose(observer.decode()[0], x[1][0])
-    assert (observer.std < 0.1).all()
+    np.testing.assert_allclose(observer.std[1:], sure[1:])  # T_inv, which is less sure, does not take over
 
 
 def test_maps_are_replaced_while_it_runs():
@@ -251,7 +221,7 @@ def test_copies_and_pickles_go_on_alike():
 def test_covariances_are_multiplied_by_factors_of_level_and_age():
     """In logarithms between the ages, of the largest level that the map was trained for, which is 1."""
     ages, values = np.array([0.0, 2.0, 4.0]), np.array([[9.0, 3.0, 1.0], [4.0, 8.0, 2.0]])
-    factors = Factors(np.array([0.0, 2 * LEVEL]), ages, values)
+    factors = Factors(np.array([0.0, 2 * LEVEL]), ages, values[None])
     (_, y), rows = runs(), np.array([True, False, False])
     sure, wide = (KKLObserver(tracking_observer(**each), LEVEL) for each in ({}, {"factors": factors}))
     for k in range(100):
@@ -281,7 +251,7 @@ def test_without_tracking_it_is_the_map_without_a_motion(options):
     artifact = tracking(**options)
     bare, (y, u) = replace(artifact, motion=None), signals(artifact, 30, (3,))
     y[5:9, 1], y[12, :, 0] = np.nan, np.nan
-    one, other = KKLObserver(artifact, 0.1, tracking=False), KKLObserver(bare, 0.1)
+    one, other = KKLObserver(artifact, 0.1, tracking=np.False_), KKLObserver(bare, 0.1)
     assert (one.tracking, KKLObserver(artifact).tracking, other.tracking) == (False, True, False)
     for k in range(30):
         if k == 20:

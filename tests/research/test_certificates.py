@@ -248,18 +248,18 @@ def test_the_command_certifies_an_own_map_beside_a_shipped_one_that_tracks(tmp_p
     assert re.search(r"\| rms error by state in % of its standard deviation, no noise \| 2 / 2 \|", page)
     assert "bound of the rms error" in capsys.readouterr().out
     out = tmp_path / "shipped"
-    research("certify", "lorenz-small", "--trajectories", "2", "--out", str(out))
-    assert "lorenz-small tracks; this is the certificate of its T_inv alone" in capsys.readouterr().out
+    research("certify", "lorenz", "--trajectories", "2", "--out", str(out))
+    assert "lorenz tracks; this is the certificate of its T_inv alone" in capsys.readouterr().out
     page = (out / "table.md").read_text()
-    assert "| lorenz-small, T_inv alone |" in page
+    assert "| lorenz, T_inv alone |" in page
     assert "sharp bound" not in page  # which needs T
-    with pytest.raises(SystemExit, match="nothing is left to certify of lorenz-small"):
-        research("certify", "lorenz-small", "--measurement-noise", "9", "--out", str(out))
+    with pytest.raises(SystemExit, match="nothing is left to certify of lorenz"):
+        research("certify", "lorenz", "--measurement-noise", "9", "--out", str(out))
     assert "left out: measurement noise 9 is beyond the map's range" in capsys.readouterr().out
 
 
 @pytest.mark.research
-@pytest.mark.parametrize("name", [f"{system}-{kind}" for system in SYSTEMS for kind in ("static", "spinn")])
+@pytest.mark.parametrize("name", [f"{system}-{kind}" for system in SYSTEMS for kind in ("large", "spinn")])
 def test_shipped_maps(name):
     system = get_system(name.rpartition("-")[0])
     found = certify(Artifact.read(resolve(name)), system, measurement_noise=0.5, trajectories=60)

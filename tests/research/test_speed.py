@@ -17,10 +17,8 @@ TINY = {"steps": 5, "turns": 1, "num_envs": 4, "vector_steps": 3}
 @pytest.mark.parametrize(
     ("observer", "wrapped", "observers"),
     [
-        ("van_der_pol-static", ["x_hat", "x_hat, error bars"], 1),
-        pytest.param(
-            None, ["x_hat", "x_hat, error bars", "x_hat, small", "x_hat, static"], 3, marks=pytest.mark.research
-        ),
+        ("van_der_pol-large", ["x_hat", "x_hat, error bars"], 1),
+        pytest.param(None, ["x_hat", "x_hat, error bars", "x_hat, large"], 2, marks=pytest.mark.research),
     ],
 )
 def test_speed_of_a_shipped_system(observer, wrapped, observers, capsys):
@@ -44,12 +42,12 @@ def test_the_table_has_the_share_of_the_products_speed_that_a_network_reaches():
         ["KKL", "10.0", "2,000", "50", "100", "50 %"],
         ["EKF", "400.0", "3,000", "", "", ""],
     ]
-    _, operations = limit(observers.load("lorenz").artifact.inverse, 7)
+    _, operations = limit(observers.load("lorenz-large").artifact.inverse, 7)
     assert operations == 2 * 7 * (28 * 128 + 2 * 128 * 128 + 128 * 3)
 
 
 def test_sizes_trains_each_width_once(tmp_path):
-    settings = {"trajectories": 20, "duration": 5.0, "samples": 20, "inverse_steps": 5, "batch": 64}
+    settings = {"trajectories": 20, "duration": 5.0, "samples": 20, "inverse_steps": 5, "batch": 64, "runs": 100}
     (tmp_path / "tiny.json").write_text(json.dumps(settings))
     how = {"config": tmp_path / "tiny.json", "trajectories": 2, "num_envs": 4, "out": tmp_path / "out"}
     frame = Sizes("van_der_pol", widths=(4,), **how).run(Console(quiet=True))

@@ -36,15 +36,15 @@ def test_impossible_configurations(change, message):
 
 
 def test_settings_that_do_not_go_with_the_pipeline():
-    for wrong in ({"box_factor": 0.5}, {"random_features": -1}, {"random_features": 10}, {"collocation": "ball"}):
-        with pytest.raises(ValueError, match=r"features|box_factor|collocation"):
+    for wrong in ({"box_factor": 0.5}, {"forward_steps": 0}, {"collocation": "ball"}):
+        with pytest.raises(ValueError, match=r"forward_steps|box_factor|collocation"):
             replace(preset(Oscillator(), "spinn", "fast"), **wrong)
     with pytest.raises(ValueError, match="policy = 'controller' needs"):
         replace(preset(Oscillator(), "spinn", "fast"), policy="controller")
     with pytest.raises(ValueError, match="does not go with"):
-        replace(preset(Oscillator(), "input-aware", "fast"), random_features=10)
-    with pytest.raises(ValueError, match=r"box_factor = 2.0, adaptive = True: settings of the pipeline 'spinn'"):
-        replace(preset(Oscillator(), "input-aware", "fast"), box_factor=2.0, adaptive=True)
+        replace(preset(Oscillator(), "input-aware", "fast"), forward_steps=10)
+    with pytest.raises(ValueError, match=r"box_factor = 2.0, transients = False: settings of the pipeline 'spinn'"):
+        replace(preset(Oscillator(), "input-aware", "fast"), box_factor=2.0, transients=False)
 
 
 def test_levels_of_noise_of_all_outputs_or_each(tmp_path):

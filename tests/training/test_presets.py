@@ -75,6 +75,17 @@ def test_uncertain_parameters_add_what_the_systems_profile_says(name):
     assert found.eigenvalues == plain.eigenvalues
     assert found.pairs == PROFILES["rossler"].uncertain_settings["pairs"]
     assert found.width == (512 if name == "paper" else 192)
+    sizes = {} if name == "paper" else presets.LARGE
     assert preset(VanDerPol(), "input-aware", name, changes={"uncertain": {"mu": 0.1}}) == replace(
-        preset(VanDerPol(), "input-aware", name), uncertain={"mu": 0.1}
+        preset(VanDerPol(), "input-aware", name), **sizes, uncertain={"mu": 0.1}
     )
+
+
+def test_large_is_a_t_inv_that_stands_alone():
+    small, large = (preset(VanDerPol(), size=size) for size in ("default", "large"))
+    assert (small.width, large.width) == (20, 128)
+    assert (small.pairs, len(large.pairs)) == ((), 4)
+    assert preset(VanDerPol(), size="large", changes={"width": 8}).width == 8
+    for wrong in ({"size": "huge"}, {"name": "slow"}, {"pipeline": "magic"}):
+        with pytest.raises(ValueError, match=f"there is no {'preset' if 'name' in wrong else next(iter(wrong))} '"):
+            preset(VanDerPol(), **wrong)

@@ -24,7 +24,6 @@ def test_complex_modes_filter_a_linear_system_to_its_sylvester_solution():
 @pytest.mark.parametrize(("ny", "nu"), [(1, 0), (2, 1)])
 def test_each_output_has_a_filter_with_the_poles(ny, nu):
     spectrum = Spectrum((-2.0, -5.0), ((-0.9, 1.7),))
-    assert spectrum == Spectrum((-2.0,)) + Spectrum((-5.0,), ((-0.9, 1.7),))
     assert spectrum.modes == len(spectrum.poles) == 4
     linear = spectrum.filter(ny, 0.02, nu)
     assert (linear.dt, linear.nu) == (0.02, nu)

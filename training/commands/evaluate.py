@@ -1,7 +1,7 @@
 """``kkl-gym evaluate``."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -93,6 +93,8 @@ class Evaluate:
     ekf: bool = False
     """Beside each observer, an extended Kalman filter that knows the equations, the inputs and the levels of noise.
     On another plant it knows those of the observer's model."""
+    no_tracking: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Evaluate T_inv alone of observers that track. "NAME, T_inv alone" then stands for each."""
     calibration: bool = False
     """In place of errors, say whether error bars are true: how many errors lie in regions of 50, 90 and 99 %, of all
     states and of each, and the mean of their normalised squares (NEES); by default at six levels of noise. With --csv
@@ -114,6 +116,8 @@ class Evaluate:
         observers = [(*found, self._plant(found[-1])) for found in read_observers(self.observers, self.system)]
         with progress_bars(console) as progress:
             for name, artifact, system, plant in observers:
+                if self.no_tracking and artifact.motion is not None:
+                    name, artifact = f"{name}, T_inv alone", replace(artifact, motion=None)
                 judge = self._calibration if self.calibration else self._evaluate
                 frames += judge(name, artifact, system, plant, progress)
         if not frames:
@@ -198,7 +202,7 @@ class Evaluate:
         """Print whether an observer's error bars are true; rows of the CSV file."""
         import pandas as pd
 
-        artifact.require_spread()
+        artifact.require_covariance()
         duration = system.duration if self.duration is None else self.duration
         on = f", plant {show_parameters(plant)}" if plant else ""
         policy = read_policy(artifact, system, self.policy)

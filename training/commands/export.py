@@ -20,11 +20,11 @@ class ExportCommand:
 
     All take in a sample and the input before it, and give the filter's next state and the estimate, as
     observers.KKLObserver does. All maps can be exported: those that ship, of your own systems, from records and from
-    rollouts. Those that track need an output that is linear. Missing samples are in JavaScript and, of maps that
-    track, in the others. The monitor is in JavaScript alone.
+    rollouts. Missing samples are in JavaScript and, of maps that track, in the others. The monitor is in JavaScript
+    alone.
 
     --format onnx writes NAME.onnx, which takes a batch of any size. Levels of noise are inputs of it. It needs the
-    extra onnx. --format c writes NAME.h and NAME.c, which allocate nothing and need the C library's math.h alone, and
+    extra onnx. --format c writes NAME.h and NAME.c, which allocate nothing and need the C library alone, and
     NAME_main.c, a program that reads samples and prints estimates. --format js writes NAME_step.safetensors, the
     constants, and kkl_observer.js, a module for browsers and Node that reads them. docs/guides/export.md has all from
     end to end.
@@ -43,7 +43,7 @@ class ExportCommand:
         NoiseLevel, tyro.conf.arg(help_behavior_hint="(default: what is usual for the map)")
     ] = None
     """For --format c and js: standard deviation of the noise on each sample that the estimate assumes, or one for each
-    output as in 0.1,0.3. The compiler and the module may be told another."""
+    output as in 0.1,0.3. The module's tell changes it."""
     process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
     """For --format c and js: level of process noise that the estimate assumes, likewise."""
     out: Path = Path("runs/export")

@@ -27,13 +27,13 @@ FARTHEST = 10.0  # factor by which a parameter without limits may move from its 
 class Identify:
     """Learn a plant's unknown parameters, and an observer for it, from records of its outputs alone.
 
-    No state is needed. A network from the filter's state to the state is trained so that it explains the measured
-    outputs and follows the equations, which gives rough parameters too. Shooting over windows of the records then makes
-    them exact and says how well each is known. The observer is trained on simulated motions of the plant found.
+    No state is needed. Multiple shooting fits the parameters and the states at which windows of the records start,
+    from random starts in the training box, and gives standard errors. The observer is trained on simulated motions of
+    the plant found.
 
-    The run's folder, runs/NAME-identified, receives parameters.json, identification.png (predictions of records left
-    out, residuals, the course of the parameters), NAME.safetensors, checkpoints and log.txt. What the outputs cannot
-    tell is said, and has no number in parameters.json.
+    The run's folder, runs/NAME-identified, receives parameters.json, identification.png (residuals, and predictions of
+    records left out), NAME.safetensors, checkpoints and log.txt. Parameters that the outputs do not identify are named,
+    and are null in parameters.json.
     """
 
     system: SystemName
@@ -48,8 +48,6 @@ class Identify:
     """The run's folder."""
     dt: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the records')")] = None
     """Sampling interval of the observer, to which records are resampled."""
-    steps: int = 1500
-    """Batches of the network that finds first guesses."""
     seed: int = 0
     """Seed of everything random."""
     resume: bool = False
@@ -79,7 +77,6 @@ class Identify:
                 folder,
                 dt=self.dt,
                 settings=self.training,
-                steps=self.steps,
                 seed=self.seed,
                 resume=self.resume,
                 console=progress,
@@ -91,8 +88,8 @@ class Identify:
 class Adapt:
     """Learn an observer anew for a plant that differs from its model, from records of the plant's outputs.
 
-    As kkl-gym identify, from an observer that is there: its estimates are the first guesses of the states, its
-    parameters those of the plant's. The observer is trained again, as it was, on the plant found.
+    As kkl-gym identify, from the parameters of an observer that is there. The observer is trained again, as it was, on
+    the plant found.
     """
 
     observer: Annotated[

@@ -18,23 +18,30 @@ class Maps:
 
     def run(self, console: Console) -> None:
         """Print a row for each."""
-        caption = "*: tracks; –: not told"
-        table = Table(box=SIMPLE_HEAD, show_edge=False, padding=0, width=WIDTH, caption=caption, caption_justify="left")
-        table.add_column("map", no_wrap=True)
-        table.add_column("pipeline", no_wrap=True)
-        for column in ("inputs", "modes", "measurement\nnoise up to", "process\nnoise\nup to", "MB"):
+        table = Table(box=SIMPLE_HEAD, show_edge=False, padding=0, width=WIDTH)
+        for column in ("map", "pipeline", "tracks by"):
+            table.add_column(column, no_wrap=True)
+        for column in ("inputs", "modes", "noise\non y\nup to", "process\nnoise\nup to", "MB"):
             table.add_column(column, justify="right", no_wrap=True)
         for name in shipped():
             path = resolve(name)
             artifact = Artifact.read(path)
-            told = artifact.inverse.features
+            informed = "measurement_noise" in artifact.inverse.features
             table.add_row(
                 name,
-                str(artifact.training.get("pipeline", "–")) + ("" if artifact.flow is None else "*"),
+                str(artifact.training.get("pipeline", "–")),
+                tracks_by(artifact) or "–",
                 str(artifact.nu),
                 str(len(artifact.filter.A)),
-                f"{artifact.inverse.measurement_noise_max:g}" if "measurement_noise" in told else "–",
+                f"{artifact.inverse.measurement_noise_max:g}" if informed else "–",
                 f"{artifact.process_noise_max:g}" if artifact.process_noise_max is not None else "–",
                 f"{path.stat().st_size / 1e6:.2f}",
             )
         console.print(table, crop=False)
+
+
+def tracks_by(artifact: Artifact) -> str:
+    """By what an observer predicts its estimate: "equations", a "flow", or nothing where it does not track."""
+    if artifact.motion is None:
+        return ""
+    return "flow" if artifact.motion.equations is None else "equations"

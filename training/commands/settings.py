@@ -1,7 +1,7 @@
-"""The settings of a configuration as options of ``kkl-gym train``, each with what the presets take for it."""
+"""The settings of a configuration as options of ``kkl-gym train``, each with its defaults."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args
 
 import tyro
@@ -9,8 +9,7 @@ import tyro
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS
 from training.config import Config, Pipeline, setting_types
-from training.presets import Preset, preset
-from training.recorded.config import RecordedConfig
+from training.presets import RECORDED, Preset, preset
 
 SHOWN = 3  # numbers of a setting that has many
 ELSEWHERE = ("pipeline", "uncertain", "inputs")  # options of their own
@@ -34,7 +33,7 @@ class Other(System):
 
 
 def defaults() -> dict[str, str]:
-    """What each setting is where nobody says it, for people."""
+    """Default of each setting as a text, for each preset and pipeline, and for records."""
     given = {"eigenvalues": (-1.0,)}  # none are to be looked for, which takes time
     found: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
     for pipeline in get_args(Pipeline):
@@ -48,7 +47,10 @@ def defaults() -> dict[str, str]:
         of = {case: _of_systems({key: config[setting] for key, config in at.items()}) for case, at in found.items()}
         parts = [_of_presets(*(of[pipeline, name] for name in get_args(Preset))) for pipeline in get_args(Pipeline)]
         texts[setting] = parts[0] if parts[0] == parts[1] else f"{parts[0]}; spinn: {parts[1]}"
-    return texts | {"eigenvalues": "from the system"}
+        if setting in RECORDED and (text := _text(RECORDED[setting])) != parts[0]:
+            texts[setting] += f"; records: {text}"
+    of_both = ("eigenvalues", "dt", "measurement_noise_max")
+    return texts | dict.fromkeys(of_both, "from the system, or from the records")
 
 
 def _of_systems(values: Mapping[str, Any]) -> str:
@@ -73,30 +75,23 @@ def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _options(name: str, of: Any, defaults: Mapping[str, str]) -> Any:
-    """A dictionary of settings, those that are given, with the descriptions of a class of settings."""
-    described = of.__pydantic_fields__
-    kinds = {entry.name: entry.type for entry in fields(of)}
-    options = {}
-    for setting, default in defaults.items():
-        argument = tyro.conf.arg(
-            help=" ".join((described[setting].description or "").split()), help_behavior_hint=f"(default: {default})"
-        )
-        options[setting] = Annotated[kinds[setting], argument]
-    return TypedDict(name, options, total=False)  # type: ignore[operator]
-
-
-def _of_records() -> dict[str, str]:
-    """Defaults of the settings that only a training on recorded states has."""
-    found = {entry.name: entry.default for entry in fields(RecordedConfig)}
-    return {name: _text(default) for name, default in found.items() if name not in setting_types()}
+def _options() -> Any:
+    """A dictionary of the settings that are given, with the descriptions of the configuration."""
+    described = Config.__pydantic_fields__  # type: ignore[attr-defined]
+    kinds, options = setting_types(), {}
+    for setting, default in defaults().items():
+        if setting not in ELSEWHERE:
+            argument = tyro.conf.arg(
+                help=" ".join((described[setting].description or "").split()),
+                help_behavior_hint=f"(default: {default})",
+            )
+            options[setting] = Annotated[kinds[setting], argument]
+    return TypedDict("Settings", options, total=False)  # type: ignore[operator]
 
 
 if TYPE_CHECKING:
     Settings = dict[str, Any]
-    RecordedSettings = dict[str, Any]
 else:
-    Settings = _options("Settings", Config, {k: v for k, v in defaults().items() if k not in ELSEWHERE})
-    RecordedSettings = _options("RecordedSettings", RecordedConfig, _of_records())
+    Settings = _options()
 
-__all__ = ["RecordedSettings", "Settings", "defaults"]
+__all__ = ["Settings", "defaults"]

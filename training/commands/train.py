@@ -1,5 +1,7 @@
 """``kkl-gym train``."""
 
+import re
+import shlex
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,36 +10,42 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from kkl_gym.system import System
-from kkl_gym.systems import get_system
+from kkl_gym.systems import SYSTEMS, get_system
 from training.commands.data import DataOptions
+from training.commands.maps import tracks_by
 from training.commands.options import HalfWidths, Parameters
-from training.commands.settings import RecordedSettings, Settings
-from training.config import Config, Pipeline, read_changes
-from training.presets import CLOSED_LOOP, SMALL, SMALL_SETTINGS, Preset, Size, preset
+from training.commands.settings import Settings
+from training.config import Pipeline, read_changes
+from training.presets import CLOSED_LOOP, Preset, Size, preset, recorded_preset
 from training.progress import LOG, ProgressBars, duration, progress_bars
 from training.spectrum import Spectrum
-from training.systems import named_policy
-from training.trajectories.controllers import Controller
 from training.trajectories.parameters import nominal_share, relative_ranges
 
 if TYPE_CHECKING:
-    import torch
+    from training.sources.recorded import RecordedSource
+    from training.sources.simulated import SimulatedSource
+    from training.train_observer import Result
 
-    from training.dry_run import Estimate
-    from training.pipeline import Result
-
-RECORDED = "recorded"  # name of an observer from recorded states, where the user gives none
+RECORDED = "recorded"  # name of an observer from records, where the user gives none
+NAME = r"[\w][\w.-]*"  # of an observer, and so of a file
+OF_SYSTEMS = ("pipeline", "preset", "size", "closed_loop", "uncertain", "parameters")  # options
+SIMULATED = (  # settings that say how motions are simulated
+    *("trajectories", "duration", "policy", "process_noise_share", "free_inverse", "lead_in_input", "runs"),
+    *("closed_loop_trajectories", "estimate_parameters", "false_alarms"),
+)
+MOTIONS = {"equations": "the system's equations", "flow": "a learned flow"}
+OF_RECORDS = ("windows", "arbitrary_zero", "held_out")
 
 
 @dataclass(frozen=True)
 class Train:
-    """Learn an observer for a system and write it to one file.
+    """Learn an observer and write it to one file: T_inv, the motion that it tracks by, covariances, a monitor's limits.
 
-    The run's folder, runs/NAME, receives NAME.safetensors, a report (PNG), checkpoints, log.txt with what is
-    printed and, where TensorBoard is installed, its scalars.
+    Motions are simulated by a system's equations, or recorded (--data). The run's folder, runs/NAME, receives
+    NAME.safetensors, report.png, checkpoints, log.txt with what is printed and, where TensorBoard is installed, its
+    scalars.
     """
 
     system: Annotated[
@@ -50,26 +58,26 @@ class Train:
         ),
     ] = ""
     pipeline: Pipeline = "input-aware"
-    """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs."""
+    """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs, which
+    does not track. Writes NAME-spinn."""
     preset: Preset = "fast"
-    """fast: about ten minutes; it made the shipped maps. paper: the paper's sizes."""
+    """fast: about half a minute; it made the shipped maps. paper: the paper's sizes."""
     size: Size = "default"
-    """small: hidden layers of 20, a twentieth of the multiplications, for microcontrollers. Writes NAME-small."""
+    """large: a T_inv that is accurate without tracking, for certificates and for use without a model; about ten minutes
+    (input-aware). Writes NAME-large."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
     config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None
-    """Settings that differ from the preset's, as `kkl-gym tune` writes them; options given here come before them."""
+    """JSON file of settings that differ from the preset's; options given here come before them."""
     closed_loop: bool = False
-    """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
-    (input-aware); takes half as long again. Writes NAME-closed-loop."""
+    """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on T_inv's estimate
+    (input-aware). Writes NAME-closed-loop."""
     uncertain: HalfWidths = ()
     """How far a parameter may be from its value, as a part of that: mu=0.1, once for each, or 0.1 for all.
-    Some motions in training then have their own (input-aware), and the observer serves every such plant."""
+    Some motions in training then have their own (input-aware), and the observer serves every such plant. It does not
+    track."""
     no_inputs: tyro.conf.FlagCreatePairsOff[bool] = False
     """Let the filter take in no inputs; an input-aware map is then fitted to free motion only."""
-    monitor: bool = True
-    """Find limits for the observer's monitor as well, which takes a minute or more for each output; left out where h
-    takes no symbols."""
     resume: bool = False
     """Go on from the checkpoints in the run's folder, if there are any."""
     parameters: Parameters = field(default_factory=dict)
@@ -77,96 +85,64 @@ class Train:
     """CPU threads. More than one hardly help networks of the fast preset's size."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks are trained; auto takes a GPU if there is one."""
-    dry_run: bool = False
-    """Train nothing; say what it would take on this machine, by short runs of the same sizes."""
     data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
-    """Recorded states, where nobody knows the equations: T_inv is fitted to them, and nothing is simulated."""
-    recorded: tyro.conf.OmitArgPrefixes[RecordedSettings] = field(default_factory=dict)
-    """Of a training with --data alone."""
+    """Recorded motions, where the equations are unknown."""
     settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=dict)
     """What of the preset's configuration is to differ."""
 
-    def run(self, console: Console) -> Path | None:
+    def run(self, console: Console) -> Path:
         """Train."""
         began = time.monotonic()
         import torch  # which takes longer to import than all the rest
 
-        from training.dry_run import RUNS, estimate
         from training.evaluation.report import write_report
-        from training.pipeline import train
+        from training.train_observer import train
 
         if self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
         if self.device == "cuda" and not torch.cuda.is_available():
             raise ValueError("device cuda: torch sees no GPU; leave --device out to train on the CPU")
         torch.set_num_threads(self.threads)
-        device = None if self.device == "auto" else torch.device(self.device)
-        if self._has_data():
-            return self._train_from_data(device, console)
-        system = get_system(self.system, self.parameters)
         changes = self._changes()
-        with progress_bars(console) as progress, progress.phase("choosing a spectrum"):
-            config = preset(system, self.pipeline, self.preset, changes=changes)
-        policy = None if config.policy is None else named_policy(system, config.policy)
-        if self.dry_run:
-            with progress_bars(console) as progress, progress.phase("timing short runs", RUNS) as report:
-                found = estimate(system, config, device=device, report=report)
-            console.print(expected(config, found))
-            return None
-        name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
-        name += "-closed-loop" if config.closed_loop_trajectories else ""
-        name += "" if self.size == "default" else f"-{self.size}"
+        system = None if self._has_records(changes) else get_system(self.system, self.parameters)
+        name = self._name(system, changes)
         folder = self.out or Path("runs") / name
         path = folder / f"{name}.safetensors"
         with progress_bars(console, folder / LOG) as progress:
-            for line in described(system, config, self.preset, changes):
-                progress.say(line)
-            result = train(system, config, folder, resume=self.resume, device=device, console=progress)
+            source = (
+                self._records(name, changes, progress) if system is None else self._motions(system, changes, progress)
+            )
+            device = None if self.device == "auto" else torch.device(self.device)
+            result = train(source, folder=folder, resume=self.resume, device=device, console=progress)
             result.artifact.save(path)  # before anything else may fail
-            if self.monitor or not result.artifact.knows_output:  # which is to be said in any case
-                find_limits(path, result, system, policy=policy, progress=progress)
             with progress.phase("drawing the report"):
-                write_report(folder / "report.png", result, system, policy=policy)
+                write_report(folder / "report.png", result, source)
+            for line in summary(result):
+                progress.say(line)
             size, took = path.stat().st_size / 1e6, duration(time.monotonic() - began)
             progress.say(f"wrote {path} ({size:.2f} MB), report.png and {LOG} beside it, in {took}")
+            if system is not None:
+                progress.say(f"{self._evaluation(path, system)} measures its errors")
         return path
 
-    def _has_data(self) -> bool:
-        """Whether to train on recorded data; ValueError if options say both that and the contrary."""
-        plain = Train()
+    def _has_records(self, changes: Mapping[str, Any]) -> bool:
+        """Whether motions are recorded; ValueError if options are for the other kind."""
         if not self.data.data:
             given = [option for option in ("time", "measured", "inputs", "hidden") if getattr(self.data, option)]
-            given += self.recorded
-            if given:
-                raise ValueError(f"--{given[0].replace('_', '-')} needs recorded data (--data)")
+            if given := [*given, *(name for name in changes if name in OF_RECORDS)]:
+                raise ValueError(f"{_options(given[:1])} needs recorded data (--data)")
             if not self.system:
                 raise ValueError("name a system, or recorded data (--data)")
             return False
-        for option in ("pipeline", "preset", "size", "closed_loop", "uncertain", "parameters", "dry_run"):
-            if getattr(self, option) != getattr(plain, option):
-                raise ValueError(f"--{option.replace('_', '-')} is of no use with --data, where nothing is simulated")
+        plain = Train()
+        given = [option for option in OF_SYSTEMS if getattr(self, option) != getattr(plain, option)]
+        if given := given or [name for name in changes if name in SIMULATED]:
+            raise ValueError(f"{_options(given)}: of no use with --data, where nothing is simulated")
         return True
-
-    def _train_from_data(self, device: "torch.device | None", console: Console) -> Path:
-        from training.commands.train_recorded import train_from_data
-
-        return train_from_data(
-            self.system or RECORDED,
-            self.data,
-            {**self._changes(), **self.recorded},
-            out=self.out,
-            resume=self.resume,
-            device=device,
-            console=console,
-        )
 
     def _changes(self) -> dict[str, Any]:
         """The settings that are to differ from the preset's: those of the file, and those of options before them."""
         changes = (read_changes(self.config) if self.config else {}) | self.settings
-        if self.size == SMALL:
-            changes = {**SMALL_SETTINGS, **changes}
-        if changes.get("random_features"):
-            changes.setdefault("forward_steps", 0)  # what is solved for is not trained
         if self.uncertain:
             named = [name for name, _ in self.uncertain]
             if len({*named}) < len(named):
@@ -178,62 +154,81 @@ class Train:
             changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
         return changes
 
+    def _name(self, system: System | None, changes: Mapping[str, Any]) -> str:
+        """The observer's name, and its file's."""
+        if system is None:
+            name = self.system or RECORDED
+            if not re.fullmatch(NAME, name):
+                raise ValueError(
+                    f"with --data, SYSTEM is a name of your choice, of letters, digits, _, - and .; got {name!r}"
+                )
+            return name
+        if self.size != "default" and self.pipeline == "spinn":
+            raise ValueError(f"--size {self.size} is of the pipeline 'input-aware', not 'spinn'")
+        name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
+        name += "-closed-loop" if changes.get("closed_loop_trajectories") else ""
+        return name if self.size == "default" else f"{name}-{self.size}"
 
-def find_limits(
-    path: Path, result: "Result", system: System, *, policy: Controller | None, progress: ProgressBars
-) -> None:
-    """Write an artifact again, with limits for its monitor, or say why there are none."""
-    from training.teaching.monitor import PARTS, calibrate
+    def _records(self, name: str, changes: Mapping[str, Any], progress: ProgressBars) -> "RecordedSource":
+        from training.sources.recorded import RecordedSource, described
 
+        records = self.data.read(progress)
+        source = RecordedSource(records, recorded_preset(records, changes), name, warn=progress.say)
+        for line in described(source):
+            progress.say(line)
+        return source
+
+    def _motions(self, system: System, changes: Mapping[str, Any], progress: ProgressBars) -> "SimulatedSource":
+        from training.sources.simulated import SimulatedSource
+
+        with progress.phase("choosing a spectrum"):
+            config = preset(system, self.pipeline, self.preset, size=self.size, changes=changes)
+        own = "".join(f", {parameter} = {value:g}" for parameter, value in system.parameters.items())
+        counts = {"state": system.nx, "output": system.ny, "input": system.nu}
+        sizes = ", ".join(f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items())
+        progress.say(f"training an observer for {system.name}{own}: {sizes}")
+        given = "".join(f"; {setting} = {value}" for setting, value in changes.items())
+        progress.say(f"pipeline {config.pipeline}, preset {self.preset}, size {self.size}{given}")
+        spectrum = Spectrum(config.eigenvalues, config.pairs)
+        rates = spectrum.poles.real
+        progress.say(
+            f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
+            f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s"
+        )
+        if ranges := relative_ranges(system, config.uncertain):
+            others = 100 * (1 - nominal_share(ranges))
+            uncertain = ", ".join(f"{parameter} from {low:g} to {high:g}" for parameter, (low, high) in ranges.items())
+            estimated = ", which the map estimates" if config.estimate_parameters else ""
+            progress.say(f"{others:.0f} % of the trajectories have parameters of their own: {uncertain}{estimated}")
+        return SimulatedSource(system, config)
+
+    def _evaluation(self, path: Path, system: System) -> str:
+        """The command that evaluates the observer."""
+        words = ["kkl-gym", "evaluate", str(path)]
+        if type(system) not in SYSTEMS.values():
+            words += ["--system", self.system]
+        policy = self.settings.get("policy")
+        return shlex.join([*words, *(["--policy", policy] if policy not in (None, "controller") else [])])
+
+
+def summary(result: "Result") -> list[str]:
+    """What a training took and made."""
     artifact = result.artifact
-    try:
-        with progress.phase("finding the monitor's limits", PARTS) as report:
-            calibrate(artifact, system, seed=artifact.training["seed"], policy=policy, report=report).save(path)
-    except ValueError as error:
-        progress.say(f"no limits for a monitor: {error}")
-
-
-def described(system: System, config: Config, name: Preset, changes: Mapping[str, Any]) -> list[str]:
-    """What is going to be done."""
-    own = "".join(f", {parameter} = {value:g}" for parameter, value in system.parameters.items())
-    given = "".join(f"; {setting} = {value}" for setting, value in changes.items())
-    counts = {"state": system.nx, "output": system.ny, "input": system.nu}
-    sizes = [f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items()]
-    spectrum = Spectrum(config.eigenvalues, config.pairs)
-    rates = spectrum.poles.real
-    ranges = relative_ranges(system, config.uncertain)
-    uncertain = ", ".join(f"{parameter} from {low:g} to {high:g}" for parameter, (low, high) in ranges.items())
-    estimated = ", which the map estimates" if config.estimate_parameters else ""
-    others = 100 * (1 - nominal_share(ranges))
-    return [
-        f"training an observer for {system.name}{own}: {', '.join(sizes)}",
-        f"pipeline {config.pipeline}, preset {name}{given}",
-        f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
-        f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
-        *(
-            [f"{others:.0f} % of the trajectories have parameters of their own: {uncertain}{estimated}"]
-            if ranges
-            else []
-        ),
+    by, covariance = tracks_by(artifact), artifact.inverse.error_covariance
+    lines = [
+        "CPU seconds: " + ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in result.seconds.items()),
+        f"it tracks by {MOTIONS[by]}; T_inv initialises it" if by else "it does not track: its estimates are T_inv's",
     ]
+    if covariance is None:
+        lines[-1] += ", without covariances"
+    if errors := artifact.training.get("held_out_errors"):
+        each = ", ".join(f"{name} {error:.3g}" for name, error in errors.items())
+        after = artifact.training["held_out_after"]
+        lines.append(
+            f"rms error over standard deviation on held-out records: {each} (after {after:.2g} s of transient)"
+        )
+    return lines
 
 
-def expected(config: Config, found: "Estimate") -> Table:
-    """What a run will take, stage by stage."""
-    batches = {"forward": config.forward_steps}
-    table = Table(
-        "stage",
-        "size",
-        "time",
-        title=f"{found.pairs:,} states, {found.parameters:,} weights, about {found.bytes / 1e9:.1f} GB of memory",
-    )
-    for stage, seconds in found.seconds.items():
-        size = f"{batches.get(stage, config.inverse_steps):,} batches of {config.batch:,}"
-        if stage == "simulating":
-            size = f"{config.trajectories:,} trajectories of {config.duration:g} s"
-        elif stage == "solving":
-            size = f"{config.random_features:,} random features"
-        table.add_row(stage, size, duration(seconds))
-    table.add_section()
-    table.add_row("all", "", duration(sum(found.seconds.values())))
-    return table
+def _options(names: list[str]) -> str:
+    return ", ".join(f"--{name.replace('_', '-')}" for name in names)

@@ -10,8 +10,8 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.evaluation.levels import Level
 from training.seeds import Stream, generator
+from training.sources.simulated import sound_motions
 from training.systems import profile
-from training.teaching.monitor import sound_trajectories
 from training.trajectories.controllers import Controller
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]
@@ -43,7 +43,10 @@ def simulate_faults(
             f"a fault in the middle of {duration} s leaves less than the {allowed:g} s within which it is to be noticed"
         )
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
-    x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng, policy=policy)
+    steps = round(duration / dt)
+    x, u, _ = sound_motions(
+        system, n=trajectories, steps=steps, dt=dt, rng=rng, driven=bool(artifact.nu), policy=policy
+    )
     clean = system.output(x)
     y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
     counted = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen it

@@ -1,4 +1,8 @@
-"""The step as C99: a header, a source without dependencies but math.h, and a program that shows how they are used."""
+"""The step as C99: a header, a source without dependencies but math.h, and a program that shows how they are used.
+
+A tracker's estimates and covariances are doubles whatever the precision is: P is what differences leave, and in floats
+its factor would break down.
+"""
 
 from textwrap import fill
 from typing import Any
@@ -6,158 +10,170 @@ from typing import Any
 import numpy as np
 
 import kkl_gym
-from training.export import c_templates, c_tracker_templates
-from training.export.c_map import levels, map_constants, map_functions, process_level
-from training.export.c_text import array, comment, number
-from training.export.c_tracker import tracker_constants, tracker_functions, tracker_networks
-from training.export.exported import Exported
+from observers.inverse import InverseMap
+from observers.motion import Motion
+from training.export.c_text import (
+    activations,
+    array,
+    comment,
+    function,
+    network_arrays,
+    network_calls,
+    number,
+    template,
+)
+from training.export.exported import Exported, output_expression, tracker_arrays, tracker_numbers
+
+_MAP = """\
+static void {map}_map(const {name}_observer *observer, real *x_hat)
+{{
+    real a[{width}], b[{width}];
+    for (int i = 0; i < {modes}; i++) {{
+        double mode = 0.0;
+        for (int j = 0; j < {size}; j++)
+            mode += {map}_whiten[i][j] * (observer->z[j] - {map}_z_offset[j]);
+        a[i] = (real)mode;
+    }}
+{conditions}    {layers}
+    for (int i = 0; i < NX; i++)
+        x_hat[i] = (real)({map}_x_offset[i] + {map}_x_scale[i] * {last}[i]);
+}}
+
+"""
+_AGE = "    a[{at}] = (real)log1p((observer->age * DT < {end} ? observer->age * DT : {end}) / {unit});\n"
 
 
 def c_files(exported: Exported) -> dict[str, str]:
     """Write the observer in C."""
-    exported.refuse_nonlinear("C")
-    name, words = exported.name, _words(exported)
+    artifact, name = exported.artifact, exported.name
+    motion = artifact.motion
+    equations = None if motion is None else motion.equations
+    chosen = {
+        "inputs": artifact.nu > 0,
+        "autonomous": not artifact.nu,
+        "free": "free" in exported.maps,
+        "tracks": motion is not None,
+        "static": motion is None,
+        "flow": equations is None,
+        "equations": equations is not None,
+        "discrete": equations is not None and not equations.substeps,
+        "continuous": equations is not None and equations.substeps > 0,
+    }
+    words = {"NAME": name, "MACRO": name.upper(), "OUTPUTS": ", ".join(exported.outputs)}
+    words = {key: comment(text) for key, text in (words | {"INPUTS": ", ".join(exported.inputs)}).items()}
+    source = words | _functions(exported) | {"/* CONSTANTS */\n": _constants(exported)}
+    digits = "9" if exported.precision == "float" else "17"
     return {
-        f"{name}.h": _header(exported, words),
-        f"{name}.c": _source(exported, words),
-        f"{name}_main.c": _program(exported, words),
+        f"{name}.h": template("observer.h", words | _heading(exported), **chosen),
+        f"{name}.c": template("observer.c", source, **chosen),
+        f"{name}_main.c": template("main.c", words | {"DIGITS": digits}, **chosen),
     }
 
 
-def _words(exported: Exported) -> dict[str, Any]:
-    """What the templates have in common."""
-    artifact, real = exported.artifact, f"{exported.name}_real"
-    return {
-        "NAME": exported.name,
-        "MACRO": exported.name.upper(),
-        "nx": len(exported.estimates),
-        "ny": artifact.ny,
-        "nu": artifact.nu,
-        "nz": len(artifact.filter.A),
-        "size": artifact.filter.size,
-        "u": f", const {real} u[{artifact.nu}]" if artifact.nu else "",
-        "pass_u": ", u" if artifact.nu else "",
-    }
-
-
-def _header(exported: Exported, words: dict[str, Any]) -> str:
+def _heading(exported: Exported) -> dict[str, str]:
+    """Words of the header."""
     artifact = exported.artifact
-    tracks = artifact.flow is not None
     finite = (
-        "Where an output is missing, pass NaN: it is predicted. The first sample and inputs must be finite, and the "
-        "compiler must know NaN, as it does without -ffast-math."
-        if tracks
-        else "Samples and inputs must be finite: a NaN stays until the next reset."
+        "Samples and inputs must be finite: a NaN stays until the next reset."
+        if artifact.motion is None
+        else "Where an output is missing, pass NaN: it is predicted. The first sample and inputs must be finite, and "
+        "the compiler must know NaN, as it does without -ffast-math."
     )
-    paragraphs = [
+    levels = []
+    if exported.levels:
+        levels.append(f"measurement noise of standard deviation {', '.join(map(number, exported.levels))}")
+    if exported.needs_process_noise:
+        levels.append(f"process noise of level {number(exported.process_noise)}")
+    text = (
         f"{exported.name}_reset takes in the first sample, {exported.name}_step every later one. {finite} Nothing is "
         "allocated, and observers share constants alone."
-    ]
-    process = process_level(exported) if tracks else None  # of which the Kalman filter takes any
-    for level in levels(exported):
-        value, to = number(level.value), " for T_inv" if level == process else ""
-        beyond = f"; what is beyond {number(level.end)} counts as that{to}" if np.isfinite(level.end) else ""
-        paragraphs.append(
-            f"{level.macro} is {level.meaning}, {value} unless the compiler is told otherwise, as in "
-            f"-D{level.macro}={value}{beyond}."
-        )
-    return c_templates.HEADER.format(
-        **words,
-        system=comment(artifact.system),
-        dt=number(artifact.filter.dt),
-        version=kkl_gym.__version__,
-        source=comment(exported.source),
-        checksum=exported.checksum,
-        outputs=comment(", ".join(exported.outputs)),
-        inputs=f" * u:     {comment(', '.join(exported.inputs))}\n" if artifact.nu else "",
-        estimates=comment(", ".join(exported.estimates)),
-        paragraphs="\n *\n".join(fill(text, 116, initial_indent=" * ", subsequent_indent=" * ") for text in paragraphs),
-        real=exported.precision,
-        age="    unsigned long age; /* samples since the first, as far as that matters */\n"
-        if exported.last_age
-        else "",
-        tracker=c_tracker_templates.FIELDS.format(**words) if tracks else "",
-        input_text=" and the input that was held since the last" if artifact.nu else "",
     )
+    text += f" It assumes {' and '.join(levels)}." * bool(levels)
+    return {
+        "SYSTEM": comment(artifact.system),
+        "SECONDS": number(artifact.filter.dt),
+        "VERSION": kkl_gym.__version__,
+        "SOURCE": comment(exported.source),
+        "CHECKSUM": exported.checksum,
+        "ESTIMATES": comment(", ".join(exported.estimates)),
+        "PARAGRAPH": fill(text, 116, initial_indent=" * ", subsequent_indent=" * ", break_on_hyphens=False),
+        "PRECISION": exported.precision,
+        "COUNT_X": str(len(exported.estimates)),
+        "COUNT_Y": str(artifact.ny),
+        "COUNT_U": str(artifact.nu),
+        "COUNT_Z": str(artifact.filter.size),
+    }
 
 
-def _source(exported: Exported, words: dict[str, Any]) -> str:
-    linear, nz = exported.artifact.filter, words["nz"]
-    parts = [
-        f'#include "{exported.name}.h"\n\n#include <math.h>\n#include <stddef.h>\n\n',
-        f"typedef {exported.name}_real real;\n",
-    ]
-    for level in levels(exported):
-        macro, end = level.macro, number(level.end)
-        parts.append(f"\n#ifndef {macro}\n#define {macro} {number(level.value)}\n#endif\n")
-        cut = f"(({macro}) < {end} ? ({macro}) : {end})" if np.isfinite(level.end) else f"({macro})"
-        parts.append(f"#define CUT_{macro} {cut}\n")
+def _constants(exported: Exported) -> str:
+    """Sizes and arrays."""
+    linear, motion = exported.artifact.filter, exported.artifact.motion
+    nz = len(linear.A)
     block = linear.transition[:nz, :nz]
-    rows, columns = np.nonzero(block - np.diag(block.diagonal()))
-    parts += [
-        "\n/* The filter. */\n",
-        array("double", "diagonal", block.diagonal()),
-        array("double", "early_y", linear.early_y[:nz]),
-        array("double", "late_y", linear.late_y[:nz]),
-        array("double", "equilibrium", linear.equilibrium[:nz]),
-    ]
-    if len(rows):
-        parts += [
-            array("double", "mixing", block[rows, columns]),
-            array("unsigned short", "mixing_row", rows),
-            array("unsigned short", "mixing_column", columns),
-        ]
+    rows, columns = np.nonzero(block)
+    macros: dict[str, Any] = {name: f"{exported.name.upper()}_{name}" for name in ("NX", "NY", "NU", "DT")}
+    macros |= {"NZ": nz, "SIZE": linear.size, "TRANSITIONS": len(rows), "LAST_AGE": f"{exported.last_age}ul"}
+    arrays = {"transition": block[rows, columns], "transition_row": rows, "transition_column": columns}
+    arrays |= {name: getattr(linear, name)[:nz] for name in ("early_y", "late_y", "equilibrium")}
+    networks = {label: inverse.mlp for label, inverse in exported.maps.items()}
     if linear.nu:
-        parts.append(array("double", "held_u", linear.held_u[nz : 2 * nz, 0]))
+        arrays["held_u"] = linear.held_u[nz : 2 * nz, 0]
     for label, inverse in exported.maps.items():
-        parts += map_constants(exported, label, inverse)
-    flow, networks = exported.artifact.flow, [inverse.mlp for inverse in exported.maps.values()]
-    if flow is not None:
-        parts += tracker_constants(exported, flow)
-        networks += tracker_networks(exported, flow)
-    parts.append(c_templates.LAYER)
-    for activation in dict.fromkeys(mlp.activation for mlp in networks if len(mlp.weights) > 1):
-        tanh = "tanhf" if exported.precision == "float" else "tanh"
-        body = c_templates.ACTIVATIONS[activation].format(tanh=tanh, half="(real)0.5")
-        parts.append(c_templates.ACTIVATION.format(activation=activation, body=body))
-    words = words | {"u": words["u"].replace(f"{exported.name}_real", "real")}
-    if flow is None:
-        parts += [map_functions(exported, label, inverse) for label, inverse in exported.maps.items()]
-        ask = c_templates.ASK_TWO if "free" in exported.maps else c_templates.ASK_ONE
-        parts.append(ask.format(**words, head=c_templates.ESTIMATE.format(**words), what="map(observer, x_hat)"))
-    else:
-        parts.append(tracker_functions(exported, flow, words))
-    last = exported.last_age
-    begin = "" if flow is None else c_tracker_templates.BEGIN
-    age_zero = "    observer->age = 0;\n" if last else ""
-    parts.append(c_templates.RESET.format(**words, begin=age_zero + begin))
-    parts.append(
-        c_templates.ADVANCE.format(nz=nz, mixing=c_templates.MIXING.format(count=len(rows)) if len(rows) else "")
-    )
-    parts.append(
-        c_templates.STEP.format(
-            **words,
-            take="" if flow is None else c_tracker_templates.TAKE.format(**words),
-            inputs=c_templates.INPUTS.format(**words) if linear.nu else "",
-            age_next=f"    if (observer->age < {last}ul)\n        observer->age++;\n" if last else "",
-            supervise="" if flow is None else "    supervise(observer, told);\n",
-        )
-    )
-    return "".join(parts)
+        own = {name: getattr(inverse, name) for name in ("z_offset", "x_offset", "x_scale")}
+        own["whiten"] = inverse.gain(exported.measurement_noise)[:, None] * inverse.whiten
+        arrays |= {f"{label}_{name}": values for name, values in own.items()}
+    if motion is not None:
+        numbers = tracker_numbers(motion, linear.dt)
+        macros |= {name.upper(): value for name, value in numbers.items()} | {"FAR": (2 * numbers["other"]) ** -0.5}
+        arrays |= _tracker_arrays(exported, motion, numbers["window"])
+        if motion.flow is not None:
+            networks["flow"] = motion.flow.mlp
+        elif motion.equations is not None and (substeps := motion.equations.substeps):
+            macros |= {"SUBSTEPS": substeps, "H": linear.dt / substeps}
+    parts = [f"#define {name} {value}\n" for name, value in macros.items()]
+    parts += [array(name, values) for name, values in arrays.items()]
+    return "".join(parts + [network_arrays(label, mlp) for label, mlp in networks.items()])
 
 
-def _program(exported: Exported, words: dict[str, Any]) -> str:
-    outputs, inputs = (comment(", ".join(names)) for names in (exported.outputs, exported.inputs))
-    macro, nu = words["MACRO"], exported.artifact.nu
-    return c_templates.PROGRAM.format(
-        NAME=exported.name,
-        MACRO=macro,
-        outputs=outputs,
-        line=f"the input that led to the next sample, {inputs}, then the sample" if nu else "the next sample",
-        missing="" if exported.artifact.flow is None else " * Outputs that are missing are nan, but for the first.\n",
-        digits=9 if exported.precision == "float" else 17,
-        declared=f"    {exported.name}_real u[{macro}_NU];\n" if nu else "",
-        first=f"u, {macro}_NU" if nu else f"y, {macro}_NY",
-        then=c_templates.READ_Y.format(MACRO=macro) if nu else "",
-        u=words["pass_u"],
-    )
+def _tracker_arrays(exported: Exported, motion: Motion, window: int) -> dict[str, np.ndarray]:
+    """Motion, Kalman filter, and T_inv's covariance at ages in samples up to the window."""
+    dt, levels = exported.artifact.filter.dt, (exported.measurement_noise, exported.process_noise)
+    arrays = tracker_arrays(motion) | dict(zip("QR", motion.variances(*levels), strict=True))
+    if motion.flow is not None:
+        arrays |= {f"flow_{name}": getattr(motion.flow, name) for name in ("linear", "gain")}
+        arrays |= {"flow_u_scale": motion.flow.u_scale} if exported.artifact.nu else {}
+    for label, inverse in exported.maps.items():
+        assert inverse.error_covariance is not None
+        ages = np.append((ages := inverse.error_covariance.ages / dt)[ages < window], window)
+        by_age = inverse.error_covariance.at_level(inverse.shares(exported.measurement_noise)[0])
+        covariance = by_age(ages * dt) / np.outer(motion.x_scale, motion.x_scale)
+        arrays |= {f"{label}_ages": ages, f"{label}_covariance": covariance.ravel()}
+    return arrays
+
+
+def _functions(exported: Exported) -> dict[str, Any]:
+    """Functions that differ between observers, by the words in the place of which they stand."""
+    motion, networks = exported.artifact.motion, [inverse.mlp for inverse in exported.maps.values()]
+    words: dict[str, Any] = {}
+    if motion is not None:
+        moved = "" if motion.equations is None else function("field", motion.equations.field) + "\n"
+        words["/* MOTION */\n"] = moved + function("h", output_expression(exported.artifact))
+        if motion.flow is not None:
+            calls = network_calls("flow", motion.flow.mlp)
+            words |= dict(zip(("FLOW_WIDTH", "/* LAYERS */", "MOVED"), calls, strict=True))
+            networks.append(motion.flow.mlp)
+    maps = "".join(_map(exported, label, inverse) for label, inverse in exported.maps.items())
+    return words | {"/* FUNCTIONS */\n\n": activations(networks, exported.precision) + maps}
+
+
+def _map(exported: Exported, label: str, inverse: InverseMap) -> str:
+    """T_inv as a function; the levels of noise are constants."""
+    modes, size = inverse.whiten.shape
+    width, layers, last = network_calls(label, inverse.mlp)
+    levels = inverse.noise_features(exported.measurement_noise, exported.process_noise)
+    conditions = [f"    a[{modes + i}] = (real){number(level)};\n" for i, level in enumerate(levels)]
+    if "age" in inverse.features:
+        end, unit = number(inverse.age_max), number(inverse.age_unit)
+        conditions.append(_AGE.format(at=modes + len(levels), end=end, unit=unit))
+    words = {"modes": modes, "size": size, "width": width, "layers": layers, "last": last}
+    return _MAP.format(map=label, name=exported.name, conditions="".join(conditions), **words)

@@ -1,5 +1,6 @@
 """What is exported: an observer, the levels of noise that it assumes, and what is said of where it comes from."""
 
+import dataclasses
 import math
 import os
 import re
@@ -12,10 +13,14 @@ from kkl_gym.systems import SYSTEMS
 from observers import Artifact, KKLObserver
 from observers.checks import choice
 from observers.errors import ArtifactError
+from observers.expression import Expression
 from observers.inverse import InverseMap
+from observers.motion import Motion
 from observers.names import resolve
 from observers.storage import checksum
-from observers.supervision import Supervision
+from observers.supervision import INFLATION, Supervision
+from observers.tracker_kernel import RELINEARISATIONS
+from observers.unscented import Points
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
 # what distinguishes them would be lost in the last digits of floats.
@@ -62,18 +67,10 @@ class Exported:
             exported._check_range()
         return exported
 
-    def refuse_nonlinear(self, what: str) -> None:
-        """See that it does not track by an output that is not linear."""
-        if self.artifact.flow is not None and self.artifact.C is None:
-            raise ArtifactError(
-                f"{self.source} tracks by an output h(x) that is not linear, and {what} takes y = C x alone: export "
-                "the map that it was made from (kkl-gym tracking leaves it as it is), which is T_inv alone"
-            )
-
     def _check_range(self) -> None:
-        flow, scales = self.artifact.flow, [(each.x_offset, each.x_scale) for each in self.maps.values()]
-        if flow is not None:
-            scales.append((flow.x_offset, flow.x_scale))
+        motion, scales = self.artifact.motion, [(each.x_offset, each.x_scale) for each in self.maps.values()]
+        if motion is not None:
+            scales.append((motion.x_offset, motion.x_scale))
         largest = float(np.abs(np.concatenate(scales, axis=None)).max())
         if largest > float(np.finfo(np.float32).max):
             raise ArtifactError(
@@ -99,17 +96,14 @@ class Exported:
         return (float(np.max(self.measurement_noise)),) if told else ()
 
     @property
-    def told_process_noise(self) -> bool:
-        """Whether the maps are told the level of process noise."""
-        return self.artifact.process_noise_max is not None
+    def needs_process_noise(self) -> bool:
+        """Whether the step depends on the level of process noise."""
+        return self.artifact.process_noise_max is not None or self.artifact.motion is not None
 
     @property
     def last_age(self) -> int:
         """Samples since the first after which the age no longer matters; 0 if it never does."""
         ends = [inverse.age_max for inverse in self.maps.values() if "age" in inverse.features]
-        if self.artifact.flow is not None:
-            dt = self.artifact.filter.dt
-            ends.append(Supervision.of(self.artifact.flow, dt).window * dt)
         return min(math.ceil(max(ends, default=0.0) / self.artifact.filter.dt), _MOST_SAMPLES)
 
     @property
@@ -151,9 +145,50 @@ class Exported:
         }
         if self.levels:
             described["measurement_noise"] = list(self.levels)
-        if self.told_process_noise or self.artifact.flow is not None:
+        if self.needs_process_noise:
             described["process_noise"] = self.process_noise
         return described
+
+
+def output_expression(artifact: Artifact) -> Expression:
+    """h(x)."""
+    if artifact.h is not None:
+        return artifact.h
+    assert artifact.C is not None
+    return Expression(
+        [["+", 0.0, 0.0, *(["*", c, ["x", i]] for i, c in enumerate(row) if c)] for row in artifact.C.tolist()]
+    )
+
+
+def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
+    """Weights of sigma points, and divergence detection."""
+    watch = Supervision.of(motion, dt)
+    points = Points(kappa=max(3.0 - motion.nx, 0.0), beta=2.0)  # as in observers.tracker
+    weights = dict(zip(("middle", "middle_squares", "other"), points.weights(motion.nx), strict=True))
+    others = {"trend_gain": watch.trend_gain, "inflation": INFLATION, "relinearisations": RELINEARISATIONS}
+    return weights | others | dataclasses.asdict(watch)
+
+
+def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
+    """Scaling of the states; bounds, and mean and covariance of where motions start, of scaled states."""
+    low, high = motion.scaled_bounds
+    mean = (motion.mean - motion.x_offset) / motion.x_scale
+    covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
+    scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}
+    return scaling | {"low": low, "high": high, "start_mean": mean, "start_covariance": covariance}
+
+
+def table(inverse: InverseMap, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """T_inv's covariance in units of ``scale`` (nx,), by level (k,) and age (m,), two of each at least."""
+    error = inverse.error_covariance
+    assert error is not None
+    covariance = error.covariance / np.outer(scale, scale)
+    levels, ages = error.levels, error.ages
+    if len(levels) == 1:
+        levels, covariance = np.array([0.0, 1.0]), np.repeat(covariance, 2, 0)
+    if len(ages) == 1:
+        ages, covariance = np.array([0.0, 1.0]), np.repeat(covariance, 2, 1)
+    return levels, ages, covariance
 
 
 def identifier(name: str) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import kkl_gym
 from training.export.exported import Exported
 from training.export.onnx_map import Maps
-from training.export.onnx_nodes import Graph
+from training.export.onnx_nodes import Graph, Value
 from training.export.onnx_tracker import TrackerNodes, state_width
 
 OPSET, IR = 13, 7  # of 2020 and 2021; what reads ONNX reads these
@@ -27,8 +27,7 @@ def onnx_model(exported: Exported) -> Any:
     """
     from onnx import checker, helper
 
-    exported.refuse_nonlinear("ONNX")
-    artifact, linear, tracks = exported.artifact, exported.artifact.filter, exported.artifact.flow is not None
+    artifact, linear, tracks = exported.artifact, exported.artifact.filter, exported.artifact.motion is not None
     real, levels = _TYPES[exported.precision], len(exported.levels)
     inputs = {
         "z": linear.size,
@@ -38,27 +37,27 @@ def onnx_model(exported: Exported) -> Any:
         "y_next": artifact.ny,
         "age": 1,
         "measurement_noise": levels,
-        "process_noise": int(tracks or exported.told_process_noise),
+        "process_noise": int(exported.needs_process_noise),
     }
     inputs = {name: width for name, width in inputs.items() if width}
     outputs = {"z_next": linear.size, "tracker_next": inputs.get("tracker", 0), "x_hat": len(exported.estimates)}
     outputs = {name: width for name, width in outputs.items() if width}
     graph = Graph()
-    given = {name: name if name in _STATES else graph.cast(name, np.float64) for name in inputs}
-    begins = graph("Equal", given["age"], graph.constant([0.0]))
-    tracker = TrackerNodes(graph, artifact, given, real) if tracks else None
+    given = {name: Value(graph, name) for name in inputs}
+    given |= {name: value.cast(np.float64) for name, value in given.items() if name not in _STATES}
+    begins = graph("Equal", given["age"], 0.0)
+    tracker = TrackerNodes(graph, artifact, given, begins, real) if tracks else None
     if tracker is None:
         z = _filtered(graph, exported, given, begins)
-        x_hat = Maps(graph, exported, z, given, real).estimate(given["age"])
+        x_hat = Maps(graph, exported, z, given, real).estimate()
     else:
         tracked, whole = tracker.taken()
-        first = graph("Where", begins, given["y_next"], whole)
-        z = _filtered(graph, exported, given | {"y": tracker.y, "y_next": first}, begins)
-        tracked = tracker.supervised(tracked, Maps(graph, exported, z, given, real), begins)
-        graph.named("tracker_next", tracker.packed(tracked, first))
-        x_hat = tracker.estimate(tracked)
+        z = _filtered(graph, exported, given | {"y": tracker.y, "y_next": whole}, begins)
+        tracked = tracker.supervised(tracked, Maps(graph, exported, z, given, real))
+        graph.named("tracker_next", graph.joined(*tracked, whole))
+        x_hat = tracker.estimate(tracked[0])
     graph.named("z_next", z)
-    graph.named("x_hat", graph.cast(x_hat, real))
+    graph.named("x_hat", x_hat.cast(real))
 
     def value(name: str, width: int) -> Any:
         kind = np.float64 if name.removesuffix("_next") in _STATES else real
@@ -84,11 +83,9 @@ def onnx_model(exported: Exported) -> Any:
     return model
 
 
-def _filtered(graph: Graph, exported: Exported, given: dict[str, str], begins: str) -> str:
+def _filtered(graph: Graph, exported: Exported, given: dict[str, Value], begins: Value) -> Value:
     """The filter's next state, (n, size)."""
     linear = exported.artifact.filter
-    signals = [given[name] for name in ("z", "y", "u", "y_next") if name in given]
+    signals = graph.joined(*(given[name] for name in ("z", "y", "u", "y_next") if name in given))
     update = np.vstack([linear.transition.T, linear.early_y.T, linear.held_u.T, linear.late_y.T])
-    advanced = graph("MatMul", graph.joined(*signals), graph.constant(update))
-    start = graph("MatMul", given["y_next"], graph.constant(linear.equilibrium.T))
-    return graph("Where", begins, start, advanced)
+    return graph.where(begins, given["y_next"] @ linear.equilibrium.T, signals @ update)

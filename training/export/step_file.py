@@ -1,6 +1,5 @@
 """The step as a file of constants, which ``kkl_observer.js`` runs in browsers and in Node."""
 
-import dataclasses
 import os
 from importlib.resources import files
 from typing import Any
@@ -8,18 +7,14 @@ from typing import Any
 import numpy as np
 
 from observers import storage
-from observers.flow import Flow
 from observers.inverse import InverseMap
-from observers.polynomial import table
-from observers.supervision import INFLATION, Supervision
-from training.export.exported import Exported
+from observers.motion import Motion
+from training.export.exported import Exported, table, tracker_arrays, tracker_numbers
 
 KEY = "kkl_step"  # of the metadata
-_MAP_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
-_MAP_SCALARS = tuple(
-    f"{name}_{end}" for name in ("measurement_noise", "process_noise", "age") for end in ("unit", "max")
-)
-_FLOW_ARRAYS = ("x_offset", "x_scale", "u_scale", "gain", "polynomial", "error", "process_noise")
+_MAP_ARRAYS = ("z_offset", "whiten", "x_offset", "x_scale")
+_MAP_SCALARS = ("process_noise_unit", "process_noise_max", "age_unit", "age_max")
+_MOTION_ARRAYS = ("error", "process_noise", "least_measurement_noise")
 _LIMIT_ARRAYS = ("levels", "mean", "low", "high")
 
 
@@ -29,67 +24,64 @@ def javascript() -> str:
 
 
 def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
-    """Write what a step needs to a safetensors file: matrices of the filter at its dt, maps, limits of the monitor."""
-    exported.refuse_nonlinear("JavaScript")
+    """Write what a step needs to a safetensors file: matrices of the filter at its dt, maps, motion, limits."""
     artifact, linear = exported.artifact, exported.artifact.filter
     nz = len(linear.A)
-    block = linear.transition[:nz, :nz]
-    at = np.argwhere(block - np.diag(block.diagonal()))
-    tensors = {"diagonal": block.diagonal()}
+    tensors = {"transition": linear.transition[:nz, :nz]}
     tensors |= {name: getattr(linear, name)[:nz] for name in ("early_y", "late_y", "equilibrium")}
-    if len(at):
-        tensors |= {"mixing": block[tuple(at.T)], "mixing_at": at.astype(float)}
     if linear.nu:
         tensors["held_u"] = linear.held_u[nz : 2 * nz, 0]
     described = exported.described | {"maps": {}}
     for label, inverse in exported.maps.items():
-        described["maps"][label] = _described_map(tensors, f"{label}.", inverse)
-    if artifact.flow is not None:
-        described["flow"] = _described_flow(tensors, artifact.flow, linear.dt)
+        described["maps"][label] = _described_map(tensors, f"{label}.", inverse, artifact.ny)
+        if inverse.error_covariance is not None:
+            scale = np.ones(artifact.nx) if artifact.motion is None else artifact.motion.x_scale
+            arrays = zip(("levels", "ages", "covariance"), table(inverse, scale), strict=True)
+            tensors |= {f"{label}.{name}": values for name, values in arrays}
     if artifact.C is not None:
         tensors["C"] = np.asarray(artifact.C, dtype=float)
+    if artifact.h is not None:
+        described["h"] = artifact.h.components
+    if artifact.motion is not None:
+        described["motion"] = _described_motion(tensors, artifact.motion, linear.dt)
     if artifact.limits is not None:
-        tensors |= {f"limits.{name}": getattr(artifact.limits, name) for name in _LIMIT_ARRAYS}
+        shape = artifact.limits.mean.shape
+        tensors |= {f"limits.{name}": _by_output(getattr(artifact.limits, name), shape) for name in _LIMIT_ARRAYS}
         described["limits"] = {name: getattr(artifact.limits, name) for name in ("window", "warm_up")}
     storage.save(path, tensors, key=KEY, described=described)
 
 
-def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap) -> dict[str, Any]:
+def _by_output(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return np.broadcast_to(values.reshape(len(values), -1), shape).copy()
+
+
+def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap, ny: int) -> dict[str, Any]:
     """Add a map's arrays; returns what else there is to say of it."""
     tensors |= {f"{prefix}{name}": getattr(inverse, name) for name in _MAP_ARRAYS}
+    tensors[f"{prefix}noise_gain"] = np.atleast_2d(inverse.noise_gain)
     storage.put_mlp(tensors, prefix, inverse.mlp)
     described: dict[str, Any] = {"activation": inverse.mlp.activation, "features": list(inverse.features)}
     for name in _MAP_SCALARS:
         value = getattr(inverse, name)
         if np.isfinite(value).all():  # JSON knows no infinity
             described[name] = value
-    if inverse.spread is not None:
-        storage.put_mlp(tensors, f"{prefix}spread.", inverse.spread.in_units(inverse.x_scale))
-        tensors |= {f"{prefix}spread.{name}": getattr(inverse.spread, name) for name in ("levels", "ages", "factors")}
-        described["spread"] = {"activation": inverse.spread.mlp.activation}
+    described["measurement_noise_unit"] = np.atleast_1d(inverse.measurement_noise_unit).tolist()
+    if "measurement_noise" in inverse.features:
+        described["measurement_noise_max"] = np.broadcast_to(inverse.measurement_noise_max, ny).tolist()
     return described
 
 
-def _described_flow(tensors: dict[str, np.ndarray], flow: Flow, dt: float) -> dict[str, Any]:
-    """Add a flow's arrays, with bounds of scaled states; returns what else there is to say of it."""
-    storage.put_mlp(tensors, "flow.", flow.mlp)
-    arrays = {name: getattr(flow, name) for name in _FLOW_ARRAYS}
-    arrays["low"], arrays["high"] = flow.scaled_bounds
-    if flow.bend is not None:
-        arrays["bend"] = flow.bend
-    arrays["least_measurement_noise"] = flow.least_measurement_noise
-    arrays["earlier"], arrays["by"] = table(flow.nx + flow.nu, flow.degree)
-    for kind, factors in (("factors", flow.factors), ("free_factors", flow.free_factors)):
-        if factors is not None:
-            doubt = np.zeros_like(factors.factors) if factors.doubt is None else factors.doubt
-            of_kind = {"levels": factors.levels, "ages": factors.ages, "factors": factors.factors, "doubt": doubt}
-            arrays |= {f"{kind}.{name}": values for name, values in of_kind.items()}
-    tensors |= {f"flow.{name}": np.asarray(values, dtype=float) for name, values in arrays.items() if values.size}
-    watch = Supervision.of(flow, dt)
-    return {
-        "activation": flow.mlp.activation,
-        "least_process_noise": flow.least_process_noise,
-        **dataclasses.asdict(watch),
-        "trend_gain": watch.trend_gain,
-        "inflation": INFLATION,
-    }
+def _described_motion(tensors: dict[str, np.ndarray], motion: Motion, dt: float) -> dict[str, Any]:
+    """Add a motion's arrays; returns what else there is to say of it."""
+    arrays = tracker_arrays(motion) | {name: getattr(motion, name) for name in _MOTION_ARRAYS}
+    arrays |= {name: getattr(motion.factors, name) for name in ("levels", "ages")}
+    arrays["factors"] = motion.factors.factors[[0, -1]].ravel()  # without process noise, and with the most
+    described = tracker_numbers(motion, dt) | {"least_process_noise": motion.least_process_noise}
+    if motion.equations is not None:
+        described |= {"field": motion.equations.field.components, "substeps": motion.equations.substeps}
+    if motion.flow is not None:
+        storage.put_mlp(tensors, "motion.", motion.flow.mlp)
+        arrays |= {name: getattr(motion.flow, name) for name in ("linear", "gain")}
+        described |= {"activation": motion.flow.mlp.activation, "u_scale": motion.flow.u_scale.tolist()}
+    tensors |= {f"motion.{name}": np.asarray(values, dtype=float) for name, values in arrays.items()}
+    return described

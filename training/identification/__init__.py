@@ -1,9 +1,8 @@
-"""Parameters of a plant, and an observer for it, from records of outputs; no state is ever seen.
+"""Parameters of a plant from records of its outputs, by multiple shooting, and an observer for it.
 
-The steps, each in a module of its own: :mod:`consistency` trains a network from the filter's state to the state, and
-rough parameters, on outputs and equations alone. :mod:`shooting` refines both over windows, which :mod:`windows` makes
-longer. :mod:`identifiability` says what outputs cannot tell. :mod:`identify` puts them together, and :mod:`learning`
-trains the observer on the plant that was identified.
+:mod:`motions` simulates windows of the records, :mod:`shooting` fits parameters on windows of one length, and
+:mod:`windows` makes them longer. :mod:`identifiability` finds what outputs cannot tell apart. :mod:`identify` puts them
+together, and :mod:`learning` trains the observer.
 """
 
 from training.identification.identify import Identified, Product, estimate_parameters

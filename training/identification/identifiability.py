@@ -1,4 +1,4 @@
-"""What measured outputs cannot tell about parameters and states."""
+"""Which parameters, products of their powers, and signs are identifiable from outputs."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,28 +10,28 @@ from kkl_gym.equations import input_matrix
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
-NOTHING = 1e-7  # of the largest eigenvalue of the information: below, a direction leaves the outputs as they are
-HARDLY = 1.0  # standard error, over the parameter itself, from which on nothing is known of it
-PART = 0.05  # of a direction that a parameter must have to be in it
-LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # of exponents that are written as fractions
-MOST_SIGNS = 12  # states and parameters, beyond which signs are not tried out
+RANK = 1e-7  # of the largest eigenvalue of the information: smaller ones are zero
+HARDLY = 1.0  # standard error over the parameter itself that makes a direction unidentifiable
+PART = 0.05  # component of a direction below which a parameter is not in it
+LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # of exponents that are rounded to fractions
+MOST_SIGNS = 12  # states and parameters of which all combinations of signs are tried
 POINTS = 64
 
 
-def hidden_directions(information: np.ndarray) -> np.ndarray:
-    """The changes of parameters, (p, k), that leave the outputs as they are, or nearly."""
+def unidentifiable_directions(information: np.ndarray) -> np.ndarray:
+    """Directions (p, k) of the parameters that change the outputs not at all, or hardly."""
     values, vectors = np.linalg.eigh(information)
-    return vectors[:, (values <= NOTHING * values[-1]) | (values <= HARDLY**-2)]
+    return vectors[:, (values <= RANK * values[-1]) | (values <= HARDLY**-2)]
 
 
-def told_directions(information: np.ndarray) -> np.ndarray:
-    """The changes of parameters, (p, k), that the outputs show, however faintly."""
+def identifiable_directions(information: np.ndarray) -> np.ndarray:
+    """Directions (p, k) of the parameters that change the outputs, however little."""
     values, vectors = np.linalg.eigh(information)
-    return vectors[:, values > NOTHING * max(values[-1], 0.0)]
+    return vectors[:, values > RANK * max(values[-1], 0.0)]
 
 
 def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fraction | float]]:
-    """Products of powers of parameters that outputs tell, where ``hidden`` (p, k) are changes that they do not."""
+    """Identifiable products of powers of parameters, for unidentifiable directions ``hidden`` (p, k)."""
     p, k = hidden.shape
     if p == k:
         return []

@@ -1,8 +1,8 @@
-"""An observer for a plant of which outputs were recorded: its parameters, then its map."""
+"""Identification and training in one: :func:`identify` and :func:`adapt`."""
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,28 +12,26 @@ from rich.console import Console
 
 from kkl_gym.system import System
 from observers import Artifact
-from observers.checks import check_dt, integer
+from observers.checks import check_dt
 from observers.storage import write
 from training.config import Config, override, settings_of
-from training.identification.identify import STEPS, Identified, Limits, estimate_parameters
+from training.identification.identify import Identified, Limits, estimate_parameters
 from training.identification.report import write_report
-from training.jobs import claimed_run, describe
-from training.maps.optimise import log_to
-from training.pipeline import Result, train
+from training.jobs import claimed_job, describe, refuse_checkpoints
 from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars
 from training.records import Record, check_signals, resampled, sampling_interval
 from training.records import check_dt as check_steps
+from training.train_observer import Result, train
 
-NOISE_RANGE = 2.0  # largest measurement noise that a map is made for, over what the records show
-LEAST_NOISE = 0.002  # the same, over the output's range, where they show hardly any
-INVERSE_STEPS = 12_000
+NOISE_RANGE = 2.0  # largest measurement noise that the observer is trained for, over that of the records
+LEAST_NOISE = 0.002  # the least of it, over the output's range
 OBSERVER_FOLDER = "observer"
 
 
 @dataclass(frozen=True)
 class Learned:
-    """What records of outputs taught."""
+    """Identified parameters, and the observer that was trained for them."""
 
     identified: Identified
     result: Result
@@ -47,15 +45,14 @@ def identify(
     *,
     dt: float | None = None,
     settings: Mapping[str, Any] | None = None,
-    steps: int = STEPS,
     seed: int = 0,
     resume: bool = False,
     console: Console | ProgressBars | None = None,
 ) -> Learned:
-    """Learn parameters of a plant, and an observer for it, from records of its outputs. No state is ever seen.
+    """Identify parameters of a plant from records of its outputs, and train an observer for it.
 
-    The parameters come from :func:`training.identification.identify.estimate_parameters`. The observer then is trained
-    on simulated motions of the plant that was identified, for noise up to twice what the records show.
+    No state is needed. :func:`training.identification.identify.estimate_parameters` fits the parameters. The observer
+    is trained on simulated motions of the identified plant, for noise up to twice that of the records.
 
     Parameters
     ----------
@@ -71,10 +68,8 @@ def identify(
         Sampling interval of the observer in seconds; by default that of the records.
     settings : mapping of str to object, optional
         Settings of :class:`training.Config` for the observer.
-    steps : int
-        Batches of the network that finds first guesses.
     seed : int
-        Of everything random.
+        Of the random starts, and of the observer's training.
     resume : bool
         Whether to go on from checkpoints in the folder.
     console : Console or ProgressBars, optional
@@ -88,41 +83,33 @@ def identify(
     Raises
     ------
     ValueError
-        If the records, or the parameters' names or limits, make no sense; see
-        :func:`training.identification.identify.estimate_parameters`.
+        If the records, or the parameters' names or limits, are invalid.
     """
-    integer("steps", steps, 0)
     check_signals(records, system)
     interval = sampling_interval(*records) if dt is None else check_dt(dt)
     given = {"dt": interval, "seed": seed, **(settings or {})}
     preset(system, "input-aware", "fast", changes={"eigenvalues": (-1.0,), **given})  # bad settings are refused early
-    found = _parameters(
-        system,
-        unknown,
-        records,
-        folder,
-        dt=interval,
-        steps=steps,
-        seed=seed,
-        resume=resume,
-        console=console,
-        observer=None,
-    )
     inputs = bool(system.nu) and records[0].u is not None
-    size = np.asarray(found.system.output_range)
-    largest = np.maximum(NOISE_RANGE * found.noise, LEAST_NOISE * size)
-    quiet = bool((found.noise < LEAST_NOISE * size / NOISE_RANGE).all())
-    changes: dict[str, Any] = {
-        "duration": 5000 * interval,
-        "inputs": inputs,
-        "inverse_steps": INVERSE_STEPS,
-        "measurement_noise_max": float(largest[0]) if len(largest) == 1 else tuple(largest.tolist()),
-        "noise_free_share": 0.5 if quiet else 0.2,
-        "high_noise_emphasis": 2.0 if quiet else 4.0,
-        **given,
-    }
-    config = preset(found.system, "input-aware", "fast", changes=changes)
-    return _observer(found, config, folder, noise=found.noise, resume=resume, console=console)
+
+    def configured(found: Identified) -> Config:
+        size = np.asarray(found.system.output_range)
+        quiet = bool((found.noise < LEAST_NOISE * size / NOISE_RANGE).all())
+        changes = {
+            "duration": 5000 * interval,
+            "inputs": inputs,
+            "measurement_noise_max": _level(np.maximum(NOISE_RANGE * found.noise, LEAST_NOISE * size)),
+            "noise_free_share": 0.5 if quiet else 0.2,
+            "high_noise_emphasis": 2.0 if quiet else 4.0,
+            **given,
+        }
+        return preset(found.system, "input-aware", "fast", changes=changes)
+
+    found, result = _learned(
+        system, unknown, records, folder, configured, dt=interval, seed=seed, resume=resume, console=console
+    )
+    artifact = dataclasses.replace(result.artifact, measurement_noise=_level(np.maximum(found.noise, 0.0)))
+    artifact.save(folder / f"{system.name}.safetensors")
+    return Learned(found, dataclasses.replace(result, artifact=artifact))
 
 
 def adapt(
@@ -136,17 +123,16 @@ def adapt(
     resume: bool = False,
     console: Console | ProgressBars | None = None,
 ) -> Learned:
-    """Learn an observer anew for a plant that differs from its model, from records of outputs.
+    """Identify a plant that differs from an observer's model, and train the observer again for it.
 
-    The observer's estimates take the place of the network from which :func:`identify` begins. What was chosen for its
-    training, noise levels among it, is chosen again.
+    The observer is trained by its own settings, noise levels among them.
 
     Parameters
     ----------
     observer : Artifact
         The observer.
     system : System
-        What it was made for.
+        The observer's model; its parameters are the first guesses.
     records : sequence of Record
         Outputs, and inputs where they acted, of one plant.
     folder : Path
@@ -171,83 +157,44 @@ def adapt(
         As for :func:`identify`, and if the observer's settings are not those of a training.
     """
     config = override(settings_of(observer.training), settings or {})
-    dt = observer.filter.dt
-    found = _parameters(
-        system,
-        unknown,
-        records,
-        folder,
-        dt=dt,
-        steps=0,
-        seed=config.seed,
-        resume=resume,
-        console=console,
-        observer=observer,
+    dt, seed = observer.filter.dt, config.seed
+    found, result = _learned(
+        system, unknown, records, folder, lambda found: config, dt=dt, seed=seed, resume=resume, console=console
     )
-    return _observer(found, config, folder, noise=None, resume=resume, console=console)
+    result.artifact.save(folder / f"{system.name}.safetensors")
+    return Learned(found, result)
 
 
-def _parameters(
+def _learned(
     system: System,
     unknown: Limits,
     records: Sequence[Record],
     folder: Path,
+    configured: Callable[[Identified], Config],
     *,
     dt: float,
-    steps: int,
     seed: int,
     resume: bool,
     console: Console | ProgressBars | None,
-    observer: Artifact | None,
-) -> Identified:
-    """Identify, and write what was found."""
+) -> tuple[Identified, Result]:
+    """Identify the parameters, write them, and train the observer."""
     check_steps(records, dt)
     uniform = [resampled(record, dt) for record in records]
-    identity = {
-        **describe(system),
-        "unknown": dict(unknown),
-        "steps": steps,
-        "seed": seed,
-        "dt": dt,
-        "records": [record.fingerprint for record in records],
-    }
-    with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console, folder / LOG) as progress:
-        found = estimate_parameters(
-            system,
-            unknown,
-            uniform,
-            folder,
-            progress=progress,
-            observer=observer,
-            seed=seed,
-            steps=steps,
-            log=log,
-            resume=resume,
-        )
-        for line in found.told():
+    fingerprints = [record.fingerprint for record in records]
+    identity = {**describe(system), "unknown": dict(unknown), "seed": seed, "dt": dt, "records": fingerprints}
+    if not resume:
+        refuse_checkpoints(folder / OBSERVER_FOLDER)
+    claimed = claimed_job(folder, identity, "a run of another configuration")
+    with claimed, progress_bars(console, folder / LOG) as progress:
+        found = estimate_parameters(system, unknown, uniform, progress=progress, seed=seed)
+        for line in found.summary():
             progress.say(line)
         write(folder / "parameters.json", json.dumps(found.to_json(), indent=2) + "\n")
-        with progress.phase("drawing what was identified"):
+        with progress.phase("drawing identification.png"):
             write_report(folder / "identification.png", found)
-    return found
+    return found, train(found.system, configured(found), folder / OBSERVER_FOLDER, resume=resume, console=console)
 
 
-def _observer(
-    found: Identified,
-    config: Config,
-    folder: Path,
-    *,
-    noise: np.ndarray | None,
-    resume: bool,
-    console: Console | ProgressBars | None,
-) -> Learned:
-    """Train the observer for the plant that was identified, and write it."""
-    result = train(found.system, config, folder / OBSERVER_FOLDER, resume=resume, console=console)
-    artifact = result.artifact
-    if noise is not None:
-        usual = np.maximum(noise, 0.0)
-        artifact = dataclasses.replace(
-            artifact, measurement_noise=float(usual[0]) if len(usual) == 1 else tuple(usual.tolist())
-        )
-    artifact.save(folder / f"{found.system.name}.safetensors")
-    return Learned(found, dataclasses.replace(result, artifact=artifact))
+def _level(noise: np.ndarray) -> float | tuple[float, ...]:
+    """A noise level as artifacts and settings have it: one number for one output."""
+    return float(noise[0]) if len(noise) == 1 else tuple(noise.tolist())

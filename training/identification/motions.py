@@ -1,19 +1,23 @@
-"""Motions that explain windows of measured outputs, for given parameters, and how they follow these."""
+"""Motions that fit windows of measured outputs for given parameters, and their derivatives."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from kkl_gym.compiled import batch_step
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
 STEP = 1e-8  # of a state's half-width, or of a parameter's unit, in numerical derivatives
 SETTLING = 12  # Levenberg-Marquardt steps of starts
-CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
+CONVERGED = 1e-3  # relative fall of a window's mean square below which its start has converged
 FIRST_DAMPING = 1e-3
-BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of windows, on which their starts are looked for again
+BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # parts of windows to which starts are fitted first
+DRAWS, KEPT = 64, 4  # random starts of each window, and the best of them, which are fitted
+SAMPLES_PER_STATE = 8  # of the shortest beginning, so that noise does not decide on the start
 MOST_ROWS = 60_000  # motions simulated at once
 
 
@@ -27,25 +31,34 @@ class Windows:
 
 
 class Shooting:
-    """The least squares of one set of windows. Shapes: ``unit`` (p,)."""
+    """Outputs of a system by its start and its unknown parameters, and their derivatives.
+
+    Substeps follow the rate of ``system``, whose parameters must be near the others. Shapes: ``unit`` (p,), the
+    parameters' units.
+    """
 
     def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
-        self.system, self.dt, self.unit, self.names = system, dt, unit, tuple(limits)
+        self.system, self.dt, self.limits, self.unit, self.names = system, dt, limits, unit, tuple(limits)
         self.low, self.high = np.array(list(limits.values()), dtype=float).T
         self.half = np.array([(high - low) / 2 for low, high in system.X])
+        self.given = np.array([system.parameters[name] for name in self.names])
+        ranges = zip((self.given - unit).tolist(), (self.given + unit).tolist(), strict=True)
+        self._both = _with_parameters(system, tuple(zip(self.names, ranges, strict=True)))
+        self._step = batch_step(self._both)
+
+    def around(self, theta: np.ndarray) -> "Shooting":
+        """The same about other parameters."""
+        system = self.system.replace(dict(zip(self.names, theta.tolist(), strict=True)))
+        return Shooting(system, self.dt, self.limits, self.unit)
 
     def outputs(self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Predicted outputs (steps + 1, n, ny) of motions with parameters (n, p), starts (n, nx) and inputs."""
-        ranges = {
-            name: (value - unit, value + unit)
-            for name, value, unit in zip(self.names, theta.mean(0), self.unit, strict=True)
-        }
-        both = with_parameters(self.system.replace(dict(zip(self.names, theta.mean(0), strict=True))), ranges)
         starts = np.concatenate([x0, theta], 1)
         parts = []
         for rows in np.array_split(np.arange(len(x0)), -(-len(x0) // MOST_ROWS)):
-            x = simulate(both, starts[rows], len(u), self.dt, u=u[:, rows] if u.shape[-1] else None)
-            parts.append(both.output(x))
+            held = u[:, rows] if u.shape[-1] else None
+            x = simulate(self._both, starts[rows], len(u), self.dt, u=held, step=self._step)
+            parts.append(self._both.output(x))
         return np.concatenate(parts, 1)
 
     def derivatives(
@@ -59,6 +72,11 @@ class Shooting:
         flat = (at + np.diag(size)[:moved, None]).reshape(-1, len(size))
         beside = self.outputs(flat[:, nx:], flat[:, :nx], np.tile(u, (1, moved, 1)))
         return np.moveaxis((beside.reshape(len(y), moved, n, -1) - y[:, None]) / STEP, 1, -1)
+
+
+@functools.lru_cache(maxsize=8)  # a class of its own each time would be compiled each time
+def _with_parameters(system: System, ranges: tuple[tuple[str, tuple[float, float]], ...]) -> System:
+    return with_parameters(system, dict(ranges))
 
 
 @dataclass
@@ -77,7 +95,7 @@ class Motions:
 
 
 class Problem:
-    """The least squares of one set of windows."""
+    """The weighted squares of one set of windows."""
 
     def __init__(self, shooting: Shooting, windows: Windows, noise: np.ndarray | None = None) -> None:
         self.shooting, self.windows = shooting, windows
@@ -90,7 +108,7 @@ class Problem:
         self.rows = np.arange(len(windows.x0))
 
     def follow(self, theta: np.ndarray, x0: np.ndarray, rows: np.ndarray) -> Motions:
-        """Motions of some windows from starts, which are put within the bounds."""
+        """Motions of some windows from starts, which are clipped to the bounds."""
         x0, there = np.clip(x0, self.low, self.high), self.there[:, rows]
         y = self.shooting.outputs(np.tile(theta, (len(x0), 1)), x0, self.windows.u[:, rows])
         r = np.where(there & np.isfinite(y), self.windows.y[:, rows] - y, 0.0)
@@ -134,31 +152,35 @@ class Problem:
             damping[rows] *= np.where(better, 0.1, 10.0)
             moved, rows = rows[going], rows[going | ~better]
 
-    def look_again(self, theta: np.ndarray, at: Motions, rows: np.ndarray) -> bool:
-        """Find starts of some windows that fit better by way of their beginnings; say whether there are any.
+    def part(self, rows: np.ndarray, x0: np.ndarray, length: int | None = None) -> "Problem":
+        """The same for some of the windows, or for their beginnings, from other starts."""
+        u = self.windows.u[:length, rows]
+        return Problem(self.shooting, Windows(self.windows.y[: len(u) + 1, rows], u, x0), self.weight**-0.5)
 
-        Squares of long chaotic windows have many minima, those of their beginnings few.
+    def beginnings(self) -> list[int]:
+        """Lengths of the windows' beginnings and of the windows."""
+        steps, nx = len(self.windows.u), self.shooting.system.nx
+        return sorted({min(max(round(part * steps), SAMPLES_PER_STATE * nx), steps) for part in (*BEGINNINGS, 1.0)})
+
+    def searched(self, theta: np.ndarray, rng: np.random.Generator) -> Motions:
+        """Motions that fit the windows, from random starts in X.
+
+        The squares of a long chaotic window have many minima, those of its beginning few: starts are fitted to the
+        beginning first, and from there to more and more of the window.
         """
-        if not len(rows):
-            return False
-        found = self.part(rows, at.x0[rows]).found_from_beginnings(theta)
-        better = found.each < (1.0 - CONVERGED) * at.each[rows]
-        at.take(found, rows[better], np.flatnonzero(better))
-        return bool(better.any())
-
-    def part(self, rows: np.ndarray, x0: np.ndarray) -> "Problem":
-        """The same for some of the windows, from other starts."""
-        windows = Windows(self.windows.y[:, rows], self.windows.u[:, rows], x0)
-        return Problem(self.shooting, windows, self.weight**-0.5)
-
-    def found_from_beginnings(self, theta: np.ndarray) -> Motions:
-        """Motions that fit the windows' beginnings, which get longer, and then the windows."""
-        x0 = self.windows.x0
-        for part in BEGINNINGS:
-            length = max(round(part * len(self.windows.u)), 1)
-            beginnings = Windows(self.windows.y[: length + 1], self.windows.u[:length], x0)
-            x0 = Problem(self.shooting, beginnings, self.weight**-0.5).settled(theta).x0
-        return self.part(self.rows, x0).settled(theta)
+        x0, (length, *longer) = self.windows.x0.copy(), self.beginnings()
+        draws = self.shooting.system.draw_starts(rng, DRAWS)
+        for rows in np.array_split(self.rows, -(-len(x0) * DRAWS // MOST_ROWS)):
+            tried = self.part(np.repeat(rows, DRAWS), np.tile(draws, (len(rows), 1)), length)
+            each = tried.follow(theta, tried.windows.x0, tried.rows).each.reshape(-1, DRAWS)
+            kept = draws[np.argsort(each, 1)[:, :KEPT]].reshape(-1, x0.shape[1])
+            at = self.part(np.repeat(rows, KEPT), kept, length).settled(theta)
+            best = KEPT * np.arange(len(rows)) + at.each.reshape(-1, KEPT).argmin(1)
+            x0[rows] = at.x0[best]
+        at = self.part(self.rows, x0, length).settled(theta)
+        for length in longer:
+            at = self.part(self.rows, at.x0, length).settled(theta)
+        return at
 
     def settled(self, theta: np.ndarray) -> Motions:
         """Motions whose starts fit best with given parameters."""
@@ -167,13 +189,8 @@ class Problem:
         return at
 
 
-def settled(shooting: Shooting, theta: np.ndarray, windows: Windows) -> np.ndarray:
-    """Starts (n, nx) of windows that fit best with given parameters."""
-    return Problem(shooting, windows).settled(theta).x0
-
-
 def damped(H: np.ndarray, damping: "float | np.ndarray") -> np.ndarray:
-    """Matrices (n, d, d) with their diagonals made larger by a part, so that they can be solved for."""
+    """Matrices (n, d, d) with a part of their diagonals added (Levenberg-Marquardt)."""
     diagonal = np.einsum("naa->na", H)
     more = np.reshape(damping, (-1, 1)) * diagonal + 1e-12 * diagonal.max(1, keepdims=True, initial=0.0) + 1e-30
     return H + more[:, :, None] * np.eye(H.shape[-1])

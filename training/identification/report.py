@@ -20,35 +20,20 @@ def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
 
 
 def write_report(path: Path, found: Identified) -> None:
-    """Draw the parameters over the fit, if a network started it, predictions of held-out records, and residuals."""
+    """Draw the residuals, and predictions of held-out records."""
     shown = found.predictions[:SHOWN]
     with drawing(path, 12, 3.2 + 2.2 * len(shown)) as figure:
-        grid = figure.add_gridspec(1 + len(shown), 2)
-        if found.history:
-            _draw_course(figure.add_subplot(grid[0, 0]), found)
-        _draw_residuals(figure.add_subplot(grid[0, 1:] if found.history else grid[0, :]), found)
-        for row, prediction in enumerate(shown, 1):
-            ax = figure.add_subplot(grid[row, :])
-            record, samples = prediction.record, slice(prediction.first, prediction.first + len(prediction.y))
-            t = record.t[samples]
+        first, *others = figure.subplots(1 + len(shown), squeeze=False)[:, 0]
+        _draw_residuals(first, found)
+        for ax, prediction in zip(others, shown, strict=True):
+            record = prediction.record
+            t = record.t[: len(prediction.y)]
             for j, name in enumerate(record.signals.measured):
-                ax.plot(t, record.y[samples, j], ".", ms=2, color=MEASURED, label=f"{name}, measured")
+                ax.plot(t, record.y[: len(t), j], ".", ms=2, color=MEASURED, label=f"{name}, measured")
                 ax.plot(t, prediction.y[:, j], color=ESTIMATE, label="predicted")
             ax.axvline(t[prediction.fitted], color=TRUTH, lw=0.8, ls=":")
             ax.set(xlabel="t in s", title=f"{record.name}, left out; its start from the samples before the line")
             ax.legend(loc="upper right")
-
-
-def _draw_course(ax: Any, found: Identified) -> None:
-    """Parameters while the network was trained, over the values that shooting found."""
-    for name in found.standard_errors:
-        final = found.system.parameters[name]
-        if final:
-            batches, values = zip(*((batch, values[name] / final) for batch, values in found.history), strict=True)
-            ax.plot(batches, values, label=name)
-    ax.axhline(1.0, color=TRUTH, lw=0.8, ls=":")
-    ax.set(xlabel="batch of the network", ylabel="parameter over its final value", title="first guesses")
-    ax.legend()
 
 
 def _draw_residuals(ax: Any, found: Identified) -> None:

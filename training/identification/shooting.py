@@ -1,29 +1,24 @@
 """Parameters of a system, and starts, that explain measured outputs: multiple shooting by Gauss-Newton."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from training.identification.identifiability import NOTHING, PART, told_directions
-from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped, settled
+from training.identification.identifiability import PART, identifiable_directions
+from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped
 
-RESETTLING = 3  # steps of starts after each of the parameters
-NONLINEAR = 0.3  # of the noise, that a change by a standard error may be off from a linear one
-WORSE = 1.0  # times the mean square of before, from which on a window's start is looked for again
-ROUNDS = 40  # Gauss-Newton steps at one length of windows
-SLOW, PATIENCE = 0.1, 3  # fall of the squares, over the noise's, that is no headway, and for how many steps in a row
-SMALL_STEP = 0.05  # of the standard errors, below which the parameters are done with
-EXACT = 1e-16  # mean square of residuals, over the outputs' variances, of which less is no better
-ROUNDING = 1e-14  # of an output's standard deviation: the least noise
+RESETTLING = 3  # steps of starts after each step of the parameters, where they fit worse than before
+NONLINEAR = 0.3  # rms error over the noise of linearised outputs, one standard error of the parameters away
+ROUNDS = 40  # Gauss-Newton steps at one length of windows, at most
+SLOW, PATIENCE = 0.1, 3  # fall of the squares, over the noise's, that is too slow, and steps in a row that may be
+SMALL_STEP = 0.05  # standard errors: a Gauss-Newton step below that ends the fit
+EXACT = 1e-16  # mean square of residuals, over the outputs' variances, that ends the fit
+ROUNDING = 1e-14  # of an output's standard deviation: lower bound of the noise
 MOST_DAMPING = 1e9
-CLUSTERS = 20  # windows, of which the scatter says something
-CLAIM = 10.0  # times the median information, from which on a window is not an ordinary one
-# Rise of its squares, over the noise's, that it claims where parameters are as far off as ordinary ones leave unknown:
-CLAIMED, MOST_CLAIMED, SHOWN = 4.0, 100.0, 0.3  # from where on it has to show, up to where, and which part
-AGAIN = 3  # times at most that this happens
-COLOURED = 1.5  # standard errors as windows scatter, over those for white noise: more than chance in 20 windows
-OUTLIER = 9.0  # median deviations from the median that a window's mean square may have
+CLUSTERS = 20  # windows, from which on their scatter gives standard errors
+COLOURED = 1.5  # standard errors by the windows' scatter over those of white noise: more than chance in 20 windows
+OUTLIER = 9.0  # median absolute deviations above the median: mean square of a window that is left out
 
 
 class UnexplainedError(ValueError):
@@ -32,18 +27,17 @@ class UnexplainedError(ValueError):
 
 @dataclass(frozen=True)
 class Fit:
-    """What shooting found.
+    """A least-squares fit: ``curvature`` is J'WJ, ``white`` and ``scattered`` are covariances of the gradient.
 
-    Shapes: ``residuals`` (steps + 1, n, ny), ``noise`` (ny,), ``information`` (p, p), ``unit`` (p,), ``curvature``,
-    ``white``, ``scattered`` (p, p), ``used`` (n,), ``starts_by_parameters`` (number used, nx, p).
+    Shapes: ``theta`` (p,), ``residuals`` (steps + 1, n, ny), ``noise`` (ny,), ``curvature``, ``white``, ``scattered``
+    (p, p), ``used`` (n,), ``starts_by_parameters`` (number used, nx, p).
     """
 
-    parameters: dict[str, float]
+    shooting: Shooting
+    theta: np.ndarray
     windows: Windows
     residuals: np.ndarray
     noise: np.ndarray
-    information: np.ndarray
-    unit: np.ndarray
     curvature: np.ndarray
     white: np.ndarray
     scattered: np.ndarray
@@ -51,14 +45,13 @@ class Fit:
     cost: float
     left: float
     starts_by_parameters: np.ndarray
-    claims: int
 
     def errors(self, directions: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Standard errors along some directions, for white noise or as windows scatter, whichever are larger.
 
-        Residuals that hang together, such as those of process noise, make parameters less certain than white ones of
-        the same size do. The gradients of windows, each with a start of its own, show by how much (the sandwich
-        estimator for clustered data). Those of few windows would show too little, and are left out.
+        Correlated residuals, such as those of process noise, make parameters less certain than white ones of the same
+        size do. The scatter of the windows' gradients shows by how much (the sandwich estimator for clustered data);
+        it needs CLUSTERS windows.
 
         Shapes: ``directions`` (p, k), ``known`` (p, m); returns (k,).
         """
@@ -66,49 +59,64 @@ class Fit:
         return np.max([self._errors(directions, known, kind) for kind in kinds], axis=0)
 
     def _errors(self, directions: np.ndarray, known: np.ndarray, kind: np.ndarray) -> np.ndarray:
-        """From one covariance of the gradient."""
+        """Standard errors from one covariance of the gradient."""
         spread = (
             known @ np.linalg.pinv(known.T @ self.curvature @ known, rcond=1e-13, hermitian=True) @ known.T @ directions
         )
         return np.sqrt(np.maximum(np.einsum("ak,ab,bk->k", spread, kind, spread), 0.0))
 
     @property
+    def parameters(self) -> dict[str, float]:
+        """The parameters by name."""
+        return dict(zip(self.shooting.names, self.theta.tolist(), strict=True))
+
+    @property
+    def unit(self) -> np.ndarray:
+        """Units (p,) of the parameters in all that follows."""
+        return self.shooting.unit
+
+    @property
     def size(self) -> np.ndarray:
-        """Sizes (p,) of the parameters found, over their units."""
-        values = np.abs(list(self.parameters.values())) / self.unit
+        """Absolute values (p,) of the parameters in their units; 1 for zero."""
+        values = np.abs(self.theta) / self.unit
         return np.where(values == 0, 1.0, values)
 
     @property
+    def information(self) -> np.ndarray:
+        """Fisher information (p, p) of the parameters in their units, for white noise."""
+        return np.asarray(self.curvature @ np.linalg.pinv(self.white, rcond=1e-13, hermitian=True) @ self.curvature)
+
+    @property
     def relative_information(self) -> np.ndarray:
-        """The information (p, p) of relative changes of the parameters."""
+        """Fisher information (p, p) of relative changes of the parameters."""
         return self.information * np.outer(self.size, self.size)
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Of the parameters, (p,); infinite where the outputs do not tell one."""
-        known = told_directions(self.relative_information)
-        silent = 1.0 - (known**2).sum(1) > PART**2
+        """Of the parameters, (p,); infinite where one is not identifiable."""
+        known = identifiable_directions(self.relative_information)
+        unidentifiable = 1.0 - (known**2).sum(1) > PART**2
         errors = self.errors(np.eye(len(self.unit)), known * self.size[:, None])
-        return np.where(silent, np.inf, self.unit * errors)
+        return np.where(unidentifiable, np.inf, self.unit * errors)
 
     @property
     def coloured(self) -> bool:
-        """Whether windows scatter more than white residuals let them, of which few windows show nothing."""
-        known = told_directions(self.information)
+        """Whether windows scatter more than they would with white residuals."""
+        known = identifiable_directions(self.information)
         return bool((self.errors(known, known) > COLOURED * self._errors(known, known, self.white)).any())
 
 
-def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
-    """Which windows are so short that what is still unknown of the parameters changes their outputs linearly.
+def predictable(fit: Fit, windows: Windows) -> np.ndarray:
+    """Which windows (n,) respond linearly to changes of the parameters by a standard error.
 
-    Beyond that, chaos makes least squares blind: they have many minima, and their curvature says nothing of errors.
+    Longer windows of a chaotic motion do not: their squares have many minima, whose curvature gives no standard errors.
     """
-    theta, problem = np.array(list(fit.parameters.values())), Problem(shooting, windows)
-    at = problem.follow(theta, settled(shooting, theta, windows), problem.rows)
+    shooting, theta, problem = fit.shooting, fit.theta, Problem(fit.shooting, windows)
+    at = problem.settled(theta)
     J = problem.derivatives(theta, at, problem.rows)
     _, beyond, by_parameters = _beyond_starts(J, problem.weight, at.x0.shape[1])
     linear = np.isfinite(at.each)
-    known = told_directions(fit.information)
+    known = identifiable_directions(fit.information)
     for change in (known * np.minimum(fit.errors(known, known), 1.0)).T:
         x0 = at.x0 + shooting.half * (by_parameters @ change)
         off = problem.follow(theta + change * shooting.unit, x0, problem.rows).y - at.y - beyond @ change
@@ -118,40 +126,10 @@ def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
 
 
 def explained(each: np.ndarray) -> np.ndarray:
-    """Which windows a model explains, by the mean squares of their residuals."""
+    """Which windows are no outliers by the mean squares (n,) of their residuals."""
     median = np.median(each)
     deviation = np.median(np.abs(each[np.isfinite(each)] - median)) if np.isfinite(median) else 0.0
     return np.isfinite(each) & (each <= median + OUTLIER * deviation)
-
-
-def believed(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray, cost: float) -> np.ndarray:
-    """Which windows (n,) tell of the parameters what they claim, if they are used.
-
-    Chaos lets some motions follow the parameters a thousand times as much as others do, as long as their starts
-    stay near: from starts a little further on they go with other parameters as well. Such a window claims much and
-    tells nothing. So what claims more than all ordinary windows together has to show it, where the parameters are
-    as far off as those leave unknown.
-    """
-    shooting = problem.shooting
-    rows, trusted = np.flatnonzero(used), np.ones(len(used), dtype=bool)
-    if len(rows) < CLUSTERS:
-        return trusted
-    J = problem.derivatives(theta, at, rows)
-    each, _, by_parameters = _beyond_starts(J, problem.weight / max(cost, EXACT), at.x0.shape[1])
-    ordinary = _ordinary(each)
-    for change in _unknown(each[ordinary].sum(0)).T:
-        for sign in (1.0, -1.0):
-            other = np.clip(theta + sign * change * shooting.unit, shooting.low, shooting.high)
-            moved = (other - theta) / shooting.unit
-            claimed = np.einsum("a,nab,b->n", moved, each, moved)
-            suspects = np.flatnonzero(~ordinary & ~(claimed < CLAIMED))
-            if not len(suspects):
-                continue
-            x0 = at.x0[rows[suspects]] + shooting.half * (by_parameters[suspects] @ moved)
-            found = problem.part(rows[suspects], x0).found_from_beginnings(other).each - at.each[rows[suspects]]
-            shown = found * problem.count[rows[suspects]] / max(cost, EXACT)
-            trusted[rows[suspects]] &= shown > SHOWN * np.fmin(claimed[suspects], MOST_CLAIMED)
-    return trusted
 
 
 def shoot(
@@ -162,24 +140,26 @@ def shoot(
     precision: float = SMALL_STEP,
     rounds: int = ROUNDS,
     noise: Sequence[float] | None = None,
+    report: Callable[[float], object] = lambda part: None,
 ) -> Fit:
-    """Least squares over parameters and starts at one length of windows.
+    """Least squares over parameters and starts of windows of one length; ``report`` takes the part that is done.
 
-    Windows that the model explains much worse than most do not count. Where a model is good for some motions and rough
-    for others, as of friction, tell the ``noise`` instead. All windows count then, by the share 1 / (1 + mean square of
-    their residuals over the noise's): the less, the worse they are explained.
+    Windows that the model explains much worse than most are left out. Where a model is good for some motions and rough
+    for others, as of friction, give the ``noise``: all windows then have the weight 1 / (1 + mean square of their
+    residuals over the noise's).
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):
         raise ValueError(f"noise must be {windows.y.shape[-1]} positive numbers, one for each output, got {noise}")
     problem = Problem(shooting, windows, deviations)
-    nx, damping, slow, again = shooting.system.nx, FIRST_DAMPING, 0, 0
-    # What a window's mean square counts: log(1 + it) grows with the share 1 / (1 + it).
-    count = np.log1p if noise is not None else np.asarray
+    nx, damping, slow = shooting.system.nx, FIRST_DAMPING, 0
+    # log(1 + mean square) is the loss whose weight is 1 / (1 + mean square).
+    loss = np.log1p if noise is not None else np.asarray
     fits = explained if noise is None else np.isfinite
-    at, trusted = problem.settled(theta), np.ones(len(windows.x0), dtype=bool)
-    for _ in range(rounds):
-        used = fits(at.each) & trusted
+    at = problem.settled(theta)
+    for done in range(rounds):
+        report(done / rounds)
+        used = fits(at.each)
         if not used.any():
             low, high = np.min(windows.x0, axis=0), np.max(windows.x0, axis=0)
             raise UnexplainedError(
@@ -194,43 +174,36 @@ def shoot(
             H, g, cost = H * share[:, None, None], g * share[:, None], 1.0
         if cost < EXACT:
             break
-        better, done = False, _left(*_reduced(H, g, used=used, nx=nx)[:2], cost) < precision
-        while not done and not better and damping < MOST_DAMPING:
+        better, rests = False, _left(*_reduced(H, g, used=used, nx=nx)[:2], cost) < precision
+        while not rests and not better and damping < MOST_DAMPING:
             S, s, along = _reduced(H, g, used=used, nx=nx, damping=damping)
             step = np.linalg.lstsq(S + damping * np.diag(S.diagonal()), s, rcond=1e-12)[0]
             new = np.clip(theta + step * shooting.unit, shooting.low, shooting.high)
             change = (new - theta) / shooting.unit
             x0 = at.x0 + (along[..., -1] - along[..., :-1] @ change) * shooting.half
             tried = problem.follow(new, x0, problem.rows)
-            problem.settle(new, tried, np.flatnonzero(tried.each > WORSE * at.each), RESETTLING)
-            # Windows that chaos has thrown off count no more than what lies beyond the worst that is explained.
+            problem.settle(new, tried, np.flatnonzero(tried.each > at.each), RESETTLING)
+            # A chaotic window may diverge by a step that is good for all others: its loss is bounded.
             worst = np.minimum(tried.each[used], 2 * at.each[used].max())
-            fall = count(at.each[used]).sum() - count(worst).sum()
+            fall = loss(at.each[used]).sum() - loss(worst).sum()
             better = fall > 0
             damping = max(damping / 10.0, 1e-12) if better else damping * 10.0
         if better:
             theta, at = new, tried
             gained = fall * len(windows.y) / cost
             slow = slow + 1 if gained < SLOW else 0
-            done = gained < precision**2 or slow == PATIENCE  # rounding, or chaos, leaves no more
-        if done or not better:
-            if again == AGAIN:
-                break
-            found = problem.look_again(theta, at, np.flatnonzero(~explained(at.each)))
-            before = trusted
-            trusted = trusted & believed(problem, theta, at, fits(at.each) & trusted, cost)
-            if not found and (before == trusted).all():
-                break  # the fit says how far off it is
-            again, damping, slow = again + 1, FIRST_DAMPING, 0
-    return _fit(problem, theta, at, explained(at.each) & trusted)
+            rests = gained < precision**2 or slow == PATIENCE
+        if rests or not better:
+            break
+    return _fit(problem, theta, at, explained(at.each))
 
 
 def _reduced(
     H: np.ndarray, g: np.ndarray, *, used: np.ndarray, nx: int, damping: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normal equations S (p, p), s (p,) of the parameters alone, with starts of the windows used that follow them.
+    """Normal equations S (p, p), s (p,) of the parameters alone, from which starts are eliminated (Schur complement).
 
-    The third is how all starts follow, (n, nx, p + 1): they move by its last column less the others times the change.
+    The third, (n, nx, p + 1), gives the starts: they move by its last column less the others times the change.
     """
     D, cross = damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
     along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))
@@ -238,34 +211,8 @@ def _reduced(
     return S, (g[:, nx:] - (cross @ along[..., -1:])[..., 0])[used].sum(0), along
 
 
-def _ordinary(each: np.ndarray) -> np.ndarray:
-    """Which windows (n,) have not much more information (n, p, p) of any change of the parameters than others have."""
-    sizes = np.einsum("naa->na", each)
-    ordinary = (sizes <= CLAIM * np.median(sizes, 0)).all(1)
-    values, vectors = np.linalg.eigh(each[ordinary].sum(0))
-    known = values > NOTHING * max(values[-1], 0.0)
-    scaled = vectors[:, known] / np.sqrt(values[known])
-    share = np.linalg.eigvalsh(scaled.T @ each @ scaled).max(1, initial=0.0)
-    return np.asarray(ordinary & (share <= CLAIM * known.sum() / max(ordinary.sum(), 1)))
-
-
-def _claims(each: np.ndarray) -> int:
-    """How many windows have more information (n, p, p) than all ordinary ones together."""
-    ordinary = _ordinary(each)
-    unknown = _unknown(each[ordinary].sum(0))
-    claimed = np.einsum("pk,npq,qk->nk", unknown, each, unknown).max(1, initial=0.0)
-    return int((~ordinary & ~(claimed < CLAIMED)).sum())
-
-
-def _unknown(information: np.ndarray) -> np.ndarray:
-    """Changes (p, k) of parameters that information leaves unknown: a standard error, or the parameter's unit."""
-    values, vectors = np.linalg.eigh(information)
-    known = values > NOTHING * max(values[-1], 0.0)
-    return np.asarray(vectors[:, known] / np.sqrt(np.maximum(values[known], 1.0)))
-
-
 def _left(S: np.ndarray, s: np.ndarray, cost: float) -> float:
-    """Length of the step that normal equations ask for, in standard errors that residuals of such a cost leave."""
+    """Length of the Gauss-Newton step of normal equations in standard errors, for a mean square of the residuals."""
     step = np.linalg.lstsq(S, s, rcond=1e-12)[0]
     return float(np.sqrt(max(step @ s, 0.0) / max(cost, 1e-300)))
 
@@ -278,17 +225,15 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
     free = 1.0 - min(nx * used.sum() / max(count.sum(), 1), 0.9)  # degrees of freedom that starts leave
     squares = np.where(there, at.r[:, used] ** 2, 0.0).sum((0, 1)) / np.maximum(count, 1) / free
     noise = np.sqrt(np.maximum(squares, ROUNDING**2 / problem.weight))
-    information = _beyond_starts(J, 1.0 / noise**2, nx)[0].sum(0)
     curvature, beyond, by_parameters = _beyond_starts(J, problem.weight, nx)
     gradients = np.einsum("knyp,kny->np", beyond, at.r[:, used] * problem.weight)
-    few = len(gradients) / max(len(gradients) - len(theta), 1)  # windows, whose gradients add up to zero
+    few = len(gradients) / max(len(gradients) - len(theta), 1)  # as the windows' gradients add up to zero
     return Fit(
-        parameters=dict(zip(shooting.names, theta.tolist(), strict=True)),
+        shooting=shooting,
+        theta=theta,
         windows=replace(problem.windows, x0=at.x0),
         residuals=np.where(problem.there, at.r, np.nan),
         noise=noise,
-        information=information,
-        unit=shooting.unit,
         curvature=curvature.sum(0),
         white=np.einsum("knya,knyb,y->ab", beyond, beyond, (problem.weight * noise) ** 2, optimize=True),
         scattered=few * gradients.T @ gradients,
@@ -296,12 +241,11 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
         cost=float(np.mean(at.each[used])),
         left=_left(curvature.sum(0), gradients.sum(0), np.mean(at.each[used])),
         starts_by_parameters=by_parameters,
-        claims=_claims(curvature / max(float(np.mean(at.each[used])), EXACT)),
     )
 
 
 def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What parameters change in the outputs beyond what starts make up for."""
+    """Curvature (n, p, p), outputs by parameters with starts refitted, and starts by parameters (n, nx, p)."""
     H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
     by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
     beyond = J[..., nx:] + np.einsum("knyx,nxp->knyp", J[..., :nx], by_parameters)

@@ -1,154 +1,146 @@
 """Windows that grow: shooting over longer and longer stretches of records, as long as they say more."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from training.identification.consistency import noise_level
-from training.identification.identifiability import told_directions
-from training.identification.motions import Shooting, Windows, settled
-from training.identification.shooting import CLUSTERS, EXACT, ROUNDS, Fit, UnexplainedError, predictable, shoot
+from training.identification.identifiability import identifiable_directions
+from training.identification.motions import Problem, Shooting, Windows
+from training.identification.shooting import CLUSTERS, Fit, UnexplainedError, predictable, shoot
 from training.records import Record
 
-FIRST_LENGTHS = (400, 200, 100)  # samples of the first windows: long ones say more, short ones find their way
-FIRST_ROUNDS = 25  # steps in which the longer of these have to find theirs
-MORE_NOISE = 1.5  # standard deviation of their residuals, over that of the noise that neighbouring samples show
-SMALL = 0.01  # of an output's standard deviation: residuals that are no matter without noise either
+FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows, fitted one after the other
+MORE_NOISE = 1.5  # largest standard deviation of their residuals, over the noise level
+SMALL = 0.01  # the same, over the output's standard deviation
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
-GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
-MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
-
-FIRST_LEFT = 1.0  # standard errors that a first fit may be from its least squares, and still be on the right way
-LEFT = 0.4  # the same of longer windows: where a fit is stuck, curvature promises more than it knows
-APART = 0.5  # standard errors that it may be from a fit that began elsewhere
+GAIN = 0.7  # standard errors at twice the length, over those before, that end the growth
+MORE_COST = 2.0  # largest mean square of the residuals at twice the length, over that before
+LEFT = 0.4  # standard errors: longest Gauss-Newton step that a fit may be short of its minimum
+APART = 0.5  # standard errors: largest distance of fits from two sides
 MOST_SAMPLES = 6400  # of a window
+DIFFERENCES = 4  # order of the differences of y that are taken for noise
 
-Starts = dict[tuple[int, int], np.ndarray]
-"""Estimates of the state (nx,) by record and sample."""
-Guess = Callable[[Record, np.ndarray], np.ndarray]
-"""Record and samples in, estimates of the states there, (n, nx), out."""
+Starts = Mapping[tuple[int, int], np.ndarray]
+"""States (nx,) by record and sample."""
+
+
+def noise_level(records: Sequence[Record]) -> np.ndarray:
+    """Standard deviation (ny,) of white noise on outputs, from differences of neighbouring samples."""
+    order = DIFFERENCES
+    gain = math.comb(2 * order, order)  # sum of the squares of the difference's coefficients
+    parts = [np.diff(record.y, n=order, axis=0) ** 2 / gain for record in records if len(record.y) > order]
+    blocks = [part.mean(0) for whole in parts for part in np.array_split(whole, max(1, len(whole) // 100))]
+    return np.sqrt(np.median(blocks, axis=0))  # the median, as fast parts of a motion are no noise
 
 
 def fit_windows(
     shooting: Shooting,
-    guesses: Sequence[np.ndarray],
     records: Sequence[Record],
-    guess: Guess,
+    rng: np.random.Generator,
     *,
-    first: int,
-    report: Callable[[str], object] = lambda line: None,
+    say: Callable[[str], object] = lambda line: None,
+    report: Callable[[float], object] = lambda part: None,
 ) -> Fit:
-    """Fit parameters and starts on windows of growing length.
+    """Fit parameters and starts on windows of growing length; ``report`` takes the part of it that is done.
 
-    Long windows say more, short ones find their way from rougher guesses: the first are as long as the model can
-    explain most of them, but for noise, from one of the guesses. Chaos and process noise set an end to their
-    growth, which no start explains for long: residuals are no longer white then, and standard errors that follow the
-    scatter of windows fall no further. Chaos also makes many minima. So longer windows are fitted from two sides, a
-    standard error of the shorter ones away, and count only if both fits come to rest, and in one place.
+    Long windows give smaller standard errors, short ones converge from rougher guesses. Chaos and process noise end the
+    growth: residuals are no longer white then, and the least squares have many minima. So longer windows are fitted
+    from two sides, a standard error of the shorter ones away, and count only if both fits converge to one point.
     """
-    longest = min(max(len(record.y) for record in records) - 1 - first, MOST_SAMPLES)
-    best, starts, length = _first_fit(shooting, guesses, records, guess, first=first, longest=longest)
-    report(described(best, length))
+    longest = min(max(len(record.y) for record in records) - 1, MOST_SAMPLES)
+    first = [length for length in FIRST_LENGTHS if length <= longest] or [longest]
+    fits, done = len(first) + 2 * max(int(math.log2(longest / first[-1])), 0), 0
+
+    def fitted(shooting: Shooting, theta: np.ndarray, cut: Windows) -> Fit:
+        nonlocal done
+        fit = shoot(shooting, theta, cut, report=lambda part: report((done + part) / fits))
+        done += 1
+        report(done / fits)
+        return fit
+
+    best = _first_fit(shooting, records, rng, first, fitted)
+    say(described(best))
+    shooting, length = shooting.around(best.theta), len(best.windows.u)
+    starts: Starts = dict(zip(_cuts(records, length), best.windows.x0, strict=True))
     while 2 * length <= longest:
         length *= 2
-        found = dict(zip(starts, best.windows.x0, strict=True))
-        starts = {
-            (index, k): x
-            for (index, k), x in found.items()
-            if (k - first) % length == 0 and k + length < len(records[index].y)
-        }
+        starts = {key: starts[key] for key in _cuts(records, length) if key in starts}
         if len(starts) < CLUSTERS and best.coloured:
-            break  # longer windows would hide what these show
-        longer = windows(records, starts, length)
-        keep = predictable(shooting, best, longer)
+            break  # too few longer windows to give standard errors for coloured residuals
+        keep = predictable(best, windows(records, starts, length))
         if keep.mean() < LEAST_USED:
             break
-        starts = {key: x for key, x, kept in zip(starts, longer.x0, keep, strict=True) if kept}
-        told = told_directions(best.information)
-        before = best.errors(told, told)
-        theta, aside = np.array(list(best.parameters.values())), shooting.unit * (told @ np.minimum(before, 1.0))
-        fit = _longer_fit(shooting, theta + aside, records, starts, length)
-        if fit.used.mean() < LEAST_USED or fit.cost > MORE_COST * best.cost or (fit.coloured and not best.coloured):
+        starts = {key: x for (key, x), kept in zip(starts.items(), keep, strict=True) if kept}
+        known = identifiable_directions(best.information)
+        before = best.errors(known, known)
+        aside = shooting.unit * (known @ np.minimum(before, 1.0))
+        longer = list[Fit]()
+        for side in (aside, -aside):
+            theta = np.clip(best.theta + side, shooting.low, shooting.high)
+            x0 = Problem(shooting, windows(records, starts, length // 2)).settled(theta).x0
+            fit = fitted(shooting, theta, windows(records, dict(zip(starts, x0, strict=True)), length))
+            if fit.left > LEFT or not _lasts(fit, best):
+                break
+            longer.append(fit)
+        if len(longer) < 2:
             break
-        if fit.left > LEFT or fit.claims > best.claims:
+        now = longer[0].errors(known, known)
+        apart = np.abs(known.T @ ((longer[0].theta - longer[1].theta) / shooting.unit))
+        if (apart > APART * now).any():
             break
-        now = fit.errors(told, told)
-        other = _longer_fit(shooting, theta - aside, records, starts, length)
-        if other.left > LEFT or other.claims > best.claims or (_apart(fit, other, told) > APART * now).any():
-            break  # so long windows have many minima, and their curvature says nothing of where the others are
-        report(described(fit, length))
         gain = now / before
         if (gain < 1).any():
-            best = min(fit, other, key=lambda each: each.cost)
+            best = min(longer, key=lambda each: each.cost)
+            say(described(best))
         if (gain > GAIN).all():
             break
+        starts = dict(zip(starts, longer[0].windows.x0, strict=True))
     return best
 
 
-def _longer_fit(shooting: Shooting, theta: np.ndarray, records: Sequence[Record], starts: Starts, length: int) -> Fit:
-    """A fit to windows twice as long as those before, if they had led to these parameters."""
-    theta = np.clip(theta, shooting.low, shooting.high)
-    x0 = settled(shooting, theta, windows(records, starts, length // 2))
-    return shoot(shooting, theta, windows(records, dict(zip(starts, x0, strict=True)), length))
-
-
-def _apart(one: Fit, other: Fit, directions: np.ndarray) -> np.ndarray:
-    """How far the parameters of two fits are from each other along directions, in their units."""
-    difference = np.subtract(list(one.parameters.values()), list(other.parameters.values()))
-    return np.asarray(np.abs(directions.T @ (difference / one.unit)))
+def _lasts(longer: Fit, shorter: Fit) -> bool:
+    """Whether the model explains longer windows as well as shorter ones."""
+    return bool(
+        longer.used.mean() >= LEAST_USED
+        and longer.cost <= MORE_COST * shorter.cost
+        and (shorter.coloured or not longer.coloured)
+    )
 
 
 def _first_fit(
     shooting: Shooting,
-    guesses: Sequence[np.ndarray],
     records: Sequence[Record],
-    guess: Guess,
-    *,
-    first: int,
-    longest: int,
-) -> tuple[Fit, Starts, int]:
-    """A fit on the longest of the first windows that the model explains, their starts, and their length.
-
-    Where chaos keeps all fits from their least squares, it is the one that is nearest, in its own standard errors, or
-    before it the one that explains its windows best to rounding.
-    """
+    rng: np.random.Generator,
+    lengths: Sequence[int],
+    fitted: Callable[[Shooting, np.ndarray, Windows], Fit],
+) -> Fit:
+    """A fit on the longest of the first windows that the model explains, from random starts in X."""
     spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
     expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
-    lengths = sorted({min(length, longest) for length in FIRST_LENGTHS}, reverse=True)
-    problem: Exception = UnexplainedError("no guess of the parameters")
-    under_way = list[tuple[Fit, Starts, int]]()  # explain their windows, but are not at their least squares
+    theta, best, problem = shooting.given, None, UnexplainedError("")
     for length in lengths:
-        starts: Starts = {}
-        for index, record in enumerate(records):
-            at = np.arange(first, len(record.y) - length, length)
-            starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
-        cut, fits = windows(records, starts, length), list[Fit]()
-        for theta in guesses:
-            try:
-                fit = shoot(shooting, theta, cut, rounds=ROUNDS if length == lengths[-1] else FIRST_ROUNDS)
-            except UnexplainedError as error:
-                problem = error
-                continue
-            fits.append(fit)
-            if fit.used.mean() >= LEAST_USED and (fit.noise <= expected).all():
-                if fit.left <= FIRST_LEFT:
-                    return fit, starts, length
-                under_way.append((fit, starts, length))
-    if under_way:
-        return min(under_way, key=lambda each: _unsettled(each[0]))
-    if fits:
-        return min(fits, key=lambda fit: fit.cost), starts, length
-    raise problem
+        nowhere = dict.fromkeys(_cuts(records, length), np.zeros(shooting.system.nx))
+        cut = windows(records, nowhere, length)
+        try:
+            fit = fitted(shooting, theta, replace(cut, x0=Problem(shooting, cut).searched(theta, rng).x0))
+        except UnexplainedError as error:
+            problem = error
+            continue
+        if best is None or (fit.used.mean() >= LEAST_USED and (fit.noise <= expected).all()):
+            best, theta = fit, fit.theta
+    if best is None:
+        raise problem
+    return best
 
 
-def _unsettled(fit: Fit) -> tuple[bool, float]:
-    """How far a fit is from being done, to compare; where all is explained to rounding, what is left is rounding."""
-    exact = fit.cost < EXACT
-    return not exact, fit.cost if exact else fit.left
+def _cuts(records: Sequence[Record], length: int) -> list[tuple[int, int]]:
+    """Record and first sample of each window of one length."""
+    return [(i, k) for i, record in enumerate(records) for k in range(0, len(record.y) - length, length)]
 
 
-def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarray], length: int) -> Windows:
+def windows(records: Sequence[Record], starts: Starts, length: int) -> Windows:
     """Cut windows of one length out of records."""
 
     def cut(values: Sequence[np.ndarray], samples: int) -> np.ndarray:
@@ -160,38 +152,31 @@ def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarr
 
 @dataclass(frozen=True)
 class Prediction:
-    """Outputs of a window of a record that took no part in the fit, predicted from the window's first half."""
+    """Outputs ``y`` (steps + 1, ny) of a held-out record, predicted from its first ``fitted`` samples."""
 
     record: Record
-    first: int
     y: np.ndarray
     fitted: int
 
-    @property
-    def residuals(self) -> np.ndarray:
-        """Measured minus predicted outputs, (steps + 1, ny)."""
-        return np.asarray(self.record.y[self.first : self.first + len(self.y)] - self.y)
 
-
-def predict(
-    shooting: Shooting, theta: np.ndarray, records: Sequence[Record], guess: Guess, *, first: int, length: int
-) -> list[Prediction]:
-    """Predict the outputs of records from half of a window at their beginning."""
-    chosen = [record for record in records if len(record.y) > first + length]
+def predict(fit: Fit, records: Sequence[Record], rng: np.random.Generator) -> list[Prediction]:
+    """Predict the outputs of the first window of records, each from the first half of it."""
+    length, theta = len(fit.windows.u), fit.theta
+    chosen = [record for record in records if len(record.y) > length]
     if not chosen:
         return []
-    fitted = length // 2
-    starts = {(i, first): guess(record, np.array([first]))[0] for i, record in enumerate(chosen)}
-    x0 = settled(shooting, theta, windows(chosen, starts, fitted))
-    whole = windows(chosen, starts, length)
-    y = shooting.outputs(np.tile(theta, (len(x0), 1)), x0, whole.u)
-    return [Prediction(record, first, y[:, i], fitted) for i, record in enumerate(chosen)]
+    nowhere = {(i, 0): np.zeros(fit.shooting.system.nx) for i in range(len(chosen))}
+    half, whole = (windows(chosen, nowhere, samples) for samples in (length // 2, length))
+    x0 = Problem(fit.shooting, half).searched(theta, rng).x0
+    y = fit.shooting.outputs(np.tile(theta, (len(x0), 1)), x0, whole.u)
+    return [Prediction(record, y[:, i], length // 2) for i, record in enumerate(chosen)]
 
 
-def described(fit: Fit, length: int) -> str:
+def described(fit: Fit) -> str:
     """A line about a fit."""
     values = ", ".join(
         f"{name} = {value:.6g} +- {error:.2g}"
         for (name, value), error in zip(fit.parameters.items(), fit.standard_errors)
     )
-    return f"windows of {length} samples: {values}; residuals {', '.join(f'{noise:.3g}' for noise in fit.noise)}"
+    noise = ", ".join(f"{noise:.3g}" for noise in fit.noise)
+    return f"windows of {len(fit.windows.u)} samples: {values}; residuals {noise}"

@@ -2,7 +2,6 @@
 
 import dataclasses
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -50,7 +49,7 @@ def calibrate(
     motion : Motion, optional
         By which it is to track; by default the one that it has, if any.
     false_alarms : float, optional
-        Probability that a sound motion of twenty seconds, at the pace of the shipped systems, exceeds a limit; by
+        Probability that a sound motion of twelve seconds, at the pace of the shipped systems, exceeds a limit; by
         default that of its training.
     console : rich.console.Console or ProgressBars, optional
         Where progress is shown.
@@ -99,19 +98,21 @@ class _Calibration:
         self.knots = np.array(sorted({k for k in knots if k < last} | {last}))
         between = np.sqrt(self.knots[1:] * np.maximum(self.knots[:-1], 0.5))
         edges = [0.0, *between.tolist(), float(steps)]
-        self.spans = [np.unique(np.linspace(a, b, PER_AGE).round()).astype(int) for a, b in pairwise(edges)]
+        counts = [PER_AGE] * len(between) + [4 * PER_AGE]
+        spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts, strict=False))
+        self.spans = [np.unique(span.round()).astype(int) for span in spans]
         self.ages = np.unique(np.concatenate(self.spans))
         self.informed = "measurement_noise" in artifact.inverse.features
         largest = (artifact.inverse if self.informed else self.source.config).measurement_noise_max
         self.levels = np.multiply.outer(LEVELS, largest)
-        self.noisy = self.runs.process_noise > 0  # others are sound without process noise
+        self.noisy = self.runs.process_noise > 0
         rng = np.random.default_rng(0)
         shape = (len(LEVELS), *self.runs.y.shape)
         self.y = self.runs.y + self.levels.reshape(len(LEVELS), 1, 1, -1) * rng.standard_normal(shape)
 
     def calibrated(self) -> Artifact:
         artifact = dataclasses.replace(self.artifact, motion=None, limits=None)
-        monitored = artifact.knows_output and isinstance(self.source, SimulatedSource)
+        monitored = artifact.knows_output and self.runs.sound
         if self.informed:
             artifact = dataclasses.replace(self.with_covariances(artifact), motion=self.motion)
         if artifact.motion is None and not monitored:
@@ -230,8 +231,8 @@ class _Calibration:
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
     """What a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
 
-    Median and 90 % quantile decide: a few motions that are lost do not. Some outputs stand still in most motions: it is
-    at most ten times the largest extreme. Shapes: ``extremes`` (n, ny); returns (ny,).
+    Median and 90 % quantile decide, not a few motions that are lost. It is at most ten times the largest extreme, for
+    outputs that stand still in most motions. Shapes: ``extremes`` (n, ny); returns (ny,).
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
     middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)

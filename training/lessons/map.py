@@ -14,7 +14,6 @@ from training.filter_noise import stationary_covariance
 from training.lessons.run import Run
 from training.maps.forward import ForwardProblem, transients, truncation_step
 from training.maps.inverse import InverseProblem
-from training.maps.least_squares import POINTS, solve_forward
 from training.maps.networks import Network, averaged, on_torch
 from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
 from training.maps.scaling import StateScale
@@ -150,7 +149,7 @@ class _MapLesson:
 
     def _minimise(self, name: str, network: Network, sampler: Sampler, **settings: Any) -> None:
         config = self.config
-        problem = InverseProblem(network, sampler, self.run.device, lipschitz_penalty=config.lipschitz_penalty)
+        problem = InverseProblem(network, sampler, self.run.device)
         share = self.share / config.members
         self.run.minimise(name, problem, problem.loss, config.inverse_steps, share=share, **settings)
 
@@ -208,14 +207,8 @@ class _MapLesson:
     def _forward(
         self, system: System, rng: np.random.Generator, pairs: Pairs, points: np.ndarray, settled: np.ndarray
     ) -> ForwardMap:
-        """T, trained or solved for."""
+        """T, trained."""
         config, linear, run = self.config, self.linear, self.run
-        if config.random_features:
-            features = config.random_features
-            run.samples["forward_samples"] = min(POINTS * features, len(points))
-            phase = run.progress.phase(f"solving for T with {features} features", linear.size)
-            with run.timed("solving"), phase as report:
-                return solve_forward(system, linear, features=features, points=points, rng=rng, report=report)
         run.samples["forward_samples"] = int(settled.sum()) * config.trajectories + len(points)
         network = Network(system.nx, linear.size, width=config.width, depth=config.depth, activation=config.activation)
         problem = ForwardProblem(
@@ -228,7 +221,6 @@ class _MapLesson:
             physics_weight=config.physics_weight,
             batch=config.batch,
             device=run.device,
-            adaptive=config.adaptive,
         )
         run.minimise("forward", problem, problem.loss, config.forward_steps, share=self.share)
         if config.solved_output_layer:

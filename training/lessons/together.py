@@ -16,7 +16,7 @@ Group = tuple[Level, float, int]
 
 def decoders(artifact: Artifact, level: Level, process_noise: float) -> Decoders:
     """T_inv of the states at levels of noise."""
-    return Decoders.of(artifact, slice(artifact.nx), measurement_noise=level, process_noise=process_noise)
+    return Decoders(artifact, slice(artifact.nx), measurement_noise=level, process_noise=process_noise)
 
 
 class Together:

@@ -11,13 +11,10 @@ from kkl_gym.system import System
 from observers import ForwardMap, LinearFilter
 from training.maps.coordinates import spread
 from training.maps.least_squares import output_layer
-from training.maps.networks import Network, tensor
+from training.maps.networks import Network, compiled, tensor
 from training.maps.pde import along, on_tensors, residual
 from training.maps.scaling import StateScale
 
-REFRESH = 500  # batches after which the residual decides anew where collocation points are drawn
-CANDIDATES = 20_000  # points among which it decides
-MOST = 10.0  # times the median, at which residuals are cut for this: a few points far out would take every batch
 SOLVED = 20_000  # pairs, and points, from which the output layer is solved for in the end
 
 
@@ -42,6 +39,8 @@ class ForwardProblem(nn.Module):
     Shapes: ``pairs`` (n, nx) and (n, nz), ``points`` (m, nx).
     """
 
+    capturable = True
+
     def __init__(
         self,
         network: Network,
@@ -54,7 +53,6 @@ class ForwardProblem(nn.Module):
         physics_weight: float,
         batch: int,
         device: torch.device,
-        adaptive: bool = False,
     ) -> None:
         super().__init__()
         x, z = pairs
@@ -68,54 +66,30 @@ class ForwardProblem(nn.Module):
         self._z = tensor((z - self.z_offset) / self.z_scale, device)
         self._points = tensor(points, device)
         self._rates = tensor(np.linalg.norm(linear.A, axis=1), device)
-        self._physics_weight, self._batch, self._adaptive = physics_weight, batch, adaptive
-        self.register_buffer("batches", torch.zeros((), dtype=torch.long, device=device))
-        self.register_buffer("candidates", torch.zeros(CANDIDATES, dtype=torch.long, device=device))
-        self.register_buffer("cumulative", torch.zeros(CANDIDATES, dtype=torch.double, device=device))
-        self.batches: torch.Tensor
-        self.candidates: torch.Tensor
-        self.cumulative: torch.Tensor
+        self._physics_weight, self._batch = physics_weight, batch
+        self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """The risk on a batch of pairs and as many collocation points."""
         device = self._x.device
         rows = torch.randint(len(self._x), (self._batch,), generator=generator, device=device)
-        data = ((self.network(self._x[rows]) - self._z[rows]) ** 2).mean()
-        physics = (self._weighted_residual(self._points[self._drawn(generator)]) ** 2).mean()
-        self.batches += 1
-        return {
-            "loss": data + self._physics_weight * physics,
-            "data": data.detach(),
-            "physics": physics.detach(),
-            "error": data.detach().sqrt(),
-        }
+        points = torch.randint(len(self._points), (self._batch,), generator=generator, device=device)
+        loss, data, physics = self._risk(self._x[rows], self._z[rows], self._points[points])
+        return {"loss": loss, "data": data.detach(), "physics": physics.detach(), "error": data.detach().sqrt()}
 
-    def _drawn(self, generator: torch.Generator) -> torch.Tensor:
-        """Rows of collocation points."""
-        device = self._points.device
-        if not self._adaptive:
-            return torch.randint(len(self._points), (self._batch,), generator=generator, device=device)
-        if self.batches % REFRESH == 0:
-            self.candidates = torch.randint(len(self._points), (CANDIDATES,), generator=generator, device=device)
-            with torch.no_grad():
-                size = self._weighted_residual(self._points[self.candidates]).norm(dim=-1).double()
-            self.cumulative = (1.0 + (size / size.median().clamp(min=1e-30)).clamp(max=MOST)).cumsum(0)
-        at = torch.rand(self._batch, generator=generator, device=device, dtype=torch.double) * self.cumulative[-1]
-        return self.candidates[torch.searchsorted(self.cumulative, at).clamp(max=CANDIDATES - 1)]
-
-    def _weighted_residual(self, x: torch.Tensor) -> torch.Tensor:
-        residual, speed = self.residual(x)
-        return residual / self._zs / (speed[:, None] + self._rates)
+    def risk(self, x: torch.Tensor, z: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """The risk, and the terms of pairs and of points that it is made of."""
+        data = ((self.network(x) - z) ** 2).mean()
+        residual, speed = self.residual(points)
+        physics = ((residual / self._zs / (speed[:, None] + self._rates)) ** 2).mean()
+        return data + self._physics_weight * physics, data, physics
 
     def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """PDE residual (n, nz) in units of z per second, and the speed |f| in scaled states (n,), at states (n, nx)."""
-        f, h = on_tensors(self.system.f, x), on_tensors(self.system.h, x)
-        return residual(self.T, x, f=f, h=h, A=self._A, B=self._B), (f / self._xs).norm(dim=-1)
-
-    def T(self, x: torch.Tensor) -> torch.Tensor:
-        """The learned map at states (n, nx), (n, nz)."""
-        z: torch.Tensor = self._zo + self._zs * self.network((x - self._xo) / self._xs)
-        return z
+        f, h = on_tensors(self.system.f, x) / self._xs, on_tensors(self.system.h, x)
+        value, derivative = along(self.network, (x - self._xo) / self._xs, f)
+        T, derivative = self._zo + self._zs * value, self._zs * derivative
+        return residual(T, derivative, h=h, A=self._A, B=self._B), f.norm(dim=-1)
 
     @torch.no_grad()
     def solve_output_layer(self, rng: np.random.Generator, report: Callable[[int], object] = lambda done: None) -> None:

@@ -3,16 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
-import torch
 from scipy.linalg import qr, solve_triangular
 
-from kkl_gym.system import System
-from observers import MLP, ForwardMap, LinearFilter
-from training.maps.coordinates import spread
-from training.maps.pde import along
+from observers import LinearFilter
 
-POINTS = 8  # collocation points for each random feature
-STEEPNESS = 5.0  # of the features at the centre of the points; it falls with the distance from there
 RIDGE = 1e-5
 
 
@@ -21,8 +15,8 @@ def output_layer(
     *,
     equation: tuple[np.ndarray, np.ndarray, np.ndarray],
     speed: np.ndarray,
-    pairs: tuple[np.ndarray, np.ndarray] | None = None,
-    physics_weight: float = 1.0,
+    pairs: tuple[np.ndarray, np.ndarray],
+    physics_weight: float,
     report: Callable[[int], object] = lambda done: None,
 ) -> np.ndarray:
     """Solve for the weights with which fixed features phi make T(x) = W [phi(x), 1].
@@ -40,10 +34,8 @@ def output_layer(
     phi, phi_along = np.column_stack([value, np.ones(len(value))]), np.column_stack([derivative, np.zeros(len(value))])
     poles, V = np.linalg.eig(linear.A)
     driven = np.linalg.solve(V, linear.B @ h.T).T
-    known, target = np.empty((0, phi.shape[1])), np.empty((0, len(poles)))
-    if pairs is not None:
-        known = np.column_stack([pairs[0], np.ones(len(pairs[0]))]) / np.sqrt(len(pairs[0]))
-        target = np.linalg.solve(V, pairs[1].T).T / np.sqrt(len(pairs[0]))
+    known = np.column_stack([pairs[0], np.ones(len(pairs[0]))]) / np.sqrt(len(pairs[0]))
+    target = np.linalg.solve(V, pairs[1].T).T / np.sqrt(len(pairs[0]))
     solved = np.empty((len(poles), phi.shape[1]), dtype=V.dtype)
     for i, pole in enumerate(poles):
         report(i)
@@ -54,45 +46,3 @@ def output_layer(
         Q, R = qr(np.vstack([matrix, ridge]), mode="economic", overwrite_a=True, check_finite=False)
         solved[i] = solve_triangular(R, Q[: len(right)].conj().T @ right)
     return np.real(V @ solved)
-
-
-def solve_forward(
-    system: System,
-    linear: LinearFilter,
-    *,
-    features: int,
-    points: np.ndarray,
-    rng: np.random.Generator,
-    report: Callable[[int], object] = lambda done: None,
-) -> ForwardMap:
-    """Solve for T with random features, from its equation alone.
-
-    Collocation points should lie along motions, because the equation transports T along them: a box that motions leave
-    and enter holds T only up to what came in, and its corners are where it then goes wrong.
-    """
-    x = points[rng.permutation(len(points))[: POINTS * features]]
-    offset, scale = x.mean(0), np.where(x.std(0) > 0, x.std(0), 1.0)
-    q, f = (x - offset) / scale, system.drift(x) / scale
-    centres = q[rng.integers(len(q), size=features)]
-    weights = rng.standard_normal((features, system.nx))
-    weights *= (STEEPNESS / (1.0 + np.linalg.norm(centres, axis=1)))[:, None]
-    biases = -(centres * weights).sum(1)
-
-    def hidden(q: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(q @ torch.as_tensor(weights.T) + torch.as_tensor(biases))
-
-    value, derivative = along(hidden, torch.as_tensor(q), torch.as_tensor(f))
-    solved = output_layer(
-        linear,
-        equation=(value.numpy(), derivative.numpy(), system.output(x)),
-        speed=np.linalg.norm(f, axis=1),
-        report=report,
-    )
-    z = value.numpy() @ solved[:, :-1].T + solved[:, -1]
-    middle, size = z.mean(0), spread(z)
-    mlp = MLP(
-        [weights.astype(np.float32), (solved[:, :-1] / size[:, None]).astype(np.float32)],
-        [biases.astype(np.float32), ((solved[:, -1] - middle) / size).astype(np.float32)],
-        "tanh",
-    )
-    return ForwardMap(mlp, offset, scale, middle, size)

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -62,6 +63,11 @@ def averaged(networks: Sequence[Network]) -> MLP:
         [*(np.concatenate(each) for each in biases), np.mean(offsets, 0)],
         members[0].activation,
     )
+
+
+def compiled(function: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
+    """A function of tensors, compiled on a GPU."""
+    return torch.compile(function) if device.type == "cuda" else function
 
 
 def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:

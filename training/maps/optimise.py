@@ -18,12 +18,11 @@ from torch import nn
 from observers.storage import naming
 from training import checkpoints
 from training.config import Optimiser
+from training.maps.step import Captured, Loss, Step
 
 LOG_EVERY = 100
 WARM_UP = 0.01  # part of a stage in which the learning rate rises
 
-# A batch is drawn with the generator it is given and nothing else, so that a resumed run goes on as it would have.
-Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
 Log = Callable[[str, float, int], object]
 """Takes the name of a scalar, its value and the number of the batch."""
 
@@ -62,6 +61,10 @@ def optimise(
     """Minimise a loss over the parameters of a module, with checkpoints.
 
     Every tensor in ``module.state_dict()`` is part of the checkpoint, buffers included.
+
+    On a GPU the batches of a ``capturable`` module replay one CUDA graph, with TF32 matrix products unless
+    NVIDIA_TF32_OVERRIDE=0. Data and initial weights of a seed are those on a CPU; batches are not, as the generators
+    differ, so that errors agree but for chance.
     """
     device = next(module.parameters()).device
     generator = torch.Generator(device).manual_seed(stage.seed)
@@ -81,26 +84,24 @@ def optimise(
         return min(1.0, (done + 1 / stage.steps) / WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * done))
 
     task = progress.add_task(stage.name, total=stage.steps, completed=course.step)
-    total, saved_at = torch.zeros((), device=device), time.monotonic()
+    batch = Step(module, loss, optimiser, generator)
+    captured = device.type == "cuda" and getattr(module, "capturable", False)
+    run, saved_at = Captured(batch, generator) if captured else batch, time.monotonic()
     for step in range(course.step, stage.steps if spent < stage.cpu_seconds else course.step):
-        for group in optimiser.param_groups:
-            group["lr"] = stage.learning_rate * rate(step)
-        terms = loss(generator)
-        optimiser.zero_grad(set_to_none=True)
-        terms["loss"].backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(module.parameters(), 1.0)
-        optimiser.step()
-        total += terms.get("error", terms["loss"]).detach()
+        batch.set_learning_rate(stage.learning_rate * rate(step))
+        run()
+        if not batch.optimises:
+            optimiser.step()
         last = step + 1 == stage.steps or seconds() >= stage.cpu_seconds
         if (step + 1) % LOG_EVERY == 0 or last:
-            mean = float(total) / ((step % LOG_EVERY) + 1)
+            mean = float(batch.total) / ((step % LOG_EVERY) + 1)
             if mean != mean:
                 raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {step + 1}")
-            total.zero_()
+            batch.total.zero_()
             course.history.append((step + 1, mean))
             if log is not None:
-                for name, value in terms.items():
-                    log(f"{stage.name}/{name}", float(value.detach()), step + 1)
+                for name, value in batch.terms.items():
+                    log(f"{stage.name}/{name}", float(value), step + 1)
             total_steps = round((step + 1) / part(step + 1))  # that there will be by the time the clock ends it
             progress.update(task, completed=step + 1, total=total_steps, description=f"{stage.name} (error {mean:.3g})")
             if time.monotonic() - saved_at > checkpoints.SECONDS or last:
@@ -131,7 +132,8 @@ def optimise_at_once(
 
 def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
     if stage.optimiser == "adam":
-        return torch.optim.Adam(module.parameters(), lr=stage.learning_rate)
+        capturable = next(module.parameters()).is_cuda
+        return torch.optim.Adam(module.parameters(), lr=stage.learning_rate, capturable=capturable)
     from pytorch_optimizer import SOAP
 
     return SOAP(module.parameters(), lr=stage.learning_rate, weight_decay=0.0)

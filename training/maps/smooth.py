@@ -65,5 +65,6 @@ def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
         raise ValueError("this observer holds no forward map T")
     at, A, B = (torch.tensor(values) for values in (x, artifact.filter.A, artifact.filter.B))
     f, h = pde.on_tensors(system.f, at), pde.on_tensors(system.h, at)
-    P: np.ndarray = pde.residual(encoder(artifact.forward).network, at, f=f, h=h, A=A, B=B).numpy()
+    value, derivative = pde.along(encoder(artifact.forward).network, at, f)
+    P: np.ndarray = pde.residual(value, derivative, h=h, A=A, B=B).numpy()
     return P

@@ -2,12 +2,11 @@
 
 import math
 import os
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +21,16 @@ from kkl_gym import KKLObservation, KKLVectorObservation
 from observers import Artifact, KKLObserver
 from observers.checks import integer, shown
 from observers.replacement import check_replacement
+from training.config import Config, settings_of
 from training.maps.coordinates import settling_time
-from training.recorded.config import OF_THE_FILTER, OF_THE_MAPS, RecordedConfig, config_of
-from training.recorded.errorbars import learn_recorded_error_bars
-from training.recorded.errors import RecordedErrors, recorded_errors
-from training.recorded.fit import train_recorded
-from training.recorded.tracking import learn_recorded_tracking
+from training.presets import OF_THE_FILTER, OF_THE_MAPS
 from training.records import Record
 from training.rollouts.gathering import Gathering
+from training.sources.errors import RecordedErrors, recorded_errors
+from training.sources.recorded import RecordedSource
+from training.train_observer import train
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again
-QUICK_ERROR_BARS, QUICK_FLOW = 1000, 5000  # batches
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ class KKLTrainingCallback(BaseCallback):
 
     Estimates are good where the rollouts have been that the observer was learned from. An agent in training goes
     elsewhere, and in a simulator its hidden signals are seen: every step serves the agent and the observer. The
-    environments keep their filters and what these hold. T_inv alone is replaced.
+    environments keep their filters and what these hold; T_inv is replaced, and with it the covariances and the flow.
 
     A refit fits T_inv anew to all episodes that are kept, but for a share that is held out for good. An observer that
     is worse on that share than the one in use is not taken. Refits take place where an algorithm begins to collect:
@@ -92,8 +90,8 @@ class KKLTrainingCallback(BaseCallback):
     verbose : int, default 0
         Whether refits are printed, as for other callbacks.
     **settings : object
-        Of :class:`training.recorded.config.RecordedConfig`, where they are to differ from those that the observer was
-        learned with; by default one network and 1,000 batches. What makes the filter stays: eigenvalues, dt and inputs.
+        Of :class:`training.Config`, where they are to differ from those that the observer was learned with; by default
+        one network and 1,000 batches. What makes the filter stays: eigenvalues, dt and inputs.
 
     Attributes
     ----------
@@ -124,7 +122,7 @@ class KKLTrainingCallback(BaseCallback):
     """
 
     artifact: Artifact
-    _config: RecordedConfig
+    _config: Config
     _level: float | tuple[float, ...]
     _gathering: Gathering
 
@@ -167,15 +165,15 @@ class KKLTrainingCallback(BaseCallback):
     def _init_callback(self) -> None:
         used = _observers(self.training_env)
         artifact = used[0].artifact
-        if artifact.environment is None or artifact.training.get("pipeline") != "recorded":
+        if artifact.environment is None or artifact.signals is None:
             raise ValueError(
                 f"the observer {artifact.system!r} in use was not learned from rollouts, and is not refitted to any; "
                 "learn one by training.learn, or by kkl-gym record and kkl-gym train"
             )
-        config = config_of(artifact, {**QUICK, **self._settings})
-        if artifact.inverse.spread is not None and not config.held_out:
+        config = settings_of(artifact.training, **QUICK | self._settings | {"tracking": artifact.motion is not None})
+        if artifact.inverse.error_covariance is not None and not config.held_out:
             raise ValueError(
-                "error bars are calibrated on episodes that are held out: held_out must be positive, got 0"
+                "covariances are calibrated on episodes that are held out: held_out must be positive, got 0"
             )
         for observer in used:
             check_replacement(artifact, observer.artifact)
@@ -193,7 +191,7 @@ class KKLTrainingCallback(BaseCallback):
             check_replacement(self.artifact, artifact)
         self.artifact, self._config = artifact, config
         # An observer that tracks is judged under the noise that it sees, where outputs are recorded without.
-        seen = self._outputs != "y" and artifact.flow is not None
+        seen = self._outputs != "y" and artifact.motion is not None
         self._level = used[0].measurement_noise if seen else 0.0
 
     def _on_training_start(self) -> None:
@@ -229,9 +227,9 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._gathering.steps + self._every
         train, held_out = self._gathering.records()
         memory = settling_time(self.artifact.filter)
-        # Records from before are long enough to learn from, but say nothing of where the agent is now.
-        telling = held_out if self._before and self._config.held_out else train
-        if any(record.duration >= memory for record in telling):
+        # Records from before are long enough to learn from, but not from where the agent is now.
+        needed = (train, held_out) if self._before and self._config.held_out else (train,)
+        if all(any(record.duration >= memory for record in records) for records in needed):
             self._refit(train, held_out)
 
     def _begin(self, row: int, *, goes_on: bool = False) -> None:
@@ -240,30 +238,23 @@ class KKLTrainingCallback(BaseCallback):
         known = _vector_wrapper(self.training_env) is None
         self._gathering.begin(row, inside.reset_infos[row] if known else {}, goes_on=goes_on)
 
-    def _refit(self, train: list[Record], held_out: list[Record]) -> None:
+    def _refit(self, train_on: list[Record], held_out: list[Record]) -> None:
         began, old = time.monotonic(), self.artifact
-        with (
-            torch.random.fork_rng(),
-            tempfile.TemporaryDirectory() as folder,
-        ):  # the agent's random numbers stay its own
-            config = replace(self._config, held_out=0.0)
-            new = train_recorded(train, config, Path(folder) / "refit", name=old.system).artifact
-            try:
-                if old.inverse.spread is not None:
-                    new = learn_recorded_error_bars(new, train, held_out, steps=QUICK_ERROR_BARS)
-                if old.flow is not None:
-                    new = learn_recorded_tracking(replace(new, C=old.C), train, held_out, steps=QUICK_FLOW)
-            except ValueError as error:  # as of too little that is held out so far
-                warnings.warn(f"the observer in use stays: {error}", stacklevel=2)
-                return
-        errors = recorded_errors(new, held_out, measurement_noise=self._level)
-        before = _together(recorded_errors(old, held_out, measurement_noise=self._level))
-        after = _together(errors)
+        with torch.random.fork_rng():  # the agent's random numbers stay its own
+            source = RecordedSource(train_on, self._config, old.system, held_out=held_out, C=old.C)
+            new = train(source).artifact
+        lost = (old.motion is not None and new.motion is None) or (
+            old.inverse.error_covariance is not None and new.inverse.error_covariance is None
+        )
+        if lost:
+            warnings.warn("the observer in use stays: too little is held out so far to calibrate another", stacklevel=2)
+            return
+        before, after = (
+            _together(recorded_errors(each, held_out, measurement_noise=self._level)) for each in (old, new)
+        )
         taken = not after > before
         if taken:
-            known = {name: error for name, error in errors.relative.items() if math.isfinite(error)}
-            training = {"held_out": self._config.held_out, "held_out_errors": known, "held_out_after": errors.after}
-            self.artifact = replace(new, training={**new.training, **training})
+            self.artifact = new
             self._replace()
         if self._path is not None:
             self.artifact.save(self._path)

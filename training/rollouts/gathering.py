@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from observers import Artifact
-from training.recorded.preparing import check_plant
 from training.records import Record, Signals, check_dt, resampled
+from training.sources.recorded import check_plant
 
 LONGEST = 250  # steps of a piece: episodes without an end are cut, so that some of each can be held out
 

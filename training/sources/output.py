@@ -15,17 +15,22 @@ OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the media
 LEAST_NOISE = 1e-4  # assumed at least, in standard deviations of the outputs: with R = 0 the gain would not fall
 
 
-def linear_output(records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray]:
-    """Find C with y = C x, and the standard deviations of what that leaves. Shapes: returns (ny, nx), (ny,)."""
+def linear_output(records: Sequence[Record], known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Find C with y = C x, and the standard deviations of what that leaves. Shapes: returns (ny, nx), (ny,).
+
+    A C that is known is taken as it is, whatever it leaves.
+    """
     y, x = (np.concatenate([getattr(record, name) for record in records if record.x is not None]) for name in "yx")
     both = np.isfinite(np.column_stack([x, y])).all(-1)
     if not both.any():
         raise ValueError("no sample has all measured and all hidden signals; record them together")
     x, y = x[both], y[both]
     scale = np.sqrt(np.mean(y**2, 0))
-    C, left = _fitted(x, y, scale)
+    C, left = _fitted(x, y, scale) if known is None else (known, _usual(y - x @ known.T))
     moves = y.std(0)
     least = np.maximum(left, LEAST_NOISE * np.where(moves > ROUNDING * scale, moves, np.where(scale > 0, scale, 1.0)))
+    if known is not None:
+        return C, least
     i, j = np.triu_indices(x.shape[1])
     _, unexplained = _fitted(np.column_stack([x, x[:, i] * x[:, j], np.ones(len(x))]), y, scale)
     much = left > np.maximum(LITTLE * moves, ROUNDING * scale)
@@ -33,9 +38,8 @@ def linear_output(records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray]:
     signals = records[0].signals
     if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
         raise ValueError(
-            f"{', '.join(other)} cannot be told as a sum of {', '.join(signals.hidden)} without an offset, and an "
-            "observer that tracks compares its samples with that: train one with what is measured, in the same "
-            "units, among the hidden signals"
+            f"{', '.join(other)} is no sum of {', '.join(signals.hidden)} without an offset, with which a tracker "
+            "compares its samples: train with what is measured, in the same units, among the hidden signals"
         )
     return C, least
 

@@ -54,6 +54,8 @@ class RecordedSource:
         Of the observer.
     held_out : sequence of Record, optional
         What is not trained on; by default a share of the records.
+    C : ndarray, shape (ny, nx), optional
+        The output y = C x, where it is known; by default it is fitted.
     warn : callable, optional
         Called with the text of a warning.
 
@@ -70,13 +72,14 @@ class RecordedSource:
         name: str,
         *,
         held_out: Sequence[Record] | None = None,
+        C: np.ndarray | None = None,
         warn: Callable[[str], object] = lambda text: None,
     ) -> None:
         if not records or any(record.x is None for record in records):
             raise ValueError("no hidden states were recorded; name their columns (--hidden), or give equations")
         check_signals([*records, *(held_out or ())])
         check_dt(records, config.dt)
-        self.records, self.config, self.name = records, config, name
+        self.records, self.config, self.name, self.C = records, config, name, C
         self.signals: Signals = records[0].signals
         if unknown := [name for name in config.arbitrary_zero if name not in self.signals.measured]:
             raise ValueError(
@@ -217,7 +220,7 @@ class RecordedSource:
         }
 
     def _output(self) -> tuple[np.ndarray, np.ndarray]:
-        return linear_output(self.kept)
+        return linear_output(self.kept, self.C)
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:

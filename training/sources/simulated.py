@@ -27,7 +27,7 @@ from training.trajectories.signals import DRIVEN, KINDS, random_inputs
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned
 LEAST_NOISE, LEAST_PROCESS_NOISE = 0.001, 0.0005  # that a tracker assumes, of the usual, and at the system's pace
-WINDOW, RUN = 0.5, 20.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
+WINDOW, RUN = 0.5, 12.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
 SUBSTEPS, INTEGRATION_ERROR = 64, 1e-5  # at most, of scaled states in a sample: far below the process noise assumed
 TOO_FAR_OFF = 0.01  # of scaled states, where a jump in f leaves more than that at any number of steps
 INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share that judges a flow
@@ -157,7 +157,7 @@ class SimulatedSource:
         xs, us, noise, usual = zip(*found, strict=True)
         x = np.concatenate(xs, 1)
         u = np.concatenate(us, 1)[..., : self.nu]
-        return Runs(x[..., : self.nx], plant.output(x), u, np.concatenate(noise), np.concatenate(usual))
+        return Runs(x[..., : self.nx], plant.output(x), u, np.concatenate(noise), np.concatenate(usual), sound=True)
 
     def equations(self) -> Equations:
         """The system's equations as an expression, with as many Runge-Kutta steps as its motions need."""

@@ -1,34 +1,23 @@
 """Where motions come from: what every source gives, whichever it is."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 
 from observers import Artifact, Equations, LinearFilter
 from training.config import Config
+from training.trajectories.record import Pairs
 
 Report = Callable[[float], object]
 
 
 @dataclass(frozen=True)
-class Pairs:
-    """States and the filter's states beside them, at ages since the filter's start, measured without noise.
-
-    Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
-    """
-
-    ages: np.ndarray
-    x: np.ndarray
-    z: np.ndarray
-    process_noise: np.ndarray
-    nominal: np.ndarray | None = field(default=None, kw_only=True)
-
-
-@dataclass(frozen=True)
 class Runs:
-    """Whole motions, measured without noise; their levels of process noise, at most two; and which start usually.
+    """Whole motions, measured without noise.
+
+    There are two levels of process noise at most. Usual motions start in X; a sound plant has no faults.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
     ``process_noise`` (n,), ``usual`` (n,): True from X, False from beyond.
@@ -39,6 +28,7 @@ class Runs:
     u: np.ndarray
     process_noise: np.ndarray
     usual: np.ndarray
+    sound: bool = False
 
 
 class TooFewRunsError(ValueError):

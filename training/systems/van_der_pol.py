@@ -1,6 +1,6 @@
 """Van der Pol: the spectrum of its observer, its settings and control task, and why they were chosen.
 
-Its equation is :class:`kkl_gym.systems.VanDerPol`. docs/guides/tuning.md compares its spectrum with others.
+Its equation is :class:`kkl_gym.systems.VanDerPol`.
 """
 
 from training.spectrum import evenly_spaced

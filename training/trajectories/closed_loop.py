@@ -8,10 +8,10 @@ import numpy as np
 from kkl_gym.simulate import advance_batch, followed_rows
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from training.sources.source import Pairs
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import ALIKE, draw_process_noise, noisy_output
 from training.trajectories.policy import EXPLORATION
+from training.trajectories.record import Pairs
 
 HOLDS = (1, 5, 10, 20)  # samples for which actions are held
 GROUPS = 50  # of closed-loop trajectories with a noise level and a time for which actions are held in common

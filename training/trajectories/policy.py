@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from kkl_gym.simulate import simulate
+from kkl_gym.simulate import Step, simulate
 from kkl_gym.system import System
 from kkl_gym.user_lines import user_line
 from training.trajectories.controllers import Controller
@@ -29,6 +29,7 @@ def under_policy(
     w: np.ndarray | None = None,
     report: Callable[[int], object] | None = None,
     plant: System | None = None,
+    step: Step | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories under a policy that errs about the state and explores.
 
@@ -56,7 +57,7 @@ def under_policy(
         u[k] = np.clip(action + exploration[k], -1.0, 1.0) * u_max
         return u[k]
 
-    return simulate(plant or system, x0, steps, dt, u=act, w=w, report=report), u
+    return simulate(plant or system, x0, steps, dt, u=act, w=w, report=report, step=step), u
 
 
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:

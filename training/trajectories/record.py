@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import LinearFilter
-from training.sources.source import Pairs
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise
 from training.trajectories.policy import under_policy
@@ -26,6 +25,20 @@ RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 # to 3.4 % of X's half-width with 4 here, to 3.2 % with 12 and to 3.1 % with none; by an exact EKF to 2.7 %.
 POLICYS_OWN = 12
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """States and the filter's states beside them, at ages since the filter's start, measured without noise.
+
+    Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
+    """
+
+    ages: np.ndarray
+    x: np.ndarray
+    z: np.ndarray
+    process_noise: np.ndarray
+    nominal: np.ndarray | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)

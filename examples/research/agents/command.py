@@ -149,7 +149,7 @@ class Compare:
                 own = get_system(name)
                 observer = observers.get(own.name) or observer_of(own)
                 if "x_hat_std" in information:
-                    Artifact.read(resolve(observer)).require_spread()
+                    Artifact.read(resolve(observer)).require_covariance()
         return observers
 
     def _in_environments(self, kinds: tuple[environment_agents.Kind, ...], out: Path, console: Console) -> None:

@@ -19,18 +19,19 @@ from observers import MLP, storage
 from training.agents.any_environment.information import Stacked, part_of
 from training.agents.any_environment.observing import KEPT, OBSERVER, SETTINGS, Estimation, oldest_first
 from training.agents.any_environment.task import HiddenTask
+from training.config import Config
 from training.maps.inverse import InverseProblem
 from training.maps.networks import Network
 from training.maps.optimise import optimise_at_once
 from training.maps.samplers import Batch
+from training.presets import RECORDED
 from training.progress import ProgressBars
-from training.recorded.config import RecordedConfig
 from training.records import Record
 from training.rollouts.callback import rehearsed
 from training.rollouts.playing import Recorder
 
 KEY = "kkl-gym-window"
-DEFAULT = RecordedConfig(eigenvalues=(-1.0,), dt=1.0, measurement_noise_max=1.0)  # for the size of its network
+DEFAULT = Config("input-aware", eigenvalues=(-1.0,), dt=1.0, **RECORDED)  # for the size of its network
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class Benchmark:
     """Names, or classes of yours as script.py:Class or module:Class."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
     """default, spinn, ae, dmf, dmf-noise, node, node-noise, gru, kalmannet, rkn, ekf, ukf, ekf-wrong, default-wrong,
-    spinn-wrong, ekf-untuned; or, with the maps that ship, guided, shipped, shipped-spinn, shipped-static; or classes
+    spinn-wrong, ekf-untuned; or, with the maps that ship, shipped, shipped-spinn, shipped-large; or classes
     of yours as script.py:Class or module:Class. Those that end in -wrong believe in parameters 10 % too large; a system
     must have some."""
     measurement_noise: NoiseLevels = None

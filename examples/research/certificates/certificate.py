@@ -87,7 +87,7 @@ def certify(
     Shapes: ``measurement_noise`` of length ny.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
-    artifact = replace(artifact, flow=None)
+    artifact = replace(artifact, motion=None)
     process_noise = system.process_noise if process_noise is None else process_noise
     for what, value in (("process_noise", process_noise), ("psi", 0.0 if psi is None else psi)):
         if not 0 <= value < math.inf:

@@ -72,8 +72,8 @@ class Certify:
                 console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
                 continue
             title = name
-            if artifact.flow is not None:
-                artifact, title = replace(artifact, flow=None), f"{name}, T_inv alone"
+            if artifact.motion is not None:
+                artifact, title = replace(artifact, motion=None), f"{name}, T_inv alone"
                 console.print(f"{name} tracks; this is the certificate of its T_inv alone", markup=False)
             process_noise = system.process_noise if self.process_noise is None else self.process_noise
             KKLObserver(artifact, level, process_noise=process_noise)  # refuses bad levels now

@@ -3,14 +3,14 @@
 from inspect import isabstract
 from typing import Any
 
-from examples.research.methods.ablation import INVERSE_METHODS, SPINN_METHODS, TUNED
+from examples.research.methods.ablation import INVERSE_METHODS, SPINN_METHODS
 from examples.research.methods.autoencoder import AE
 from examples.research.methods.base import Budget, CausalObserver, Configuration, Data, Method, Task, WrongParameters
 from examples.research.methods.dmf import DMF, DMFNoise
 from examples.research.methods.gru import GRU
-from examples.research.methods.kalman import EKF, UKF, Guided, UntunedEKF, WrongEKF
+from examples.research.methods.kalman import EKF, UKF, UntunedEKF, WrongEKF
 from examples.research.methods.kalmannet import KalmanNet
-from examples.research.methods.kkl import SPINN, Default, Shipped, ShippedSPINN, ShippedStatic, WrongDefault, WrongSPINN
+from examples.research.methods.kkl import SPINN, Default, Shipped, ShippedLarge, ShippedSPINN, WrongDefault, WrongSPINN
 from examples.research.methods.node import NODE, NODENoise
 from examples.research.methods.rkn import RKN
 from kkl_gym.loading import load_class
@@ -40,10 +40,10 @@ METHODS = _by_name(
     WrongSPINN(),
     UntunedEKF(),
 )
-# Steps from the paper's pipeline to the package's and past it, in the order of ``make ablation``.
-ABLATION = _by_name(*SPINN_METHODS, *INVERSE_METHODS, default, TUNED)
+# Steps from the paper's pipeline to the package's, in the order of ``make ablation``.
+ABLATION = _by_name(*SPINN_METHODS, *INVERSE_METHODS, default)
 # Those that need a map that ships for the system; they run only if they are named.
-AS_SHIPPED = _by_name(Shipped(), ShippedSPINN(), ShippedStatic(), Guided())
+AS_SHIPPED = _by_name(Shipped(), ShippedSPINN(), ShippedLarge())
 SHIPPED = METHODS | ABLATION | AS_SHIPPED
 
 

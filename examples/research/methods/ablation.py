@@ -5,23 +5,19 @@ One series of steps leads from the paper's SPINN to the package's, the other fro
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 from examples.research.methods.base import Configuration, Task
 from examples.research.methods.kkl import KKLMethod, within
-from kkl_gym.system import System
 from observers import Artifact
 from training.config import Pipeline
 from training.evaluation.levels import multiple
-from training.pipeline import train
-from training.presets import preset
+from training.presets import Size, preset
 from training.spectrum import papers_spectrum
-from training.tuning import Probe, Spectrum
+from training.train_observer import train
 
 Settings = Mapping[str, Any]
 
-PENALTY = 0.03  # of the mean square error for a factor e in the Lipschitz constant
 NO_NOISE = 0.02  # of the system's own measurement noise: the largest in training of inverses for none
 # One inverse for free and driven motion, with samples drawn alike for all systems.
 TOGETHER: Settings = {
@@ -41,7 +37,6 @@ PAPERS: Settings = {
     "scaling": "range",
     "transients": False,
     "solved_output_layer": False,
-    "adaptive": False,
 }
 # Name, label and the settings of the paper that are the preset's from this step on.
 SPINN_STEPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
@@ -64,7 +59,8 @@ class Ablation(KKLMethod):
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
-        config = within(preset(task.system, self.pipeline, "fast"), task.budget, task.seed)
+        size: Size = "large" if self.pipeline == "input-aware" else "default"
+        config = within(preset(task.system, self.pipeline, size=size), task.budget, task.seed)
         config = replace(config, **self.changes(task))
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 
@@ -72,17 +68,6 @@ class Ablation(KKLMethod):
 def papers_modes(task: Task) -> Settings:
     """The paper's spectrum."""
     return {"eigenvalues": papers_spectrum(task.system), "pairs": ()}
-
-
-@cache
-def tuned_spectrum(system: System, dt: float, duration: float) -> Spectrum:
-    """Choose modes for a system's own level of noise, as ``kkl-gym tune`` does; each system is tuned once."""
-    return Probe(system, dt, duration).choose(multiple(system, 1.0))[-1].spectrum
-
-
-def _tuned(task: Task) -> Settings:
-    spectrum = tuned_spectrum(task.system, task.budget.dt, task.budget.duration)
-    return {"eigenvalues": spectrum.eigenvalues, "pairs": spectrum.pairs}
 
 
 def _without(given_back: tuple[str, ...]) -> Callable[[Task], Settings]:
@@ -95,17 +80,7 @@ def _spinn() -> list[Ablation]:
     for name, label, more in SPINN_STEPS:
         given_back += more
         methods.append(Ablation(name, label, _without(given_back), "spinn"))
-    adaptive: Settings = {"adaptive": True}
-    return [
-        *methods,
-        Ablation("ablation-spinn-adaptive", "... adaptive points", lambda task: adaptive, "spinn"),
-        Ablation(
-            "ablation-spinn-lipschitz",
-            "... Lipschitz penalty",
-            lambda task: {**adaptive, "lipschitz_penalty": PENALTY},
-            "spinn",
-        ),
-    ]
+    return methods
 
 
 def _without_noise(task: Task) -> Settings:
@@ -121,4 +96,3 @@ INVERSE_METHODS = [
     Ablation("ablation-soap", "... by SOAP", lambda task: TOGETHER, "input-aware"),
     Ablation("ablation-free", "... inverse of free motion", lambda task: {"process_noise_share": 0.0}, "input-aware"),
 ]
-TUNED = Ablation("ablation-tuned", "... tuned spectrum", _tuned, "input-aware")

@@ -14,7 +14,7 @@ from kkl_gym.system import System, typical_rate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
-from training.maps.pde import along, on_tensors
+from training.maps.pde import on_tensors
 from training.spectrum import bessel_spectrum
 from training.trajectories.derivatives import output_matrix
 
@@ -145,7 +145,7 @@ class _Problem(nn.Module):
         position = torch.rand((BATCH, 1), generator=generator, device=x.device)
         w = self.slowest * (self.fastest / self.slowest) ** position
         scaled, f = (x - self._xo) / self._xs, on_tensors(self.system.f, x) / self._xs
-        z, derivative = along(lambda s: self.encode(s, w), scaled, f)
+        z, derivative = torch.func.jvp(lambda s: self.encode(s, w), (scaled,), (f,))  # type: ignore[misc]
         h = on_tensors(self.system.h, x)
         # The residual of the scaled z, where A = w D and B = w F are others in each row.
         steady = (self.z_offset + self.z_scale * z) @ self._D.T + h @ self._F.T

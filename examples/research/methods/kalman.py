@@ -7,14 +7,8 @@ import numpy as np
 from examples.research.methods.base import Arrays, CausalObserver, Configuration, Method, Task, WrongParameters
 from kkl_gym.system import System
 from training.evaluation.levels import Level
-from training.guided import GuidedKalmanFilter
-from training.kalman import (
-    ExtendedKalmanFilter,
-    KalmanFilter,
-    UnscentedKalmanFilter,
-    measurement_covariance,
-    unknown_start,
-)
+from training.kalman import ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, measurement_covariance
+from training.sources.simulated import unknown_start
 
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
 # white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
@@ -60,18 +54,6 @@ class UKF(EKF):
     name: ClassVar[str] = "ukf"
     label: ClassVar[str] = "UKF"
     filter: ClassVar[type[KalmanFilter]] = UnscentedKalmanFilter
-
-
-class Guided(EKF):
-    """Kalman filter with the exact model and noise level, guided by the shipped map and tuned as the EKF is."""
-
-    name: ClassVar[str] = "guided"
-    label: ClassVar[str] = "UKF, guided by the shipped map"
-
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
-        """The filter and the map for a noise level."""
-        Q = diffusion_intensity(trained, system)
-        return GuidedKalmanFilter(system, dt=dt, measurement_noise=noise, process_noise=0.0, Q=Q)
 
 
 class WrongEKF(WrongParameters, EKF):

@@ -11,7 +11,7 @@ from examples.research.methods.chunks import Chunks, error, noise_feature, varyi
 from kkl_gym.simulate import SubstepsError, advance_batch
 from kkl_gym.system import System
 from training.evaluation.levels import Level
-from training.kalman import unknown_start
+from training.sources.simulated import unknown_start
 from training.maps.pde import on_tensors
 
 ROWS = 64

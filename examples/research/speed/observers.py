@@ -10,7 +10,8 @@ from kkl_gym.simulate import advance, simulate
 from kkl_gym.system import System
 from observers import Artifact, InverseMap, KKLObserver
 from observers.compiled import available
-from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity, unknown_start
+from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
+from training.sources.simulated import unknown_start
 from training.trajectories.derivatives import jacobian
 
 BATCHES = 10  # of one step each, by filters that take one sample at a time
@@ -56,7 +57,7 @@ def observer_tasks(
     for way, (compiled, count) in ways.items():
         taken = tuple(each[: count + 1] for each in samples)
         tasks[f"KKL{way}"] = _stepping(KKLObserver(artifact, compiled=compiled), *taken)
-        if artifact.inverse.spread is not None:
+        if artifact.inverse.error_covariance is not None:
             observer = KKLObserver(artifact, compiled=compiled)
             tasks[f"KKL, error bars{way}"] = _stepping(observer, *taken, error_bars=True)
     R = measurement_covariance(system, artifact.measurement_noise)

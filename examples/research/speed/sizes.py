@@ -30,11 +30,11 @@ TURNS, STEPS, BATCH_STEPS = 7, 1000, 100  # of each observer that is timed
 
 @dataclass(frozen=True)
 class Sizes:
-    """Train observers of several sizes for a system, and show their errors against the time of a step.
+    """Train a T_inv of several sizes for a system, and show errors against the time of a step.
 
-    The widths are those of hidden layers; all else is as `kkl-gym train SYSTEM` has it. Errors are medians over unseen
-    motions from X, over all steps. Times are CPU time of one thread: run it with OMP_NUM_THREADS=1, on an idle machine.
-    Observers that are there already are not trained again, so that times can be taken again.
+    The widths are those of hidden layers; all else is as `kkl-gym train SYSTEM --size large` has it. Errors are medians
+    over unseen motions from X, over all steps. Times are CPU time of one thread: run it with OMP_NUM_THREADS=1, on an
+    idle machine. Observers that are there already are not trained again, so that times can be taken again.
 
     Writes OUT/NAME-WIDTH.safetensors, OUT/sizes.csv and OUT/sizes.png.
     """
@@ -43,7 +43,7 @@ class Sizes:
     widths: tuple[int, ...] = (16, 24, 40, 64, 128, 256)
     """Neurons in each hidden layer."""
     config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None
-    """Settings that differ from the preset's, as `kkl-gym tune` writes them."""
+    """JSON file of settings that differ from the preset's."""
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y, for errors under noise."""
     trajectories: int = 100
@@ -88,9 +88,9 @@ class Sizes:
 
     def _trained(self, system: System, changes: Mapping[str, Any], out: Path, progress: ProgressBars) -> Artifact:
         """Train an observer, or read an earlier training of the same."""
-        from training.pipeline import train
+        from training.train_observer import train
 
-        config = preset(system, "input-aware", "fast", changes=changes)
+        config = preset(system, size="large", changes={"tracking": False, **changes})
         progress.say(f"an observer for {system.name} with hidden layers of {config.width}")
         artifact = train(system, config, out / f"{config.width}", resume=True, console=progress).artifact
         artifact.save(out / f"{system.name}-{config.width}.safetensors")

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,12 +20,11 @@ from observers import Artifact, KKLObserver
 from observers import shipped as shipped_maps
 from observers.names import resolve
 from training.commands.options import OneObserver, OneSystem, Shown, shown
-from training.presets import SMALL
 from training.progress import ProgressBars, progress_bars
 
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
-OTHERS = (SMALL, "static")  # kinds of maps that ship beside the default ones
+OTHERS = ("large",)  # kinds of maps that ship beside the default ones
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ class Speed:
                 artifact = Artifact.read(resolve(name))
                 tasks = observer_tasks(artifact, one.system, rows=None, steps=self.steps)
                 batch = observer_tasks(artifact, one.system, rows=n, steps=vector_steps)
-                many = KKLObserver(replace(artifact, flow=None))  # for its network, T_inv
+                many = KKLObserver(artifact, tracking=False)  # for its network, T_inv
                 many.reset(np.zeros((n, artifact.ny)))
                 many.step(np.zeros((n, artifact.ny)), np.full((n, artifact.nu), 1e-3))
                 products, operations = limit(artifact.inverse, n)
@@ -161,7 +160,7 @@ def variants(
         if with_z:
             wrapped["z"] = {**default, "estimate": "z"}
         wrapped["x_hat"] = default
-        if artifact.inverse.spread is not None:
+        if artifact.inverse.error_covariance is not None:
             wrapped["x_hat, error bars"] = {**default, "uncertainty": True}
         wrapped |= {f"x_hat, {kind}": {"observer": name} for kind, name in _others(one).items()}
     envs = {f"{one.label}, {what}": observe(make(), **options) for what, options in wrapped.items()}
@@ -232,7 +231,7 @@ def _parts(env: Any, step: float) -> tuple[str, str]:
         system, x = base.plant.system, info["x"].T.copy()
         u, w, advance = np.zeros((system.nu, x.shape[1])), np.zeros_like(x), batch_step(system)
         simulation = _share(lambda: advance(x, u, w, base.plant.dt), step)
-    if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x" and env.observer.artifact.flow is None:
+    if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x" and not env.observer.tracking:
         network = _share(partial(_decoded, env.observer, error_bars="x_cov" in info), step)
     return simulation, network
 

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from error_bars import with_error_bars
 from rich.console import Console
+from tracking import tracking_observer
 
 from training.cli import main
 from training.commands.evaluate import Evaluate
@@ -153,6 +154,21 @@ def test_a_level_beyond_the_maps_range_is_left_out_and_named(saved):
         printed(path, policy="controller")
 
 
+def test_t_inv_alone_of_an_observer_that_tracks(saved):
+    artifact = tracking_observer()
+    artifact.save("map.safetensors")
+    options = {"system": f"{linear_system.__file__}:Oscillator", "trajectories": 2, "duration": 5.0}
+    tracked, alone = (
+        Evaluate(("map.safetensors",), no_tracking=without, **options).run(Console()) for without in (False, True)
+    )
+    assert set(alone.observer) == {"map.safetensors, T_inv alone"}
+    assert not np.allclose(alone.smape, tracked.smape)
+    dataclasses.replace(artifact, motion=None).save("map.safetensors")
+    same = Evaluate(("map.safetensors",), no_tracking=True, **options).run(Console())
+    assert set(same.observer) == {"map.safetensors"}
+    np.testing.assert_array_equal(same.smape, alone.smape)
+
+
 def test_calibration_is_judged(make_artifact, saved):
     system = f"{linear_system.__file__}:Oscillator"
     with_error_bars(make_artifact(system, dt=0.1)).save("map.safetensors")
@@ -164,5 +180,5 @@ def test_calibration_is_judged(make_artifact, saved):
     assert Path("coverage.csv").exists()
     assert Path("coverage.png").exists()
     assert "NEES" in console.export_text()
-    with pytest.raises(ValueError, match="no error bars"):
+    with pytest.raises(ValueError, match="no covariance"):
         Evaluate((saved(),), calibration=True).run(console)

@@ -15,7 +15,7 @@ def export(kind, *options):
 def test_c(tmp_path, capsys, monkeypatch):
     export("c", "--measurement-noise", "0.3")
     assert {path.name for path in tmp_path.iterdir()} == {"lorenz_spinn.c", "lorenz_spinn.h", "lorenz_spinn_main.c"}
-    assert "#define LORENZ_SPINN_MEASUREMENT_NOISE 0.3\n" in (tmp_path / "lorenz_spinn.c").read_text()
+    assert "standard deviation 0.3" in (tmp_path / "lorenz_spinn.h").read_text()
     wrote, size = capsys.readouterr().out.splitlines()
     assert wrote.startswith("wrote lorenz_spinn.h, ")
     assert size.startswith("flash 1" if shutil.which("cc") and shutil.which("size") else "there is no cc")

@@ -22,7 +22,7 @@ def test_from_files_to_an_observer_and_to_another(tmp_path, capsys):
     for i, path in enumerate(data):
         y = plant.output(x[:, i]) + 0.02 * np.random.default_rng(i).standard_normal((201, 1))
         np.savez(path, t=0.02 * np.arange(201), y=y)
-    options = ["--unknown", "mu=2.5:1:5", "--steps", "20", *SIZES.split()]
+    options = ["--unknown", "mu=2.5:1:5", *SIZES.split()]
     main(["identify", "van_der_pol", "--data", *data, *options])
     folder = tmp_path / "runs" / "van_der_pol-identified"
     found = json.loads((folder / "parameters.json").read_text())["mu"]

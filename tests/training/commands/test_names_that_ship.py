@@ -21,18 +21,16 @@ def test_maps_has_a_row_for_each_file_and_cuts_no_name():
     assert all(words.count(name) == 1 for name in shipped())
     assert max(map(len, printed(80).splitlines())) <= 80
     rows = {line.split()[0]: line.split() for line in printed(120).splitlines() if line.strip()}
-    assert rows["van_der_pol"][1:] == ["input-aware*", "1", "23", "1", "0.05", "0.36"]
-    assert rows["lorenz-spinn"][1:] == ["spinn", "0", "9", "1", "–", "0.28"]
+    assert rows["van_der_pol"][1:] == ["input-aware", "equations", "1", "15", "1", "0.05", "0.04"]
+    assert rows["lorenz-spinn"][1:] == ["spinn", "–", "0", "9", "1", "–", "0.29"]
 
 
-@pytest.mark.parametrize("name", ["lorenz", "lorenz-static"])
+@pytest.mark.parametrize("name", ["lorenz", "lorenz-large"])
 @pytest.mark.parametrize(
     ("command", "work"),
     [
-        ("errorbars NAME", "training.teaching.errorbars.learn_error_bars"),
-        ("tracking NAME", "training.teaching.tracking.learn_tracking"),
         ("adapt NAME --data y.csv", "training.identification.adapt"),
-        ("evaluate NAME --trajectories 2 --duration 1", None),
+        ("evaluate NAME --trajectories 2 --duration 1 --no-tracking", None),
         ("evaluate NAME --calibration --trajectories 2 --duration 1 --measurement-noise 0.5", None),
         ("faults NAME --trajectories 2 --duration 4", None),
         ("export NAME --format c", None),

@@ -8,25 +8,18 @@ import pytest
 
 import observers
 from kkl_gym import get_system
-from observers.names import resolve
 from training.evaluation.errors import unseen_trajectories
-from training.presets import SMALL_SETTINGS, preset
-
-
-def test_a_map_that_tracks_has_the_t_inv_of_the_one_that_does_not():
-    tracking, plain = (observers.Artifact.read(resolve(name)).inverse.mlp for name in ("lorenz", "lorenz-static"))
-    for mine, other in zip(tracking.weights, plain.weights, strict=True):
-        np.testing.assert_array_equal(mine, other)
+from training.presets import preset
 
 
 @pytest.mark.parametrize("name", observers.shipped())
 def test_shipped_maps_are_what_the_preset_makes(name):
     artifact = observers.load(name).artifact
-    kind = name.removeprefix(artifact.system)
-    pipeline, changes = "spinn" if kind == "-spinn" else "input-aware", {"-small": SMALL_SETTINGS}
-    settings = preset(get_system(artifact.system), pipeline, "fast", changes=changes.get(kind))
-    made, config = artifact.training, json.loads(json.dumps(asdict(settings)))
-    assert {key: made[key] for key in config} == config
+    kind = name.removeprefix(artifact.system).removeprefix("-")
+    pipeline, size = ("spinn", "default") if kind == "spinn" else ("input-aware", kind or "default")
+    config = json.loads(json.dumps(asdict(preset(get_system(artifact.system), pipeline, "fast", size=size))))
+    assert {key: artifact.training[key] for key in config} == config
+    assert (artifact.motion is not None and artifact.motion.equations is not None) == (pipeline == "input-aware")
 
 
 def test_coasting_runs_as_a_model_of_the_system():

@@ -10,15 +10,19 @@ import pytest
 
 import training.commands.faults
 import training.evaluation.faults
-import training.teaching.monitor
 from kkl_gym import VanDerPol
 from kkl_gym.elementary import sin
 from observers import KKLObserver, Limits
 from training.cli import main
 from training.commands.faults import report
 from training.evaluation.faults import FAULTS, simulate_faults
+from training.presets import preset
+from training.trajectories.expression import output_facts
 
 COLUMNS = "observer,system,fault,deadline,trajectory,amplitude,score,delay"
+LIMITS = Limits(
+    np.array([0.0, 1.0]), np.full((2, 1), 0.5), np.zeros((2, 1)), np.full((2, 1), 2.0), 0.5, 5.0, 0.01, 50.0
+)
 OSCILLATOR = f"{linear_system.__file__}:Oscillator"
 
 
@@ -33,14 +37,10 @@ def test_monitors_are_given_the_process_noise_of_the_runs(make_artifact, monkeyp
     class Noisy(VanDerPol):
         process_noise = 0.12  # not what such an observer takes by default, 0.2
 
-    for module in (training.teaching.monitor, training.evaluation.faults):
-        monkeypatch.setattr(module, "KKLObserver", Spy)
-    artifact = dataclasses.replace(make_artifact(process=True, free_inverse=True), C=np.array([[1.0, 0.0]]))
-    calibrated = training.calibrate(artifact, Noisy(), duration=6.0, false_alarms=0.5)
-    calibrating = len(levels)
-    simulate_faults(calibrated, Noisy(), trajectories=2, duration=20.0, measurement_noise=0.5, seed=0)
-    assert len(levels) > calibrating > 0
-    assert set(levels) == {0.12}
+    monkeypatch.setattr(training.evaluation.faults, "KKLObserver", Spy)
+    artifact = dataclasses.replace(make_artifact(process=True), C=np.array([[1.0, 0.0]]), limits=LIMITS)
+    simulate_faults(artifact, Noisy(), trajectories=2, duration=20.0, measurement_noise=0.5, seed=0)
+    assert levels == [0.12]
 
 
 def test_the_command_and_its_report(tmp_path, capsys):
@@ -81,11 +81,8 @@ def test_the_table_is_made_of_the_file_alone_for_duffing_by_amplitude_too(tmp_pa
 
 
 def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path, capsys):
-    limits = Limits(
-        np.array([0.0, 1.0]), np.full((2, 1), 0.5), np.zeros((2, 1)), np.full((2, 1), 2.0), 0.5, 5.0, 0.01, 50.0
-    )
     path = str(tmp_path / "mine.safetensors")
-    dataclasses.replace(make_artifact(system=OSCILLATOR), C=np.array([[1.0, 0.0]]), limits=limits).save(path)
+    dataclasses.replace(make_artifact(system=OSCILLATOR), C=np.array([[1.0, 0.0]]), limits=LIMITS).save(path)
     with pytest.raises(SystemExit, match="name its class with --system"):
         main(["faults", path])
     options = ["--system", OSCILLATOR, "--trajectories", "4", "--duration", "12", "--out", str(tmp_path / "out")]
@@ -107,8 +104,10 @@ def test_faults_of_an_output_that_is_not_linear():
         def h(self, x):
             return (sin(x[0]),)
 
-    blind = dataclasses.replace(linear_system.exact_observer(), C=None, measurement_noise=0.01)
-    calibrated = training.calibrate(blind, Sine(), duration=10.0, false_alarms=0.1)
+    h = output_facts(Sine())["h"]
+    exact = dataclasses.replace(linear_system.exact_observer(), C=None, h=h, measurement_noise=0.01)
+    config = preset(Sine(), changes={"dt": 0.05, "runs": 100, "inputs": False})
+    calibrated = training.calibrate(exact, training.SimulatedSource(Sine(), config), false_alarms=0.1)
     rows = simulate_faults(calibrated, Sine(), trajectories=10, duration=20.0, measurement_noise=0.01, seed=0)
     alarms = rows.assign(alarm=rows.delay < np.inf).groupby("fault").alarm.mean()
     assert alarms["none"] <= 0.2

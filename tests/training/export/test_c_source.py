@@ -7,7 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compiled_c import compiled, estimates, fed, microseconds, needs_cc, written
-from exported_steps import MAPS, apart, apart_at_all_levels, exported_of, in_doubles, in_python, mapped, motion, noise
+from exported_steps import (
+    MAPS,
+    apart,
+    apart_at_all_levels,
+    exported_of,
+    in_doubles,
+    in_python,
+    mapped,
+    motion,
+    noise,
+    tracked,
+)
 from random_tracking import tracking
 from rollout_observers import observer_of
 
@@ -60,13 +71,13 @@ def test_how_long_a_step_takes(name, tmp_path):
 
 
 @needs_cc
-def test_the_compiler_may_be_told_other_levels_of_noise(tmp_path):
+def test_other_levels_of_noise(tmp_path):
     exported, y, u, expected = mapped(1)
-    told = ["-DMADE_MEASUREMENT_NOISE_1=0.9", "-DMADE_MEASUREMENT_NOISE_2=7", "-DMADE_PROCESS_NOISE=0.02"]
-    x_hat = estimates(compiled(exported, tmp_path, *told), y[:, 1], u[:, 1])
-    other = replace(exported, measurement_noise=(0.9, 2.0), process_noise=0.02)  # 2 is the largest that is told
+    other = replace(exported, measurement_noise=(0.9, 2.0), process_noise=7.0)  # of which training ended at 0.2
+    x_hat = estimates(compiled(other, tmp_path), y[:, 1], u[:, 1])
     np.testing.assert_allclose(x_hat, in_doubles(other, y[:, 1], u[:, 1]), rtol=0, atol=1e-9)
     assert abs(x_hat - expected[:, 1]).max() > 1e-3
+    assert "process noise of level 7.0." in (tmp_path / "made.h").read_text()
 
 
 @needs_cc
@@ -97,7 +108,7 @@ def test_numbers_are_read_back_as_the_same(make_artifact, tmp_path):
         found = re.search(rf" {name}[\[\]0-9]+ = {{(.*?)}};", text, re.DOTALL)
         return [word.rstrip("f") for word in re.findall(r"[^\s,{}]+", found[1])]
 
-    assert np.array_equal(np.array(numbers("driven_whiten"), float), inverse.whiten.ravel())
+    assert np.array_equal(np.array(numbers("driven_z_offset"), float), inverse.z_offset)
     assert np.array_equal(np.array(numbers("driven_weights0"), np.float32), inverse.mlp.weights[0].ravel())
     assert all({".", "e", "inf"} & set(word) for word in numbers("driven_weights0"))  # 1f is no number of C
 
@@ -111,9 +122,9 @@ def test_names():
 
 def test_what_cannot_be_exported(make_artifact, tmp_path):
     inverse, tracker = make_artifact().inverse, tracking()
-    flow = replace(tracker.flow, x_offset=1e39 * tracker.flow.x_offset)
+    motion = replace(tracker.motion, x_offset=1e39 * tracker.motion.x_offset)
     huge = replace(make_artifact(), inverse=replace(inverse, x_scale=1e39 * inverse.x_scale))
-    for artifact in (huge, replace(tracker, flow=flow)):
+    for artifact in (huge, replace(tracker, motion=motion)):
         with pytest.raises(ValueError, match="beyond the range of floats: export it with --precision double"):
             exported_of(artifact, tmp_path)
     assert exported_of(huge, tmp_path, precision="double").precision == "double"
@@ -124,7 +135,7 @@ def test_what_cannot_be_exported(make_artifact, tmp_path):
 @needs_cc
 @pytest.mark.skipif(shutil.which("size") is None, reason="there is no size")
 def test_the_footprint_is_that_of_weights_and_state(tmp_path):
-    exported = Exported.read("van_der_pol-small")  # the largest of those for microcontrollers
+    exported, *_ = tracked(0)
     path = written(exported, tmp_path)
     found, artifact = footprint(path), exported.artifact
     weights = sum(4 * each.size for inverse in exported.maps.values() for each in inverse.mlp.weights)

@@ -5,7 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exported_steps import MAPS, apart, apart_at_all_levels, doubles, exported_of, in_doubles, mapped, stepped, t_inv
+from exported_steps import (
+    MAPS,
+    apart,
+    apart_at_all_levels,
+    doubles,
+    exported_of,
+    in_doubles,
+    mapped,
+    operated,
+    stepped,
+    t_inv,
+)
 from exported_steps import tracked as tracked_record
 from random_tracking import KINDS
 from rollout_observers import observer_of
@@ -34,17 +45,26 @@ def test_every_kind_of_map(index, precision):
     assert apart(exported, runner.along(y, u), expected) < TOLERANCES[precision]
 
 
-@pytest.mark.parametrize(("index", "precision"), [*((i, "double") for i in range(len(KINDS))), (2, "float")])
+@pytest.mark.parametrize(
+    ("index", "precision"), [*((i, "double") for i in range(len(KINDS))), (1, "float"), (5, "float")]
+)
 def test_maps_that_track(index, precision):
     exported, y, u, expected = tracked_record(index)
     x_hat = Runner(replace(exported, precision=precision)).along(y[:, None], u[:, None])[:, 0]
     assert apart(exported, x_hat, expected) < TOLERANCES[precision]
 
 
+def test_equations_of_all_operations_but_atan2():
+    exported, y, u, expected = operated()
+    assert apart(exported, Runner(exported).along(y[:, None], u[:, None])[:, 0], expected) < 1e-9
+    with pytest.raises(ArtifactError, match="ONNX has no atan2"):
+        onnx_model(operated(["atan2", ["u", 0], ["x", 1]])[0])
+
+
 @pytest.mark.parametrize(
     ("name", "precision", "size"),
     [
-        ("van_der_pol-static", "float", {"steps": 600, "length": 200}),
+        ("van_der_pol-spinn", "float", {"steps": 600, "length": 200}),
         ("lorenz", "double", {"steps": 600, "length": 200}),
         *(
             pytest.param(name, precision, {"steps": 34_000}, marks=pytest.mark.slow)
@@ -64,7 +84,7 @@ def test_what_ships(name, precision, size):
 
 @pytest.mark.parametrize("tracks", [False, True])
 def test_rows_have_levels_of_their_own(tracks):
-    exported, y, u, _ = tracked_record(2) if tracks else mapped(1)
+    exported, y, u, _ = tracked_record(5) if tracks else mapped(1)
     y, u = (np.stack([each[:100]] * 2, 1) for each in ((y, u) if tracks else (y[:, 1], u[:, 1])))
     levels = [((0.2, 0.7), 0.1), ((0.9, 7.0), 0.6)]  # T_inv is told 2 and 0.2 at most, and the Kalman filter any
     told = {"measurement_noise": np.array([a for a, _ in levels]), "process_noise": np.array([[b] for _, b in levels])}
@@ -103,11 +123,11 @@ def test_an_input_that_is_no_number_is_not_taken_for_none(make_artifact, tmp_pat
 
 
 def test_what_is_said_of_it():
-    model = onnx_model(Exported.read("van_der_pol-static"))
+    model = onnx_model(Exported.read("van_der_pol"))
     said = {entry.key: entry.value for entry in model.metadata_props}
-    assert (said["name"], said["system"]) == ("van_der_pol_static", "van_der_pol")
-    assert said["artifact"] == resolve("van_der_pol-static").name
-    assert said["sha256"] == checksum(resolve("van_der_pol-static"), ArtifactError)
+    assert (said["name"], said["system"]) == ("van_der_pol", "van_der_pol")
+    assert said["artifact"] == resolve("van_der_pol").name
+    assert said["sha256"] == checksum(resolve("van_der_pol"), ArtifactError)
     names = ("parameters", "dt", "y", "u", "x_hat", "measurement_noise", "process_noise")
     assert {name: json.loads(said[name]) for name in names} == {
         "parameters": {"mu": 3.0}, "dt": 0.01, "y": ["y"], "u": ["u"], "x_hat": ["x1", "x2"],

@@ -1,6 +1,6 @@
 """Windows of records: standard errors, and first guesses that explain nothing."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -12,7 +12,7 @@ from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.identification import windows as fitting
-from training.identification.motions import Shooting, Windows
+from training.identification.motions import Problem, Shooting, Windows
 from training.identification.shooting import UnexplainedError, shoot
 from training.identification.windows import fit_windows
 from training.records import Record
@@ -95,22 +95,16 @@ def test_standard_errors_cover_the_truth_under_process_noise(process_noise, colo
     assert (np.mean(white) < 0.5) == coloured
 
 
-def recorded_swings(process_noise, n, steps):
-    """Records of the swing, its shooting, and the true state as a guess."""
-    rng = np.random.default_rng(1)
+@pytest.mark.parametrize(("process_noise", "length"), [(0.0, 64), (0.1, 16)])
+def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypatch):
+    monkeypatch.setattr(fitting, "FIRST_LENGTHS", (8,))
+    rng, steps, n = np.random.default_rng(1), 64, 45
     w = process_noise * rng.standard_normal((steps, n, 2))
     x = simulate(SWING, SWING.draw_starts(rng, n), steps, SWING.dt, w=w)
     y = x[..., :1] + 0.02 * rng.standard_normal((steps + 1, n, 1))
     records = [Record(str(i), SWING.dt * np.arange(steps + 1), y[:, i]) for i in range(n)]
-    shooting = Shooting(SWING, SWING.dt, {"stiffness": (0.4, 40.0)}, np.array([4.0]))
-    return shooting, records, lambda record, at: x[at, int(record.name)]
-
-
-@pytest.mark.parametrize(("process_noise", "length"), [(0.0, 64), (0.1, 16)])
-def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypatch):
-    monkeypatch.setattr(fitting, "FIRST_LENGTHS", (8,))
-    shooting, records, guess = recorded_swings(process_noise, 45, 64)
-    fit = fit_windows(shooting, [np.array([4.1])], records, guess, first=0)
+    shooting = Shooting(SWING.replace({"stiffness": 4.1}), SWING.dt, {"stiffness": (0.4, 40.0)}, np.array([4.0]))
+    fit = fit_windows(shooting, records, rng)
     assert len(fit.windows.u) == length
     assert abs(fit.parameters["stiffness"] - 4.0) < 3 * fit.standard_errors[0] < 0.3
 
@@ -135,15 +129,16 @@ def test_derivatives_are_those_of_closed_form():
     np.testing.assert_allclose(J, np.stack([0.5 * by_start, 1.3 * by_rate, 0.7 * by_gain], -1), rtol=1e-5, atol=1e-6)
 
 
-def test_starts_far_from_right_are_found_by_way_of_the_beginnings():
+def test_random_starts_lead_to_the_state():
     """Squares of a second and a half of a chaotic motion have minima that trap a start three units away."""
     plant, rng = get_system("lorenz"), np.random.default_rng(2)
     x0 = simulate(plant, plant.draw_starts(rng, 8), 500, plant.dt)[-1]
     y = plant.output(simulate(plant, x0, 150, plant.dt))
-    far = x0 + 3 * rng.standard_normal(x0.shape)
-    measured = Windows(y + 0.1 * rng.standard_normal(y.shape), np.zeros((150, 8, 0)), far)
+    measured = Windows(y + 0.1 * rng.standard_normal(y.shape), np.zeros((150, 8, 0)), np.zeros((8, 3)))
     shooting = Shooting(plant, plant.dt, {"rho": (20.0, 40.0)}, np.array([28.0]))
-    fit = shoot(shooting, np.array([27.9]), measured)
+    at = Problem(shooting, measured).searched(np.array([27.9]), rng)
+    np.testing.assert_allclose(at.x0, x0, atol=1.0)
+    fit = shoot(shooting, np.array([27.9]), replace(measured, x0=at.x0))
     assert fit.used.all()
     assert fit.noise[0] == pytest.approx(0.1, rel=0.05)
     assert fit.left < 0.2

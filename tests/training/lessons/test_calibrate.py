@@ -106,7 +106,7 @@ def test_estimates_of_t_inv_stay_as_they_are(tracking):
     np.testing.assert_array_equal(KKLObserver(plain_observer(), 0.3).estimate(y), KKLObserver(alone, 0.3).estimate(y))
 
 
-def ever_above(artifact, system, level, fault=lambda y: y, n=400, duration=20.0):
+def ever_above(artifact, system, level, fault=lambda y: y, n=400, duration=12.0):
     """Which new runs raise an alarm."""
     rng = np.random.default_rng(11)
     runs = unseen_trajectories(system, DT, n=n, duration=duration, seed=3, process_noise=system.process_noise)

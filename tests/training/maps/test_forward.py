@@ -35,7 +35,7 @@ def test_shipped_forward_map_of_reverse_duffing_against_backward_quadrature():
     assert np.sqrt((error**2).mean()) < 1e-3 * np.sqrt((truth**2).mean())
 
 
-def problem_of_the_oscillator(unit=1.0, **options):
+def problem_of_the_oscillator(unit=1.0):
     """An untrained T of the linear oscillator, with exact pairs."""
     system, linear = Autonomous(), Spectrum((-1.0,), ((-0.5, 2.0),)).filter(1, 0.01)
     x = unit * np.random.default_rng(0).uniform(-1, 1, (3000, 2))
@@ -51,7 +51,6 @@ def problem_of_the_oscillator(unit=1.0, **options):
         physics_weight=0.1,
         batch=256,
         device=CPU,
-        **options,
     )
     return problem, exact
 
@@ -74,28 +73,6 @@ def test_solved_output_layer_minimises_the_risk_over_it(unit):
             last.weight += step
             assert risk() > least
             last.weight -= step
-
-
-def test_adaptive_points_are_drawn_in_proportion_to_the_residual_and_its_median(monkeypatch):
-    problem, _ = problem_of_the_oscillator(adaptive=True)
-    drawn, residual = [], problem.residual
-
-    def spy(x):
-        found, speed = residual(x)
-        size = found / torch.tensor(problem.z_scale) / (speed[:, None] + torch.tensor([1.0, 2.0616, 2.0616]))
-        drawn.append((x, size.norm(dim=-1).detach().numpy()))
-        return found, speed
-
-    monkeypatch.setattr(problem, "residual", spy)
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(100):
-        problem.loss(generator)
-    (_, every), *batches = drawn
-    size = np.concatenate([each for _, each in batches])
-    strong, weak, middle = np.quantile(every, 0.9), np.quantile(every, 0.1), np.median(every)
-    expected = (every[every > strong] + middle).mean() / (every[every < weak] + middle).mean()
-    assert expected > 1.5
-    assert (size > strong).sum() / (size < weak).sum() == pytest.approx(expected, rel=0.1)
 
 
 def test_filter_state_from_T_and_what_is_left_of_its_start():

@@ -44,7 +44,8 @@ def register():
 def spy(tmp_path, register):
     """Path of an observer for Spy-v0."""
     register("Spy-v0", Spy)
-    recorded = {"pipeline": "recorded", "eigenvalues": [-0.3, -1.0, -3.0], "dt": 1.0, "measurement_noise_max": 0.1}
-    artifact = observer_of("Spy-v0", ["obs[0]"], ["obs[1]"], ["action[0]"])
-    dataclasses.replace(artifact, training={**recorded, "held_out": 0.5}).save(tmp_path / "spy.safetensors")
+    training = {"pipeline": "input-aware", "eigenvalues": [-1.2, -2.4, -4.8], "dt": 1.0, "held_out": 0.5}
+    rates = (1.2, 2.4, 4.8)  # with which the filter settles within an episode
+    artifact = observer_of("Spy-v0", ["obs[0]"], ["obs[1]"], ["action[0]"], rates=rates)
+    dataclasses.replace(artifact, training=training).save(tmp_path / "spy.safetensors")
     return tmp_path / "spy.safetensors"

@@ -92,14 +92,13 @@ def asked(monkeypatch):
     """Records that observers would be fitted to, by the refit; none is fitted."""
     found = []
 
-    def train(records, config, folder, *, name):
+    def train(source):
         train.random = torch.get_rng_state()
         torch.manual_seed(0)
-        found.append(list(records))
+        found.append(source.records)
         return SimpleNamespace(artifact=train.artifact)
 
-    monkeypatch.setattr(module, "train_recorded", train)
-    monkeypatch.setattr(module, "settling_time", lambda linear: 5.0)
+    monkeypatch.setattr(module, "train", train)
     train.found = found
     return train
 
@@ -275,7 +274,7 @@ def test_environments_that_are_refused(pendulum, tmp_path):
     two.envs[1] = wrapped("Pendulum-v1", tmp_path / "other.safetensors")
     for env, settings, told in (
         (gym.make("Pendulum-v1"), {}, r"the environment has none: put KKLObservation"),
-        (wrapped("Pendulum-v1", tmp_path / "plain.safetensors"), {}, "was not learned from rollouts"),
+        (wrapped("Pendulum-v1", tmp_path / "plain.safetensors"), {}, "does not say how it was trained"),
         (hiding, {}, r"environment 0 has no 'x': KKLObservation tells the true obs\[2\] as 'x'"),
         (ActionRepeat(wrapped("Pendulum-v1", pendulum), 2), {}, "showed sample 4 after 2: put wrappers that skip"),
         (noise, {"measurement_noise_max": 0.01}, r"measurement_noise_max = 0\.01 is less than the noise 0\.05"),
@@ -295,7 +294,7 @@ def test_environments_that_are_refused(pendulum, tmp_path):
         ({"path": "observer.zip"}, "path must end in"),
         ({"on_refit": 3}, "on_refit must be a function"),
         ({"eigenvalues": (-1.0,), "dt": 0.1}, "eigenvalues, dt cannot change"),
-        ({"neurons": 3}, "there is no setting neurons; there are measurement_noise_max"),
+        ({"neurons": 3}, "there is no setting neurons; there are samples"),
     ],
 )
 def test_arguments_that_make_no_sense(arguments, told):

@@ -8,7 +8,7 @@ from gymnasium import spaces
 import training
 from kkl_gym import KKLObservation
 from observers import Artifact
-from training.recorded.config import recorded_config
+from training import recorded_preset
 from training.records import Signals, check_signals, resampled
 from training.rollouts import make, policy_of, roll_out
 from training.rollouts.playing import Recorder
@@ -162,7 +162,7 @@ def test_agents_of_stable_baselines3(tmp_path):
 def test_modes_follow_steps_and_the_length_of_episodes(drift):
     for env, n, slowest, dt in (("Pendulum-v1", 200, 0.2, 0.05), (drift, 8, 1.0, 0.1)):
         names = {"hidden": ["2"], "measured": ["0"]} if n == 200 else {}
-        config = recorded_config(played(make(env), steps=n, **names).records())
+        config = recorded_preset(played(make(env), steps=n, **names).records())
         assert config.dt == pytest.approx(dt)
         rates = -np.array(config.eigenvalues) * dt
         assert rates[[0, -1]] == pytest.approx([slowest, 4.0])
@@ -171,9 +171,9 @@ def test_modes_follow_steps_and_the_length_of_episodes(drift):
 def test_records_that_nothing_is_learned_from(drift):
     records = played(make(drift)).records()
     with pytest.raises(ValueError, match=r"dt = 0\.3 s: an observer for Drift-v0 takes a sample .*, every 0\.1"):
-        recorded_config(records, {"dt": 0.3})
-    with pytest.raises(ValueError, match=r"goal\[0\], goal\[1\] never changes and tells nothing"):
-        recorded_config(played(make(drift), measured=["place", "goal"]).records())
+        recorded_preset(records, {"dt": 0.3})
+    with pytest.raises(ValueError, match=r"goal\[0\], goal\[1\] never changes: leave it out"):
+        recorded_preset(played(make(drift), measured=["place", "goal"]).records())
     other = dataclasses.replace(records[0], environment={"id": "Drift-v0", "kwargs": {"text": False}})
     with pytest.raises(ValueError, match=r"with arguments {'text': False}, but .* with arguments {}: one observer"):
         check_signals([records[0], other])

@@ -1,6 +1,5 @@
 """An observer for an agent: from the first steps that it makes in an environment, and from later ones."""
 
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +12,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 from training.agents.any_environment.information import part_of, show
 from training.agents.any_environment.task import CLEAN_Y, HiddenTask
 from training.maps.coordinates import SETTLED
+from training.presets import RECORDED_NOISE, recorded_preset
 from training.progress import ProgressBars
-from training.recorded.config import NOISE_SHARE, recorded_config
-from training.recorded.fit import train_recorded
-from training.recorded.preparing import split
 from training.records import Record
 from training.rollouts.callback import KKLTrainingCallback
 from training.rollouts.playing import Recorder, roll_out
 from training.rollouts.policies import WANDERING, policy_of
+from training.sources.recorded import RecordedSource, split
 from training.spectrum import evenly_spaced
+from training.train_observer import train
 
 OBSERVER = "observer.safetensors"
 HEADROOM = 1.5  # of the noise that a map is trained for over the noise that there is
@@ -85,20 +84,18 @@ def learn_observer(
     task: HiddenTask, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars
 ) -> Path:
     """Learn an observer from an agent's first steps."""
-    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, **SETTINGS}
+    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, "tracking": False, **SETTINGS}
     if task.measurement_noise:
         spread = np.std(np.concatenate([record.y for record in records]), 0)
-        changes["measurement_noise_max"] = tuple(np.maximum(NOISE_SHARE * spread, HEADROOM * task.measurement_noise))
+        changes["measurement_noise_max"] = tuple(np.maximum(RECORDED_NOISE * spread, HEADROOM * task.measurement_noise))
         dt = float(np.diff(records[0].t[:2])[0])
         # The filter has to settle in one episode at least of those that are trained on; a beginner's may be short.
         longest = max(record.duration for record in split(records, HELD_OUT, seed)[0])
         fastest = FASTEST_UNDER_NOISE / dt
         slowest = min(max(SLOWEST_UNDER_NOISE / dt, 1.1 * SETTLED / longest), fastest / 2)
         changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, -slowest, -fastest))
-    config = recorded_config(list(records), changes)
-    with tempfile.TemporaryDirectory() as scratch:  # a training of agents begins anew, and so do its observers
-        run = Path(scratch) / "observer"
-        artifact = train_recorded(list(records), config, run, name=task.env_id, console=progress).artifact
+    source = RecordedSource(records, recorded_preset(records, changes), task.env_id)
+    artifact = train(source, console=progress).artifact
     path = folder / OBSERVER
     artifact.save(path)
     return path

@@ -1,0 +1,311 @@
+"""Systems that are deliberately wrong, each with what is said of it; and systems of which nothing is to be said."""
+
+import importlib.util
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import linear_system
+import numpy as np
+import pytest
+from discrete_systems import Sampled
+from linear_system import Autonomous, Oscillator
+
+import kkl_gym.compiled
+import training.diagnosis.subject
+from kkl_gym import SYSTEMS, get_system
+from kkl_gym.elementary import sqrt
+from kkl_gym.simulate import SubstepsError
+from kkl_gym.systems import Lorenz
+from training.cli import main
+from training.diagnosis import FIRST, THEN, check
+from training.diagnosis.outputs import noise_of
+from training.diagnosis.subject import Subject
+from training.systems import controller
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+
+
+def made(base=Oscillator, **changes):
+    """A system that differs from another in some of its attributes."""
+    return type("Made", (base,), {"name": "made", **changes})()
+
+
+def findings(system, name=None, *, dt=None, duration=2.0, policy=None):
+    """Of one check alone, or of all."""
+    if name is None:
+        return list(check(system, dt=dt, duration=duration, policy=policy))
+    if name in FIRST:
+        return list(FIRST[name](system))
+    return list(THEN[name](Subject(system, dt or system.dt, duration, policy, noise_of(system, None))))
+
+
+def one(system, name, verdict="problem", **options):
+    (found,) = (one for one in findings(system, name, **options) if one.verdict == verdict)
+    return found
+
+
+def problems(system, **options):
+    return [one for one in findings(system, **options) if one.verdict == "problem"]
+
+
+def test_a_system_that_ships():
+    found = findings(get_system("van_der_pol"))
+    assert "problem" not in {one.verdict for one in found}
+    assert {one.check for one in found} >= {"equations", "rate", "bounds", "sampling", "observability"}
+    assert all(bool(one.advice) == (one.verdict != "ok") for one in found)
+    assert found[0].found == "van_der_pol: 2 states (x1, x2); 1 input up to 5; parameters mu = 3"
+
+
+def test_the_page_explains_every_line_of_its_example():
+    found = findings(get_system(str(EXAMPLES / "own_system.py:Pendulum")))
+    page = (EXAMPLES.parent / "docs" / "guides" / "check.md").read_text(encoding="utf-8")
+    for name in (*FIRST, *THEN):
+        assert f"\n| {name} |" in page
+    assert all(f" {one.check} " in page.split("```\n")[2] for one in found)
+
+
+@pytest.mark.parametrize(
+    ("name", "duration"),
+    [
+        (f"{EXAMPLES}/circle_pendulum.py:CirclePendulum", 2.0),
+        pytest.param(f"{EXAMPLES}/physical_units.py:Motor", 0.1, marks=pytest.mark.slow),
+        pytest.param(f"{EXAMPLES}/physical_units.py:HeatedTank", 400.0, marks=pytest.mark.slow),
+        *(pytest.param(name, 2.0, marks=pytest.mark.slow) for name in SYSTEMS),
+    ],
+)
+def test_neither_do_others_have_problems(name, duration):
+    assert not problems(get_system(name), duration=duration)
+
+
+def test_a_linear_system_has_its_numbers():
+    subject = Subject(Oscillator(), 0.01, 20.0)
+    found = {name: next(THEN[name](subject)).found for name in ("rate", "sampling", "inputs", "bounds")}
+    # The norm of ((0, 1), (-1, 0)), whose eigenvalues are +-i.
+    assert found["rate"] == "typically 1.41/s in X, at most 1.41/s within the bounds"
+    assert (
+        "time constants 1 to 1 s (medians over X), of which the fastest spans 100 samples and a motion 20 of"
+        in found["sampling"]
+    )
+    assert "y changes by 1 % of its standard deviation" in found["sampling"]
+    assert found["inputs"] == "input 1 at its bound 0.5 moves x2 by 0.5 per second"
+    assert found["bounds"] == "all of 100 motions of 20 s from X, free and driven, stay within them"
+
+
+def test_the_command_prints_a_table_of_findings(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "1000")
+    options = ["--dt", "0.05", "--duration", "2", "--policy", "controller", "--json", str(tmp_path / "found.json")]
+    main(["check", f"{linear_system.__file__}:Oscillator", *options])
+    shown = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("checking ")]  # if it is slow
+    assert shown[-1] == "no problems, no notes"
+    for line, finding in zip(shown[:-1], json.loads((tmp_path / "found.json").read_text()), strict=True):
+        assert line.split()[0] == finding["verdict"] == "ok"
+        assert finding["check"] in line
+        assert finding["found"] in line
+
+
+def on_a_circle(self, rng, n, factor=1.0):
+    angle = rng.uniform(0, 2 * np.pi, n)
+    return factor * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def test_discrete_time_and_starts_of_its_own():
+    system = made(Sampled, draw_starts=on_a_circle)
+    found = {one.check: one for one in findings(system)}
+    assert "problem" not in {one.verdict for one in found.values()}
+    assert found["equations"].found.startswith("step and h work on floats, arrays, tensors, symbols")
+    assert found["starts"].found == "draw_starts of its own, all within the bounds"
+    assert "rate" not in found
+    assert found["observability"].found.startswith("x2: at best an error of ")
+    with pytest.raises(ValueError, match="no others"):
+        findings(system, dt=0.2)
+
+
+@dataclass(frozen=True)
+class Branching(Oscillator):
+    gain: float = 1.0
+
+    name: ClassVar[str] = "branching"
+
+    def f(self, x):
+        if x[0] > 0:
+            return x[1], -x[0]
+        return x[1], -self.gain * x[0]
+
+
+def test_an_if_on_the_state_is_a_problem_and_ends_the_command_with_status_1(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit) as end:
+        main(["check", f"{__file__}:Branching", "--parameters", "gain", "2", "--json", str(tmp_path / "found.json")])
+    assert end.value.code == 1
+    shown = capsys.readouterr().out
+    assert "gain = 2" in shown
+    assert "→ as it is, batches, training and evaluation do not run" in shown
+    assert shown.splitlines()[-1] == "1 problem, 3 notes"
+    found = json.loads((tmp_path / "found.json").read_text())
+    (wrong,) = (one["found"] for one in found if one["verdict"] == "problem")
+    assert wrong in shown  # square brackets are no markup
+    assert "on arrays: f(x) of 'branching' failed in" in wrong
+    assert "(`if x[0] > 0:`)" in wrong
+    assert "kkl_gym.elementary.where" in wrong
+    assert found[-1]["found"] == "all other checks are left out"
+
+
+def test_functions_of_other_modules():
+    found = one(made(f=lambda self, x: (x[1], -math.sin(x[0]))), "equations").found
+    assert "on arrays" in found
+    assert "use kkl_gym.elementary.sin" in found
+    of_numpy = made(f=lambda self, x: (x[1], -np.sin(x[0])))
+    assert not problems(of_numpy)
+    (note,) = (one for one in findings(of_numpy, "equations") if "on symbols" in one.found)
+    assert note.verdict == "note"
+    assert "no Kalman filter" in note.advice
+
+
+def test_compiled_or_not(monkeypatch):
+    pytest.importorskip("numba")
+    machine_code = "large batches of environments run as machine code"
+    assert one(Oscillator(), "compiled", "ok").found == f"{machine_code}, and so do single ones"
+    cubic = made(f=lambda self, x: (x[1], -(x[0] ** 3)))
+    assert "single ones take their steps in Python (ValueError: f has a power" in one(cubic, "compiled", "ok").found
+    monkeypatch.setattr(training.diagnosis.subject, "batch_step", kkl_gym.compiled.batch_step)
+    assert "not integrated" in one(Sampled(), "compiled", "ok").found
+    of_numpy = made(f=lambda self, x: (x[1], -np.sin(x[0])))
+    assert "several times slower: " in one(of_numpy, "compiled", "note").found
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert one(Oscillator(), "compiled", "note").advice == 'pip install "kkl-gym[fast]"'
+
+
+def drawn(*shape):
+    return lambda self, rng, n, factor=1.0: 20 * factor * rng.uniform(-1, 1, (n, *shape))
+
+
+LONG = {"duration": 5.0}
+NO_INPUT = {"u_max": (), "G": ()}
+SETTLING = NO_INPUT | {"f": lambda self, x: (-5.0 * x[0], x[0] - 5.0 * x[1])}
+UPRIGHT = {"f": lambda self, x: (x[1], 4.0 * x[0]), "bounds": ((-4, 4), (-8, 8)), "u_max": (20.0,)}
+BLIND = NO_INPUT | {
+    "state_names": ("x1", "x2", "bias"),
+    "X": ((-1, 1), (-1, 1), (-1, 1)),
+    "bounds": ((-30, 30), (-30, 30), (-30, 30)),
+    "f": lambda self, x: (x[1], -x[0], 0.0 * x[0]),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "verdict", "changes", "options", "found", "advice"),
+    [
+        ("finite", "problem", {"f": lambda self, x: (x[1], -sqrt(x[0] + 0.5))}, {}, " % of X, ",
+         "draw the bounds, and X, where the equations hold, or change the equations"),
+        ("inputs", "problem", {"u_max": (1.0, 1.0), "G": ((0.0, 0.0), (1.0, 0.0))}, {}, "input 2 moves no state",
+         "give column 2 of G"),
+        ("inputs", "ok", {"g": lambda self, x: ((0.0,), (2.0 + 0.0 * x[0],))}, {}, "moves x2 by 1 per second", ""),
+        ("rate", "problem", {"rate": lambda self, x: 0.01 + 0.0 * x[0]}, {},
+         "the fastest eigenvalue of df/dx is 1/s at the median", "leave rate(x) out, or raise it"),
+        ("bounds", "problem", UPRIGHT, LONG, "50 of 50 free and 50 of 50 driven leave them",
+         "train with --policy controller, under which 100 of 100 stay"),
+        ("bounds", "problem", UPRIGHT | {"u_max": (0.01,)}, LONG, "leave them", "--policy script.py:function"),
+        ("sampling", "note", {}, {"dt": 0.7, "duration": 60.0}, "dt = 0.7 s", "samples are few: take dt = 0.1 s"),
+        ("sampling", "problem", {}, {"dt": 1.5, "duration": 60.0}, "dt = 1.5 s",
+         "the motion between samples is lost: take dt = 0.1 s"),  # 2 pi / 0.1: some sixty samples a period
+        ("sampling", "note", {}, {"duration": 0.5}, "motions of 0.5 s",
+         "motions end before the slow part has moved: take a duration of 5 s"),
+        ("output", "problem", {"h": lambda self, x: (x[0], 0.0 * x[0] + 2.5)}, {}, "y2 is 2.5 everywhere in X",
+         "let h measure something that moves, or leave this output out"),
+        ("output", "note", {"measurement_noise": 1.0}, {}, "noise 1 by default",
+         "set measurement_noise: 0.1 is 5 % of the range"),
+        ("output", "note", SETTLING, LONG, "hardly any more in their second half", "a shorter duration shows more"),
+        ("process noise", "problem", {"process_noise": 5.0}, {"duration": 50.0},
+         "over 50 s it leads 2.04 half-widths of X away", "set process_noise = 0.05, "),  # 5 sqrt(0.01 50 / 3)
+        ("observability", "problem", BLIND, {}, "y tells nothing of bias at the start", "let h measure bias too, or"),
+        ("observability", "problem", BLIND | {"f": lambda self, x: (x[1] + x[2], 0.0 * x[0], 0.0 * x[0])}, {},
+         "y tells nothing of a combination of x2 and bias at the start", "let h measure x2 or bias too"),
+        ("observability", "note", BLIND | {"h": lambda self, x: (x[0] + 1e-3 * x[2],)}, {}, "y tells little of bias",
+         "let h measure bias too"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_found_and_how_to_change_it(name, verdict, changes, options, found, advice):
+    said = one(made(**changes), name, verdict, **options)
+    assert found in said.found
+    assert advice in said.advice
+    assert bool(said.advice) == (verdict != "ok")
+
+
+def test_bounds_that_are_too_narrow():
+    elongated = {"f": lambda self, x: (4.0 * x[1], -0.25 * x[0])}  # x1 swings four times as far as x2
+    found = one(made(Autonomous, bounds=((-1.3, 1.3), (-3, 3)), **elongated), "bounds", dt=0.1, duration=20.0)
+    assert "leave them" in found.found
+    low, high = map(float, found.advice.removeprefix("widen the bounds of x1 to (").removesuffix(")").split(","))
+    assert -4.6 < low < -4.0  # sqrt(17) and some room
+    assert 4.0 < high < 4.6
+    wide = made(Autonomous, bounds=((1.2 * low, 1.2 * high), (-3, 3)), **elongated)
+    assert one(wide, "bounds", "ok", dt=0.1, duration=20.0)
+
+
+def test_a_system_that_only_a_policy_holds():
+    upright = made(**UPRIGHT)
+    assert findings(upright, "bounds", policy=controller(upright), **LONG)[0].verdict == "ok"
+    found = one(upright, "bounds", policy=lambda x: np.zeros((len(x), 1)), **LONG)
+    assert "100 of 100 under the policy leave them" in found.found
+    assert found.advice.startswith("let the policy hold the system")
+
+
+def test_starts_beyond_the_bounds_or_of_another_shape_end_the_check():
+    for shape, said, advice in (
+        ((), "draw_starts(rng, 100, 1) returns starts of shape (100,)", "return (100, 2)"),
+        ((2,), "draw_starts(rng, 100, 2) lie beyond the bounds", "draw them within the bounds"),
+    ):
+        *_, wrong, left_out = findings(made(draw_starts=drawn(*shape)))
+        assert said in wrong.found
+        assert advice in wrong.advice
+        assert left_out.found == "all other checks are left out"
+
+
+def test_motions_that_need_too_many_substeps(monkeypatch):
+    def fails(*args, **options):
+        raise SubstepsError("stiff changes at a rate of 1e+09/s; take a smaller dt")
+
+    (found,) = (one for one in findings(Oscillator(), dt=1e6) if one.verdict == "problem")
+    assert (found.check, "would need more than" in found.found) == ("sampling", True)
+    monkeypatch.setattr("training.diagnosis.subject.simulate", fails)
+    found = findings(Oscillator())[-1]
+    assert (found.check, found.found) == ("sampling", "stiff changes at a rate of 1e+09/s")
+    assert found.advice == "take a smaller dt"
+
+
+def test_a_state_of_which_y_tells_nothing_but_which_the_motion_forgets():
+    forgotten = made(**BLIND | {"f": lambda self, x: (x[1], -x[0], -2.0 * x[2])})
+    (found,) = (one for one in findings(forgotten, "observability") if "nothing" in one.found)
+    assert found.verdict == "note"
+    assert "forgets by itself" in found.found
+
+
+def test_the_least_errors_of_states_at_levels_of_noise():
+    """A position and its speed, of uniform starts: those of a Kalman filter are in test_limits.py."""
+    found = [
+        one for one in check(Oscillator(), duration=6.0, measurement_noise=[0.1, 0.3]) if one.check == "observability"
+    ]
+    assert [one.found.partition(":")[0] for one in found] == ["x1", "x2"]
+    assert all("without noise (seen 0" in one.found for one in found)
+    assert all(" % at noise 0.1, " in one.found and " % at noise 0.3, in its standard" in one.found for one in found)
+    with pytest.raises(ValueError, match="measurement_noise must"):
+        list(check(Oscillator(), measurement_noise=[float("inf")]))
+
+
+@dataclass(frozen=True)
+class ThroughThird(Lorenz):
+    """Seen through x3, which (x1, x2) -> (-x1, -x2) leaves as it is."""
+
+    name: ClassVar[str] = "lorenz_through_x3"
+
+    def h(self, x):
+        return (x[2],)
+
+
+def test_a_symmetry_is_told_from_what_is_hard_to_see():
+    found = findings(ThroughThird(), "observability", duration=6.0)
+    assert [one.verdict for one in found] == ["problem", "ok"]
+    assert found[0].found.startswith("x1, x2: y tells them near each state, but not which of several states it is: (")
+    assert not any("near each state" in one.found for one in findings(Lorenz(), "observability", duration=6.0))

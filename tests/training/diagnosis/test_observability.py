@@ -1,0 +1,171 @@
+"""What is said of signals of which physics says what y tells."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy
+from recorded_runs import as_csv, swing
+
+import training
+from training.cli import main
+from training.diagnosis import Observability, of_records
+from training.records import Record, Signals
+
+
+def looked(env_id, measured, hidden, **changes):
+    wanted = {"steps": 3000, "measurement_noise": [], "seed": 1} | changes
+    return training.observability(env_id, measured=measured, hidden=hidden, **wanted)
+
+
+def verdicts(found):
+    return {judged.signal: judged for judged in found.judgements}
+
+
+def test_pendulums_rate_is_determined_by_its_angle():
+    found = looked("Pendulum-v1", [0, 1], [2], measurement_noise=[0.05])
+    (rate,) = found.judgements
+    assert found.dt == pytest.approx(0.05)
+    assert rate.verdict == "determined"
+    assert 1 <= rate.window <= 8
+    assert found.errors[0, found.windows.index(8), 0] < 0.05
+    assert found.errors[0, 0, 0] > 0.9  # the angle alone says nothing of it
+    of_differences = 0.05 * np.sqrt(2) / 0.05 / 3  # of angles, over a rate of 3 rad/s or so
+    assert 2 * rate.errors[0] < rate.errors[1] < of_differences
+
+
+def test_pendulums_angle_is_determined_by_its_rate_but_for_which_side_is_up():
+    found = verdicts(looked("Pendulum-v1", [2], [0, 1], steps=5000))
+    assert found["obs[1]"].verdict == "determined"  # gravity turns it
+    assert found["obs[0]"].errors[0] > 2 * found["obs[1]"].errors[0]  # a cosine is flat where the sine is steep
+    assert found["obs[0]"].verdict.startswith("partly")
+
+
+def test_cart_poles_place_is_seen_up_to_a_constant_by_its_velocities():
+    found = verdicts(looked("CartPole-v1", [1, 3], [0, 2]))
+    assert found["obs[0]"].verdict == "up to a constant"
+    assert found["obs[0]"].errors[0] > 0.2
+    assert found["obs[2]"].verdict == "determined"
+
+
+def wandering(records=40, n=150, a=0.95):
+    rng = np.random.default_rng(0)
+    x = scipy.signal.lfilter([1.0], [1.0, -a], rng.normal(size=(records, n + 100)))[:, 100:, None]
+    t = np.arange(n) + 0.0
+    return [Record(f"{i}", t, each, x=each, source="wandering") for i, each in enumerate(x)]
+
+
+def test_what_no_output_sees_is_not_determined():
+    rng, records = np.random.default_rng(0), wandering()
+    for i, record in enumerate(records):  # noise, a constant of each record, and one of all
+        x = np.stack([rng.normal(size=len(record.t)), np.full(len(record.t), rng.normal()), np.ones(len(record.t))], 1)
+        records[i] = replace(record, x=x, signals=Signals("t", ("y1",), (), ("noise", "weight", "one")))
+    found = verdicts(of_records(records, measurement_noise=[]))
+    for name in ("noise", "weight"):
+        assert (found[name].verdict, found[name].window) == ("not determined", None)
+    assert found["one"].verdict == "never moves"
+
+
+def test_errors_under_noise_are_those_of_a_kalman_filter():
+    a, levels = 0.95, [0.5, 2.0]
+    found = of_records(wandering(a=a), measurement_noise=levels)
+    assert found.noise == (0.0, 0.5, 2.0)
+    size = np.concatenate([record.y for record in wandering(20, 50)]).std()
+    assert of_records(wandering(20, 50)).noise == pytest.approx((0.0, 0.01 * size, 0.1 * size), rel=0.01)
+    for level, error in zip(levels, found.judgements[0].errors[1:]):
+        before = scipy.linalg.solve_discrete_are([[a]], [[1.0]], [[1.0]], [[level**2]])[0, 0]
+        after = before * level**2 / (before + level**2)
+        assert error == pytest.approx(np.sqrt(after * (1 - a**2)), rel=0.12)
+
+
+def test_too_little_data_is_warned_of():
+    short = of_records(wandering(30, 16), measurement_noise=[])
+    assert short.windows == (0, 1, 2, 4)
+    assert short.warnings == (
+        "windows of 8 steps and more are left out, as too few samples have so many before them; record longer "
+        "episodes, or more",
+    )
+    few = [replace(record, t=0.1 * record.t, source="") for record in wandering(3, 2000)]
+    assert "fewer than 5 records" in of_records(few, measurement_noise=[]).warnings[0]
+    bent = [
+        Record(f"{i}", np.arange(60.0), y, x=np.sin(9 * y).prod(1, keepdims=True), source="bent")
+        for i, y in enumerate(np.random.default_rng(0).uniform(0, 1, (20, 60, 2)))
+    ]
+    found = of_records(bent, measurement_noise=[])
+    assert found.judgements[0].verdict.startswith("partly")
+    assert any("with half of them" in text for text in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"measurement_noise": [(0.1, 0.2)]}, "one for each of 1 outputs"),
+        ({"measurement_noise": 0.1}, r"must be a list of levels, as in \[0.1, 0.3\], got 0.1"),
+        ({"records": []}, "there is no record"),
+        ({"records": wandering(2, 8)}, "16 samples in 2 records are too few"),
+        ({"records": [replace(wandering(1)[0], x=None, signals=Signals())]}, "no hidden states were recorded"),
+    ],
+)
+def test_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        of_records(**{"records": wandering(6, 20)} | changes)
+    with pytest.raises(ValueError, match="cannot make 'None-v0'"):
+        looked("None-v0", [0], [1])
+
+
+NONE = [np.nan] * 3
+
+
+@pytest.mark.parametrize(
+    ("errors", "changes", "verdict", "window"),
+    [
+        ([0.9, 0.04, 0.01], [np.nan, 0.5, 0.5], "determined", 1),
+        ([0.5, 0.3, 0.29], [np.nan, 0.5, 0.5], "partly (29 % left)", 1),
+        ([0.9, 0.41, 0.4], [np.nan, 0.3, 0.03], "up to a constant", 2),
+        ([0.9, 0.07, 0.07], [np.nan, 0.02, 0.02], "partly (7 % left)", 1),  # its change is no better seen
+        ([0.99, 0.95, 1.0], NONE, "not determined", None),
+        (NONE, NONE, "never moves", None),
+    ],
+)
+def test_verdicts(errors, changes, verdict, window):
+    errors, changes = np.reshape(errors, (1, -1, 1)), np.reshape(changes, (-1, 1))
+    of = {"errors": errors, "changes": changes, "warnings": ("too few; record more",)}
+    every = Observability(("y",), ("u",), ("x",), dt=0.1, windows=(0, 1, 2), noise=(0.0,), **of)
+    (found,) = every.judgements
+    assert (found.verdict, found.window) == (verdict, window)
+    signals, line, data = every.findings()
+    assert signals.found == "x from y and u, in steps of 0.1 s"
+    assert line.found.startswith(f"x: {verdict}")
+    assert line.verdict == {"determined": "ok", "not determined": "problem"}.get(verdict, "note")
+    assert (data.verdict, data.found, data.advice) == ("note", "too few", "record more")
+
+
+def shown(arguments, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
+    main(["check", *arguments])
+    return capsys.readouterr().out
+
+
+def test_the_command_on_an_environment(capsys, tmp_path, monkeypatch):
+    words = "Pendulum-v1 --measured 0,1 --hidden 2 --steps 2000 --measurement-noise 0.05,0.1 --csv"
+    text = shown([*words.split(), str(tmp_path / "errors.csv")], capsys, monkeypatch)
+    assert "obs[2] from obs[0], obs[1] and action[0], in steps of 0.05 s" in text
+    assert "obs[2]: determined from 1 step (0.05 s) of y" in text
+    assert " % at noise 0.05, 0.1" in text
+    written = pd.read_csv(tmp_path / "errors.csv", dtype={"measurement_noise": str})
+    assert list(written) == ["signal", "measurement_noise", "steps", "seconds", "error"]
+    assert set(written.measurement_noise) == {"0", "0.05 0.1"}
+    np.testing.assert_allclose(written.seconds, 0.05 * written.steps)
+    exact = written[written.measurement_noise == "0"].set_index("steps")
+    assert exact.error[0] > 0.9 > 0.05 > exact.error[8]
+
+
+def test_the_command_on_records(capsys, tmp_path, monkeypatch):
+    files = [as_csv(tmp_path / f"{i}.csv", swing(i, n=200)) for i in range(6)]
+    options = ["--measured", "position", "--inputs", "force", "--hidden", "speed", "--measurement-noise", "0.5"]
+    text = shown(["--data", *files, *options, "--json", str(tmp_path / "found.json")], capsys, monkeypatch)
+    assert "speed from position and force" in text
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found[1]["found"].startswith("speed: determined from")
