@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from training.lessons.flow import learn_flow
     from training.lessons.map import Maps, learn_map
     from training.lessons.run import Run
-    from training.observable import Observability, observability
     from training.presets import preset, recorded_preset
     from training.rollouts import learn
     from training.rollouts.callback import KKLTrainingCallback

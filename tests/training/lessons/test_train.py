@@ -50,7 +50,7 @@ LONG = {"duration": 20.0, "inverse_steps": 200}
 KINDS = {
     "equations": (Slow(), "inverse", LONG),
     "flow": (Table(), "flow", {**LONG, "inputs": False, "flow_steps": 200}),
-    "spinn": (Slow(), "inverse", {**LONG, "pipeline": "spinn", "adaptive": True, "lipschitz_penalty": 0.1}),
+    "spinn": (Slow(), "inverse", {**LONG, "pipeline": "spinn"}),
 }
 
 
@@ -278,16 +278,6 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
     error = artifact.forward(x) - x @ M.T
     relative = np.sqrt((error**2).mean() / ((x @ M.T) ** 2).mean())
     assert relative < 1e-3
-
-
-def test_training_on_a_solved_map():
-    solved = {"pipeline": "spinn", "random_features": 200, "forward_steps": 0, "box_factor": 1.5}
-    result, _ = trained(Slow(), **solved, inverse_steps=500, duration=15.0, width=32)
-    assert list(result.losses) == ["inverse"]
-    assert result.artifact.forward.mlp.weights[0].shape == (200, 2)
-    runs = unseen_trajectories(Slow(), 0.05, n=20, duration=20.0, seed=0, domain="1.5X")
-    # long after the start, whose last traces in z an inverse of exact T(x) magnifies
-    assert np.median(errors(result.artifact, Slow(), runs, measurement_noise=0.0, seed=0, skip=12.0).late) < 5.0
 
 
 def test_the_papers_own_way_is_told_neither_noise_nor_age(monkeypatch):
