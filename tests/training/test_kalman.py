@@ -11,12 +11,16 @@ from filterpy.kalman import UnscentedKalmanFilter as FilterpyUKF
 from linear_system import Autonomous, C, F, Oscillator, TwoOutputs
 from scipy.linalg import expm
 
-from examples.research.benchmark.protocol import run
 from kkl_gym import get_system
 from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance, simulate
 from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter, unknown_start
 from training.trajectories.derivatives import jacobian
+
+
+def run(observer, y):
+    """Estimates along outputs (steps, n, ny)."""
+    return np.array([observer.reset(y[0]), *(observer.step(sample) for sample in y[1:])])
 
 
 @pytest.fixture(params=[ExtendedKalmanFilter, UnscentedKalmanFilter])

@@ -11,7 +11,6 @@ import pytest
 from small_runs import toy
 
 import kkl_gym
-from examples.research.benchmark.protocol import run
 from kkl_gym.simulate import simulate
 from training import train
 from training.cli import main
@@ -22,6 +21,11 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 CART_POLE = f"{EXAMPLES / 'cart_pole.py'}:CartPole"
 PENDULUM = f"{EXAMPLES / 'circle_pendulum.py'}:CirclePendulum"
 SMALL = "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch 64 --inverse-steps 9 --runs 100"
+
+
+def run(observer, y):
+    """Estimates along outputs (steps, n, ny)."""
+    return np.array([observer.reset(y[0]), *(observer.step(sample) for sample in y[1:])])
 
 
 @pytest.fixture

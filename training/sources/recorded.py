@@ -285,7 +285,8 @@ def signal_rate(records: Sequence[Record]) -> float:
         columns = [getattr(record, letter) for record in records if getattr(record, letter) is not None]
         if columns:
             steps = [np.diff(values, axis=0) / np.diff(record.t)[:, None] for values, record in zip(columns, records)]
-            change = np.sqrt(np.nanmean(np.concatenate(steps) ** 2, 0))
+            change = np.concatenate(steps)
+            change = np.sqrt(np.nansum(change**2, 0) / np.maximum(np.isfinite(change).sum(0), 1))
             size = np.nanstd(np.concatenate(columns), 0)
             rates += (change[size > 0] / size[size > 0]).tolist()
     moving = [rate for rate in rates if rate > 0]

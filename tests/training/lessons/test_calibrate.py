@@ -75,9 +75,8 @@ def test_the_covariance_of_t_inv_is_that_of_noise_and_of_what_is_left_of_the_sta
     np.testing.assert_allclose(found.covariance[-1, settled] / size, expected[settled] / size, atol=0.15)
     first = (left @ left.mT)[:2].mean(0)  # about the first knot are ages 0 and 1
     assert ages[:2].tolist() == [0, 1]
-    np.testing.assert_allclose(
-        found.covariance[0, 0] / found.covariance[0, 0].trace(), first / first.trace(), atol=0.05
-    )
+    table = found.covariance[0, 0]
+    np.testing.assert_allclose(table / table.trace(), first / first.trace(), atol=0.05)
 
 
 def test_factors_of_an_exact_kalman_filter_are_about_one(tracking):
@@ -95,7 +94,7 @@ def test_regions_hold_what_they_should_on_other_runs(tracking, quiet, alone):
     for level in (0.1, 0.7):
         spans = (slice(20, 22), slice(100, None))
         early, late = coverage(artifact, system, runs, measurement_noise=level, seed=7, spans=spans)
-        assert late.joint[1] == pytest.approx(0.9, abs=0.03)
+        assert late.joint[1] == pytest.approx(0.9, abs=0.05 if alone else 0.03)
         # Of 600, three standard deviations are 0.037. Beyond X, where T_inv's covariance counts too, starts are worse.
         assert 0.85 < early.joint[1] < (0.97 if alone else 0.95)
         np.testing.assert_allclose(late.joint, REGIONS, atol=0.07)
@@ -107,7 +106,7 @@ def test_estimates_of_t_inv_stay_as_they_are(tracking):
     np.testing.assert_array_equal(KKLObserver(plain_observer(), 0.3).estimate(y), KKLObserver(alone, 0.3).estimate(y))
 
 
-def ever_above(artifact, system, level, fault=lambda y: y, n=400, duration=20.0):
+def ever_above(artifact, system, level, fault=lambda y: y, n=400, duration=12.0):
     """Which new runs raise an alarm."""
     rng = np.random.default_rng(11)
     runs = unseen_trajectories(system, DT, n=n, duration=duration, seed=3, process_noise=system.process_noise)
@@ -182,9 +181,7 @@ def test_a_system_is_a_source_too_if_the_observer_says_how_it_was_trained():
         calibrate(dataclasses.replace(artifact, training={}), Slow())
     with pytest.raises(ValueError, match=r"false_alarms must lie between 0 and 1, got 0\.0"):
         calibrate(artifact, Slow(), false_alarms=0.0)
-    with pytest.raises(
-        ValueError, match=r"source of \(2, 1, 1\) states, outputs and inputs does not fit .* \(2, 1, 0\)"
-    ):
+    with pytest.raises(ValueError, match=r"source of \(2, 1, 1\) states, .* does not fit .* \(2, 1, 0\)"):
         calibrate(artifact, SimulatedSource(Slow(), settings_of(plain_observer().training)))
     with pytest.raises(ArtifactError, match="system"):
         calibrate(artifact, type("Steep", (Slow,), {"name": "steep"})())

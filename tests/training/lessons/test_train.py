@@ -50,7 +50,7 @@ LONG = {"duration": 20.0, "inverse_steps": 200}
 KINDS = {
     "equations": (Slow(), "inverse", LONG),
     "flow": (Table(), "flow", {**LONG, "inputs": False, "flow_steps": 200}),
-    "spinn": (Slow(), "inverse", {**LONG, "pipeline": "spinn", "adaptive": True, "lipschitz_penalty": 0.1}),
+    "spinn": (Slow(), "inverse", {**LONG, "pipeline": "spinn"}),
 }
 
 
@@ -78,7 +78,7 @@ def test_an_observer_tracks_by_its_equations(whole, tmp_path):
     assert artifact.motion.factors.factors.shape == (2, 6, len(ages))  # without process noise and with it
     for inverse in (artifact.inverse, artifact.free_inverse):
         assert inverse.error_covariance.covariance.shape == (6, len(ages), 2, 2)
-    assert artifact.limits.duration == 20.0
+    assert artifact.limits.duration == 12.0
     runs = unseen_trajectories(Slow(), 0.05, n=100, duration=20.0, seed=0, driven=True)
     tracked, alone = (
         np.median(errors(each, Slow(), runs, measurement_noise=0.1, seed=0).late)
@@ -241,8 +241,8 @@ def test_closing_the_loop_is_a_second_stage(tmp_path, monkeypatch):
     again, _ = trained(Slow(), tmp_path, resume=True, **small, **noise)
     for expected, found in zip(parts(result.artifact), parts(again.artifact), strict=True):
         np.testing.assert_array_equal(expected, found)
-    with monkeypatch.context() as patch, pytest.raises(ValueError, match="no inputs"):
-        patch.delattr(training.lessons.map, "TrajectorySampler")  # before any work
+    monkeypatch.delattr(training.lessons.map, "TrajectorySampler")
+    with pytest.raises(ValueError, match="no inputs"):  # before any work
         trained(Autonomous(), **small)
 
 
@@ -278,16 +278,6 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
     error = artifact.forward(x) - x @ M.T
     relative = np.sqrt((error**2).mean() / ((x @ M.T) ** 2).mean())
     assert relative < 1e-3
-
-
-def test_training_on_a_solved_map():
-    solved = {"pipeline": "spinn", "random_features": 200, "forward_steps": 0, "box_factor": 1.5}
-    result, _ = trained(Slow(), **solved, inverse_steps=500, duration=15.0, width=32)
-    assert list(result.losses) == ["inverse"]
-    assert result.artifact.forward.mlp.weights[0].shape == (200, 2)
-    runs = unseen_trajectories(Slow(), 0.05, n=20, duration=20.0, seed=0, domain="1.5X")
-    # long after the start, whose last traces in z an inverse of exact T(x) magnifies
-    assert np.median(errors(result.artifact, Slow(), runs, measurement_noise=0.0, seed=0, skip=12.0).late) < 5.0
 
 
 def test_the_papers_own_way_is_told_neither_noise_nor_age(monkeypatch):

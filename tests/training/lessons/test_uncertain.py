@@ -13,7 +13,7 @@ from small_runs import CPU, toy
 import training.lessons.map
 from kkl_gym import VanDerPol
 from kkl_gym.system import System
-from training import SimulatedSource, calibrate, errors, train, unseen_trajectories
+from training import SimulatedSource, errors, train, unseen_trajectories
 from training.config import Config
 from training.evaluation.parameters import parameter_errors
 from training.spectrum import Spectrum
@@ -55,7 +55,7 @@ def test_an_observer_for_uncertain_plants_holds_on_another():
     system = Spring()
     plant = system.replace({"stiffness": 4.8})
     late = {}
-    for name, artifact in {"one": trained(), "many": trained(stiffness=0.3)}.items():
+    for name, artifact in {"one": replace(trained(), motion=None), "many": trained(stiffness=0.3)}.items():
         assert artifact.nx == 2
         for what, moving in {"model": system, "plant": plant}.items():
             runs = unseen_trajectories(moving, 0.05, n=20, duration=15.0, seed=3)
@@ -127,15 +127,6 @@ def test_it_does_not_track_and_says_why():
     assert "does not track: a motion is of one plant, not of a range of stiffness" in said.file.getvalue()
     assert artifact.motion is None
     assert artifact.inverse.error_covariance.nx == 2
-
-
-def test_limits_of_a_monitor_hold_for_every_plant_of_the_range():
-    alone = replace(trained(), motion=None)
-    one, many = (
-        calibrate(alone, SimulatedSource(Spring(), toy(Spring(), inputs=False, uncertain=uncertain))).limits
-        for uncertain in ({}, {"stiffness": 0.2})
-    )
-    assert (many.mean[0] > 1.5 * one.mean[0]).all()
 
 
 @pytest.mark.parametrize(
