@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,7 +26,7 @@ def describe(system: System) -> dict[str, Any]:
     else:
         moved = [*components(system.f, x.T), *(entry for row in input_matrix(system, x.T) for entry in row)]
     rows = [*moved, *system.output(x).T]
-    equations = np.round([np.broadcast_to(row, 20) for row in rows], 6)  # the same on every machine
+    equations = np.array([_rounded(np.broadcast_to(row, 20)) for row in rows])
     return {
         "system": system.name,
         "parameters": system.parameters,
@@ -34,6 +35,12 @@ def describe(system: System) -> dict[str, Any]:
         "u_max": system.u_max,
         "equations": hashlib.sha256(json.dumps(equations.tolist()).encode()).hexdigest()[:16],
     }
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """Values as they are on every machine: to six decimals, or to more where all are small."""
+    size = np.abs(values).max()
+    return np.round(values, 6 - min(0, math.floor(math.log10(size))) if 0 < size < np.inf else 6)
 
 
 def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:

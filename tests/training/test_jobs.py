@@ -5,10 +5,11 @@ import os
 import subprocess
 import sys
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import pytest
 
-from kkl_gym import get_system
+from kkl_gym import System, get_system
 from observers.storage import UNFINISHED
 from training.jobs import check_identity, claimed_job, claimed_run, describe
 
@@ -99,3 +100,21 @@ def test_a_system_is_told_from_another():
     assert describe(lorenz) == describe(get_system("lorenz"))
     other = describe(lorenz.replace({"rho": 30.0}))
     assert {name for name, value in describe(lorenz).items() if value != other[name]} == {"parameters", "equations"}
+
+
+@dataclass(frozen=True)
+class Tiny(System):
+    decay: float = 0.03
+
+    name = "tiny"
+    X = bounds = ((-2e-6, 2e-6),)
+
+    def f(self, x):
+        return (-self.decay * x[0],)
+
+    def h(self, x):
+        return (x[0],)
+
+
+def test_equations_of_small_numbers_are_told_apart():
+    assert describe(Tiny())["equations"] != describe(Tiny(0.06))["equations"]
