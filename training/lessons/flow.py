@@ -39,7 +39,8 @@ def learn_flow(source: Source, run: Run) -> Motion:
     parts = source.tracking()
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
-    offset, scale = learned.x.mean(0), spread(learned.x)
+    parts = {"x_offset": learned.x.mean(0), "x_scale": spread(learned.x)} | parts
+    offset, scale = parts["x_offset"], parts["x_scale"]  # of a simulated source, in which its process noise is
     u_scale = np.abs(learned.u).max(0, initial=0.0)
     u_scale = np.where(u_scale > 0, u_scale, 1.0)
     problem = FlowProblem(learned, offset, scale, u_scale, run.device)
@@ -51,7 +52,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     missed = np.abs(flow(s, judged.u) - s - judged.change / scale)
     least = LEAST_ERROR * np.sqrt(np.mean((learned.change / scale) ** 2, axis=0))
     error = np.maximum(OF_MEDIAN * np.median(missed, axis=0), least)
-    return Motion(**parts | {"flow": flow, "x_offset": offset, "x_scale": scale, "error": error})
+    return Motion(**parts | {"flow": flow, "error": error})
 
 
 class FlowProblem:

@@ -98,6 +98,7 @@ def test_equations_that_no_expression_holds_give_way_to_a_flow(whole):
     off = (motion.step(x, np.zeros((200, 0)), 0.05) - later) / motion.x_scale
     assert np.sqrt(np.mean(off**2)) < 3e-4
     assert (motion.error > 0).all()
+    assert motion.process_noise * motion.x_scale == pytest.approx(np.array(Table().scale) * 0.05 / np.sqrt(3))
 
 
 def test_equations_that_branch_are_refused():
