@@ -145,7 +145,8 @@ def assert_shown(batch, row, artifact, data, exact=False):
     ny = artifact.ny
     level = np.zeros(ny) if exact else data.measurement_noise[trajectory]
     process = float(data.process_noise[trajectory]) if "process_noise" in inverse.features else 0.0
-    decoder = Decoder(inverse, slice(None), tuple(level) if ny > 1 else float(level[0]), process)
+    level_of = tuple(level) if ny > 1 else float(level[0])
+    decoder = Decoder(inverse, slice(None), measurement_noise=level_of, process_noise=process)
     x_hat = decoder(data.z[slot, trajectory], float(data.ages[slot] * artifact.filter.dt))
     shown = inverse.x_offset + inverse.x_scale * inverse.mlp(batch.inputs[row].numpy())
     np.testing.assert_allclose(shown, x_hat, rtol=1e-3, atol=1e-4 * inverse.x_scale.max())

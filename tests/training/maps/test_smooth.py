@@ -22,7 +22,7 @@ def test_jacobians_by_differences(activation):
         assert np.allclose(network.jacobian(x)[..., j], (network(x + step) - network(x - step)) / (2 * eps), atol=1e-7)
 
 
-@pytest.mark.parametrize("name", ["van_der_pol-static", "rossler-spinn"])
+@pytest.mark.parametrize("name", ["van_der_pol-large", "rossler-spinn"])
 def test_the_smooth_maps_are_the_observers(name):
     observer = observers.load(name, 0.3, process_noise=0.03)
     y = np.random.default_rng(2).normal(size=(1, 1))

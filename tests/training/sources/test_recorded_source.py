@@ -88,7 +88,7 @@ def test_regions_hold_what_they_should_on_new_records(tracking):
 def test_signals_that_are_not_among_the_hidden_ones_cannot_be_tracked(tmp_path):
     records = [swing(seed, jitter=0.1) for seed in range(6)]
     result, said = trained(records, untold_noise=0.01)
-    assert "does not track: position cannot be told as a sum of speed without an offset" in said
+    assert "does not track: position is no sum of speed without an offset" in said
     artifact = result.artifact
     assert (artifact.motion, artifact.limits, list(result.losses)) == (None, None, ["inverse"])
     assert artifact.inverse.error_covariance is not None
@@ -171,7 +171,7 @@ def test_outputs_are_sums_of_states_or_an_error():
         np.testing.assert_allclose(C, [[1.0, 0.0]], atol=off)
         assert least == pytest.approx(noise, rel=0.1)
     for other in (run.y**2, run.y + 3.0, rng.standard_normal(run.y.shape)):
-        with pytest.raises(ValueError, match=r"position cannot be told as a sum of position, speed"):
+        with pytest.raises(ValueError, match=r"position is no sum of position, speed"):
             linear_output([replace(run, y=other)])
     early = np.arange(600)[:, None] < 300
     apart = replace(run, x=np.where(early, run.x, np.nan), y=np.where(early, np.nan, run.y))
