@@ -106,6 +106,9 @@ def test_the_readmes_table():
     for i, title in enumerate(titles):
         pairs = [f"{without[i]} / {under[i]}" for without, under in zip(*cells, strict=True)]
         assert row(title, pairs) in page("README.md")
+    medians = of_benchmark()
+    pairs = [" / ".join(text(medians[system, "ukf", noise]) for noise in (0.0, 0.5)) for system in SYSTEMS]
+    assert row("unscented Kalman filter, tuned, on the benchmark's runs", pairs) in page("README.md")
 
 
 def test_the_guide_on_noise_levels():
