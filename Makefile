@@ -66,7 +66,7 @@ results: $(VENV)/ready  ## the accuracy in the README and in docs/
 		--csv docs/results/accuracy.csv
 	$(BIN)/kkl-gym evaluate $(LARGE) --no-tracking --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
 	$(BIN)/kkl-gym evaluate $(LARGE) --no-tracking --plant-error 0.1 --csv docs/results/plant-error.csv
-	for map in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$map --calibration --trajectories 400 \
+	for map in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$map --calibration --trajectories 200 \
 		--csv runs/calibration/$$map.csv || exit 1; done
 	cp $(SYSTEMS:%=runs/calibration/%.csv) docs/results/tracking
 	$(MAKE) figures
