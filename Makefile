@@ -58,21 +58,17 @@ maps-%: $(VENV)/ready
 
 # T_inv alone is that of NAME-large, without tracking.
 results: $(VENV)/ready  ## the accuracy in the README and in docs/
-	$(BIN)/kkl-gym evaluate $(LARGE) $(SYSTEMS:%=%-spinn) --no-tracking --csv docs/results/accuracy.csv
-	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system-large $$system-spinn --no-tracking \
-		--measurement-noise 0.05 0.1 0.2 1 --csv docs/results/noise_levels/$$system.csv || exit 1; done
-	mkdir -p docs/results/error_bars docs/results/tracking
-	for map in $(LARGE); do $(BIN)/kkl-gym evaluate $$map --no-tracking --calibration --ekf \
-		--csv runs/error_bars/$$map.csv || exit 1; done
-	cp $(LARGE:%=runs/error_bars/%.csv) docs/results/error_bars
+	mkdir -p runs/calibration
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --measurement-noise 0 0.1 0.5 1 --ekf --csv docs/results/tracking/accuracy.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --process-noise 0.05 --csv docs/results/tracking/process-noise.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/tracking/plant-error.csv
-	for map in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$map --calibration --csv runs/error_bars/$$map.csv || exit 1; \
-		$(BIN)/kkl-gym evaluate $$map --calibration --trajectories 400 --csv runs/error_bars/$$map-400.csv || exit 1; done
-	cp $(SYSTEMS:%=runs/error_bars/%.csv) runs/error_bars/*-400.csv docs/results/tracking
+	$(BIN)/kkl-gym evaluate $(LARGE) $(SYSTEMS:%=%-spinn) --no-tracking --measurement-noise 0 0.1 0.5 1 \
+		--csv docs/results/accuracy.csv
 	$(BIN)/kkl-gym evaluate $(LARGE) --no-tracking --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
 	$(BIN)/kkl-gym evaluate $(LARGE) --no-tracking --plant-error 0.1 --csv docs/results/plant-error.csv
+	for map in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$map --calibration --trajectories 200 \
+		--csv runs/calibration/$$map.csv || exit 1; done
+	cp $(SYSTEMS:%=runs/calibration/%.csv) docs/results/tracking
 	$(MAKE) figures
 
 figures: $(VENV)/ready  ## the pictures of the pages, light and dark, from the files in docs/results, two minutes

@@ -31,7 +31,7 @@ from observers.storage import replacing, write
 from training.agents import picture
 from training.agents.agent import Agent
 from training.agents.play import Episodes, play
-from training.commands import coverage, demo, faults
+from training.commands import demo, faults
 from training.commands.agent_files import find
 from training.commands.options import shown
 from training.commands.portraits import animate
@@ -146,8 +146,7 @@ def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
 
 def noise_levels() -> Draw:
     """Errors by level of noise, of the maps that ship and of some of the benchmark's observers."""
-    files = [RESULTS / "accuracy.csv", RESULTS / "tracking" / "accuracy.csv"]
-    files += [RESULTS / "noise_levels" / f"{name}.csv" for name in SYSTEMS]
+    files = RESULTS / "accuracy.csv", RESULTS / "tracking" / "accuracy.csv"
     ours = pd.concat(map(pd.read_csv, files))
     rivals = pd.read_csv(RESULTS / "benchmark" / "results.csv")
 
@@ -159,14 +158,14 @@ def noise_levels() -> Draw:
             for ax, name in zip(axes, SYSTEMS, strict=True):
                 for observer, line, color, label in (
                     (name, "o-", ESTIMATE, "default maps"),
-                    (f"{name}-large", "o:", ESTIMATE, "T_inv alone"),
+                    (f"{name}-large, T_inv alone", "o:", ESTIMATE, "T_inv alone"),
                     (f"{name}-spinn", "o-", TARGET, "SPINN"),
                 ):
                     ax.plot(medians[observer], line, color=color, label=label)
                 for (method, label), marker in zip(RIVALS.items(), ("x", "+", "^"), strict=True):
                     if (name, method) in others.index:
                         ax.plot(others[name, method], marker, ms=6, mfc="none", color=RIVAL, label=label)
-                levels = medians[f"{name}-large"].index
+                levels = medians[name].index
                 ax.set_xscale("symlog", linthresh=levels[1], linscale=0.4)
                 ax.set_xticks(levels, [f"{level:g}" for level in levels], fontsize="small")
                 ax.minorticks_off()
@@ -178,9 +177,9 @@ def noise_levels() -> Draw:
 
 
 def errors_of_runs(
-    suffixes: Sequence[str], level: float, *, trajectories: int = 100, duration: float | None = None
+    level: float, *, trajectories: int = 100, duration: float | None = None
 ) -> dict[str, list[np.ndarray]]:
-    """Errors in % by system, (steps, n) for each map NAME + suffix and for an EKF, in the runs of ``kkl-gym evaluate``.
+    """Errors in % by system, (steps, n) for the default map and for an EKF, in the runs of ``kkl-gym evaluate``.
 
     The runs start in X; the tables of the pages have their means.
     """
@@ -188,15 +187,17 @@ def errors_of_runs(
     for name, kind in SYSTEMS.items():
         system, how = kind(), dict[str, Any](measurement_noise=level, seed=0)
         runs = unseen_trajectories(system, DT, n=trajectories, duration=duration or system.duration, seed=0)
-        x_hats = [estimates_of(Artifact.read(resolve(name + suffix)), system, runs, **how) for suffix in suffixes]
-        x_hats.append(kalman_estimates(system, runs, DT, **how))
+        x_hats = (
+            estimates_of(Artifact.read(resolve(name)), system, runs, **how),
+            kalman_estimates(system, runs, DT, **how),
+        )
         errors[name] = [percentage_error(runs.x, x_hat) for x_hat in x_hats]
     return errors
 
 
 def errors_over_time(**sizes: Any) -> Draw:
     """Medians and bands of errors at each step, of observers and Kalman filters: a column a system, a row a level."""
-    errors = {level: errors_of_runs([""], level, **sizes) for level in LEVELS}
+    errors = {level: errors_of_runs(level, **sizes) for level in LEVELS}
 
     def draw(path: Path) -> None:
         with drawing(path, 10, 4.6) as figure:
@@ -221,26 +222,6 @@ def errors_over_time(**sizes: Any) -> Draw:
     return draw
 
 
-def tracking(**sizes: Any) -> Draw:
-    """Median errors at each step at noise 0.5, of T_inv alone, of tracking and of a Kalman filter."""
-    errors = errors_of_runs(["-large", ""], LEVELS[-1], **sizes)
-
-    def draw(path: Path) -> None:
-        labels = "T_inv alone", "tracking", EKF
-        with drawing(path, 10, 3.2) as figure:
-            axes = figure.subplots(1, len(SYSTEMS), sharey=True)
-            for ax, name in zip(axes, SYSTEMS, strict=True):
-                for own, color, label in zip(errors[name], (TARGET, ESTIMATE, RIVAL), labels, strict=True):
-                    median = np.median(own, axis=1)
-                    ax.plot(DT * np.arange(1, len(own)), median[1:], color=color, lw=0.9, label=label)
-                ax.set(title=name.replace("_", " "), xlabel="t in s")
-                _set_logarithmic(ax, lowest=0.1)
-            axes[0].set_ylabel("median error in %")
-            figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(labels))
-
-    return draw
-
-
 def _set_logarithmic(ax: "Axes", lowest: float) -> None:
     ax.set(xscale="log", yscale="log", ylim=(lowest, 200.0))
     ax.xaxis.set_major_formatter("{x:g}")
@@ -254,9 +235,8 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "figures/agents.gif": agents_moving,
     "figures/agents.png": agents_over_time,
     "figures/errors_over_time.png": errors_over_time,
-    "figures/tracking.png": tracking,
     "figures/error_bars.png": error_bars,
-    "results/noise_levels/noise_levels.png": noise_levels,
+    "figures/noise_levels.png": noise_levels,
     "results/certificates/rossler-spinn.png": partial(certificate, "rossler-spinn"),
     "results/benchmark/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "benchmark"),
     "results/ablation/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "ablation"),
@@ -270,9 +250,6 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "results/faults/scores.png": lambda: partial(faults.draw, found=pd.read_csv(RESULTS / "faults" / "faults.csv")),
     "results/sizes/sizes.png": lambda: (
         lambda path: sizes.draw(path, *map(pd.read_csv, sorted((RESULTS / "sizes").glob("*.csv"))))
-    ),
-    "results/error_bars/van_der_pol.png": lambda: partial(
-        coverage.draw, rows=pd.read_csv(RESULTS / "error_bars" / "van_der_pol-large.csv")
     ),
 }
 

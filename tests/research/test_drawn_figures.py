@@ -48,7 +48,6 @@ def test_every_picture_is_shown_and_drawn():
     [
         partial(figures.error_bars, duration=1.5),
         pytest.param(partial(figures.errors_over_time, trajectories=3, duration=0.5), marks=pytest.mark.research),
-        pytest.param(partial(figures.tracking, trajectories=3, duration=0.5), marks=pytest.mark.research),
         pytest.param(figures.noise_levels, marks=pytest.mark.research),
     ],
 )
@@ -68,7 +67,7 @@ def test_figures_take_their_colours_from_the_style(make, tmp_path, monkeypatch):
 
 
 def test_a_picture_is_written_in_both_themes(tmp_path, capsys):
-    name = "results/error_bars/van_der_pol.png"
+    name = "results/faults/scores.png"
     figures.main([name], tmp_path)
     assert capsys.readouterr().out.count("wrote ") == 2
     for theme in ("light", "dark"):
