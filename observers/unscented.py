@@ -1,8 +1,7 @@
 """Gaussians through functions that are not linear, by sigma points, for a batch of them.
 
 The points are the mean +- sqrt(nx + kappa) times each column of the covariance's Cholesky factor, and the mean itself
-where it has a weight (Wan and van der Merwe, 2000, with alpha = 1). They are drawn anew for outputs that are not
-linear.
+(Wan and van der Merwe, 2000, with alpha = 1). They are drawn anew for outputs that are not linear.
 """
 
 import math
@@ -17,13 +16,10 @@ Gaussian = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Points:
-    """How sigma points are chosen; by default as in the cubature Kalman filter (Arasaratnam and Haykin, 2009).
+    """Which sigma points are drawn."""
 
-    That has no point in the middle, and all weigh the same.
-    """
-
-    kappa: float = 0.0
-    beta: float = 0.0
+    kappa: float
+    beta: float
 
     def weights(self, nx: int) -> tuple[float, float, float]:
         """What the mean weighs in means and in covariances, and each other point in both."""
@@ -33,58 +29,25 @@ class Points:
     def of(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
         """Those of means (n, nx) and covariances (n, nx, nx): (points, n, nx); NaN where these are none."""
         columns = math.sqrt(x.shape[-1] + self.kappa) * factor(P).transpose(2, 0, 1)
-        return np.concatenate([*([x[None]] if self._middle else []), x + columns, x - columns])
+        return np.concatenate([x[None], x + columns, x - columns])
 
     def moments(self, moved: np.ndarray, nx: int) -> Gaussian:
         """Mean (n, k) of points (points, n, k), and what these differ from it by."""
         middle, _, other = self.weights(nx)
-        mean = other * moved[1:].sum(0) + middle * moved[0] if self._middle else other * moved.sum(0)
+        mean = other * moved[1:].sum(0) + middle * moved[0]
         return mean, moved - mean
 
     def products(self, a: np.ndarray, b: np.ndarray, nx: int) -> np.ndarray:
         """Sum over points of outer products of (points, n, k) and (points, n, l), as (n, k, l)."""
         _, middle, other = self.weights(nx)
         weighted = other * a
-        if self._middle:
-            weighted[0] *= middle / other
+        weighted[0] *= middle / other
         products: np.ndarray = weighted.transpose(1, 2, 0) @ b.transpose(1, 0, 2)
         return products
 
-    @property
-    def _middle(self) -> bool:
-        """Whether the mean is one of them."""
-        return bool(self.kappa or self.beta)
-
-
-CUBATURE = Points()
-
-
-def predicted(
-    x: np.ndarray, P: np.ndarray, *, move: Callable[[np.ndarray], np.ndarray], Q: np.ndarray, points: Points = CUBATURE
-) -> Gaussian:
-    """Move a batch of Gaussians. Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``Q`` (nx, nx)."""
-    nx = x.shape[-1]
-    mean, spread = points.moments(move(points.of(x, P)), nx)
-    return mean, points.products(spread, spread, nx) + Q
-
-
-def corrected(
-    x: np.ndarray,
-    P: np.ndarray,
-    y: np.ndarray,
-    *,
-    output: Callable[[np.ndarray], np.ndarray],
-    R: np.ndarray,
-    points: Points = CUBATURE,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Condition Gaussians (n, nx), (n, nx, nx) on samples (n, ny) with covariance R; ``nis`` is (n,)."""
-    expected, S, across = transformed(x, P, function=output, points=points)
-    x, P, white = conditioned(x, P, y - expected, S + R, across, np.isnan(y))
-    return x, P, (white**2).sum(-1) / np.maximum((~np.isnan(y)).sum(-1), 1)
-
 
 def transformed(
-    x: np.ndarray, P: np.ndarray, *, function: Callable[[np.ndarray], np.ndarray], points: Points = CUBATURE
+    x: np.ndarray, P: np.ndarray, *, function: Callable[[np.ndarray], np.ndarray], points: Points
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a function makes of a batch of Gaussians: means (n, k), covariances (n, k, k) and across (n, nx, k)."""
     nx, at = x.shape[-1], points.of(x, P)
@@ -129,4 +92,4 @@ def factor(P: np.ndarray) -> np.ndarray:
     return found
 
 
-__all__ = ["CUBATURE", "Points", "conditioned", "corrected", "factor", "predicted", "transformed"]
+__all__ = ["Points", "conditioned", "factor", "transformed"]

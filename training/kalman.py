@@ -1,13 +1,12 @@
 """Kalman filters that know the equations of motion: what a control engineer would try first."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
-from observers import unscented
 from observers.unscented import Gaussian
 from training.sources.simulated import unknown_start
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
@@ -151,53 +150,3 @@ class ExtendedKalmanFilter(KalmanFilter):
         I_KH = np.eye(x.shape[1]) - K @ H
         P = I_KH @ P @ I_KH.mT + K @ R @ K.mT  # Joseph's form stays positive
         return x, P, np.where(inside, _normalised(innovation, S, y), np.inf)
-
-
-class UnscentedKalmanFilter(KalmanFilter):
-    """A batch of unscented Kalman filters (Wan and van der Merwe, 2000), see :mod:`observers.unscented`.
-
-    Their sigma points are those with alpha = 1, beta = 2 and kappa = 3 - nx, which are usual. Where h is undefined at
-    one, it is taken at their mean. A filter starts anew if its corrected mean leaves the system's declared bounds, or
-    if its covariance is no longer positive definite. Parameters are those of :class:`KalmanFilter`.
-    """
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def _predicted(self, u: np.ndarray) -> Gaussian:
-        move = self._motion(u)
-        return unscented.predicted(self.x, self.P, move=move, Q=self._Q * self._dt, points=self._points)
-
-    def _motion(self, u: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """What takes sigma points, (points, n, nx), to where they are one sample later."""
-
-        def move(points: np.ndarray) -> np.ndarray:
-            flat = np.ascontiguousarray(points.reshape(-1, points.shape[-1]).T)
-            moved = advance_batch(self._system, flat, np.tile(u, len(points)), np.zeros_like(flat), self._dt)
-            return moved.T.reshape(points.shape)
-
-        return move
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
-        x, P, nis = self._updated(x, P, y)
-        lost = ~self._inside(x, P)
-        if lost.any():
-            start = self._starts(int(lost.sum()))
-            anew = self._updated(*start, y[lost])
-            sound = self._inside(*anew[:2])  # or else the start stands as it is
-            x[lost] = np.where(sound[:, None], anew[0], start[0])
-            P[lost] = np.where(sound[:, None, None], anew[1], start[1])
-            nis[lost] = np.inf
-        return x, P, nis
-
-    def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
-        return unscented.corrected(x, P, y, output=self._output, R=self._R, points=self._points)
-
-    def _output(self, points: np.ndarray) -> np.ndarray:
-        y = self._system.output(points)
-        if not np.isfinite(y).all():
-            y = np.where(np.isfinite(y), y, self._system.output(points.mean(0, keepdims=True)))
-        return y
-
-    @property
-    def _points(self) -> unscented.Points:
-        return unscented.Points(kappa=3.0 - self._system.nx, beta=2.0)

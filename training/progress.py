@@ -1,11 +1,12 @@
-"""Progress for people: one kind of bar for everything that takes long, and lines where bars cannot be drawn.
+"""Progress bars; where none can be drawn, a line a minute, which the log of a run gets as well.
 
 A line says what a bar would: ``simulating lorenz: 30 of 100, 0:00:30 passed, 0:01:10 left``. A thread writes it, so
-that nothing that takes long is silent, whether it tells how far it is or not.
+that a phase that does not report is not silent.
 """
 
+import math
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -17,24 +18,21 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
     Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
+    TimeRemainingColumn,
 )
-from rich.text import Text
 
 LOG = "log.txt"  # in the folder of a run
 
-FIRST_LINE = 5.0  # seconds after which a phase is said to be under way
-SECONDS_BETWEEN_LINES = 15.0  # at first; a twentieth of the time that passed later on
-MOST_BETWEEN_LINES = 60.0
+FIRST_LINE, NEXT_LINE = 5.0, 60.0  # seconds before the first line of a phase, and between lines
 BEAT = 1.0  # seconds between looks at the clock
 
 
 class ProgressBars(Progress):
-    """Bars with counts, the time that passed and the time that is left; on what is no terminal, a line now and then.
+    """Bars with counts, the time that passed and the time that is left; lines where the console is no terminal.
 
     ``add_task``, ``update``, ``advance`` and ``track`` are those of :class:`rich.progress.Progress`.
     """
@@ -46,9 +44,10 @@ class ProgressBars(Progress):
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            _Left(),
+            TimeRemainingColumn(),
             console=console or Console(quiet=True),
             disable=not drawn,
+            speed_estimate_period=3600.0,
             **options,
         )
         self._written = None if drawn else console
@@ -74,32 +73,9 @@ class ProgressBars(Progress):
 
     def say(self, text: str) -> None:
         """Print a line above the bars, and to the log."""
+        self.tell()
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
         self._append(text)
-
-    def add_task(
-        self,
-        description: str,
-        start: bool = True,
-        total: float | None = 100.0,
-        completed: int = 0,
-        visible: bool = True,
-        **fields: Any,
-    ) -> TaskID:
-        """Begin a task, as :meth:`rich.progress.Progress.add_task` does."""
-        task = super().add_task(description, start, total, completed, visible, first=completed, **fields)
-        self._due[task] = self.get_time() + FIRST_LINE
-        return task
-
-    def update(self, task_id: TaskID, **changes: Any) -> None:
-        """Change a task, as :meth:`rich.progress.Progress.update` does."""
-        super().update(task_id, **changes)
-        self.tell()
-
-    def advance(self, task_id: TaskID, advance: float = 1) -> None:
-        """Add to what is done, as :meth:`rich.progress.Progress.advance` does."""
-        super().advance(task_id, advance)
-        self.tell()
 
     def start(self) -> None:
         """Begin to draw, or to write."""
@@ -110,6 +86,7 @@ class ProgressBars(Progress):
     def stop(self) -> None:
         """End it."""
         self._ended.set()
+        self.tell()
         if not self.disable:  # old versions of rich end even disabled bars with a line
             super().stop()
 
@@ -121,26 +98,20 @@ class ProgressBars(Progress):
             self._append(f"ended by {type(error).__name__}{': ' if str(error) else ''}{error}")
 
     def tell(self) -> None:
-        """Write a line for each task that is due."""
+        """Write a line for each task that is due, or that ended."""
         if self._written is None and self._log is None:
             return
-        now = self.get_time()
-        for task in self.tasks:
-            with self._lock:
-                due = self._due.get(task.id)
-                if due is None or (now < due and not task.finished):
-                    continue
+        with self._lock:
+            for task in self.tasks:
                 passed = task.elapsed or 0.0
-                pause = min(max(SECONDS_BETWEEN_LINES, passed / 20), MOST_BETWEEN_LINES)
-                self._due[task.id] = now + pause
-                if task.finished:
-                    del self._due[task.id]
-                    if passed < FIRST_LINE:
-                        continue
-            line = _line(task)
-            if self._written is not None:
-                self._written.print(line, markup=False, highlight=False, soft_wrap=True)
-            self._append(line)
+                due = self._due.get(task.id, FIRST_LINE)
+                if due == math.inf or passed < (FIRST_LINE if task.finished else due):
+                    continue
+                self._due[task.id] = math.inf if task.finished else passed + NEXT_LINE
+                line = _line(task, passed)
+                if self._written is not None:
+                    self._written.print(line, markup=False, highlight=False, soft_wrap=True)
+                self._append(line)
 
     def _beat(self) -> None:
         while not self._ended.wait(BEAT):
@@ -165,37 +136,11 @@ def progress_bars(console: Console | ProgressBars | None, log: Path | None = Non
             yield progress
 
 
-def under_way(what: str, names: Iterable[str]) -> str:
-    """Describe jobs by what they are and the names of those that run: ``observers (now lorenz/ekf)``."""
-    running = ", ".join(names)
-    return f"{what} (now {running})" if running else what
-
-
-class _Left(ProgressColumn):
-    """The time that is left."""
-
-    def render(self, task: Task) -> Text:
-        left = _left(task)
-        return Text("-:--:--" if left is None else _clock(left), style="progress.remaining")
-
-
-def _left(task: Task) -> float | None:
-    """Seconds that are left of a task at its mean speed; None if nobody knows."""
-    done = task.completed - task.fields.get("first", 0)
-    if task.total is None or task.elapsed is None or done <= 0:
-        return None
-    return max(0.0, (task.total - task.completed) * task.elapsed / done)
-
-
-def _line(task: Task) -> str:
+def _line(task: Task, passed: float) -> str:
     count = "" if task.total is None else f" {task.completed:.0f} of {task.total:.0f},"
-    line = f"{task.description}:{count} {_clock(task.elapsed or 0.0)} passed"
-    left = _left(task)
-    return line if left is None or task.finished else f"{line}, {_clock(left)} left"
-
-
-def _clock(seconds: float) -> str:
-    return str(timedelta(seconds=round(seconds)))
+    line = f"{task.description}:{count} {timedelta(seconds=round(passed))} passed"
+    left = None if task.finished else task.time_remaining
+    return line if left is None else f"{line}, {timedelta(seconds=round(left))} left"
 
 
 def duration(seconds: float) -> str:

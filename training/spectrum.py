@@ -1,7 +1,6 @@
 """The eigenvalues of A: how they are spaced, what others take, and the filter that they make."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import scipy
@@ -47,10 +46,3 @@ def evenly_spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
 def papers_spectrum(system: System) -> tuple[float, ...]:
     """2 nx + 1 eigenvalues in [-3, -1.5] (paper, sec. 8), in one over the seconds of the system's pace."""
     return tuple((np.linspace(-1.5, -3.0, 2 * system.nx + 1) / system.pace).tolist())
-
-
-def bessel_spectrum(order: int, cutoff: float, norm: Literal["mag", "phase"] = "mag") -> Spectrum:
-    """Poles of an analogue Bessel filter."""
-    _, poles, _ = scipy.signal.besselap(order, norm=norm)
-    real = tuple(float(cutoff * pole.real) for pole in poles if pole.imag == 0)
-    return Spectrum(real, tuple((float(cutoff * p.real), float(cutoff * p.imag)) for p in poles if p.imag > 0))

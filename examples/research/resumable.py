@@ -2,14 +2,29 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
+import tyro
 from rich.console import Console
 
-from training.commands.running import Workers, run_missing
+from examples.research.parallel import Backend, engine
 from training.jobs import check_identity, claimed_job
 from training.progress import LOG, ProgressBars, progress_bars
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where jobs run; docs/guides/many_machines.md says more."""
+
+    jobs: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 2, or all cores of a cluster)")] = None
+    """Jobs at a time, each in a process of one thread."""
+    backend: Backend = "loky"
+    """loky: processes of this machine. dask, ray: a cluster that shares the folder of results
+    (docs/guides/many_machines.md)."""
+    address: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: none)")] = None
+    """Of the cluster: tcp://HOST:8786 for Dask's scheduler; auto or HOST:6379 for Ray's head."""
 
 
 class Job(ABC):
@@ -72,6 +87,31 @@ def run_and_report(
         with progress_bars(console, out / LOG) as progress, progress.phase("collecting results"):
             report(progress)
     check_failures(failures, jobs, what)
+
+
+def run_missing(
+    run: Callable[[Job], None], jobs: Sequence[Job], *, workers: Workers, what: str, progress: ProgressBars
+) -> list[str]:
+    """Run the jobs that are not done."""
+    todo, failures = [job for job in jobs if not job.done], list[str]()
+    names = [job.name for job in todo]  # the engine begins jobs in this order: the first ones run
+    bar = progress.add_task(what, total=len(jobs), completed=len(jobs) - len(todo))
+
+    def described() -> str:
+        running = ", ".join(names[: here.workers])
+        return f"{what} (now {running})" if running else what
+
+    with engine(workers.jobs, backend=workers.backend, address=workers.address) as here:
+        progress.update(bar, description=described())
+        for job, failure in here.run(run, todo):
+            names.remove(job.name)
+            if failure:
+                failures.append(f"{job.name}: {failure}")
+                progress.say(f"failed {failures[-1]} (in {job.folder})")
+            else:
+                progress.say(f"finished {job.name}")
+            progress.update(bar, advance=1, description=described())
+    return failures
 
 
 def check_failures(failures: Sequence[str], jobs: Sequence[Job], what: str) -> None:

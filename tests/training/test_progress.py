@@ -38,6 +38,7 @@ def work(progress, clock, *, steps=100, seconds=1.0, completed=0):
                 progress.advance(task)
             else:
                 progress.update(task, completed=done)
+            progress.tell()
 
 
 def written(clock, log=None, **how):
@@ -47,11 +48,10 @@ def written(clock, log=None, **how):
 
 
 def test_what_is_no_terminal_gets_a_line_now_and_then(clock):
-    assert written(clock, steps=40) == [
-        "simulating [lorenz]: 5 of 40, 0:00:05 passed, 0:00:35 left",
-        "simulating [lorenz]: 20 of 40, 0:00:20 passed, 0:00:20 left",
-        "simulating [lorenz]: 35 of 40, 0:00:35 passed, 0:00:05 left",
-        "simulating [lorenz]: 40 of 40, 0:00:40 passed",
+    assert written(clock, steps=80) == [
+        "simulating [lorenz]: 5 of 80, 0:00:05 passed, 0:01:15 left",
+        "simulating [lorenz]: 65 of 80, 0:01:05 passed, 0:00:15 left",
+        "simulating [lorenz]: 80 of 80, 0:01:20 passed",
     ]
     assert written(clock, steps=4) == []  # not worth a line
     assert "simulating [lorenz]: 2 of 4, 2:00:00 passed, 2:00:00 left" in written(clock, steps=4, seconds=3600.0)

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from linear_system import Oscillator, sylvester
-from scipy.signal import bessel, freqs_zpk
 
 from kkl_gym import get_system
-from training.spectrum import Spectrum, bessel_spectrum, evenly_spaced, papers_spectrum
+from training.spectrum import Spectrum, evenly_spaced, papers_spectrum
 from training.trajectories.record import record
 
 
@@ -32,22 +31,6 @@ def test_each_output_has_a_filter_with_the_poles(ny, nu):
     np.testing.assert_array_equal(linear.A, np.kron(np.eye(ny), block))
     np.testing.assert_array_equal(linear.B, np.kron(np.eye(ny), np.ones((4, 1))))
     np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(spectrum.A)), np.sort_complex(spectrum.poles))
-
-
-@pytest.mark.parametrize("order", [2, 5])
-@pytest.mark.parametrize("norm", ["mag", "phase"])
-def test_bessel_spectra_are_scipys(order, norm):
-    cutoff = 7.0
-    spectrum = bessel_spectrum(order, cutoff, norm=norm)
-    zeros, poles, gain = bessel(order, cutoff, analog=True, output="zpk", norm=norm)
-    assert spectrum.modes == order
-    np.testing.assert_allclose(np.sort_complex(spectrum.poles), np.sort_complex(poles), rtol=1e-9)
-    _, response = freqs_zpk(zeros, spectrum.poles, gain, [cutoff])
-    if norm == "mag":
-        assert abs(response[0]) == pytest.approx(1 / np.sqrt(2), rel=1e-6)
-    else:
-        assert abs(np.prod(spectrum.poles)) == pytest.approx(cutoff**order)  # the asymptotes are a Butterworth filter's
-    assert (spectrum == bessel_spectrum(order, cutoff)) == (norm == "mag")
 
 
 def test_evenly_spaced_eigenvalues():

@@ -15,7 +15,7 @@ from examples.research.agents.tables import (
     report_systems,
     write_environments,
 )
-from examples.research.resumable import run_and_report
+from examples.research.resumable import Workers, run_and_report
 from kkl_gym import get_system
 from observers import Artifact
 from observers.names import resolve
@@ -23,7 +23,6 @@ from observers.storage import write
 from training.agents.information import OBSERVED, observer_of
 from training.agents.tasks import TASKS
 from training.commands.environment import EnvironmentOptions
-from training.commands.running import Workers
 from training.progress import ProgressBars
 
 # On systems or in environments; tyro would list those in both twice in a union of the two.

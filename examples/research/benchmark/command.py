@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from examples.research.resumable import check_failures, run_job
+from examples.research.resumable import Workers, check_failures, run_job, run_missing
 from kkl_gym.systems import SYSTEMS, get_system
 from observers.checks import noise_levels
 from observers.storage import clear_unfinished
 from training.commands.options import NoiseLevels
-from training.commands.running import Workers, run_missing
 from training.evaluation.levels import multiple, show_level
 from training.progress import LOG, progress_bars
 from training.seeds import Stream, generator

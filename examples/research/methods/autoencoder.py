@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from scipy.linalg import solve_continuous_lyapunov
+from scipy.signal import besselap
 from torch import nn
 
 from examples.research.methods.base import Configuration, Task
@@ -15,7 +16,7 @@ from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
 from training.maps.pde import on_tensors
-from training.spectrum import bessel_spectrum
+from training.spectrum import Spectrum
 from training.trajectories.derivatives import output_matrix
 
 BATCH = 512
@@ -24,6 +25,13 @@ RECONSTRUCTION = 0.1  # weight of |x - T_inv(T(x))|^2 beside the PDE residual, t
 TUNING = 0.15  # share of the CPU time in which the maps are learned for every cutoff
 STARTS = 100_000  # among which states are drawn where the system draws its own starts
 CUTOFFS = (0.1, 1.0)  # range of the cutoff, in multiples of the system's median rate over X
+
+
+def bessel_spectrum(order: int) -> Spectrum:
+    """Poles of the analogue Bessel filter whose asymptotes are those of a Butterworth filter of cutoff 1."""
+    _, poles, _ = besselap(order, norm="phase")
+    real = tuple(float(pole.real) for pole in poles if pole.imag == 0)
+    return Spectrum(real, tuple((float(pole.real), float(pole.imag)) for pole in poles if pole.imag > 0))
 
 
 class AE(KKLMethod):
@@ -92,7 +100,7 @@ class _Problem(nn.Module):
     def __init__(self, task: Task, slowest: float, fastest: float) -> None:
         super().__init__()
         system, budget, data, device = task.system, task.budget, task.data, task.device
-        unit = bessel_spectrum(system.nx + 1, 1.0, norm="phase").filter(system.ny, budget.dt)
+        unit = bessel_spectrum(system.nx + 1).filter(system.ny, budget.dt)
         self.D, self.F = unit.A, unit.B
         self.system, self.slowest, self.fastest = system, slowest, fastest
         low, high = system.box()

@@ -5,9 +5,10 @@ from typing import ClassVar
 import numpy as np
 
 from examples.research.methods.base import Arrays, CausalObserver, Configuration, Method, Task, WrongParameters
+from examples.research.methods.unscented import UnscentedKalmanFilter
 from kkl_gym.system import System
 from training.evaluation.levels import Level
-from training.kalman import ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, measurement_covariance
+from training.kalman import ExtendedKalmanFilter, KalmanFilter, measurement_covariance
 from training.sources.simulated import unknown_start
 
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from busy_jobs import Busy, alive, until, work
 
-from training.parallel import TRIES, engine
+from examples.research.parallel import TRIES, engine
 
 IMPORTS = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1] / "helpers"), *sys.path])}
 FAILURES = {"bad": "this one is bad", "silent": "ValueError", "leaving": "left with sys.exit('enough')"}
@@ -59,7 +59,7 @@ def test_a_job_that_kills_its_workers_stops_neither_the_others_nor_this_process(
 
 PARENT = """
 import signal, sys, pathlib, busy_jobs
-from training.parallel import engine
+from examples.research.parallel import engine
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore it
 with engine(2) as here:
