@@ -157,6 +157,25 @@ def test_the_benchmark_has_what_ships():
         assert row(title, cells) in benchmark
 
 
+def test_what_is_said_of_tuned_kalman_filters():
+    medians = of_benchmark().unstack("method")
+    ratios = {
+        (rival, noise): from_to((medians["shipped"] / medians[rival]).xs(noise, level="noise"))
+        for rival in ("ekf", "ukf")
+        for noise in (0.0, 0.5)
+    }
+    benchmark, faq = (" ".join(page(name).split()) for name in ("docs/results/benchmark.md", "docs/faq.md"))
+    assert (
+        f"At noise 0.5, from X, it leaves {ratios['ekf', 0.5]} times the error of the tuned EKF and "
+        f"{ratios['ukf', 0.5]} times that of the tuned UKF. Without noise it leaves {ratios['ekf', 0.0]} times and "
+        f"{ratios['ukf', 0.0]} times."
+    ) in benchmark
+    assert (
+        f"they leave {ratios['ekf', 0.5]} times the error of tuned extended filters, and {ratios['ukf', 0.5]} times "
+        "that of tuned unscented ones"
+    ) in faq
+
+
 def test_the_guide_to_speed_has_the_errors_and_times_of_each_width():
     for title, column, digits in (
         ("width of the hidden layers", "width", 0),
