@@ -52,7 +52,7 @@ def test_lorenz_serves_noise_up_to_three_and_the_others_up_to_one():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_worst_start_of_many_beyond_x_is_found_and_kept(name):
-    system = kkl_gym.get_system(name)
+    system = get_system(name)
     rng = np.random.default_rng(2024)
     x = simulate(system, rng.uniform(*system.box(2.0), (64, system.nx)), 2000, 0.01)
     x = x[:, np.isfinite(x[-1]).all(-1)]
