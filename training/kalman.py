@@ -9,8 +9,9 @@ from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from observers.unscented import Gaussian
 from training.sources.simulated import unknown_start
-from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
+from training.trajectories.derivatives import evaluate, jacobian
 
+ASIDE = 1e-4  # of X's half-widths, steps of the central differences
 NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in multiples of the system's default
 LEAST_PROCESS_NOISE = 0.005  # that a filter assumes, at the system's pace: a tenth of the environments' default
 
@@ -18,20 +19,16 @@ Corrected = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Means, covariances and normalised innovations squared (n,) of a batch."""
 
 
-def measurement_covariance(
-    system: System, measurement_noise: float | Sequence[float], *, floor: float = NOISE_FLOOR
-) -> np.ndarray:
+def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
     """Covariance (ny, ny) of the measurement noise that a filter assumes: at least a part of the system's default."""
-    least = floor * np.asarray(system.measurement_noise, dtype=float)
+    least = NOISE_FLOOR * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
 
 
-def process_intensity(
-    system: System, process_noise: float, dt: float, *, least: float = LEAST_PROCESS_NOISE
-) -> np.ndarray:
+def process_intensity(system: System, process_noise: float, dt: float) -> np.ndarray:
     """Intensity (nx, nx) of the white noise that a filter assumes for the plant's process noise, never quite 0."""
-    assumed = max(process_noise, least / system.pace)
+    assumed = max(process_noise, LEAST_PROCESS_NOISE / system.pace)
     return np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)
 
 
@@ -111,7 +108,7 @@ def _normalised(innovation: np.ndarray, S: np.ndarray, y: np.ndarray) -> np.ndar
 class ExtendedKalmanFilter(KalmanFilter):
     """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3).
 
-    Mean and sensitivity Phi are moved together over each sample, P = Phi P Phi^T + Q dt. A filter whose predicted mean
+    P = Phi P Phi^T + Q dt, with central differences of the flow as Phi. A filter whose predicted mean
     leaves the system's declared bounds starts anew. An output that is undefined there, or its slope, corrects nothing.
     Parameters are those of :class:`KalmanFilter`.
     """
@@ -120,17 +117,19 @@ class ExtendedKalmanFilter(KalmanFilter):
         self, system: System, dt: float, *, Q: np.ndarray, R: np.ndarray, start: Gaussian | None = None
     ) -> None:
         super().__init__(system, dt, Q=Q, R=R, start=start)
-        self._joint = with_sensitivity(system)
+        low, high = system.box()
+        self._aside = ASIDE * (high - low) / 2
         self._outputs = jacobian(system.h, system.nx)
 
     @np.errstate(over="ignore", invalid="ignore")  # of filters that are lost, which start anew
     def _predicted(self, u: np.ndarray) -> Gaussian:
-        n, nx = self.x.shape
-        Phi0 = np.broadcast_to(np.eye(nx).reshape(-1, 1), (nx * nx, n))
-        joint = np.concatenate([self.x.T, Phi0])
-        joint = advance_batch(self._joint, joint, u, np.zeros_like(joint), self._dt)
-        x, Phi = joint[:nx].T, joint[nx:].T.reshape(n, nx, nx)
-        return x, Phi @ self.P @ Phi.mT + self._Q * self._dt
+        (n, nx), aside = self.x.shape, np.diag(self._aside)[..., None]
+        starts = np.concatenate([self.x.T[:, None], self.x.T[:, None] + aside, self.x.T[:, None] - aside], 1)
+        flat = starts.reshape(nx, -1)
+        ends = advance_batch(self._system, flat, np.tile(u, 1 + 2 * nx), np.zeros_like(flat), self._dt)
+        ends = ends.reshape(nx, 1 + 2 * nx, n)
+        Phi = ((ends[:, 1 : nx + 1] - ends[:, nx + 1 :]) / (2 * self._aside[:, None])).transpose(2, 0, 1)
+        return ends[:, 0].T, Phi @ self.P @ Phi.mT + self._Q * self._dt
 
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
         inside = self._inside(x, P)

@@ -228,6 +228,25 @@ def _set_logarithmic(ax: "Axes", lowest: float) -> None:
     ax.yaxis.set_major_formatter("{x:g}")
 
 
+def coverage(path: Path, rows: pd.DataFrame) -> None:
+    """Draw the coverage of 90 % regions by level of noise, a panel for each span."""
+    spans = list(rows.span.unique())
+    with drawing(path, 4.0 * len(spans), 3.4) as figure:
+        axes: Any = figure.subplots(1, len(spans), sharey=True, squeeze=False)[0]
+        cases = list(rows[["starts", "driven"]].drop_duplicates().itertuples(index=False, name=None))
+        for ax, span in zip(axes, spans, strict=True):
+            for (who, starts, driven), group in rows[rows.span == span].groupby(
+                ["observer", "starts", "driven"], sort=False
+            ):
+                label = f"{who}, {starts}{', driven' if driven else ''}"
+                look, color = "o-" if who == "KKL" else "s--", f"C{cases.index((starts, driven))}"
+                ax.plot(group.measurement_noise.astype(str), group["90"], look, color=color, label=label)
+            ax.axhline(90, color=TRUTH, linewidth=0.8)
+            ax.set(title=span, xlabel="measurement noise", ylim=(0, 102))
+        axes[0].set_ylabel("errors in the 90 % region, %")
+        axes[-1].legend(loc="lower right")
+
+
 FIGURES: Mapping[str, Callable[[], Draw]] = {
     "figures/estimates.png": estimates,
     "figures/portraits.gif": portraits,

@@ -50,33 +50,20 @@ def test_lorenz_serves_noise_up_to_three_and_the_others_up_to_one():
             observers.load(name, measurement_noise=limit + 0.1)
 
 
-@pytest.mark.parametrize("name", ["lorenz", "van_der_pol"])
-def test_small_maps_are_small_and_nearly_as_good(name):
-    """On 20 runs of 10 s; ``kkl-gym evaluate`` measures more."""
-    large, small = (observers.load(which, 0.5, process_noise=0.0) for which in (name, f"{name}-small"))
+@pytest.mark.parametrize("name", NAMES)
+def test_the_worst_start_of_many_beyond_x_is_found_and_kept(name):
     system = get_system(name)
-    small.artifact.check(name, system.parameters, dt=0.01, ny=system.ny, nu=system.nu)
-    for inverse in ("inverse", "free_inverse"):
-        multiplications = [
-            sum(weight.size for weight in getattr(one.artifact, inverse).mlp.weights) for one in (small, large)
-        ]
-        assert multiplications[0] / multiplications[1] < 0.1
-    assert len(small.artifact.motion.flow.mlp.weights[0]) <= 8
-    rng = np.random.default_rng(0)
-    x = simulate(system, rng.uniform(*system.box(), (20, system.nx)), 1000, 0.01)
-    y = system.output(x)
-    noisy = y + 0.5 * rng.standard_normal(y.shape)
-
-    def error(observer, y):
-        apart = np.linalg.norm(observer.estimate(y) - x, axis=-1)[400:]
-        return np.median(apart.mean(0) / np.linalg.norm(x, axis=-1).mean(0))
-
-    assert error(small, noisy) < 1.5 * error(large, noisy)
-    small.measurement_noise = 0.0
-    assert error(small, y) < 0.005
+    rng = np.random.default_rng(2024)
+    x = simulate(system, rng.uniform(*system.box(2.0), (64, system.nx)), 2000, 0.01)
+    x = x[:, np.isfinite(x[-1]).all(-1)]
+    y = system.output(x) + 0.1 * rng.standard_normal((*x.shape[:2], system.ny))
+    x_hat = observers.load(name, 0.1, process_noise=0.0).estimate(y)
+    late = slice(1000, None)
+    smape = np.abs(x_hat - x)[late].sum(-1) / (np.abs(x_hat) + np.abs(x))[late].sum(-1)
+    assert smape.mean(0).max() < 0.03
 
 
-@pytest.mark.parametrize("name", ["van_der_pol", "lorenz-small"])
+@pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
 def test_a_few_false_samples_are_forgotten(name):
     """Far off, so that a covariance grows far beyond the motions that the flow was fitted to."""
     observer = observers.load(name)

@@ -16,7 +16,6 @@ from training import errors, preset, train, unseen_trajectories
 from training.kalman import ExtendedKalmanFilter
 from training.smoothness import smooth_spectrum
 from training.systems import controller
-from training.trajectories.derivatives import with_sensitivity
 
 
 def test_a_step_in_closed_form_is_the_integration():
@@ -44,17 +43,6 @@ def test_the_kalman_filter_follows_a_map_as_it_follows_its_integration():
         one = ExtendedKalmanFilter(system, DT, Q=np.diag([0.01, 0.02]), R=np.array([[0.3]]))
         found.append([one.reset(y[0]), *(one.step(y[k], u[k]) for k in range(1, 60))])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-7, atol=1e-9)
-
-
-def test_the_sensitivity_of_a_map():
-    system = Henon()
-    joint = with_sensitivity(system, True)
-    x, u, step = np.array([[0.2, 0.1]]), np.full((6, 1, 1), 0.01), 1e-6
-    last = simulate(joint, np.hstack([x, np.eye(2).reshape(1, -1)]), 6, 1.0, u[..., : joint.nu])[-1]
-    around = np.concatenate([x + step * row for row in (*np.eye(2), *-np.eye(2))])
-    ends = simulate(system, around, 6, 1.0, np.tile(u, (1, 4, 1)))[-1]
-    np.testing.assert_allclose(last[0, :2], simulate(system, x, 6, 1.0, u)[-1, 0])
-    np.testing.assert_allclose(last[0, 2:].reshape(2, 2), ((ends[:2] - ends[2:]) / (2 * step)).T, rtol=1e-5, atol=1e-7)
 
 
 def test_the_regulator_of_a_map_holds_it():

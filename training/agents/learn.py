@@ -3,14 +3,12 @@
 import ast
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
 import yaml
 from rich.progress import Progress
 from sb3_contrib import RecurrentPPO
@@ -28,7 +26,6 @@ from training.agents.bridge import SB3VecEnv
 from training.agents.checkpoint import CURVE, Checkpoint
 from training.agents.cost import Cost
 from training.agents.information import OBSERVED, Features, Information, make, observer_of
-from training.agents.play import Policy
 from training.agents.policy import linear, perceptron
 from training.checkpoints import SUFFIX
 from training.seeds import agent_training_seed
@@ -62,7 +59,9 @@ def learn(
     name, settings = hyperparameters(task, algorithm)
     named = (observer or observer_of(get_system(task.system))) if information in OBSERVED else None
     env = make(task, information, settings["n_envs"], observer=named)
-    timesteps = _positive(settings["n_timesteps"] if timesteps is None else timesteps)
+    timesteps = settings["n_timesteps"] if timesteps is None else timesteps
+    if timesteps < 1:
+        raise ValueError(f"timesteps must be positive, got {timesteps}")
     seen: dict[str, Any] = {
         "information": information,
         "observer": named,
@@ -74,7 +73,7 @@ def learn(
     checkpoint = Checkpoint(folder / f"agent{SUFFIX}", hashlib.sha256(identity.encode()).hexdigest())
     if not resume:
         checkpoint.path.unlink(missing_ok=True)
-    model = _fit(
+    model = fit(
         name,
         settings,
         env=env,
@@ -98,48 +97,7 @@ def learn(
     return agent
 
 
-def learn_recurrent(
-    task: ControlTask, of: Literal["y", "state"], folder: Path, *, seed: int = 0, timesteps: int | None = None
-) -> Callable[[], Policy]:
-    """Train RecurrentPPO on the noisy output, or on the full state as a control, each with the action before."""
-    name, settings = hyperparameters(task, "ppo_lstm")
-    env = make(task, of, settings["n_envs"], with_action=True)
-    timesteps = _positive(settings["n_timesteps"] if timesteps is None else timesteps)
-    model = _fit(
-        name,
-        settings,
-        env=env,
-        task=task,
-        timesteps=timesteps,
-        seed=seed,
-        folder=folder,
-        progress=None,
-        description=f"{get_system(task.system).name} recurrent {of}",
-    )
-
-    def policy() -> Policy:
-        memory: dict[str, Any] = {"state": None, "episode_start": None}
-
-        def act(obs: np.ndarray) -> np.ndarray:
-            if memory["episode_start"] is None:
-                memory["episode_start"] = np.ones(len(obs), dtype=bool)
-            action, memory["state"] = model.predict(obs, deterministic=True, **memory)
-            memory["episode_start"] = np.zeros(len(obs), dtype=bool)
-            bounded: np.ndarray = np.clip(action, -1.0, 1.0)
-            return bounded
-
-        return act
-
-    return policy
-
-
-def _positive(timesteps: int) -> int:
-    if timesteps < 1:
-        raise ValueError(f"timesteps must be positive, got {timesteps}")
-    return timesteps
-
-
-def _fit(
+def fit(
     algorithm: str,
     settings: dict[str, Any],
     *,
@@ -149,7 +107,7 @@ def _fit(
     seed: int,
     folder: Path,
     checkpoint: Checkpoint | None = None,
-    progress: Progress | None,
+    progress: Progress | None = None,
     description: str,
 ) -> BaseAlgorithm:
     """Train on minus the cost, with the learning curve in FOLDER/progress.csv; goes on from the checkpoint's file."""

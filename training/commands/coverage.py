@@ -1,6 +1,5 @@
 """What ``kkl-gym evaluate --calibration`` prints: whether error bars are true."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from observers import Artifact
 from training.evaluation.coverage import REGIONS, Coverage, coverage, kalman_coverage
 from training.evaluation.errors import UnseenTrajectories
 from training.evaluation.levels import Level, as_cell, show_level
-from training.figures import TRUTH, drawing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -80,22 +78,3 @@ def coverage_table(title: str, rows: "pd.DataFrame") -> Table:
             f"{row['nees']:.2f}",
         )
     return shown
-
-
-def draw(path: Path, rows: "pd.DataFrame") -> None:
-    """Draw the coverage of 90 % regions by level of noise, a panel for each span."""
-    spans = list(rows.span.unique())
-    with drawing(path, 4.0 * len(spans), 3.4) as figure:
-        axes: Any = figure.subplots(1, len(spans), sharey=True, squeeze=False)[0]
-        cases = list(rows[["starts", "driven"]].drop_duplicates().itertuples(index=False, name=None))
-        for ax, span in zip(axes, spans, strict=True):
-            for (who, starts, driven), group in rows[rows.span == span].groupby(
-                ["observer", "starts", "driven"], sort=False
-            ):
-                label = f"{who}, {starts}{', driven' if driven else ''}"
-                look, color = "o-" if who == "KKL" else "s--", f"C{cases.index((starts, driven))}"
-                ax.plot(group.measurement_noise.astype(str), group["90"], look, color=color, label=label)
-            ax.axhline(90, color=TRUTH, linewidth=0.8)
-            ax.set(title=span, xlabel="measurement noise", ylim=(0, 102))
-        axes[0].set_ylabel("errors in the 90 % region, %")
-        axes[-1].legend(loc="lower right")

@@ -94,26 +94,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of an environment with an observer.
-
-    Parameters
-    ----------
-    label : str
-        For tables.
-    chosen : bool
-        Whether the observer is another than the default.
-    env : KKLObservation
-        Where it was played.
-    x, x_hat : ndarray, shape (steps + 1, nx)
-        States and their estimates.
-    spinn : ndarray, shape (steps + 1, nx), or None
-        What the paper's observer makes of the same outputs, if it ships and nothing acts on
-        the system, of which it would not know.
-    y : ndarray, shape (steps + 1, ny)
-        Noisy outputs.
-    seconds : float
-        Time that the steps took.
-    """
+    """One episode of an environment with an observer; ``spinn`` is the paper's observer's estimate, where it ships."""
 
     label: str
     chosen: bool

@@ -1,6 +1,6 @@
 """``kkl-gym evaluate``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from rich.table import Table
 from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import require_writable, write
-from training.commands.coverage import coverage_table, default_levels, draw, judged
+from training.commands.coverage import coverage_table, default_levels, judged
 from training.commands.options import (
     NoiseLevels,
     Observers,
@@ -39,7 +39,6 @@ from training.evaluation.metrics import by_state
 from training.evaluation.parameters import parameter_errors, show_ranges
 from training.evaluation.plants import off_by, show_parameters
 from training.progress import ProgressBars, progress_bars
-from training.trajectories.controllers import Controller
 
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
 SKIPPED = 5.0  # seconds of driven runs at the pace of the shipped systems, half of the run at most
@@ -97,8 +96,7 @@ class Evaluate:
     """Evaluate T_inv alone of observers that track. "NAME, T_inv alone" then stands for each."""
     calibration: bool = False
     """In place of errors, say whether error bars are true: how many errors lie in regions of 50, 90 and 99 %, of all
-    states and of each, and the mean of their normalised squares (NEES); by default at six levels of noise. With --csv
-    there is a figure beside the file."""
+    states and of each, and the mean of their normalised squares (NEES); by default at six levels of noise."""
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the errors of each trajectory are written as well."""
 
@@ -126,8 +124,6 @@ class Evaluate:
         if self.csv:
             write(self.csv, found.to_csv(index=False, float_format="%.6g"))
             console.print(f"wrote {self.csv}")
-        if self.csv and self.calibration:
-            draw(self.csv.with_suffix(".png"), found)
         return found
 
     def _plant(self, system: System) -> System | None:
@@ -145,6 +141,8 @@ class Evaluate:
         self, name: str, artifact: Artifact, system: System, plant: System | None, progress: ProgressBars
     ) -> list["pd.DataFrame"]:
         """Print an observer's tables, and what is left out of them; rows of the CSV file."""
+        import pandas as pd
+
         duration = system.duration if self.duration is None else self.duration
         on = f", plant {show_parameters(plant)}, model {show_parameters(system)}" if plant else ""
         runs = f"{self.trajectories} runs of {duration:g} s"
@@ -162,35 +160,34 @@ class Evaluate:
             everyone["EKF, same model" if plant else "exact EKF"] = lambda runs, **how: kalman_errors(
                 system, runs, artifact.filter.dt, **how
             )
-        policy = read_policy(artifact, system, self.policy)
         levels, left_out = self._levels(artifact, system)
-        cases = CASES[: 3 if artifact.nu else 2] if levels else ()
-        bar = progress.add_task(f"evaluating {name}", total=len(cases) * (1 + len(levels)))
-        for starts, domain, driven in cases:
-            trajectories = self._trajectories(
-                artifact, system, domain, duration=duration, driven=driven, policy=policy, plant=plant
-            )
-            if isinstance(trajectories, str):
-                progress.advance(bar, 1 + len(levels))
-                left_out.append(f"starts in {starts}{', driven' if driven else ''}: {trajectories}")
-                continue
-            progress.advance(bar)
+        cases = self._cases(f"evaluating {name}", artifact, system, plant, levels, progress, left_out)
+        for starts, driven, trajectories, level in cases:
             skip = min(SKIPPED * system.pace, duration / 2) if driven else None
-            for level in levels:
-                for who, measure_errors in everyone.items():
-                    found = measure_errors(trajectories, measurement_noise=level, seed=self.seed, skip=skip)
-                    case = [*([who] if self.ekf else []), starts, *(["yes" if driven else "no"] if artifact.nu else [])]
-                    case += [*([f"{self.process_noise:g}"] if self.process_noise else []), show_level(level)]
-                    smape.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
-                    nrmse.add_row(*case, *map(percent, np.median(found.nrmse, axis=0)))
-                    of = {"observer": who, **({"plant": show_parameters(plant)} if plant else {})}
-                    frames.append(self._rows(found, {**of, "starts": starts, "driven": driven}, level))
-                progress.advance(bar)
+            for who, measure_errors in everyone.items():
+                found = measure_errors(trajectories, measurement_noise=level, seed=self.seed, skip=skip)
+                case = [*([who] if self.ekf else []), starts, *(["yes" if driven else "no"] if artifact.nu else [])]
+                case += [*([f"{self.process_noise:g}"] if self.process_noise else []), show_level(level)]
+                smape.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
+                nrmse.add_row(*case, *map(percent, np.median(found.nrmse, axis=0)))
+                columns = {
+                    "observer": who,
+                    **({"plant": show_parameters(plant)} if plant else {}),
+                    "starts": starts,
+                    "driven": driven,
+                    "process_noise": self.process_noise,
+                    "measurement_noise": as_cell(level),
+                    "trajectory": np.arange(len(found.full)),
+                    "smape": found.full,
+                    "smape_late": found.late,
+                    **by_state(found.nrmse),
+                }
+                frames.append(pd.DataFrame(columns))
         if frames:
             progress.console.print(smape, nrmse)
             if artifact.estimated_parameters:
                 with progress.phase("estimating parameters"):
-                    table = self._parameters(name, artifact, system, plant, levels, policy)
+                    table = self._parameters(name, artifact, system, plant, levels)
                 progress.console.print(table)
         for reason in left_out:
             progress.say(f"{name}, left out: {reason}")
@@ -205,25 +202,14 @@ class Evaluate:
         artifact.require_covariance()
         duration = system.duration if self.duration is None else self.duration
         on = f", plant {show_parameters(plant)}" if plant else ""
-        policy = read_policy(artifact, system, self.policy)
         levels, left_out = self._levels(artifact, system)
         if self.measurement_noise is None:
             levels = default_levels(artifact)
-        cases = CASES[: 3 if artifact.nu else 2] if levels else ()
         rows: list[dict[str, Any]] = []
-        bar = progress.add_task(f"judging the error bars of {name}", total=len(cases) * len(levels))
-        for starts, domain, driven in cases:
-            trajectories = self._trajectories(
-                artifact, system, domain, duration=duration, driven=driven, policy=policy, plant=plant
-            )
-            if isinstance(trajectories, str):
-                left_out.append(f"starts in {starts}{', driven' if driven else ''}: {trajectories}")
-                progress.advance(bar, len(levels))
-                continue
-            for level in levels:
-                found = judged(artifact, system, trajectories, level=level, seed=self.seed, ekf=self.ekf)
-                rows += [{"map": name, "starts": starts, "driven": driven, **row} for row in found]
-                progress.advance(bar)
+        cases = self._cases(f"judging the error bars of {name}", artifact, system, plant, levels, progress, left_out)
+        for starts, driven, trajectories, level in cases:
+            found = judged(artifact, system, trajectories, level=level, seed=self.seed, ekf=self.ekf)
+            rows += [{"map": name, "starts": starts, "driven": driven, **row} for row in found]
         for reason in left_out:
             progress.say(f"{name}, left out: {reason}")
         if not rows:
@@ -239,7 +225,6 @@ class Evaluate:
         system: System,
         plant: System | None,
         levels: Sequence[Level],
-        policy: Controller | None,
     ) -> Table:
         """A table of errors of estimated parameters, from starts in X."""
         on = f"plant {show_parameters(plant)}" if plant else "plants drawn from their ranges"
@@ -257,7 +242,7 @@ class Evaluate:
                     seed=self.seed,
                     process_noise=self.process_noise,
                     driven=driven,
-                    policy=policy,
+                    policy=read_policy(artifact, system, self.policy),
                     plant=plant,
                 )
                 table.add_row(
@@ -265,51 +250,47 @@ class Evaluate:
                 )
         return table
 
-    def _rows(self, found: Errors, case: dict[str, Any], level: Level) -> "pd.DataFrame":
-        """Of the CSV file."""
-        import pandas as pd
-
-        columns = {
-            **case,
-            "process_noise": self.process_noise,
-            "measurement_noise": as_cell(level),
-            "trajectory": np.arange(len(found.full)),
-            "smape": found.full,
-            "smape_late": found.late,
-            **by_state(found.nrmse),
-        }
-        return pd.DataFrame(columns)
-
-    def _trajectories(
+    def _cases(
         self,
+        description: str,
         artifact: Artifact,
         system: System,
-        domain: Domain,
-        *,
-        duration: float,
-        driven: bool,
-        policy: Controller | None,
         plant: System | None,
-    ) -> UnseenTrajectories | str:
-        """Test trajectories, or why there are none."""
-        try:
-            found = unseen_trajectories(
-                system,
-                artifact.filter.dt,
-                n=self.trajectories,
-                duration=duration,
-                seed=self.seed,
-                domain=domain,
-                driven=driven,
-                process_noise=self.process_noise,
-                policy=policy,
-                plant=plant,
-            )
-        except NoStartsError as error:
-            return str(error)
-        if found.inside.any():
-            return found
-        return f"each of {self.trajectories} runs left bounds = {system.bounds}"
+        levels: Sequence[Level],
+        progress: ProgressBars,
+        left_out: list[str],
+    ) -> Iterator[tuple[str, bool, UnseenTrajectories, Level]]:
+        """Yield where trajectories start, whether they are driven, the trajectories and each level of noise.
+
+        Starts without trajectories are described in ``left_out``.
+        """
+        policy = read_policy(artifact, system, self.policy)
+        cases = CASES[: 3 if artifact.nu else 2] if levels else ()
+        bar = progress.add_task(description, total=len(cases) * len(levels))
+        for starts, domain, driven in cases:
+            try:
+                trajectories = unseen_trajectories(
+                    system,
+                    artifact.filter.dt,
+                    n=self.trajectories,
+                    duration=system.duration if self.duration is None else self.duration,
+                    seed=self.seed,
+                    domain=domain,
+                    driven=driven,
+                    process_noise=self.process_noise,
+                    policy=policy,
+                    plant=plant,
+                )
+                lacking = f"each of {self.trajectories} runs left bounds = {system.bounds}"
+            except NoStartsError as error:
+                trajectories, lacking = None, str(error)
+            if trajectories is None or not trajectories.inside.any():
+                left_out.append(f"starts in {starts}{', driven' if driven else ''}: {lacking}")
+                progress.advance(bar, len(levels))
+                continue
+            for level in levels:
+                yield starts, driven, trajectories, level
+                progress.advance(bar)
 
     def _levels(self, artifact: Artifact, system: System) -> tuple[list[Level], list[str]]:
         """Levels of measurement noise that a map can be told, and what is to be said of the others."""

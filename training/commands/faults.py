@@ -104,29 +104,12 @@ def report(out: Path) -> Table:
             noticed = f"{100 * (faulty.score > 1).mean():.1f} %"
             delays = (f"{delay:.2f}" for delay in np.quantile(faulty.delay, [0.5, 0.95], method="higher"))
             rows.append([str(observer), false, str(fault), f"{faulty.deadline.iloc[0]:g} s", noticed, *delays])
-    lines = markdown.table(["", *header], rows)
     shown = Table(Column("observer", overflow="fold"), *header)
     for row in rows:
         shown.add_row(*row)
-    duffing = found[(found.system == "reverse_duffing") & (found.fault != "none")]
-    for observer, group in duffing.groupby("observer", sort=False):
-        lines += ["", f"{observer} by amplitude of the output, noticed in time:", "", *_by_amplitude(group)]
-    write(out / "table.md", "\n".join(lines) + "\n")
+    write(out / "table.md", "\n".join(markdown.table(["", *header], rows)) + "\n")
     draw(out / "scores.png", found)
     return shown
-
-
-def _by_amplitude(duffing: "pd.DataFrame") -> list[str]:
-    import pandas as pd
-
-    edges = np.quantile(duffing.amplitude, [0.0, 0.25, 0.5, 0.75, 1.0])
-    quarter = pd.cut(duffing.amplitude, edges, include_lowest=True, labels=False)
-    names = [f"{low:.1f} to {high:.1f}" for low, high in zip(edges, edges[1:])]  # noqa: RUF007
-    rows = []
-    for fault, faulty in duffing.groupby("fault", sort=False):
-        shares = [f"{100 * (faulty[quarter[faulty.index] == i].score > 1).mean():.0f} %" for i in range(4)]
-        rows.append([str(fault), *shares])
-    return markdown.table(["fault", *names], rows)
 
 
 def draw(path: Path, found: "pd.DataFrame") -> None:

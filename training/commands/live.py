@@ -22,24 +22,7 @@ KEYS = "space: pause   n: new start   left, right: input   up, down: noise   f: 
 
 
 class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
-    """Noise and faults on the outputs of an environment that has none of its own.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        A :class:`kkl_gym.KKLEnv` without measurement noise.
-    level : float or tuple of float, length ny
-        Standard deviation of the noise, of all outputs or each.
-    seed : int
-        Of the noise.
-
-    Attributes
-    ----------
-    level : float or tuple of float, length ny
-        As given; it may be changed.
-    fault : str
-        One of ``FAULTS``, which is that of all outputs. It may be changed.
-    """
+    """Adds noise and faults to the outputs of an environment without noise; ``level`` and ``fault`` may be changed."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], level: Level, *, seed: int) -> None:
         super().__init__(env)
@@ -71,25 +54,8 @@ class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
 class Live:
     """An environment with its observer, drawn on a figure that is redrawn again and again.
 
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        Where it is drawn, with widgets.
-    environment : Shown
-        What is shown.
-    measurement_noise : float, tuple of float or None
-        Standard deviation of the noise on each sample at first; None for the system's own.
-    seed : int
-        Of starts and noise.
-
-    Attributes
-    ----------
-    paused : bool
-        Whether time stands still.
-    clock : float
-        Seconds that a sample takes in the window.
-    history : deque
-        (x, x_hat, y, score) of the samples that are shown.
+    ``clock`` is the seconds that a sample takes in the window; ``history`` holds x, x_hat, y and score of the samples
+    that are drawn.
     """
 
     def __init__(self, figure: Any, environment: Shown, measurement_noise: Level | None, *, seed: int) -> None:

@@ -181,21 +181,7 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
 
 @dataclass(frozen=True)
 class Shown:
-    """An environment that a command shows.
-
-    Parameters
-    ----------
-    label : str
-        For tables.
-    env_id : str
-        For :func:`gymnasium.make`.
-    options : mapping of str to object
-        For that, too.
-    system : System
-        What moves in it.
-    observer : str or None
-        A shipped map or a ``.safetensors`` file; None for the one that ships for the system, if one does.
-    """
+    """An environment that a command shows, and its observer; None for the one that ships for the system."""
 
     label: str
     env_id: str

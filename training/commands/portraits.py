@@ -18,19 +18,7 @@ TRAIL = 0.35  # of what is shown: older points would hide the new ones
 
 @dataclass(frozen=True)
 class Motion:
-    """What is shown of an episode.
-
-    Parameters
-    ----------
-    system : System
-        What moves.
-    dt : float
-        Sampling interval in seconds.
-    x, x_hat : ndarray, shape (steps + 1, nx)
-        States and their estimates.
-    y : ndarray, shape (steps + 1, ny)
-        Measured outputs.
-    """
+    """One episode. Shapes: ``x``, ``x_hat`` (steps + 1, nx), ``y`` (steps + 1, ny)."""
 
     system: System
     dt: float
@@ -63,15 +51,7 @@ def animate(path: Path, motions: Sequence[Motion]) -> None:
 
 
 class Column:
-    """A phase portrait, and the measured outputs below it.
-
-    Parameters
-    ----------
-    motion : Motion
-        Whose beginning is shown.
-    portrait, strip : matplotlib Axes
-        Where both are drawn.
-    """
+    """A phase portrait of the beginning of a motion, and the measured outputs below it."""
 
     def __init__(self, motion: Motion, portrait: Any, strip: Any) -> None:
         system, shown = motion.system, list(motion.system.portrait)

@@ -25,8 +25,6 @@ class Coverage:
     states: np.ndarray
     nees: float
     limits: tuple[float, float]
-    rms: np.ndarray
-    said: np.ndarray
 
 
 def coverage(
@@ -98,15 +96,11 @@ def _judged(
     """Judge estimates and covariances, chunk by chunk of the trajectories."""
     distances: list[np.ndarray] = []
     ratios: list[np.ndarray] = []
-    squares: list[np.ndarray] = []
-    said: list[np.ndarray] = []
     for rows, (x_hat, covariance) in zip(_chunks(x.shape[1]), estimates, strict=True):
-        error, std = x[:, rows] - x_hat, standard_deviations(covariance)
+        error = x[:, rows] - x_hat
         distances.append(squared_distance(error, covariance))
-        ratios.append((error / std) ** 2)
-        squares.append(error**2)
-        said.append(std**2)
-    distance, ratio, square, variance = (np.concatenate(each, 1) for each in (distances, ratios, squares, said))
+        ratios.append((error / standard_deviations(covariance)) ** 2)
+    distance, ratio = (np.concatenate(each, 1) for each in (distances, ratios))
     nx, n = x.shape[-1], x.shape[1]
     joint, single = chi_square(REGIONS, nx), chi_square(REGIONS, 1)
     low, high = (float(chi_square((1 + side * INTERVAL) / 2, n * nx) / n) for side in (-1, 1))
@@ -116,8 +110,6 @@ def _judged(
             np.array([(ratio[span] <= edge).mean((0, 1)) for edge in single]),
             float(distance[span].mean()),
             (low, high),
-            np.sqrt(square[span].mean((0, 1))),
-            np.sqrt(variance[span].mean((0, 1))),
         )
         for span in spans
     ]

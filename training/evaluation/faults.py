@@ -74,7 +74,6 @@ def simulate_faults(
                     "fault": fault,
                     "deadline": allowed,
                     "trajectory": np.arange(trajectories),
-                    "amplitude": np.abs(clean[at:]).max((0, 2)),
                     "score": judged.max(0),
                     "delay": np.where(alarmed, (late > 1).argmax(0) * dt, np.inf),
                 }

@@ -2,7 +2,6 @@
 
 import math
 import operator
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -113,23 +112,6 @@ def optimise(
     return course.history
 
 
-def optimise_at_once(
-    name: str, module: nn.Module, loss: Loss, progress: Progress, *, steps: int, learning_rate: float, seed: int
-) -> None:
-    """Minimise a loss by SOAP in a minute or so, of which no checkpoint is kept."""
-    with tempfile.TemporaryDirectory() as folder:
-        stage = Stage(
-            name=name,
-            steps=steps,
-            learning_rate=learning_rate,
-            folder=Path(folder),
-            fingerprint="",
-            seed=seed,
-            optimiser="soap",
-        )
-        optimise(stage, module, loss, progress, resume=False)
-
-
 def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
     if stage.optimiser == "adam":
         capturable = next(module.parameters()).is_cuda
@@ -155,16 +137,6 @@ def log_to(folder: Path) -> Iterator[Log | None]:
             yield writer.add_scalar
     finally:
         threading.excepthook = hook
-
-
-def seconds_spent(folder: Path) -> float:
-    """CPU seconds of all stages whose checkpoints are in a folder, interruptions included."""
-    spent = 0.0
-    for path in sorted(folder.glob(f"[!.]*{checkpoints.SUFFIX}")):  # not those that somebody writes or has left
-        found = checkpoints.load(path)
-        with checkpoints.restoring(path):
-            spent += float(found["seconds"])
-    return spent
 
 
 def _save(stage: Stage, parts: dict[str, Any], generator: torch.Generator, course: _Course) -> None:

@@ -2,14 +2,13 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from kkl_gym.equations import components, input_matrix
-from kkl_gym.system import Box, Components, System
+from kkl_gym.system import Components, System
 
-LARGEST = 1e9  # entry of Phi, with each state in units of X's width, beyond which a motion is lost
 ROUNDING = 1e-9  # of an output's size: what may be left of a linear one
 
 # Functions in the derivatives that some releases of sympy do not print for NumPy, or for arrays of one shape only.
@@ -92,84 +91,6 @@ def _of_step(system: System) -> list[dict[int, Callable[..., Any]]]:
         return components(system.step, both[: system.nx], both[system.nx :])
 
     return jacobian(moved, system.nx + system.nu)
-
-
-def with_sensitivity(system: System, driven: bool = True) -> System:
-    """Put a system beside its variational equation, x' = f(x) + g(x) u and Phi' = d(f + g u)/dx Phi.
-
-    In discrete time the next Phi is that of the step, d step/dx Phi. A motion whose Phi grows beyond LARGEST is lost.
-    """
-    nx, nu = system.nx, system.nu if driven else 0
-    low, high = system.box()
-    units = np.divide.outer(high - low, high - low).ravel().tolist()  # of Phi's entries
-    box: Box = (*system.X, *((0.0, unit) for unit in units))
-    limits: Box = (*system.bounds, *((-LARGEST * unit, LARGEST * unit) for unit in units))
-    inputs = system.u_max if driven else ()
-    joint = f"{system.name}-sensitivity"
-    if system.discrete:
-        moves = _of_step(system)
-
-        class Stepping(System):
-            name = joint
-            X: ClassVar[Box] = box
-            bounds: ClassVar[Box] = limits
-            u_max: ClassVar[tuple[float, ...]] = inputs
-            dt = system.dt
-
-            def step(self, x: Components, u: Components) -> Components:
-                acting = u if nu else (0.0,) * system.nu
-                return [*system.step(x[:nx], acting), *_times(moves, (*x[:nx], *acting), x[nx:])]
-
-        return Stepping()
-    rows = jacobian(system.f, nx)
-    steered = bool(nu) and type(system).g is not System.g
-    columns = [_of_column(system, j) for j in range(nu)] if steered else []
-
-    class Sensitivity(System):
-        name = joint
-        X: ClassVar[Box] = box
-        bounds: ClassVar[Box] = limits
-        u_max: ClassVar[tuple[float, ...]] = inputs
-        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu and not steered else ()
-
-        def f(self, x: Components) -> Components:
-            state = x[:nx]
-            return [*system.f(state), *_times(rows, state, x[nx:])]
-
-        if steered:
-
-            def g(self, x: Components) -> Sequence[Components]:
-                state = x[:nx]
-                return [*system.g(state), *zip(*(_times(column, state, x[nx:]) for column in columns), strict=True)]
-
-        def rate(self, x: Components) -> Any:
-            return system.rate(x[:nx])
-
-    return Sensitivity()
-
-
-def _of_column(system: System, j: int) -> list[dict[int, Callable[..., Any]]]:
-    """Derivatives of a column of the input matrix, by state."""
-
-    def column(x: Components) -> Components:
-        return [row[j] for row in input_matrix(system, x)]
-
-    return jacobian(column, system.nx)
-
-
-def _times(rows: Sequence[dict[int, Callable[..., Any]]], at: Components, Phi: Components) -> list[Any]:
-    """Derivatives by the state, of as many components as it has, times Phi, row by row."""
-    nx, out = len(rows), list[Any]()
-    # Rows of Phi are multiplied as one where they are arrays, since each operation costs as much as its work.
-    blocks = [Phi[k * nx : (k + 1) * nx] for k in range(nx)]
-    for row in rows:
-        values = {k: derivative(*at) for k, derivative in row.items() if k < nx}
-        if isinstance(Phi, np.ndarray):
-            total = sum(value * blocks[k] for k, value in values.items())
-            out += list(total) if values else [0] * nx
-        else:
-            out += [sum(value * blocks[k][j] for k, value in values.items()) for j in range(nx)]
-    return out
 
 
 def output_matrix(system: System) -> np.ndarray | None:

@@ -86,14 +86,15 @@ class SystemAgent(Job):
 
     def work(self) -> None:
         """Train the agent, play it and write its scores."""
-        from training.agents.learn import learn, learn_recurrent
+        from examples.research.agents.recurrent import learn_recurrent
+        from training.agents.learn import learn
 
         task = get_task(self.system, self.measurement_noise)
         began = time.process_time()
         policy: Policy
         if self.information in ("recurrent", "recurrent-state"):
             shown: Literal["y", "state"] = "y" if self.information == "recurrent" else "state"
-            policy = learn_recurrent(task, shown, self.folder, seed=self.seed, timesteps=self.timesteps)()
+            policy = learn_recurrent(task, shown, self.folder, seed=self.seed, timesteps=self.timesteps)
             env = make(task, shown, self.episodes, autoreset_mode="Disabled", with_action=True)
         else:
             information: Any = self.information

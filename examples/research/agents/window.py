@@ -5,6 +5,7 @@ observer's filter is worth is the difference between the two.
 """
 
 import os
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from training.agents.any_environment.task import HiddenTask
 from training.config import Config
 from training.maps.inverse import InverseProblem
 from training.maps.networks import Network
-from training.maps.optimise import optimise_at_once
+from training.maps.optimise import Stage, optimise
 from training.maps.samplers import Batch
 from training.presets import RECORDED
 from training.progress import ProgressBars
@@ -115,15 +116,17 @@ def learn_window(
     network = Network(len(stacks.mean), len(stacks.x_mean), width=width, depth=depth, activation=activation)
     sampler: Any = stacks
     problem = InverseProblem(network, sampler, torch.device("cpu"))
-    optimise_at_once(
-        f"estimates from {task.frames} observations",
-        problem,
-        problem.loss,
-        progress,
-        steps=SETTINGS["inverse_steps"],
-        learning_rate=DEFAULT.learning_rate,
-        seed=seed,
-    )
+    with tempfile.TemporaryDirectory() as checkpoints:
+        stage = Stage(
+            name=f"estimates from {task.frames} observations",
+            steps=SETTINGS["inverse_steps"],
+            learning_rate=DEFAULT.learning_rate,
+            folder=Path(checkpoints),
+            fingerprint="",
+            seed=seed,
+            optimiser="soap",
+        )
+        optimise(stage, problem, problem.loss, progress, resume=False)
     path = folder / OBSERVER
     WindowEstimator(stacks.in_units(network.export()), stacks.mean, stacks.scale).save(path)
     return path

@@ -17,11 +17,21 @@ from examples.research.methods import SHIPPED, Budget, Configuration, Task, get_
 from examples.research.resumable import Job
 from kkl_gym.systems import get_system
 from observers.storage import explained, write
+from training import checkpoints
 from training.jobs import describe
-from training.maps.optimise import seconds_spent
 
 FAILED = 200.0  # the largest SMAPE, for a configuration whose training diverges
 REVISION = 8  # rises with every change of the shipped methods: results from before are not reused
+
+
+def seconds_spent(folder: Path) -> float:
+    """CPU seconds of all stages whose checkpoints are in a folder, interruptions included."""
+    spent = 0.0
+    for path in sorted(folder.glob(f"[!.]*{checkpoints.SUFFIX}")):  # not those that somebody writes or has left
+        found = checkpoints.load(path)
+        with checkpoints.restoring(path):
+            spent += float(found["seconds"])
+    return spent
 
 
 @dataclass(frozen=True)

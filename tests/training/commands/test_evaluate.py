@@ -178,7 +178,6 @@ def test_calibration_is_judged(make_artifact, saved):
     assert found["90"].between(0, 100).all()
     assert set(found.observer) == {"KKL", "EKF"}
     assert Path("coverage.csv").exists()
-    assert Path("coverage.png").exists()
     assert "NEES" in console.export_text()
     with pytest.raises(ValueError, match="no covariance"):
         Evaluate((saved(),), calibration=True).run(console)

@@ -16,6 +16,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 import training.evaluation.errors
 import training.maps.optimise
 import training.trajectories.record
+from examples.research.benchmark.jobs import seconds_spent
 from kkl_gym import VanDerPol, get_system
 from observers.storage import UNFINISHED
 from training import checkpoints
@@ -92,18 +93,18 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
     monkeypatch.setattr(checkpoints, "SECONDS", 0.0)
     with pytest.raises(KeyboardInterrupt):
         fit(stop_after=150)  # the checkpoint is of step 100
-    spent = training.maps.optimise.seconds_spent(tmp_path)
+    spent = seconds_spent(tmp_path)
     assert 1.5 < spent < 3.0
     rest = fit()
-    assert 4.0 <= training.maps.optimise.seconds_spent(tmp_path) < 4.1
+    assert 4.0 <= seconds_spent(tmp_path) < 4.1
     assert rest == pytest.approx(100 * (4.0 - spent) / spent, rel=0.1)
     assert rates[-1] < 1e-4  # the learning rate has followed the clock to zero
     assert fit() == 0
     (tmp_path / f"{UNFINISHED}1234-line{checkpoints.SUFFIX}").write_bytes(b"half")  # of a process that was killed
-    assert 4.0 <= training.maps.optimise.seconds_spent(tmp_path) < 4.1
+    assert 4.0 <= seconds_spent(tmp_path) < 4.1
     (tmp_path / f"other{checkpoints.SUFFIX}").write_bytes(b"half")
     with pytest.raises(ValueError, match="is damaged or of another version, remove it"):
-        training.maps.optimise.seconds_spent(tmp_path)
+        seconds_spent(tmp_path)
 
 
 @pytest.mark.parametrize("optimiser", ["adam", "soap"])

@@ -12,10 +12,8 @@ from linear_system import Oscillator
 from wrong_systems import Branching, Flat, Late, Wide
 
 from kkl_gym import EquationError, elementary, get_system
-from kkl_gym.elementary import sin
-from kkl_gym.simulate import simulate
 from kkl_gym.system import on_states
-from training.trajectories.derivatives import evaluate, jacobian, output_matrix, with_sensitivity
+from training.trajectories.derivatives import evaluate, jacobian, output_matrix
 
 
 def test_output_matrix_of_linear_and_other_outputs():
@@ -81,49 +79,6 @@ def test_what_sympy_cannot_differentiate_is_named():
 
     with pytest.raises(ValueError, match=r"component 1 of rounded\(x\) has no derivative .* knows: ceiling\(x0\)"):
         jacobian(rounded, 1)
-
-
-class Steered(Oscillator):
-    """Two inputs through a matrix that depends on the state."""
-
-    name: ClassVar[str] = "steered"
-    u_max: ClassVar[tuple[float, ...]] = (1.0, 2.0)
-
-    def g(self, x):
-        return (x[1], 1.0), (x[0] * x[1], sin(x[0]))
-
-
-@pytest.mark.parametrize("system", [get_system("lorenz"), Steered()], ids=lambda system: system.name)
-def test_sensitivity_is_the_derivative_of_the_flow(system):
-    dt, eps, nx = 0.05, 1e-5, system.nx
-    x = np.random.default_rng(0).uniform(*system.box(0.5), (4, nx))
-    start = np.concatenate([x, np.tile(np.eye(nx).ravel(), (4, 1))], 1)
-    u = np.random.default_rng(1).uniform(-1, 1, (1, 4, system.nu)) * system.u_max
-    Phi = simulate(with_sensitivity(system), start, 1, dt, u=u)[1][:, nx:].reshape(4, nx, nx)
-    for j in range(nx):
-        step = eps * np.eye(nx)[j]
-        difference = np.subtract(*(simulate(system, x + one, 1, dt, u=u)[1] for one in (step, -step))) / (2 * eps)
-        np.testing.assert_allclose(Phi[..., j], difference, rtol=1e-5, atol=1e-6)
-
-
-def test_sensitivity_is_in_any_units():
-    unit = 1e-11
-
-    class OddUnits(Oscillator):
-        """Its second state in units a hundred thousand million times as large."""
-
-        name: ClassVar[str] = "odd-units"
-        X: ClassVar = ((-1.0, 1.0), (-unit, unit))
-        bounds: ClassVar = ((-9.0, 9.0), (-9.0 * unit, 9.0 * unit))
-        u_max: ClassVar[tuple[float, ...]] = ()
-
-        def f(self, x):
-            return x[1] / unit, -unit * x[0]
-
-    start = np.array([[0.1, 0.2 * unit, 1.0, 0.0, 0.0, 1.0]])
-    Phi = simulate(with_sensitivity(OddUnits()), start, 10, 0.05)[-1, 0, 2:].reshape(2, 2)
-    cosine, sine = np.cos(0.5), np.sin(0.5)
-    np.testing.assert_allclose(Phi, [[cosine, sine / unit], [-sine * unit, cosine]], rtol=1e-9)
 
 
 @pytest.mark.parametrize(
