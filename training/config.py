@@ -196,7 +196,7 @@ def setting_types() -> dict[str, Any]:
 
 
 def read_changes(path: Path) -> dict[str, Any]:
-    """Settings from a JSON file, as ``kkl-gym tune`` writes it, for :func:`override`."""
+    """Settings from a JSON file, for :func:`override`."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:  # that of JSON, or of a text in another encoding

@@ -8,11 +8,11 @@ from observers import Flow, Motion
 from training.lessons.run import Run
 from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
+from training.sources.output import OF_MEDIAN
 from training.sources.source import Increments, Source
 
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
 LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative
-OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 LEAST_ERROR = 0.01  # of the increments' size, that is assumed at least
 
 
