@@ -1,6 +1,7 @@
 """Covariances by age and level of measurement noise, as calibration on runs finds them."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -52,6 +53,11 @@ class Factors:
             raise ArtifactError(f"factors of shape {self.factors.shape} do not fit {sizes[0]} levels, {sizes[1]} ages")
         if not ((self.factors > 0) & (self.factors <= _MAX_FACTOR)).all():
             raise ArtifactError(f"factors must be positive and at most {_MAX_FACTOR:g}, got {shown(self.factors)}")
+
+    @classmethod
+    def ones(cls) -> Self:
+        """Factors of 1, before calibration."""
+        return cls(np.zeros(1), np.zeros(1), np.ones((1, 1, 1)))
 
     def at_levels(self, measurement_noise: float, process_noise: float) -> np.ndarray:
         """Return the factors at levels in multiples of the largest. Shapes: returns (m,)."""

@@ -1,6 +1,6 @@
 """How a state moves over one sample: by the system's equations, or by a flow that was learned."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -124,7 +124,7 @@ class Motion:
         Standard deviations of the measurement noise that are assumed at least.
     window : float
         Seconds over which innovations are averaged, and after a start within which T_inv is consulted.
-    factors : Factors
+    factors : Factors, optional
         Factors of the filter's covariance, with which regions of 90 % hold 90 % of the errors.
 
     Raises
@@ -144,7 +144,7 @@ class Motion:
     least_process_noise: float
     least_measurement_noise: np.ndarray
     window: float
-    factors: Factors
+    factors: Factors = field(default_factory=Factors.ones)
     equations: Equations | None = None
     flow: Flow | None = None
 

@@ -137,7 +137,7 @@ class Config:
     runs: Annotated[int, Field(ge=100)] = 400
     """Simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability that a sound motion of twelve seconds, at the pace of the shipped systems, raises an alarm."""
+    """Probability that a sound motion of twenty seconds, at the pace of the shipped systems, raises an alarm."""
     truncation: Positive = 1e-6
     """Part epsilon of the filter's start that may be left where the forward map's data begins (paper, sec. 5.2)."""
     closed_loop_trajectories: Annotated[int, Field(ge=0)] = 0

@@ -8,12 +8,11 @@ import numpy as np
 from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from observers.unscented import Gaussian
-from training.sources.simulated import unknown_start
+from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
 from training.trajectories.derivatives import evaluate, jacobian
 
 ASIDE = 1e-4  # of X's half-widths, steps of the central differences
 NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in multiples of the system's default
-LEAST_PROCESS_NOISE = 0.005  # that a filter assumes, at the system's pace: a tenth of the environments' default
 
 Corrected = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Means, covariances and normalised innovations squared (n,) of a batch."""

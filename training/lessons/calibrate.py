@@ -17,7 +17,7 @@ from training.sources.simulated import SimulatedSource
 from training.sources.source import Runs, Source, TooFewRunsError
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of measurement noise, in multiples of the largest in training
-AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0)  # seconds at the shipped systems' pace
+AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds at the usual pace
 PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
 FEWEST = 50  # errors from which a covariance or a quantile is taken
 LEAST_VARIANCE = 1e-6  # added to that of each state, over its range squared
@@ -49,7 +49,7 @@ def calibrate(
     motion : Motion, optional
         By which it is to track; by default the one that it has, if any.
     false_alarms : float, optional
-        Probability that a sound motion of twelve seconds, at the pace of the shipped systems, exceeds a limit; by
+        Probability that a sound motion of twenty seconds, at the pace of the shipped systems, exceeds a limit; by
         default that of its training.
     console : rich.console.Console or ProgressBars, optional
         Where progress is shown.
@@ -94,7 +94,7 @@ class _Calibration:
         artifact, steps = self.artifact, len(self.runs.u)
         dt = artifact.filter.dt
         knots = {round(age * self.source.pace / dt) for age in AGES}
-        last = max(1, min(steps // 2, round(AGES[-1] * self.source.pace / dt)))
+        last = max(1, min(4 * steps // 5, round(AGES[-1] * self.source.pace / dt)))
         self.knots = np.array(sorted({k for k in knots if k < last} | {last}))
         between = np.sqrt(self.knots[1:] * np.maximum(self.knots[:-1], 0.5))
         edges = [0.0, *between.tolist(), float(steps)]
@@ -114,7 +114,11 @@ class _Calibration:
         artifact = dataclasses.replace(self.artifact, motion=None, limits=None)
         monitored = artifact.knows_output and self.runs.sound
         if self.informed:
-            artifact = dataclasses.replace(self.with_covariances(artifact), motion=self.motion)
+            artifact = self.with_covariances(artifact)
+            if self.motion is not None:  # factors are of P as the filter has it
+                artifact = dataclasses.replace(
+                    artifact, motion=dataclasses.replace(self.motion, factors=Factors.ones())
+                )
         if artifact.motion is None and not monitored:
             return artifact
         with self.progress.phase("calibrating", len(self.runs.y)) as report:

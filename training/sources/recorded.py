@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from observers import Artifact, Equations, Factors, LinearFilter
+from observers import Artifact, Equations, LinearFilter
 from observers.checks import shown
 from training.config import Config
 from training.maps.coordinates import settling_time
@@ -216,7 +216,6 @@ class RecordedSource:
             "least_process_noise": 1.0,
             "least_measurement_noise": least,
             "window": max(WINDOW * self.dt, 0.5 / self.rate),
-            "factors": Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1))),
         }
 
     def _output(self) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
-from observers import Artifact, Equations, Factors, LinearFilter
+from observers import Artifact, Equations, LinearFilter
 from training.config import Config
 from training.jobs import describe
 from training.maps.coordinates import spread
@@ -26,9 +26,10 @@ from training.trajectories.signals import DRIVEN, KINDS, random_inputs
 
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned
-LEAST_NOISE, LEAST_PROCESS_NOISE = 0.001, 0.0005  # that a tracker assumes, of the usual, and at the system's pace
-WINDOW, RUN = 0.5, 12.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
-SUBSTEPS, INTEGRATION_ERROR = 64, 1e-5  # at most, of scaled states in a sample: far below the process noise assumed
+LEAST_NOISE = 0.001  # that a tracker assumes, of the usual
+LEAST_PROCESS_NOISE = 0.005  # that filters assume, at the system's pace: a tenth of the environments' default
+WINDOW, RUN = 0.5, 20.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
+SUBSTEPS, INTEGRATION_ERROR = 64, 2e-5  # at most, of scaled states in a sample: no more than the noise assumed
 TOO_FAR_OFF = 0.01  # of scaled states, where a jump in f leaves more than that at any number of steps
 INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share that judges a flow
 DEVIATIONS = (1e-4, 0.3)  # of these pairs from motions, in standard deviations of the states, log-uniform
@@ -223,7 +224,6 @@ class SimulatedSource:
             "least_process_noise": LEAST_PROCESS_NOISE / self.pace,
             "least_measurement_noise": least,
             "window": WINDOW * self.pace,
-            "factors": Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1))),
         }
 
     @functools.cached_property
