@@ -25,7 +25,8 @@ def medians():
 @pytest.mark.parametrize("name", kkl_gym.ENV_IDS)
 def test_the_page_of_an_environment(name):
     system, text = kkl_gym.get_system(name), (DOCS / "environments" / f"{name}.md").read_text()
-    cells = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE))
+    shared = (DOCS / "environments" / "index.md").read_text()
+    cells = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", text + shared, re.MULTILINE))
 
     def of(start):
         (cell,) = (cell for title, cell in cells.items() if title.startswith(start))
