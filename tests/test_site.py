@@ -65,6 +65,13 @@ def test_pictures_are_light_and_dark_where_both_are_there(tmp_path):
     assert HOOKS["themed"](text.format(a, b, code), tmp_path / "guides") == text.format(twice, b, code)
 
 
+def test_formulas_are_mathml():
+    page = '<span class="arithmatex">\\(a &lt; b\\)</span><div class="arithmatex">\\[\nx_1\n\\]</div>'
+    typeset = HOOKS["typeset"](page)
+    assert re.search(r'<span class="formula"><math [^>]+"inline"><mrow><mi>a</mi><mo>&#x0003C;</mo><mi>b</mi>', typeset)
+    assert re.search(r'<div class="formula"><math [^>]+"block"><mrow><msub><mi>x</mi><mn>1</mn></msub>', typeset)
+
+
 def test_notebooks_are_pages():
     png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (800).to_bytes(4, "big") + (400).to_bytes(4, "big")
     drawn = {"output_type": "display_data", "data": {"image/png": b64encode(png).decode(), "text/plain": ["<Figure>"]}}
