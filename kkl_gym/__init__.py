@@ -5,6 +5,7 @@ import gymnasium as gym
 from kkl_gym.envs import KKLEnv
 from kkl_gym.equation_errors import EquationError
 from kkl_gym.own import OWN_ID
+from kkl_gym.sensor import Sensor
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, VanDerPol, get_system
 from kkl_gym.vector import KKLVectorEnv
@@ -50,6 +51,7 @@ __all__ = [
     "Lorenz",
     "ReverseDuffing",
     "Rossler",
+    "Sensor",
     "System",
     "VanDerPol",
     "VectorActionRepeat",

@@ -25,7 +25,10 @@ class Outputs:
     Tuple one after the other, Discrete ones one-hot. Of a Dict, keys that are not measured are not looked at.
     """
 
-    def __init__(self, space: Space, measured: Entries | None, angles: Angles, *, source: str) -> None:
+    def __init__(
+        self, space: Space, measured: Entries | None, angles: Angles, *, source: str, missing: bool = False
+    ) -> None:
+        self._missing = missing  # whether NaN may stand for an entry that is missing
         self.measured = None if measured is None else _entries("measured", measured)
         self.angles = _angles(angles)
         if self.measured == ():
@@ -82,7 +85,7 @@ class Outputs:
         y = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
         if not self._whole:
             y = y[..., self._take]
-        if not all_finite(y):
+        if not all_finite(np.where(np.isnan(y), 0.0, y) if self._missing else y):
             at = np.argwhere(~(np.abs(y) <= LARGEST))[0]
             row = f", row {at[0]}" if batch else ""
             raise ValueError(

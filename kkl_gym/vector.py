@@ -15,6 +15,7 @@ from kkl_gym.equations import components, target_of
 from kkl_gym.plant import NOISE_BLOCK, OfPlant, Plant
 from kkl_gym.rendering import ARRAYS, Canvas, Trails, check_render_mode, render_metadata
 from kkl_gym.rows import held, judged
+from kkl_gym.sensor import Readings, Sensor
 from kkl_gym.simulate import followed_rows
 from kkl_gym.system import Box, System
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
@@ -54,6 +55,8 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         As for :class:`KKLEnv`.
     start_box : tuple of (float, float), length nx, optional
         As for :class:`KKLEnv`.
+    sensor : Sensor or mapping of its parameters, optional
+        As for :class:`KKLEnv`.
     render_mode : {None, "rgb_array"}
         Whether :meth:`render` draws.
     max_episode_steps : int, optional
@@ -92,6 +95,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         observe: Literal["state", "output"] = "state",
         parameters: Mapping[str, float] | None = None,
         start_box: Box | None = None,
+        sensor: Sensor | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
@@ -109,6 +113,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             observe=observe,
             parameters=parameters,
             start_box=start_box,
+            sensor=sensor,
         )
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
@@ -121,20 +126,22 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-        nx, ny = self.system.nx, self.system.ny
+        nx, ny = self.system.nx, self.plant.ny
+        self._readings = None if self.sensor is None else Readings(self.sensor, ny, self.plant.dt, num_envs)
         self._u_max = np.array(self.system.u_max, dtype=float)
         self._exchanged()
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
         # A block of noise for each row, not yet scaled, and where in its block the row is; at first, past the end.
-        self._w, self._v = (np.empty((NOISE_BLOCK, width, num_envs)) for width in (nx, ny))
+        self._w, self._v = (np.empty((NOISE_BLOCK, width, num_envs)) for width in (nx, self.plant.nv))
         self._used = np.full(num_envs, NOISE_BLOCK)
         self._everyone = np.arange(num_envs)
         self._x = np.full((nx, num_envs), np.nan)  # component first, as everything inside
-        self._y = np.full((ny, num_envs), np.nan)
+        self._y = self._held = np.full((ny, num_envs), np.nan)
         self._sample = np.zeros(num_envs, dtype=np.int64)
         self._terminated, self._truncated = np.zeros((2, num_envs), dtype=bool)
         self._ready = False
+        self.emitted = b""  # the last observations, as observers around it compare what reaches them
         self._u = np.zeros((self.system.nu, num_envs))  # kept, as the trails are, for rendering
         self._trails = None if render_mode is None else Trails(self.num_envs)
         self._canvas: Canvas | None = None
@@ -338,7 +345,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         if starts is None:
             starts = np.array([self.plant.draw_start(self._rng(row)) for row in rows.tolist()])
         self._x[:, rows] = starts.T
-        self._y[:, rows] = self._measure(self._x[:, rows], self._noise(rows)[1])
+        self._y[:, rows] = self._measure(self._x[:, rows], self._noise(rows)[1], rows, start=True)
         self._u[:, rows] = 0.0
         self._sample[rows] = 0
         self._terminated[rows] = self._truncated[rows] = False
@@ -366,10 +373,10 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(~inside))
             inside, reward = self._judged(x)
         if inside.all():
-            y = self._measure(x, v)
+            y = self._measure(x, v, rows, start=False)
         else:  # the last state and output inside
             x = np.where(inside, x, before)
-            y = np.where(inside, self._measure(x, v), self._y[:, rows])
+            y = np.where(inside, self._measure(x, v, rows, start=False), self._y[:, rows])
             reward = self._judged(x)[1]
         sample = self._sample[rows] + 1
         truncated = sample >= (self.max_episode_steps or np.inf)
@@ -419,20 +426,24 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             for block, drawn in ((self._w, w), (self._v, v)):
                 block[:, :, at] = drawn[: len(some)].transpose(1, 2, 0)
 
-    def _measure(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def _measure(self, x: np.ndarray, v: np.ndarray, rows: np.ndarray, *, start: bool) -> np.ndarray:
         # As System.output, component first and in a third of its time, which a step would feel.
+        white = v if self._readings is None else np.zeros((self.plant.ny, len(rows)))
         try:
-            return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])
+            y = np.array([hi + vi for hi, vi in zip(self.system.h(x), white, strict=True)])
         except Exception:
             components(self.system.h, x)  # says what went wrong
             raise
+        return y if self._readings is None else self._readings.read(y, v, rows, start=start)
 
     def _observation(self) -> np.ndarray:
-        values = self._x if self.plant.observe == "state" else self._y
+        self._held = self._y if self._readings is None else np.where(np.isnan(self._y), self._held, self._y)
+        values = self._x if self.plant.observe == "state" else self._held
         obs = values.T.astype(np.float32, order="C")
         if self.plant.observe == "output":
             space = self.single_observation_space
             np.clip(obs, space.low, space.high, out=obs)  # type: ignore[attr-defined]
+        self.emitted = obs.tobytes()
         return obs
 
     def _info(self, rows: np.ndarray) -> Infos:

@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from kkl_gym.envs import KKLEnv
 from kkl_gym.identity import how_to_make_one, source_of
 from kkl_gym.rendering import TRAIL
-from kkl_gym.wrappers.estimator import KKLEstimator, observation
+from kkl_gym.wrappers.estimator import KKLEstimator, check_untouched, observation
 from kkl_gym.wrappers.named import NamedEstimator, Samples
 from observers import Artifact
 from observers.checks import integer, shown
@@ -25,15 +25,20 @@ _FLOAT32 = np.dtype(np.float32)
 class _SystemSamples:
     """What an observer sees of environments of systems: ``info`` says it, and numbers the samples."""
 
-    count = 0  # of the sample that the observer has seen last
+    def __init__(self, env: Any) -> None:
+        self.count = 0  # of the sample that the observer has seen last
+        self._env = self._inside = env
+        while not isinstance(self._inside, KKLEnv | KKLObservation):
+            self._inside = self._inside.env
 
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Output and state after a reset."""
+        """Output and state after a reset; ValueError if a wrapper inside changes observations."""
+        check_untouched(observation, self._inside.emitted, self._env, self._inside)
         self.count = int(info["sample"])
         return info["y"], info["x"]
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Output after a step, and the input that led to it; ValueError if a sample was skipped."""
+        """Output after a step, and the input that led to it; ValueError if a sample was skipped or changed."""
         sample = int(info["sample"])
         if sample != self.count + 1:
             raise ValueError(
@@ -41,16 +46,18 @@ class _SystemSamples:
                 "wrappers that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation, and "
                 "reset after an error"
             )
+        check_untouched(observation, self._inside.emitted, self._env, self._inside)
         return info["y"], info["u"]
 
 
 class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
     """Shows a learned observer's estimate in place of the state.
 
-    Around an environment of ours the observer sees only ``info["y"]`` and the input ``info["u"]`` that the environment
-    applied. ``info`` gains ``z``, the filter's state, and with ``estimate="x"`` ``x_hat``, shape (nx,), both float64
-    and not clipped. With ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit
-    the estimates (a faulty sensor, states that the map was not made for).
+    Around an environment of ours the observer sees only ``info["y"]``, which the environment's ``sensor`` makes, and
+    the input ``info["u"]`` that the environment applied. ``info`` gains ``z``, the filter's state, and with
+    ``estimate="x"`` ``x_hat``, shape (nx,), both float64 and not clipped. With ``monitor`` it gains ``score`` too, an
+    array of shape (), above 1 where the samples do not fit the estimates (a faulty sensor, states that the map was not
+    made for).
 
     With ``estimate="z"`` the network is not evaluated, and nothing tracks (the map of :attr:`observer` holds no
     motion), unless there is a monitor or the start is known. There is then no ``x_hat``, and :meth:`render` shows no
@@ -66,8 +73,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     Parameters
     ----------
     env : gymnasium.Env
-        A :class:`KKLEnv`, bare or under wrappers that leave ``info`` alone; or the environment that the observer's file
-        names, under wrappers that leave its measured signals, its actions and its steps alone.
+        A :class:`KKLEnv`, bare or under wrappers that leave observations and ``info`` alone; or the environment that
+        the observer's file names, under wrappers that leave its measured signals, its actions and its steps alone.
     observer : str or path, optional
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the environment's
         system.
@@ -106,6 +113,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         If the environment is not one of ours and the observer not from its rollouts, ``estimate`` is unknown, a flag is
         no bool, no map ships for the system, or the noise level is beyond the map's range. At a step, if the agent acts
         on a map that knows no inputs and ``ignore_input`` is false, or a wrapper inside hides samples from the
+        observer. At a reset and at a step, if a wrapper inside changes observations, which would not reach the
         observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
@@ -171,7 +179,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 uncertainty=uncertainty,
                 compiled=compiled,
             )
-            samples = _SystemSamples()
+            samples = _SystemSamples(env)
         else:
             raise ValueError(
                 f"KKLObservation needs a kkl_gym environment, or an observer from rollouts of {source_of(env)}: "
@@ -305,8 +313,12 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 if not low <= value <= high:
                     break
             else:
-                return np.array(values, _FLOAT32)
-        return observation(self._estimator.shown(report), self._estimator.space)
+                return self._emit(np.array(values, _FLOAT32))
+        return self._emit(observation(self._estimator.shown(report), self._estimator.space))
+
+    def _emit(self, obs: np.ndarray) -> np.ndarray:
+        self.emitted = obs.tobytes()  # as another observer around this one compares what reaches it
+        return obs
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
