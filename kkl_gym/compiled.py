@@ -174,7 +174,7 @@ def single_kernel(system: System, motion: Motion) -> Any:
         "        need = n * error**0.1",
         f"    return {in_tuple(['nan'] * nx)}",
     ]
-    jit = functools.partial(numba.njit, error_model="python")  # which raises where Python does
+    jit: Any = functools.partial(numba.njit, error_model="python")  # which raises where Python does
     # Of floats alone: a bound of the input that is written as an integer must not compile it again.
     kernel = jit((numba.float64,) * (nx + nu + nx + 1))(_assembled(motion, lines, jit))
     rng = np.random.default_rng(0)
@@ -257,7 +257,7 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         f"                    needs[row] = {substeps} * {error} ** 0.1",
         "    return left > 0",
     ]
-    jit = functools.partial(numba.njit, error_model="numpy")  # a division by zero is infinite
+    jit: Any = functools.partial(numba.njit, error_model="numpy")  # a division by zero is infinite
     inlined = functools.partial(jit, forceinline=True)  # a call would keep rows from going through together
     kernel = jit(_assembled(motion, lines, inlined))
     u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None] / system.pace

@@ -271,18 +271,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return self.draw()
 
     def draw(self, estimates: Collection[Sequence[float]] = ()) -> np.ndarray | None:
-        """Draw the phase portrait with estimated states beside the true ones.
-
-        Parameters
-        ----------
-        estimates : collection of sequences of float, length nx
-            Estimates so far, the latest last.
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3), or None
-            As :meth:`render`, and the same exceptions are raised.
-        """
+        """Draw the phase portrait as :meth:`render`, with estimates so far, the latest last, beside the states."""
         if self.render_mode is None:
             return None
         if self._x is None:
@@ -298,13 +287,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return None
 
     def animate(self, estimates: Collection[Sequence[float]] = ()) -> None:
-        """Draw the window's next frame, if one is due at this sample.
-
-        Parameters
-        ----------
-        estimates : collection of sequences of float, length nx
-            As for :meth:`draw`.
-        """
+        """Draw the window's next frame, if one is due at this sample, with estimates as :meth:`draw` takes them."""
         if self._sample % samples_a_frame(self.dt) == 0:
             self.draw(estimates)
 

@@ -73,10 +73,10 @@ class Sensor:
             "gain": _finite,
             "bias": _finite,
             "coloured_noise": noise_level,
-            "time_constant": _positive,
+            "time_constant": _number("positive, finite number of seconds", lambda value: value > 0),
             "quantum": noise_level,
             "delay": lambda name, value: integer(name, value, 0, MAX_SAMPLES),
-            "drop_out": _probability,
+            "drop_out": _number("probability, from 0 to below 1", lambda value: 0 <= value < 1),
             "every": lambda name, value: integer(name, value, 1, MAX_SAMPLES),
         }
         for name, check in checks.items():
@@ -184,22 +184,16 @@ def _each(name: str, value: Any, check: Callable[[str, Any], float]) -> float | 
     return check(name, value)
 
 
-def _finite(name: str, value: Any) -> float:
-    if not is_finite(value):
-        raise ValueError(f"{name} must be a finite number, got {shown(value)}")
-    return float(value)
+def _number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str, Any], float]:
+    def check(name: str, value: Any) -> float:
+        if not is_finite(value) or not holds(value):
+            raise ValueError(f"{name} must be a {wanted}, got {shown(value)}")
+        return float(value)
+
+    return check
 
 
-def _positive(name: str, value: Any) -> float:
-    if not is_finite(value) or not value > 0:
-        raise ValueError(f"{name} must be a positive, finite number of seconds, got {shown(value)}")
-    return float(value)
-
-
-def _probability(name: str, value: Any) -> float:
-    if not is_finite(value) or not 0 <= value < 1:
-        raise ValueError(f"{name} must be a probability, from 0 to below 1, got {shown(value)}")
-    return float(value)
+_finite = _number("finite number", lambda value: True)
 
 
 __all__ = ["Sensor"]

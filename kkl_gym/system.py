@@ -290,33 +290,11 @@ class System:
         raise NotImplementedError(f"{type(self).__name__} does not define h")
 
     def output(self, x: np.ndarray) -> np.ndarray:
-        """Outputs h(x) of many states.
-
-        Parameters
-        ----------
-        x : ndarray, shape (..., nx)
-            States.
-
-        Returns
-        -------
-        ndarray, shape (..., ny)
-            Outputs without noise.
-        """
+        """Outputs h(x), without noise, of many states. Shapes: ``x`` (..., nx); returns (..., ny)."""
         return on_states(self.h, x)
 
     def drift(self, x: np.ndarray) -> np.ndarray:
-        """Drift f(x) of many states.
-
-        Parameters
-        ----------
-        x : ndarray, shape (..., nx)
-            States.
-
-        Returns
-        -------
-        ndarray, shape (..., nx)
-            Their derivatives without input and noise.
-        """
+        """Drift f(x) of many states, without input and noise. Shapes: ``x`` (..., nx); returns (..., nx)."""
         return on_states(self.f, x)
 
     def rate(self, x: Components) -> Any:
@@ -339,18 +317,7 @@ class System:
         return slope(self.f, x, self.X)
 
     def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of the training box, or of a multiple of it about ``X_centre``, cut at the bounds.
-
-        Parameters
-        ----------
-        factor : float
-            How many times as wide the box is to be.
-
-        Returns
-        -------
-        low, high : ndarray, shape (nx,)
-            The corners.
-        """
+        """Corners (nx,) of the training box, or of a multiple of it about ``X_centre``, cut at the bounds."""
         low, high = np.array(self.X, dtype=float).T
         if factor != 1:
             centre, (lowest, highest) = np.array(self.X_centre), np.array(self.bounds, dtype=float).T

@@ -1,7 +1,7 @@
 """Equations written down as a program, one operation after the other, in the order in which Python runs them."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
@@ -48,11 +48,12 @@ class Symbol:
         return self.call("abs", self)
 
     def __pow__(self, power: Any) -> Any:
-        if isinstance(power, Real) and power == 0.5:
+        n = float(power) if isinstance(power, Real) else math.nan
+        if n == 0.5:
             return self.tape.write(f"sqrt({self.name})", exact=False)
-        if isinstance(power, Real) and float(power).is_integer() and power:
-            whole = self.tape.write(f"{self.name} ** {abs(int(power))}", exact=False)
-            return whole if power > 0 else 1.0 / whole
+        if n.is_integer() and n:
+            whole = self.tape.write(f"{self.name} ** {abs(int(n))}", exact=False)
+            return whole if n > 0 else self.tape.write(f"1.0 / {whole.name}", exact=False)
         return self.tape.write(f"{self.name} ** {text(power)}", exact=False)
 
     def __rpow__(self, base: Any) -> "Symbol":
@@ -84,7 +85,8 @@ def text(value: Any) -> str:
         return str(bool(value))
     if not isinstance(value, Real):
         raise TypeError(f"equations take numbers and symbols, not {type(value).__name__}")
-    return f"({float(value)!r})" if math.copysign(1.0, value) < 0 else repr(float(value))
+    number = float(value)
+    return f"({number!r})" if math.copysign(1.0, number) < 0 else repr(number)
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def in_tuple(values: Iterable[str]) -> str:
     return "(" + "".join(f"{value}, " for value in values) + ")"
 
 
-def program(function: Callable[..., Sequence[Any]], *letters: tuple[str, int]) -> Program:
+def program(function: Callable[..., Any], *letters: tuple[str, int]) -> Program:
     """Run a function of groups of components on symbols, each group with a letter and as many of these as it has."""
     tape = Tape()
     groups = [[Symbol(tape, f"{letter}{i}") for i in range(n)] for letter, n in letters]

@@ -22,14 +22,11 @@ class NamedEstimator(KKLEstimator):
         env: Any,
         observation_space: gym.Space[Any],
         action_space: gym.Space[Any],
-        *,
         artifact: Artifact,
+        *,
         estimate: str,
-        measurement_noise: float | Sequence[float] | None,
-        monitor: bool,
-        known_start: bool,
         uncertainty: bool,
-        compiled: bool | None = None,
+        **how: Any,
     ) -> None:
         choice("estimate", estimate, ("x", "z"))
         uncertainty = flag("uncertainty", uncertainty)
@@ -51,16 +48,7 @@ class NamedEstimator(KKLEstimator):
         low, high = np.concatenate([measured.low, low]), np.concatenate([measured.high, high])
         with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
             space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
-        super().__init__(
-            artifact,
-            space,
-            estimate=estimate,
-            measurement_noise=measurement_noise,
-            monitor=monitor,
-            known_start=known_start,
-            uncertainty=uncertainty,
-            compiled=compiled,
-        )
+        super().__init__(artifact, space, estimate=estimate, uncertainty=uncertainty, **how)
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past and take in the first samples; see :class:`KKLEstimator`."""

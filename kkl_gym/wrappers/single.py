@@ -15,7 +15,7 @@ from kkl_gym.rendering import TRAIL
 from kkl_gym.wrappers.estimator import KKLEstimator, check_untouched, observation
 from kkl_gym.wrappers.named import NamedEstimator, Samples
 from observers import Artifact
-from observers.checks import integer, shown
+from observers.checks import choice, flag, integer, shown
 from observers.names import resolve
 
 _FEW = 8  # numbers that are compared one by one more quickly than NumPy clips them
@@ -151,52 +151,33 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 f"KKLObservation needs a gymnasium.Env (for vectors: KKLVectorObservation), got {shown(env)}"
             )
         base, artifact = env.unwrapped, None if observer is None else Artifact.read(resolve(observer))
+        # As the specification can write it down, once it is known to be what it should.
+        how: dict[str, Any] = {
+            "estimate": choice("estimate", estimate, ("x", "z")),
+            "measurement_noise": measurement_noise,
+            "monitor": flag("monitor", monitor),
+            "known_start": flag("known_start", known_start),
+            "uncertainty": flag("uncertainty", uncertainty),
+            "compiled": None if compiled is None else flag("compiled", compiled),
+        }
+        ignore_input = flag("ignore_input", ignore_input)
         estimator: KKLEstimator
         samples: Samples | _SystemSamples
         if artifact is not None and artifact.environment is not None:
-            estimator = NamedEstimator(
-                env,
-                env.observation_space,
-                env.action_space,
-                artifact=artifact,
-                estimate=estimate,
-                measurement_noise=measurement_noise,
-                monitor=monitor,
-                known_start=known_start,
-                uncertainty=uncertainty,
-                compiled=compiled,
-            )
+            estimator = NamedEstimator(env, env.observation_space, env.action_space, artifact, **how)
             samples = estimator.samples
         elif isinstance(base, KKLEnv):
-            estimator = KKLEstimator.of_plant(
-                base.plant,
-                artifact,
-                estimate=estimate,
-                measurement_noise=measurement_noise,
-                ignore_input=ignore_input,
-                monitor=monitor,
-                known_start=known_start,
-                uncertainty=uncertainty,
-                compiled=compiled,
-            )
+            estimator = KKLEstimator.of_plant(base.plant, artifact, ignore_input=ignore_input, **how)
             samples = _SystemSamples(env)
         else:
             raise ValueError(
                 f"KKLObservation needs a kkl_gym environment, or an observer from rollouts of {source_of(env)}: "
                 f"{how_to_make_one(source_of(env))}"
             )
-        # As the specification can write them down, once they are known to be what they should.
-        RecordConstructorArgs.__init__(
-            self,
-            observer=None if observer is None else os.fspath(observer),
-            estimate=estimate,
-            measurement_noise=None if measurement_noise is None else estimator.observer.measurement_noise,
-            ignore_input=bool(ignore_input),
-            monitor=bool(monitor),
-            known_start=bool(known_start),
-            uncertainty=bool(uncertainty),
-            compiled=None if compiled is None else bool(compiled),
-        )
+        if measurement_noise is not None:
+            how["measurement_noise"] = estimator.observer.measurement_noise
+        observer = None if observer is None else os.fspath(observer)
+        RecordConstructorArgs.__init__(self, observer=observer, ignore_input=ignore_input, **how)
         gym.Wrapper.__init__(self, env)
         self._estimator, self._samples = estimator, samples
         self.observer = self._estimator.observer
@@ -213,51 +194,14 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Reset the environment, and the observer to its first sample.
-
-        Parameters
-        ----------
-        seed : int, optional
-            As for the environment.
-        options : dict, optional
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            The first estimate.
-        info : dict
-            The environment's, with what the observer adds.
-        """
+        """Reset the environment, and the observer to its first sample; the first estimate."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._trail.clear()
         self._estimator.reset(*self._samples.first(obs, info))
         return self._show(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Step the environment, and the observer with the new sample and the input that led to it.
-
-        Parameters
-        ----------
-        action : array_like, shape (nu,)
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            The estimate after the new sample.
-        reward : float
-            The environment's.
-        terminated, truncated : bool
-            The environment's.
-        info : dict
-            The environment's, with what the observer adds.
-
-        Raises
-        ------
-        ValueError
-            As described above.
-        """
+        """Step the environment, and the observer with the new sample and the input that led to it."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._estimator.advance(*self._samples.next(obs, info, action))
         self._samples.count += 1
@@ -284,13 +228,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self._estimator.replace(observer)
 
     def render(self) -> np.ndarray | None:
-        """Draw the phase portrait with states and estimates so far; other environments draw what they draw.
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3), or None
-            An RGB image; None without ``render_mode``, and where it is shown in a window.
-        """
+        """Draw the phase portrait with states and estimates so far; other environments draw what they draw."""
         base = self.unwrapped
         return base.draw(self._trail) if isinstance(base, KKLEnv) else self.env.render()  # type: ignore[return-value]
 
@@ -360,24 +298,7 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
         self.metadata = {**env.metadata, "render_fps": max(1, round(frames / repeat))}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold an action for ``repeat`` steps.
-
-        Parameters
-        ----------
-        action : array_like, shape (nu,)
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray
-            Of the last step.
-        reward : float
-            Sum over the steps.
-        terminated, truncated : bool
-            Of the last step.
-        info : dict
-            Of the last step.
-        """
+        """Hold an action for ``repeat`` steps; all but the sum of rewards is of the last of them."""
         total = 0.0
         for _ in range(self.repeat):
             obs, reward, terminated, truncated, info = self.env.step(action)

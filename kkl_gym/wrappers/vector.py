@@ -305,31 +305,19 @@ class KKLVectorObservation(VectorEstimate):
         uncertainty: bool = False,
     ) -> None:
         artifact = None if observer is None else Artifact.read(resolve(observer))
+        how: dict[str, Any] = {
+            "estimate": estimate,
+            "measurement_noise": measurement_noise,
+            "monitor": monitor,
+            "known_start": known_start,
+            "uncertainty": uncertainty,
+        }
         estimator: KKLEstimator
         if artifact is not None and artifact.environment is not None and isinstance(env, gym.vector.VectorEnv):
-            estimator = NamedEstimator(
-                env,
-                env.single_observation_space,
-                env.single_action_space,
-                artifact=artifact,
-                estimate=estimate,
-                measurement_noise=measurement_noise,
-                monitor=monitor,
-                known_start=known_start,
-                uncertainty=uncertainty,
-            )
+            estimator = NamedEstimator(env, env.single_observation_space, env.single_action_space, artifact, **how)
             env = _Telling(env, estimator.samples)
         else:
-            estimator = KKLEstimator.of_plant(
-                plant_of(env),
-                artifact,
-                estimate=estimate,
-                measurement_noise=measurement_noise,
-                ignore_input=ignore_input,
-                monitor=monitor,
-                known_start=known_start,
-                uncertainty=uncertainty,
-            )
+            estimator = KKLEstimator.of_plant(plant_of(env), artifact, ignore_input=ignore_input, **how)
             _check_process_noise(env, estimator.observer.artifact)
         super().__init__(env, estimator)
         self._estimator: KKLEstimator = estimator
@@ -337,20 +325,7 @@ class KKLVectorObservation(VectorEstimate):
         self.estimate = estimate
 
     def replace_observer(self, observer: str | os.PathLike[str] | Artifact) -> None:
-        """Take the maps of another observer with the same filter, in all rows at once: the filters' states stay.
-
-        Parameters
-        ----------
-        observer : str or path or Artifact
-            As for :meth:`kkl_gym.KKLObservation.replace_observer`.
-
-        Raises
-        ------
-        ValueError
-            As there.
-        observers.ArtifactError
-            As there.
-        """
+        """As :meth:`kkl_gym.KKLObservation.replace_observer`, in all rows at once: the filters' states stay."""
         asked = self._estimator.asked(observer)
         if self.observer.artifact.environment is None:  # the vector is of environments of ours
             _check_process_noise(self.env, asked)
@@ -417,46 +392,14 @@ class VectorActionRepeat(VectorWrapper):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Reset the environments, or the rows of ``options["reset_mask"]``.
-
-        Parameters
-        ----------
-        seed : int or sequence of int or None, length num_envs, optional
-            As for the environment.
-        options : mapping, optional
-            As for the environment.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            Of all rows.
-        info : dict
-            The environment's.
-        """
+        """Reset the environments, or the rows of ``options["reset_mask"]``."""
         options, mask = with_mask(options, self.num_envs)
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self._ended = self._ended & ~mask
         return obs, info
 
     def step(self, actions: np.ndarray) -> Step:
-        """Hold actions for ``repeat`` steps.
-
-        Parameters
-        ----------
-        actions : array_like, shape (num_envs, nu)
-            As for the environment.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            Of each row's last step.
-        rewards : ndarray, shape (num_envs,)
-            Sums over each row's steps.
-        terminated, truncated : ndarray of bool, shape (num_envs,)
-            Of each row's last step.
-        info : dict
-            Of each row's last step.
-        """
+        """Hold actions for ``repeat`` steps; rewards are sums over each row's steps, the rest is of its last one."""
         waiting = self._ended  # since an earlier step; they stay as they are in this one
         total, info = np.zeros(self.num_envs), Infos()
         for _ in range(self.repeat):
