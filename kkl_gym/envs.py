@@ -154,7 +154,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode.
+        """Start an episode; observation and info are as described above.
 
         Parameters
         ----------
@@ -162,13 +162,6 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             Of starts and noise; None goes on with the generator as it is.
         options : dict, optional
             ``"x0"``, shape (nx,), is the start, which is otherwise uniform in ``start_box``; None is none.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            As described above.
-        info : dict
-            As described above.
 
         Raises
         ------
@@ -202,25 +195,12 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return self._observation(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold the input over one sampling interval.
+        """Hold the input over one sampling interval; what comes back is described above.
 
         Parameters
         ----------
         action : array_like, shape (nu,)
             Inputs over their bounds; values outside [-1, 1] are clipped.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            As described above.
-        reward : float
-            As described above.
-        terminated : bool
-            Whether the state left its declared bounds.
-        truncated : bool
-            False; a time limit is a wrapper's.
-        info : dict
-            As described above.
 
         Raises
         ------

@@ -71,10 +71,7 @@ def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]
 
 
 class Reader:
-    """Reads named signals from observations and from what ``info`` holds, NaN if these may be ``missing``.
-
-    Shapes: ``low``, ``high`` (n,).
-    """
+    """Reads named signals from observations and ``info``; they may be NaN if ``missing``. Shapes: ``low`` (n,)."""
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str, missing: bool = False) -> None:
         there, self._source = observed(space), source

@@ -158,7 +158,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Start episodes.
+        """Start episodes; observations and info are of all rows, with masks of those that were reset.
 
         Parameters
         ----------
@@ -167,13 +167,6 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         options : mapping, optional
             ``"x0"`` is the start, shape (nx,) for all or (num_envs, nx), which is otherwise uniform in ``start_box``.
             ``"reset_mask"``, boolean of shape (num_envs,), says which rows to reset, otherwise all.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            Of all rows.
-        info : dict
-            Of all rows, with masks of those that were reset.
 
         Raises
         ------

@@ -26,7 +26,6 @@ class _Remembering:
         env: Any,
         action_space: gym.Space[Any],
         observation_space: gym.Space[Any],
-        *,
         measured: Entries | None,
         angles: Angles,
         time_constants: Sequence[float],
@@ -105,13 +104,7 @@ class KKLMemory(gym.Wrapper[np.ndarray, Any, Any, Any], RecordConstructorArgs):
             other = "for vectors there is KKLVectorMemory, and make_vec_env of stable-baselines3 takes wrapper_class"
             raise ValueError(f"KKLMemory needs a gymnasium.Env ({other}), got {shown(env)}")
         found = _Remembering(
-            env,
-            env.action_space,
-            env.observation_space,
-            measured=measured,
-            angles=angles,
-            time_constants=time_constants,
-            input_time_constants=input_time_constants,
+            env, env.action_space, env.observation_space, measured, angles, time_constants, input_time_constants
         )
         # As the specification can write them down, once they are known to be what they should.
         RecordConstructorArgs.__init__(
@@ -197,10 +190,10 @@ class KKLVectorMemory(VectorWrapper):
             env,
             env.single_action_space,
             env.single_observation_space,
-            measured=measured,
-            angles=angles,
-            time_constants=time_constants,
-            input_time_constants=input_time_constants,
+            measured,
+            angles,
+            time_constants,
+            input_time_constants,
         )
         super().__init__(env)
         self.autoreset_mode = autoreset_mode_in(env)

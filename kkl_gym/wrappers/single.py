@@ -13,7 +13,7 @@ from kkl_gym.envs import KKLEnv
 from kkl_gym.identity import how_to_make_one, source_of
 from kkl_gym.rendering import TRAIL
 from kkl_gym.wrappers.estimator import KKLEstimator, check_untouched, observation
-from kkl_gym.wrappers.named import NamedEstimator, Samples
+from kkl_gym.wrappers.rollouts import NamedEstimator, Samples
 from observers import Artifact
 from observers.checks import choice, flag, integer, shown
 from observers.names import resolve
@@ -232,19 +232,15 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         base = self.unwrapped
         return base.draw(self._trail) if isinstance(base, KKLEnv) else self.env.render()  # type: ignore[return-value]
 
-    def _animate(self) -> None:
-        """Draw the window of an environment of ours, unless another observer further out does."""
-        base = self.unwrapped
-        if isinstance(base, KKLEnv) and base.drawn_by == self._draws:
-            base.animate(self._trail)
-
     def _show(self, info: dict[str, Any]) -> np.ndarray:
         report = self._estimator.report()
         info.update(report)
         if self._rendering and "x_hat" in report:
             self._trail.append(report["x_hat"].tolist())
         if self._rendering and self.render_mode == "human":
-            self._animate()
+            base = self.unwrapped
+            if isinstance(base, KKLEnv) and base.drawn_by == self._draws:  # and no observer further out
+                base.animate(self._trail)
         if len(self._low) <= _FEW:
             values = self._estimator.listed(report)
             for value, low, high in zip(values, self._low, self._high):

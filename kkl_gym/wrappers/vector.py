@@ -14,7 +14,7 @@ from kkl_gym.plant import Plant
 from kkl_gym.rendering import Trails
 from kkl_gym.vector import Infos, KKLVectorEnv, autoreset_mode_of, last_of_episodes, with_mask
 from kkl_gym.wrappers.estimator import Estimator, KKLEstimator, check_untouched, observation
-from kkl_gym.wrappers.named import NamedEstimator, Samples
+from kkl_gym.wrappers.rollouts import NamedEstimator, Samples
 from observers import Artifact
 from observers.checks import integer, shown
 from observers.names import resolve

@@ -33,7 +33,7 @@ def test_many_as_one_batch():
 def test_a_system_must_be_named(make):
     with pytest.raises(TypeError, match="missing 1 required positional argument: 'system'"):
         make(kkl_gym.OWN_ID)
-    with pytest.raises(ValueError, match="the system must be the name of one .*, got None"):
+    with pytest.raises(ValueError, match="the system must be the name of one or"):
         make(kkl_gym.OWN_ID, system=None)
 
 
