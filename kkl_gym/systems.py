@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 from kkl_gym.equations import check_equations
 from kkl_gym.loading import load_class
 from kkl_gym.system import Box, Components, System
-from observers import Artifact
 from observers.checks import mapping, shown
 
 
@@ -257,16 +256,4 @@ def _find(name: str) -> type[System]:
     return load_class(name, System)
 
 
-def system_of(artifact: Artifact, given: str | None) -> System:
-    """The system that an artifact was made for, checked against it."""
-    artifact.require_system()
-    if given is None and artifact.system not in SYSTEMS:
-        raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")
-    base = get_system(given or artifact.system)
-    if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
-        base = base.replace(artifact.parameters)
-    artifact.check(base.name, base.parameters, dt=artifact.filter.dt, ny=base.ny, nu=base.nu)
-    return base
-
-
-__all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system", "system_of"]
+__all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system"]

@@ -12,6 +12,7 @@ from gymnasium.vector import SyncVectorEnv
 
 import kkl_gym
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
+from kkl_gym.wrappers.estimator import observation
 from observers import Artifact, ArtifactError, KKLObserver, load
 
 checking_wrapped = pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version:UserWarning")
@@ -378,3 +379,10 @@ def test_render_shows_the_estimate_and_the_input(saved):
     of_z = wrapped(saved, "van_der_pol", "z", env={"render_mode": "rgb_array"})
     of_z.reset(seed=0)
     assert (of_z.render() == of_z.unwrapped.render()).all()  # which has no estimate of the state
+
+
+def test_observations_are_clipped_and_what_float32_cannot_hold_is_infinite():
+    box = gym.spaces.Box(np.array([-1, -np.inf], np.float32), np.array([1, np.inf], np.float32))
+    shown = observation(np.array([[2.0, 1e39], [-1e300, -1e300], [0.5, 0.5]]), box)
+    assert shown.dtype == np.float32
+    assert shown.tolist() == [[1.0, np.inf], [-1.0, -np.inf], [0.5, 0.5]]

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from kkl_gym.systems import get_system, system_of
+from kkl_gym.systems import get_system
 from observers import Artifact
 from observers.names import resolve
 from training.commands.data import DataOptions
-from training.commands.options import OwnSystem, Parameters, SystemName, Unknowns
+from training.commands.options import OwnSystem, Parameters, SystemName, Unknowns, system_of
 from training.commands.settings import Settings
 from training.progress import LOG, duration, progress_bars
 

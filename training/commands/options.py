@@ -9,7 +9,6 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from kkl_gym import ENV_IDS, OWN_ID, SYSTEMS, get_system
 from kkl_gym.system import System
-from kkl_gym.systems import system_of
 from observers import Artifact, shipped
 from observers.names import resolve
 from training.evaluation.levels import Level, read_level
@@ -224,3 +223,15 @@ def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> C
     if not artifact.nu:
         raise ValueError(f"the policy {name!r} needs an observer that takes in inputs; this one takes none")
     return named_policy(system, name)
+
+
+def system_of(artifact: Artifact, given: str | None) -> System:
+    """The system that an artifact was made for, checked against it."""
+    artifact.require_system()
+    if given is None and artifact.system not in SYSTEMS:
+        raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")
+    base = get_system(given or artifact.system)
+    if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
+        base = base.replace(artifact.parameters)
+    artifact.check(base.name, base.parameters, dt=artifact.filter.dt, ny=base.ny, nu=base.nu)
+    return base

@@ -169,7 +169,7 @@ def test_compiled_or_not(monkeypatch):
     machine_code = "large batches of environments run as machine code"
     assert one(Oscillator(), "compiled", "ok").found == f"{machine_code}, and so do single ones"
     cubic = made(f=lambda self, x: (x[1], -(x[0] ** 3)))
-    assert "single ones take their steps in Python (ValueError: f has a power" in one(cubic, "compiled", "ok").found
+    assert "single ones take their steps in Python (ValueError: there is a power" in one(cubic, "compiled", "ok").found
     monkeypatch.setattr(training.diagnosis.subject, "batch_step", kkl_gym.compiled.batch_step)
     assert "not integrated" in one(Sampled(), "compiled", "ok").found
     of_numpy = made(f=lambda self, x: (x[1], -np.sin(x[0])))

@@ -84,7 +84,7 @@ def test_what_sympy_cannot_differentiate_is_named():
 @pytest.mark.parametrize(
     ("equations", "message"),
     [
-        (Late().f, "; x held sympy symbols: use kkl_gym.elementary.sin, which serves floats, arrays, tensors"),
+        (Late().f, "; x held symbols: use kkl_gym.elementary.sin, which serves floats, arrays, tensors"),
         (Branching().f, "use kkl_gym.elementary.where, minimum, maximum or clip, and combine conditions by & and |"),
         (Wide().f, "must return 2 components, one for each state; it returned 3 of them"),
         (Flat().f, "of which [0] is x1 > 0, which is no number: use kkl_gym.elementary.where(x1 > 0, 1.0, 0.0)"),

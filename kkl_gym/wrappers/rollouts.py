@@ -22,14 +22,11 @@ class NamedEstimator(KKLEstimator):
         env: Any,
         observation_space: gym.Space[Any],
         action_space: gym.Space[Any],
-        *,
         artifact: Artifact,
+        *,
         estimate: str,
-        measurement_noise: float | Sequence[float] | None,
-        monitor: bool,
-        known_start: bool,
         uncertainty: bool,
-        compiled: bool | None = None,
+        **how: Any,
     ) -> None:
         choice("estimate", estimate, ("x", "z"))
         uncertainty = flag("uncertainty", uncertainty)
@@ -51,28 +48,19 @@ class NamedEstimator(KKLEstimator):
         low, high = np.concatenate([measured.low, low]), np.concatenate([measured.high, high])
         with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
             space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
-        super().__init__(
-            artifact,
-            space,
-            estimate=estimate,
-            measurement_noise=measurement_noise,
-            monitor=monitor,
-            known_start=known_start,
-            uncertainty=uncertainty,
-            compiled=compiled,
-        )
+        super().__init__(artifact, space, estimate=estimate, uncertainty=uncertainty, **how)
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past and take in the first samples; see :class:`KKLEstimator`."""
         self._check_start(x0)
         super().reset(y0, x0)
-        self._y = y0.copy()
+        self._y, self._held = y0.copy(), y0.copy()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past in some rows; see :class:`KKLEstimator`."""
         self._check_start(x0)
         super().restart(y0, rows, x0)
-        self._y[rows] = y0
+        self._y[rows] = self._held[rows] = y0
 
     def _check_start(self, x0: np.ndarray) -> None:
         known = x0.shape[-1] == self.observer.artifact.nx and np.isfinite(x0).all()
@@ -84,18 +72,22 @@ class NamedEstimator(KKLEstimator):
         """Take in samples and the inputs that led to them; see :class:`KKLEstimator`."""
         super().advance(y, u, rows)
         self._y = y.copy() if rows is None else np.where(rows[..., None], y, self._y)
+        self._held = np.where(np.isnan(self._y), self._held, self._y)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains: as :class:`KKLEstimator`, and ``y``, what is measured."""
+        """What ``info`` gains: as :class:`KKLEstimator`, and ``y``, what is measured, NaN where it is missing."""
         return super().report(rows) | {"y": self._y.copy() if rows is None else self._y[rows]}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What of a report is the observation: y, then x_hat or z."""
-        return np.concatenate([report["y"], super().shown(report)], axis=-1)
+        """What of a report is the observation: y, its last value where it is missing, then x_hat or z."""
+        y = report["y"]
+        if np.isnan(y).any():  # not in rows that have been restarted, whose first sample is whole
+            y = np.where(np.isnan(y), self._held, y)
+        return np.concatenate([y, super().shown(report)], axis=-1)
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
         """The same of a single sample."""
-        return [*report["y"].tolist(), *super().listed(report)]
+        return [*self._held.tolist(), *super().listed(report)]
 
 
 class Samples:
@@ -106,7 +98,7 @@ class Samples:
     ) -> None:
         signals = artifact.signals or {}
         names = resolved(signals["measured"], observation_space, role="measured", source=source)
-        self.outputs = Reader(observation_space, names, source=source)
+        self.outputs = Reader(observation_space, names, source=source, missing=True)
         self.inputs = InputReader(action_space, signals["inputs"], source=source)
         self.hidden = _reader_of_hidden(observation_space, signals["hidden"], source)
         self.nx, self._nothing = artifact.nx, np.full(artifact.nx, np.nan)
