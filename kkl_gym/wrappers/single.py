@@ -96,9 +96,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         ``info`` gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). It needs a map with a covariance,
         as ``kkl-gym train`` makes them.
     compiled : bool, optional
-        Whether Numba runs the observer's steps, as :class:`observers.KKLObserver` has it. None compiles them at a reset
-        after a thousand samples; from there on estimates are rounded in another way. True or False make what is seen
-        the same in every episode of the same seed.
+        Whether Numba compiles the observer's step, as :class:`observers.KKLObserver` has it; None: where installed.
 
     Attributes
     ----------

@@ -18,8 +18,7 @@ from observers.inverse import InverseMap
 from observers.motion import Motion
 from observers.names import resolve
 from observers.storage import checksum
-from observers.supervision import INFLATION, Supervision
-from observers.tracker_kernel import RELINEARISATIONS
+from observers.supervision import INFLATION, RELINEARISATIONS, Supervision
 from observers.unscented import Points
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and

@@ -1,13 +1,13 @@
 """Rows of one observer at several levels of noise, stepped as one batch."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from observers import Artifact
 from observers.decoder import Decoders
 from observers.tracker import Tracker
-from observers.unscented import Gaussian
 
 Level = float | tuple[float, ...]
 Group = tuple[Level, float, int]
@@ -32,13 +32,13 @@ class Together:
         """Begin. Shapes: ``y`` (n, ny); returns (n, nx)."""
         self._z, self._y, self._age = self._linear.start(y), y, 0
         if self._tracker is not None:
-            self._tracker.reset(y)
+            self._rows = self._tracker.begin(y)
         return self._decoded()
 
     def step(self, y: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Take in the next samples, all of them present. Shapes: ``u`` (n, nu); returns (n, nx)."""
         if self._tracker is not None:
-            self._tracker.advance(y, u)
+            self._rows, _ = self._tracker.advance(self._rows, y, u)
         self._z, self._y, self._age = self._linear.advance(self._z, self._y, u, y), y, self._age + 1
         return self._decoded()
 
@@ -46,15 +46,19 @@ class Together:
     def covariance(self) -> np.ndarray:
         """That of the tracker, (n, nx, nx)."""
         assert self._tracker is not None
-        return self._tracker.covariance(self._age)
+        return self._tracker.covariance(self._rows, self._ages)
+
+    @property
+    def _ages(self) -> np.ndarray:
+        return np.full(len(self._z), float(self._age))
 
     def _decoded(self) -> np.ndarray:
         if self._tracker is None:
             age = self._age * self._linear.dt
             parts = [each(self._z[self._owner == i], age) for i, each in enumerate(self._decoders)]
             return np.concatenate(parts)
-        self._tracker.supervise(self._z, self._age)
-        return self._tracker.estimate
+        self._rows = self._tracker.supervise(self._rows, self._z, self._ages)
+        return self._rows[:, self._tracker.x]
 
 
 class _Stacked(Tracker):
@@ -63,18 +67,20 @@ class _Stacked(Tracker):
     def __init__(self, artifact: Artifact, groups: Sequence[Group], of: Sequence[Decoders], owner: np.ndarray) -> None:
         (level, noise, _), self._each, self._owner = groups[0], of, owner
         super().__init__(artifact, of[0], measurement_noise=level, process_noise=noise)
-        q, r = zip(*(self._motion.variances(level, noise) for level, noise, _ in groups), strict=True)
+        q, r = zip(*(self.motion.variances(level, noise) for level, noise, _ in groups), strict=True)
+        q = [each * self.motion.x_scale**2 for each in q]
         self._Q, self._R = (np.array([np.diag(one) for one in each])[owner] for each in (q, r))
 
-    @property
-    def _machine(self) -> None:
-        """NumPy alone: to compile takes as long as a calibration."""
+    def _map_estimates(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
+        return self._by_group(z, age, where, Decoders.__call__)
 
-    def _inverted(self, z: np.ndarray, age: np.ndarray, learned: np.ndarray, where: np.ndarray) -> Gaussian:
-        x, P = np.empty((len(z), self._motion.nx)), np.empty((len(z), *self._units.shape))
-        for i, each in enumerate(self._each):
-            mine = self._owner[where] == i
-            if mine.any():
-                x[mine] = each(z[mine], age[mine])
-                P[mine] = each.covariances(z[mine], learned[mine])
-        return x, P / self._units
+    def _map_covariances(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
+        return self._by_group(z, age, where, Decoders.covariances)
+
+    def _by_group(self, z: np.ndarray, age: np.ndarray, where: np.ndarray, of: Any) -> np.ndarray:
+        owner = self._owner[where]
+        parts = {i: of(self._each[i], z[owner == i], age[owner == i]) for i in np.unique(owner)}
+        found = np.empty((len(z), *next(iter(parts.values())).shape[1:]))
+        for i, part in parts.items():
+            found[owner == i] = part
+        return found

@@ -3,7 +3,7 @@
 import numpy as np
 
 from kkl_gym.simulate import advance_batch
-from observers.unscented import Gaussian, Points, conditioned, transformed
+from observers.unscented import Gaussian, Points, add, shift, transformed, whitened
 from training.kalman import Corrected, KalmanFilter
 
 
@@ -41,8 +41,8 @@ class UnscentedKalmanFilter(KalmanFilter):
 
     def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
         expected, S, across = transformed(x, P, function=self._output, points=self._points)
-        x, P, white = conditioned(x, P, y - expected, S + self._R, across, np.isnan(y))
-        return x, P, (white**2).sum(-1) / np.maximum((~np.isnan(y)).sum(-1), 1)
+        V, white = whitened(y - expected, S + self._R, across, np.isnan(y))
+        return shift(x, V, white), add(P, V, V, -1.0), (white**2).sum(-1) / np.maximum((~np.isnan(y)).sum(-1), 1)
 
     def _output(self, points: np.ndarray) -> np.ndarray:
         y = self._system.output(points)
