@@ -12,8 +12,7 @@ from training.diagnosis.records import ASKING, ASKING_SHARE, Filtered, compare
 from training.diagnosis.signals import AS_GOOD, DETERMINED
 from training.diagnosis.subject import Subject
 from training.evaluation.levels import Level, show_level
-from training.filter_noise import noise_covariance
-from training.maps.coordinates import settling_time
+from training.maps.coordinates import noise_covariance, settling_time
 from training.presets import eigenvalues
 from training.records import Record, Signals
 from training.sources.recorded import split

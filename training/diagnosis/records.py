@@ -12,8 +12,7 @@ from observers import LinearFilter
 from observers.checks import integer, noise_levels, shown
 from training.diagnosis.signals import DETERMINED, Observability
 from training.evaluation.levels import Level
-from training.filter_noise import noise_covariance, root
-from training.maps.coordinates import coordinates, settling_time, spread
+from training.maps.coordinates import coordinates, noise_covariance, root, settling_time, spread
 from training.neighbours import told
 from training.presets import recorded_preset
 from training.progress import ProgressBars, progress_bars

@@ -15,7 +15,7 @@ from training.config import settings_of
 from training.evaluation.levels import Level, show_level
 from training.figures import ESTIMATE, TRUTH, drawing
 from training.lessons.calibrate import chi_square, squared_distance
-from training.maps.smooth import residual
+from training.maps.forward import residual
 from training.sources.simulated import SimulatedSource
 from training.sources.source import Runs, Source, TooFewRunsError
 from training.train_observer import Result

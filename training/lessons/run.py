@@ -16,8 +16,7 @@ import torch
 from torch import nn
 
 from training.config import Config
-from training.maps.optimise import Log, Stage, log_to, optimise
-from training.maps.step import Loss
+from training.maps.optimise import Log, Loss, Stage, log_to, optimise
 from training.progress import LOG, ProgressBars, progress_bars
 
 

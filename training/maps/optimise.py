@@ -1,4 +1,4 @@
-"""One optimisation loop for every network: Adam or SOAP, cosine decay, checkpoints, resuming, progress."""
+"""One optimisation loop for every network: Adam or SOAP, cosine decay, checkpoints, resuming, progress, CUDA graphs."""
 
 import math
 import operator
@@ -17,10 +17,12 @@ from torch import nn
 from observers.storage import naming
 from training import checkpoints
 from training.config import Optimiser
-from training.maps.step import Captured, Loss, Step
 
 LOG_EVERY = 100
 WARM_UP = 0.01  # part of a stage in which the learning rate rises
+
+# A batch is drawn with the generator it is given and nothing else, so that a resumed run goes on as it would have.
+Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
 
 Log = Callable[[str, float, int], object]
 """Takes the name of a scalar, its value and the number of the batch."""
@@ -153,3 +155,88 @@ def _restore(stage: Stage, parts: dict[str, Any], generator: torch.Generator) ->
         generator.set_state(found["generator"])
         history = [(int(step), float(error)) for step, error in found["history"]]
         return _Course(operator.index(found["step"]), float(found["seconds"]), history)
+
+
+class Step:
+    """One batch: draw, loss, gradients, clipping, Adam's step and the sum of errors, in tensors that stay in place.
+
+    SOAP steps after it, because its eigenvectors cannot be part of a CUDA graph.
+    """
+
+    def __init__(
+        self, module: nn.Module, loss: Loss, optimiser: torch.optim.Optimizer, generator: torch.Generator
+    ) -> None:
+        self.module, self.loss, self.optimiser, self.generator = module, loss, optimiser, generator
+        self.optimises = isinstance(optimiser, torch.optim.Adam)
+        device = next(module.parameters()).device
+        self.total, self.terms = torch.zeros((), device=device), dict[str, torch.Tensor]()
+        if self.optimises and device.type == "cuda":  # a graph would keep a number as it was when captured
+            for group in optimiser.param_groups:
+                group["lr"] = torch.as_tensor(group["lr"], dtype=torch.float32, device=device)
+
+    def set_learning_rate(self, rate: float) -> None:
+        """For the batches that follow."""
+        for group in self.optimiser.param_groups:
+            if isinstance(group["lr"], torch.Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+
+    def __call__(self) -> None:
+        """Run it."""
+        terms = self.loss(self.generator)
+        self.optimiser.zero_grad(set_to_none=True)
+        terms["loss"].backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
+        if self.optimises:
+            self.optimiser.step()
+        self.total += terms.get("error", terms["loss"]).detach()
+        self.terms = {name: value.detach() for name, value in terms.items()}
+
+
+class Captured:
+    """A function of tensors that stay in place: its first calls run as they are, the others replay a CUDA graph."""
+
+    WARM_UP = 3  # calls in which the optimiser and torch's libraries allocate what they keep
+
+    def __init__(self, function: Callable[[], None], generator: torch.Generator) -> None:
+        self._function, self._generator, self._calls = function, generator, 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        """Run the function, or replay it."""
+        if self._calls < self.WARM_UP:
+            stream, current = torch.cuda.Stream(), torch.cuda.current_stream()  # type: ignore[no-untyped-call]
+            stream.wait_stream(current)
+            with _on_gpu(), torch.cuda.stream(stream):
+                self._function()
+            current.wait_stream(stream)
+        else:
+            self._graph = self._graph or self._captured()
+            self._graph.replay()
+        self._calls += 1
+
+    def _captured(self) -> torch.cuda.CUDAGraph:
+        graph = torch.cuda.CUDAGraph()
+        graph.register_generator_state(self._generator)
+        try:
+            with _on_gpu(), torch.cuda.graph(graph):
+                self._function()
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"a batch cannot be captured as a CUDA graph, as if f or h copied tensors to the host: {error}; train "
+                "with --device cpu"
+            ) from error
+        return graph
+
+
+@contextmanager
+def _on_gpu() -> Iterator[None]:
+    """TF32 matrix products, and functions uncompiled that the compiler fails on."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        with torch._dynamo.config.patch(suppress_errors=True):
+            yield
+    finally:
+        torch.set_float32_matmul_precision(before)

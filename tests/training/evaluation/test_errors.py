@@ -12,7 +12,7 @@ from observers import KKLObserver
 from training import errors, unseen_trajectories
 from training.evaluation.errors import kalman_errors, measured
 from training.evaluation.plants import off_by, show_parameters
-from training.filter_noise import stationary_covariance
+from training.maps.coordinates import stationary_covariance
 
 
 def test_process_noise_disturbs_the_motion_and_is_passed_to_the_observer(make_artifact, monkeypatch):

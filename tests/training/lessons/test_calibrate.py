@@ -13,8 +13,8 @@ from training import SimulatedSource, calibrate
 from training.config import settings_of
 from training.evaluation.coverage import REGIONS, coverage, kalman_coverage
 from training.evaluation.errors import unseen_trajectories
-from training.filter_noise import noise_covariance
 from training.lessons.calibrate import chi_square, rare, squared_distance
+from training.maps.coordinates import noise_covariance
 
 DT, DISTURBED = 0.05, 0.5
 

@@ -20,12 +20,11 @@ from examples.research.benchmark.jobs import seconds_spent
 from kkl_gym import VanDerPol, get_system
 from observers.storage import UNFINISHED
 from training import checkpoints
+from training.maps.coordinates import StateScale
 from training.maps.forward import ForwardProblem
-from training.maps.inverse import InverseProblem
+from training.maps.inverse import ForwardMapSampler, InverseProblem
 from training.maps.networks import Network
-from training.maps.samplers import ForwardMapSampler
-from training.maps.scaling import StateScale
-from training.maps.step import Captured
+from training.maps.optimise import Captured
 from training.progress import progress_bars
 from training.spectrum import Spectrum
 
