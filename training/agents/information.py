@@ -17,7 +17,7 @@ from observers import KKLObserver, load, shipped
 from observers.factors import standard_deviations
 from training.agents.tasks import deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
-from training.systems import ControlTask, profile
+from training.systems import ControlTask
 from training.trajectories.derivatives import linearised
 
 Information = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"]
@@ -174,11 +174,10 @@ def make(
 
 
 def observer_of(system: System) -> str:
-    """Name of the map that agents get for a system: the one of its profile, or of its own name."""
-    name = profile(system).agent_observer or system.name
-    if name not in shipped():
+    """Name of the shipped map of a system."""
+    if system.name not in shipped():
         raise ValueError(f"no observer ships for {system.name!r}: name a .safetensors file (--observer FILE)")
-    return name
+    return system.name
 
 
 def estimate_and_spread(system: System) -> Feature:
