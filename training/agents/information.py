@@ -120,7 +120,7 @@ class KalmanFilters:
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Report the estimates, (n, nx), of all rows or of those that a mask names."""
-        return {"x_hat": self._filters.decode(rows)}
+        return {"x_hat": self._filters.x.copy() if rows is None else self._filters.x[rows]}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """Show the estimates that were reported."""
