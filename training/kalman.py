@@ -50,6 +50,11 @@ class ExtendedKalmanFilter:
         self.x, self.P = self._corrected(*self._starts(len(y0)), y0)
         return self.x.copy()
 
+    @property
+    def covariance(self) -> np.ndarray:
+        """That of the estimates, (n, nx, nx)."""
+        return self.P
+
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
         """Begin again in some rows. Shapes: ``y0`` (number of rows, ny), ``rows`` (n,)."""
         self.x, self.P = self.x.copy(), self.P.copy()

@@ -36,7 +36,7 @@ from training.commands.agent_files import find
 from training.commands.options import shown
 from training.commands.portraits import animate
 from training.evaluation.errors import estimates as estimates_of
-from training.evaluation.errors import kalman_estimates, unseen_trajectories
+from training.evaluation.errors import unseen_trajectories
 from training.evaluation.metrics import percentage_error
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
 from training.lessons.calibrate import chi_square
@@ -189,7 +189,7 @@ def errors_of_runs(
         runs = unseen_trajectories(system, DT, n=trajectories, duration=duration or system.duration, seed=0)
         x_hats = (
             estimates_of(Artifact.read(resolve(name)), system, runs, **how),
-            kalman_estimates(system, runs, DT, **how),
+            estimates_of(None, system, runs, **how),
         )
         errors[name] = [percentage_error(runs.x, x_hat) for x_hat in x_hats]
     return errors
