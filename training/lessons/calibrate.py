@@ -1,6 +1,7 @@
 """The lesson of calibration: covariances and limits of a monitor, from one pass of motions nothing was trained on."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,9 +10,11 @@ from scipy.special import gammaincinv
 
 from kkl_gym.system import System
 from observers import Artifact, ErrorCovariance, Factors, InverseMap, Limits, Motion
+from observers.decoder import Decoders
 from observers.factors import COVERAGE
+from observers.tracker import Tracker
+from observers.unscented import Gaussian
 from training.config import settings_of
-from training.lessons.together import Together, decoders
 from training.progress import ProgressBars, progress_bars
 from training.sources.simulated import SimulatedSource
 from training.sources.source import Runs, Source, TooFewRunsError
@@ -24,6 +27,10 @@ LEAST_VARIANCE = 1e-6  # added to that of each state, over its range squared
 WINDOW, WARM_UP = 0.5, 5.0  # seconds of the monitor, likewise
 REPORTED = 100  # samples from report to report
 MARGIN = 1.05  # on limits found among finitely many motions
+
+Level = float | tuple[float, ...]
+Group = tuple[Level, float, int]
+"""Level of measurement noise, level of process noise, number of rows."""
 
 
 def calibrate(
@@ -230,6 +237,72 @@ class _Calibration:
         pace, dt = self.source.pace, self.artifact.filter.dt
         seconds = len(self.runs.u) * dt
         return Limits(self.levels, mean, below, above, WINDOW * pace, WARM_UP * pace, self.false_alarms, seconds)
+
+
+class Together:
+    """An observer whose rows fall into groups of like noise, one group after the other."""
+
+    def __init__(self, artifact: Artifact, groups: Sequence[Group]) -> None:
+        self._linear, self._age = artifact.filter, 0
+        self._decoders = [decoders(artifact, level, noise) for level, noise, _ in groups]
+        self._owner = np.repeat(np.arange(len(groups)), [n for _, _, n in groups])
+        self._tracker = None if artifact.motion is None else _Stacked(artifact, groups, self._decoders, self._owner)
+
+    def reset(self, y: np.ndarray) -> np.ndarray:
+        """Begin. Shapes: ``y`` (n, ny); returns (n, nx)."""
+        self._z, self._y, self._age = self._linear.start(y), y, 0
+        if self._tracker is not None:
+            self._tracker.reset(y)
+        return self._decoded()
+
+    def step(self, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Take in the next samples, all of them present. Shapes: ``u`` (n, nu); returns (n, nx)."""
+        if self._tracker is not None:
+            self._tracker.advance(y, u)
+        self._z, self._y, self._age = self._linear.advance(self._z, self._y, u, y), y, self._age + 1
+        return self._decoded()
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """That of the tracker, (n, nx, nx)."""
+        assert self._tracker is not None
+        return self._tracker.covariance(self._age)
+
+    def _decoded(self) -> np.ndarray:
+        if self._tracker is None:
+            age = self._age * self._linear.dt
+            parts = [each(self._z[self._owner == i], age) for i, each in enumerate(self._decoders)]
+            return np.concatenate(parts)
+        self._tracker.supervise(self._z, self._age)
+        return self._tracker.estimate
+
+
+class _Stacked(Tracker):
+    """A tracker whose rows have levels of their own."""
+
+    def __init__(self, artifact: Artifact, groups: Sequence[Group], of: Sequence[Decoders], owner: np.ndarray) -> None:
+        (level, noise, _), self._each, self._owner = groups[0], of, owner
+        super().__init__(artifact, of[0], measurement_noise=level, process_noise=noise)
+        q, r = zip(*(self._motion.variances(level, noise) for level, noise, _ in groups), strict=True)
+        self._Q, self._R = (np.array([np.diag(one) for one in each])[owner] for each in (q, r))
+
+    @property
+    def _machine(self) -> None:
+        """NumPy alone: to compile takes as long as a calibration."""
+
+    def _inverted(self, z: np.ndarray, age: np.ndarray, learned: np.ndarray, where: np.ndarray) -> Gaussian:
+        x, P = np.empty((len(z), self._motion.nx)), np.empty((len(z), *self._units.shape))
+        for i, each in enumerate(self._each):
+            mine = self._owner[where] == i
+            if mine.any():
+                x[mine] = each(z[mine], age[mine])
+                P[mine] = each.covariances(z[mine], learned[mine])
+        return x, P / self._units
+
+
+def decoders(artifact: Artifact, level: Level, process_noise: float) -> Decoders:
+    """T_inv of the states at levels of noise."""
+    return Decoders(artifact, slice(artifact.nx), measurement_noise=level, process_noise=process_noise)
 
 
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
