@@ -31,6 +31,8 @@ from observers.storage import replacing, write
 from training.agents import picture
 from training.agents.agent import Agent
 from training.agents.play import Episodes, play
+from training.agents.seeds import agent_evaluation_seed
+from training.agents.tasks import ControlTask
 from training.commands import demo, faults
 from training.commands.agent_files import find
 from training.commands.options import shown
@@ -40,8 +42,6 @@ from training.evaluation.errors import unseen_trajectories
 from training.evaluation.metrics import percentage_error
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
 from training.lessons.calibrate import chi_square
-from training.seeds import agent_evaluation_seed
-from training.systems import ControlTask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,9 +15,8 @@ from kkl_gym.vector import with_mask
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
 from observers import KKLObserver, load, shipped
 from observers.factors import standard_deviations
-from training.agents.tasks import deviation
+from training.agents.tasks import ControlTask, deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
-from training.systems import ControlTask
 from training.trajectories.derivatives import linearised
 
 Information = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"]

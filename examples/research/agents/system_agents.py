@@ -16,9 +16,9 @@ from observers.storage import explained, write
 from training.agents.agent import fingerprint, rules
 from training.agents.information import OBSERVED, make, observer_of
 from training.agents.play import Policy, play
+from training.agents.seeds import AGENT_EVALUATION_SEED
 from training.agents.tasks import TASKS, get_task, scores, successes
 from training.evaluation.levels import Level, as_cell, as_name
-from training.seeds import AGENT_EVALUATION_SEED
 
 if TYPE_CHECKING:
     import pandas as pd
