@@ -25,6 +25,7 @@ from training.trajectories.record import Pairs
 
 MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
 AGE_UNIT = 5  # samples, in the age feature log(1 + t / unit)
+SAMPLES = 100_000  # of z, from which coordinates are found
 PROCESS_NOISE_UNIT = 0.1  # of the highest level, in the process noise feature log(1 + level / unit)
 
 
@@ -81,7 +82,7 @@ class TrajectorySampler:
         largest = np.broadcast_to(np.asarray(measurement_noise_max, dtype=float), ny)
         usual = np.where(measurement_noise, measurement_noise, largest / 2)
         self.measurement_noise_max, self.measurement_noise_unit = largest, MEASUREMENT_NOISE_UNIT * usual
-        rows = np.random.default_rng(0).permutation(m * n)[:100_000]
+        rows = np.random.default_rng(0).permutation(m * n)[:SAMPLES]
         each = stationary_covariance(linear)
         together = np.einsum("j,jab->ab", (largest / largest.max()) ** 2, each)
         self.coordinates = coordinates(data.z.reshape(m * n, size)[rows], together, silent)
@@ -279,8 +280,7 @@ class ForwardMapSampler:
     Shapes: ``error`` (n, nz), ``points`` (n, nx).
     """
 
-    cells, kinds_of_plant = 1, 1
-    parameters = 0
+    cells, kinds_of_plant, parameters = 1, 1, 0
 
     def __init__(
         self,
@@ -293,30 +293,23 @@ class ForwardMapSampler:
         scaling: Scaling = "relative",
     ) -> None:
         self.scale = StateScale.of(points, scaling)
-        self._points, self._weight = tensor(points, device), tensor(self.scale.weight(points), device)
-        self._forward, self._batch = forward, batch
-        x = self._points[self._draw(torch.Generator(device).manual_seed(0), 100_000)]
+        self._x, self._weight = tensor(self.scale(points), device), tensor(self.scale.weight(points), device)
         with torch.no_grad():
-            z = forward(x).cpu().numpy().astype(float)
-        self.coordinates = coordinates(z, error.T @ error / len(error))
-        self._offset, self._scale = tensor(self.scale.offset, device), tensor(self.scale.scale, device)
-        self._z_offset = torch.as_tensor(self.coordinates.offset, device=device)
-        self._whiten = torch.as_tensor(self.coordinates.whiten, device=device)
-        self._blur = tensor(self.coordinates.noise_gain, device)
+            parts = [forward(part).cpu().numpy() for part in torch.split(tensor(points, device), SAMPLES)]
+        z = np.concatenate(parts).astype(float)
+        some = np.random.default_rng(0).permutation(len(z))[:SAMPLES]
+        self.coordinates = coordinates(z[some], error.T @ error / len(error))
+        self._modes = tensor(self.coordinates(z), device)
+        self._blur, self._batch = tensor(self.coordinates.noise_gain, device), batch
 
-    def _draw(self, generator: torch.Generator, n: int) -> torch.Tensor:
-        return torch.randint(len(self._points), (n,), generator=generator, device=generator.device)
-
-    @torch.no_grad()
     def __call__(self, generator: torch.Generator) -> Batch:
         """One batch."""
-        rows = self._draw(generator, self._batch)
-        x = self._points[rows]
-        modes = ((self._forward(x).double() - self._z_offset) @ self._whiten.T).float()
-        modes = modes + self._blur * torch.randn(modes.shape, generator=generator, device=x.device)
-        modes = modes / (1.0 + self._blur**2)
-        cell = torch.zeros(len(x), dtype=torch.long, device=x.device)
-        return Batch(modes, (x - self._offset) / self._scale, self._weight[rows], cell)
+        device = self._x.device
+        rows = torch.randint(len(self._x), (self._batch,), generator=generator, device=device)
+        modes = self._modes[rows]
+        modes = modes + self._blur * torch.randn(modes.shape, generator=generator, device=device)
+        cell = torch.zeros(len(rows), dtype=torch.long, device=device)
+        return Batch(modes / (1.0 + self._blur**2), self._x[rows], self._weight[rows], cell)
 
     def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
         """The map that a network trained on these batches makes: the paper's, of z alone."""

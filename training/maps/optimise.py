@@ -2,7 +2,6 @@
 
 import math
 import operator
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -131,14 +130,8 @@ def log_to(folder: Path) -> Iterator[Log | None]:
     except ImportError:
         yield None
         return
-    hook = threading.excepthook
-    # The thread that writes tells its errors to whoever calls next: it need not print them as well.
-    threading.excepthook = lambda failed: None if isinstance(failed.exc_value, OSError) else hook(failed)
-    try:
-        with naming(folder), SummaryWriter(folder) as writer:
-            yield writer.add_scalar
-    finally:
-        threading.excepthook = hook
+    with naming(folder), SummaryWriter(folder) as writer:
+        yield writer.add_scalar
 
 
 def _save(stage: Stage, parts: dict[str, Any], generator: torch.Generator, course: _Course) -> None:

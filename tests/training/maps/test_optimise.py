@@ -1,15 +1,11 @@
 """The optimisation loop."""
 
 import contextlib
-import errno
-import re
-import threading
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-import torch.utils.tensorboard
 from small_runs import CPU, closed_loop, open_loop
 from torch._subclasses.fake_tensor import FakeTensorMode
 
@@ -223,38 +219,3 @@ def test_a_captured_stage_on_a_gpu_is_the_same_as_an_eager_one(optimiser, tmp_pa
             training.maps.optimise.optimise(stage, problem, problem.loss, progress, resume=False)
         weights.append(problem.network.linear_layers()[0].weight.detach().cpu())
     torch.testing.assert_close(*weights, rtol=1e-3, atol=1e-4)
-
-
-class FullDisk:
-    """A writer of TensorBoard's whose thread and whose caller both meet a full disk."""
-
-    def __init__(self, folder):
-        pass
-
-    def __enter__(self):
-        for error in (OSError(errno.ENOSPC, "No space left on device"), ValueError("of something else")):
-            thread = threading.Thread(target=self.fail, args=(error,))
-            thread.start()
-            thread.join()
-        self.fail(OSError(errno.ENOSPC, "No space left on device"))
-
-    def __exit__(self, *arguments):
-        pass
-
-    def fail(self, error):
-        raise error
-
-
-def test_a_disk_that_is_full_of_scalars_is_told_once(tmp_path, monkeypatch):
-    seen = []
-    monkeypatch.setattr(threading, "excepthook", seen.append)
-    hook = threading.excepthook
-    monkeypatch.setattr(torch.utils.tensorboard, "SummaryWriter", FullDisk)
-    with (
-        pytest.raises(OSError, match=re.escape(f"No space left on device: '{tmp_path}'")),
-        training.maps.optimise.log_to(tmp_path),
-    ):
-        raise AssertionError
-    (failed,) = seen
-    assert str(failed.exc_value) == "of something else"
-    assert threading.excepthook == hook
