@@ -25,6 +25,7 @@ THEN: dict[str, Callable[[Subject], Iterator[Finding]]] = {
     "bounds": system.bounds,
     "sampling": system.sampling,
     "output": system.outputs,
+    "spectrum": outputs.spectrum,
     "observability": outputs.observability,
 }
 

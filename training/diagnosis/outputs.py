@@ -1,5 +1,6 @@
 """What the outputs of a system determine of its states: near each state by its equations, and globally by motions."""
 
+import contextlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +13,7 @@ from training.kalman import ExtendedKalmanFilter
 from training.maps.coordinates import noise_covariance, settling_time
 from training.presets import eigenvalues
 from training.records import Record, Signals
+from training.smoothness import smooth_spectrum
 from training.sources.recorded import split
 from training.sources.simulated import unknown_start
 from training.spectrum import Spectrum
@@ -106,6 +108,19 @@ def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], F
                 f"let h measure {' or '.join(states)} too, or leave it out of the state",
             )
     return found
+
+
+def spectrum(subject: Subject) -> Iterator[Finding]:
+    """The eigenvalues that a training takes, and those from which on T is smooth."""
+    system, dt = subject.system, subject.dt
+    taken = eigenvalues(system, dt)
+    memory = settling_time(Spectrum(taken).filter(system.ny, dt))
+    found = f"{len(taken)} eigenvalues of A for each output, {taken[0]:.3g} to {taken[-1]:.3g} 1/s, with which the "
+    found += f"filter forgets its start in {memory:.3g} s"
+    if not (system.discrete or subject.policy):
+        with contextlib.suppress(ValueError):  # motions leave the bounds too soon
+            found += f"; T is smooth for those beyond {smooth_spectrum(system, dt).eigenvalues[0]:.3g} 1/s"
+    yield Finding("spectrum", "ok", found)
 
 
 def _torn(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Finding]:

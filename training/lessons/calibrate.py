@@ -27,8 +27,6 @@ WINDOW, WARM_UP = 0.5, 5.0  # seconds of the monitor, likewise
 REPORTED = 100  # samples from report to report
 MARGIN = 1.05  # on limits found among finitely many motions
 
-Level = float | tuple[float, ...]
-
 
 def calibrate(
     artifact: Artifact,
@@ -207,7 +205,7 @@ class _Calibration:
 class Rows:
     """An observer whose rows belong to groups, each with a level of measurement and of process noise of its own."""
 
-    def __init__(self, artifact: Artifact, groups: Sequence[tuple[Level, float]], owner: np.ndarray) -> None:
+    def __init__(self, artifact: Artifact, groups: Sequence[tuple[Any, float]], owner: np.ndarray) -> None:
         self._linear, self._nx, self._age, self._owner = artifact.filter, artifact.nx, 0, owner
         self._decoders = [
             Decoders(artifact, slice(artifact.nx), measurement_noise=level, process_noise=noise)
@@ -256,7 +254,7 @@ class _Stacked(Tracker):
     def __init__(
         self,
         artifact: Artifact,
-        groups: Sequence[tuple[Level, float]],
+        groups: Sequence[tuple[Any, float]],
         decoders: Sequence[Decoders],
         owner: np.ndarray,
     ) -> None:

@@ -122,13 +122,32 @@ class Stage:
         return self.folder / f"{self.name}{checkpoints.SUFFIX}"
 
 
-@dataclass
 class _Course:
     """How far a stage has come: batches done, CPU seconds spent, and the error by batch."""
 
-    step: int = 0
-    seconds: float = 0.0
-    history: list[tuple[int, float]] = field(default_factory=list)
+    def __init__(
+        self, stage: Stage, step: int = 0, seconds: float = 0.0, history: list[tuple[int, float]] | None = None
+    ) -> None:
+        self.stage, self.step, self.history = stage, step, history or []
+        self._spent, self._began = seconds, time.process_time()
+
+    @property
+    def seconds(self) -> float:
+        return self._spent + time.process_time() - self._began
+
+    @property
+    def part(self) -> float:
+        return max(self.step / self.stage.steps, min(1.0, self.seconds / self.stage.cpu_seconds))
+
+    @property
+    def learning_rate(self) -> float:
+        done = self.part
+        warm = min(1.0, (done + 1 / self.stage.steps) / WARM_UP)
+        return self.stage.learning_rate * (warm * 0.5 * (1.0 + math.cos(math.pi * done)))
+
+    @property
+    def over(self) -> bool:
+        return self.step >= self.stage.steps or self.seconds >= self.stage.cpu_seconds
 
 
 def optimise(
@@ -146,46 +165,33 @@ def optimise(
     generator = torch.Generator(device).manual_seed(stage.seed)
     optimiser = _optimiser(stage, module)
     parts = {"module": module, "optimiser": optimiser}
-    course = _restore(stage, parts, generator) if resume and stage.checkpoint.exists() else _Course()
-    spent, began = course.seconds, time.process_time()
-
-    def seconds() -> float:
-        return spent + time.process_time() - began
-
-    def part(step: int) -> float:
-        return max(step / stage.steps, min(1.0, seconds() / stage.cpu_seconds))
-
-    def rate(step: int) -> float:
-        done = part(step)
-        return min(1.0, (done + 1 / stage.steps) / WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * done))
-
+    course = _restore(stage, parts, generator) if resume and stage.checkpoint.exists() else _Course(stage)
     task = progress.add_task(stage.name, total=stage.steps, completed=course.step)
     batch = Step(module, loss, optimiser, generator)
     captured = device.type == "cuda" and getattr(module, "capturable", False)
-    run, saved_at = Captured(batch, generator) if captured else batch, time.monotonic()
-    for step in range(course.step, stage.steps if spent < stage.cpu_seconds else course.step):
-        batch.set_learning_rate(stage.learning_rate * rate(step))
+    run, saved_at, over = Captured(batch, generator) if captured else batch, time.monotonic(), course.over
+    while not over:
+        batch.set_learning_rate(course.learning_rate)
         run()
         if not batch.optimises:
             optimiser.step()
-        last = step + 1 == stage.steps or seconds() >= stage.cpu_seconds
-        if (step + 1) % LOG_EVERY == 0 or last:
-            mean = float(batch.total) / ((step % LOG_EVERY) + 1)
-            if mean != mean:
-                raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {step + 1}")
-            batch.total.zero_()
-            course.history.append((step + 1, mean))
-            if log is not None:
-                for name, value in batch.terms.items():
-                    log(f"{stage.name}/{name}", float(value), step + 1)
-            total_steps = round((step + 1) / part(step + 1))  # that there will be by the time the clock ends it
-            progress.update(task, completed=step + 1, total=total_steps, description=f"{stage.name} (error {mean:.3g})")
-            if time.monotonic() - saved_at > checkpoints.SECONDS or last:
-                course.step, course.seconds = step + 1, seconds()
-                _save(stage, parts, generator, course)
-                saved_at = time.monotonic()
-        if last:
-            break
+        course.step += 1
+        over = course.over
+        if course.step % LOG_EVERY and not over:
+            continue
+        mean = float(batch.total) / ((course.step - 1) % LOG_EVERY + 1)
+        if mean != mean:
+            raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {course.step}")
+        batch.total.zero_()
+        course.history.append((course.step, mean))
+        if log is not None:
+            for name, value in batch.terms.items():
+                log(f"{stage.name}/{name}", float(value), course.step)
+        total = round(course.step / course.part)  # that there will be by the time the clock ends it
+        progress.update(task, completed=course.step, total=total, description=f"{stage.name} (error {mean:.3g})")
+        if over or time.monotonic() - saved_at > checkpoints.SECONDS:
+            _save(course, parts, generator)
+            saved_at = time.monotonic()
     return course.history
 
 
@@ -210,10 +216,10 @@ def log_to(folder: Path) -> Iterator[Log | None]:
         yield writer.add_scalar
 
 
-def _save(stage: Stage, parts: dict[str, Any], generator: torch.Generator, course: _Course) -> None:
-    states = {name: part.state_dict() for name, part in parts.items()}
-    state = {"generator": generator.get_state(), **states, **vars(course)}
-    checkpoints.save(stage.checkpoint, state, fingerprint=stage.fingerprint)
+def _save(course: _Course, parts: dict[str, Any], generator: torch.Generator) -> None:
+    state = {name: part.state_dict() for name, part in parts.items()} | {"generator": generator.get_state()}
+    state |= {"step": course.step, "seconds": course.seconds, "history": course.history}
+    checkpoints.save(course.stage.checkpoint, state, fingerprint=course.stage.fingerprint)
 
 
 def _restore(stage: Stage, parts: dict[str, Any], generator: torch.Generator) -> _Course:
@@ -223,7 +229,7 @@ def _restore(stage: Stage, parts: dict[str, Any], generator: torch.Generator) ->
             part.load_state_dict(found[name])
         generator.set_state(found["generator"])
         history = [(int(step), float(error)) for step, error in found["history"]]
-        return _Course(operator.index(found["step"]), float(found["seconds"]), history)
+        return _Course(stage, operator.index(found["step"]), float(found["seconds"]), history)
 
 
 class Step:
