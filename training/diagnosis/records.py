@@ -271,7 +271,7 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
 
 
 def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows: Sequence[int]) -> Iterator[str]:
-    """What the data are too few for; ``halves`` (windows, nx) are the errors with half of the samples."""
+    """Warnings of too few data; ``halves`` (windows, nx) are the errors with half of the samples."""
     if records < FEW:
         yield (
             f"there are fewer than {FEW} records: samples are compared with others of the same, and what is constant "

@@ -325,7 +325,7 @@ def _apart(expected: np.ndarray, values: np.ndarray, *, rate: bool) -> np.ndarra
 
 
 def _way_out(subject: Subject, *, unstable: bool) -> str:
-    """What to change so that motions stay: bounds, if wider ones hold them, or else X or the policy."""
+    """Advice for motions that leave: other bounds, if wider ones hold them, or else another X or a policy."""
     system, (x, u), lost = subject.system, subject.motions, np.flatnonzero(~subject.stays)
     if subject.policy:
         return "let the policy hold the system from all of X, widen the bounds, shrink X, or take a smaller dt"

@@ -28,7 +28,7 @@ def show_parameters(system: System) -> str:
 
 
 def show_ranges(artifact: Artifact) -> str:
-    """For people: ``mu from 2.7 to 3.3``, with commas between several; nothing where there are none."""
+    """``mu from 2.7 to 3.3``, with commas between several parameters; empty without any."""
     return ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in artifact.parameter_ranges.items())
 
 

@@ -177,7 +177,7 @@ class _Calibration:
         return self.by_level(distances), [self.by_level(each[None])[:, 0] for each in (largest, low, high)]
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
-        """What is found of the values (ages, n, ...) about each knot; where too few are there, of the next knot."""
+        """A function of the values (ages, n, ...) about each knot; where these are too few, that of the next knot."""
         known = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
         cells = [np.isin(self.ages, span)[:, None] & known for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
@@ -289,7 +289,7 @@ def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
-    """What a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
+    """Value that a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
 
     Median and 90 % quantile decide, not a few motions that are lost. It is at most ten times the largest extreme, for
     outputs that stand still in most motions. Shapes: ``extremes`` (n, ny); returns (ny,).

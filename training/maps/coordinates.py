@@ -92,7 +92,7 @@ def stationary_covariance(linear: LinearFilter) -> np.ndarray:
 
 
 def _columns(linear: LinearFilter) -> Iterator[tuple[np.ndarray, ...]]:
-    """What each output acts through: its columns of early_y, late_y and equilibrium, each (size, 1)."""
+    """Each output's columns of early_y, late_y and equilibrium, each (size, 1)."""
     for j in range(linear.B.shape[1]):
         yield tuple(matrix[:, j : j + 1] for matrix in (linear.early_y, linear.late_y, linear.equilibrium))
 

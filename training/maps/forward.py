@@ -213,7 +213,7 @@ def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon
 
 
 def transients(T: np.ndarray, z0: np.ndarray, *, linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
-    """What the filter holds along trajectories by T alone: z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)).
+    """Filter states along trajectories by T alone: z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)).
 
     For an exact T this is the filter's own state at every age, so that none needs to be simulated (paper, sec. 3).
 

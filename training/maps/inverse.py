@@ -169,7 +169,7 @@ class TrajectorySampler:
         return position, torch.where(loud, level, torch.zeros_like(level))
 
     def process_conditions(self, process_noise: np.ndarray, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the network is told of levels of process noise, (n,), and their parts in the number of the cell."""
+        """Process noise features of levels (n,), and their parts in the number of the cell."""
         part = process_noise / self.process_noise_max
         cell = (part > 0).astype(int) + (part > 0.5)
         return tensor(np.log1p(part / PROCESS_NOISE_UNIT), device), torch.as_tensor(cell, device=device)
@@ -216,7 +216,7 @@ class TrajectorySampler:
 
 
 def _float_or_tuple(values: np.ndarray) -> float | tuple[float, ...]:
-    """What an inverse map of one output is told, or of several."""
+    """A number for one output, a tuple for several, as inverse maps hold them."""
     return tuple(values.tolist()) if len(values) > 1 else float(values[0])
 
 
