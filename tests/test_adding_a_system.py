@@ -81,7 +81,8 @@ import observers
 from kkl_gym import ENV_IDS, get_system
 from training.agents.agent import Agent
 from training.presets import preset
-from training.systems import PROFILES, controller
+from training.agents.tasks import TASKS
+from training.systems import controller
 
 assert list(ENV_IDS)[-1] == "fitzhugh_nagumo" and ENV_IDS["fitzhugh_nagumo"] == "KKLFitzHughNagumo-v0"
 system = get_system("fitzhugh_nagumo")
@@ -90,7 +91,7 @@ assert np.allclose(controller(system)(np.array([system.target])), 0.0)
 assert preset(system, "input-aware", "fast").eigenvalues[0] == -0.1
 assert observers.load("fitzhugh_nagumo", 0.5, monitor=True).artifact.system == "fitzhugh_nagumo"
 agent = Agent.read("runs/first-look/agent/agent.safetensors")
-assert agent.observer == "fitzhugh_nagumo" and agent.task == PROFILES["fitzhugh_nagumo"].task
+assert agent.observer == "fitzhugh_nagumo" and agent.task == TASKS["fitzhugh_nagumo"]
 """
     do(sys.executable, "-c", checks)
 

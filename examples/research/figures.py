@@ -31,17 +31,17 @@ from observers.storage import replacing, write
 from training.agents import picture
 from training.agents.agent import Agent
 from training.agents.play import Episodes, play
+from training.agents.seeds import agent_evaluation_seed
+from training.agents.tasks import ControlTask
 from training.commands import demo, faults
 from training.commands.agent_files import find
 from training.commands.options import shown
 from training.commands.portraits import animate
 from training.evaluation.errors import estimates as estimates_of
-from training.evaluation.errors import kalman_estimates, unseen_trajectories
+from training.evaluation.errors import unseen_trajectories
 from training.evaluation.metrics import percentage_error
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
 from training.lessons.calibrate import chi_square
-from training.seeds import agent_evaluation_seed
-from training.systems import ControlTask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -189,7 +189,7 @@ def errors_of_runs(
         runs = unseen_trajectories(system, DT, n=trajectories, duration=duration or system.duration, seed=0)
         x_hats = (
             estimates_of(Artifact.read(resolve(name)), system, runs, **how),
-            kalman_estimates(system, runs, DT, **how),
+            estimates_of(None, system, runs, **how),
         )
         errors[name] = [percentage_error(runs.x, x_hat) for x_hat in x_hats]
     return errors

@@ -9,8 +9,8 @@ from kkl_gym import VanDerPol
 from observers import Artifact, LinearFilter
 from training import preset
 from training.config import override
+from training.maps.inverse import ClosedLoopSampler, TrajectorySampler
 from training.maps.networks import Network
-from training.maps.samplers import ClosedLoopSampler, TrajectorySampler
 from training.spectrum import papers_spectrum
 from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.record import Motions, record, recording_ages

@@ -119,15 +119,15 @@ def test_some_rows_restart_and_others_go_on(filters):
     together.reset(y[0])
     for k in range(1, 10):
         together.step(y[k])
-    before = together.decode()
+    before = together.x.copy()
     together.restart(y[0, rows], rows)
-    np.testing.assert_array_equal(together.decode()[~rows], before[~rows])
-    np.testing.assert_array_equal(together.decode(rows), whole[0, rows])
+    np.testing.assert_array_equal(together.x[~rows], before[~rows])
+    np.testing.assert_array_equal(together.x[rows], whole[0, rows])
     for k in range(1, 10):
         together.advance(y[k], rows=rows)
-    np.testing.assert_allclose(together.decode(), whole[9], rtol=1e-12)
+    np.testing.assert_allclose(together.x, whole[9], rtol=1e-12)
     together.advance(y[10], rows=np.zeros(3, dtype=bool))
-    np.testing.assert_allclose(together.decode(), whole[9], rtol=1e-12)
+    np.testing.assert_allclose(together.x, whole[9], rtol=1e-12)
 
 
 def test_a_filter_that_leaves_the_bounds_starts_anew_without_the_others(filters):
@@ -138,14 +138,7 @@ def test_a_filter_that_leaves_the_bounds_starts_anew_without_the_others(filters)
     spoiled = run(of_van_der_pol(filters), wild)
     np.testing.assert_allclose(spoiled[:, 1], whole[:, 1], rtol=1e-12, atol=1e-12)
     assert np.isfinite(spoiled).all()
-    observer = of_van_der_pol(filters)
-    observer.reset(np.array([[1.0], [1.0]]))
-    lost = []
-    for value in (1e9, 1e-9, 1e12):
-        observer.step(np.array([[value], [1.0]]))
-        lost.append(np.isinf(observer.nis))
-    assert np.any(lost, axis=0).tolist() == [True, False]
-    x_hat = run(observer, np.full((50, 1, 1), 0.5))
+    x_hat = run(of_van_der_pol(filters), np.concatenate([wild[:4, :1], np.full((50, 1, 1), 0.5)]))
     assert abs(x_hat[-1, 0, 0] - 0.5) < 0.2
 
 
@@ -161,27 +154,6 @@ def test_a_ukf_whose_covariance_is_none_starts_anew_without_the_others(P):
     np.testing.assert_allclose(found, [fresh[0], expected[1]], rtol=1e-12)
     assert np.isfinite(observer.P).all()
     assert np.abs(fresh[0] - expected[0]).max() > 1e-3
-
-
-def test_innovations_are_as_large_as_expected_where_the_model_holds(filters):
-    """On the linear system, with the noise that is assumed."""
-    rng, dt, system = np.random.default_rng(0), 0.02, TwoOutputs()
-    R = np.diag(np.square(system.measurement_noise))
-    Phi, Q = expm(F * dt), np.diag([0.01, 0.02])
-    ours = filters(system, dt, Q=Q, R=R, start=(np.zeros(2), np.eye(2)))
-    x, found = rng.normal(size=(400, 2)), []
-    for k in range(50):
-        if k:
-            x = x @ Phi.T + rng.normal(size=x.shape) * np.sqrt(np.diag(Q) * dt)
-        y = x + rng.normal(size=x.shape) * system.measurement_noise
-        ours.step(y) if k else ours.reset(y)
-        found.append(ours.nis)
-    assert np.mean(found) == pytest.approx(1.0, abs=0.03)
-    before = ours.nis.copy()
-    rows = np.arange(400) == 7
-    ours.advance(y, rows=rows)
-    np.testing.assert_array_equal(ours.nis[~rows], before[~rows])
-    assert ours.nis[7] != before[7]
 
 
 @dataclass(frozen=True)
@@ -203,17 +175,15 @@ def test_samples_count_where_h_is_undefined_at_some_sigma_points(filters):
     ours = filters(system, dt, Q=1e-6 * np.eye(2), R=1e-4 * np.eye(1), start=wide)
     for k, sample in enumerate(y):
         x_hat = ours.step(sample) if k else ours.reset(sample)
-        assert (ours.nis > 0.0).all()
     assert np.abs(x_hat - x[-1]).max() < 0.05
 
 
-def test_where_h_is_undefined_all_over_nothing_is_learned_and_that_is_said(filters):
+def test_where_h_is_undefined_all_over_nothing_is_learned(filters):
     system = Level()
     start = np.array([-3.0, 0.0]), 1e-4 * np.eye(2)
     ours = filters(system, 0.02, Q=1e-6 * np.eye(2), R=1e-4 * np.eye(1), start=start)
     found = ours.reset(np.array([[1.0]]))
     np.testing.assert_allclose(found, [[-3.0, 0.0]])
-    assert np.isinf(ours.nis)
     found = run(ours, np.ones((20, 1, 1)))
     assert np.isfinite(found).all()
 
@@ -226,10 +196,8 @@ def test_missing_outputs_correct_nothing(filters):
     y = np.random.default_rng(0).normal(size=(30, 3, 1))
     found = run(both, np.concatenate([y, np.full_like(y, np.nan)], -1))
     np.testing.assert_allclose(found, run(one, y), rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(both.nis, one.nis, rtol=1e-8)
     x, P = both.x, both.P
     both.advance(np.full((3, 2), np.nan))
     Phi = expm(F * dt)
     np.testing.assert_allclose(both.x, x @ Phi.T, rtol=1e-8)
     np.testing.assert_allclose(both.P, Phi @ P @ Phi.T + Q * dt, rtol=1e-7)
-    assert (both.nis == 0).all()

@@ -10,6 +10,7 @@ from linear_system import F, Oscillator, TwoOutputs, sylvester
 from scipy.linalg import expm
 
 from examples.research.benchmark.protocol import run
+from examples.research.certificates.smooth import decoder
 from examples.research.methods import ABLATION, METHODS, Budget, Task, get_method
 from examples.research.methods.kalmannet import Gain, KalmanNetFilter
 from examples.research.methods.recurrent import rollout
@@ -18,7 +19,6 @@ from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from kkl_gym.systems import VanDerPol
 from observers import LinearFilter
-from training.maps.smooth import decoder
 
 SMALL = Budget("small", 100, 25.0, samples=60, cpu_seconds=math.inf, width=32, depth=2, dt=0.05)
 TINY = replace(SMALL, trajectories=10, samples=20, width=8, depth=1, dt=0.02, steps=2)

@@ -14,8 +14,8 @@ from observers import MLP, storage
 from observers.errors import ArtifactError
 from observers.names import resolve
 from training.agents.information import EKF_PROCESS_NOISE, INFORMATION, OBSERVED, STACKED, Features, Information, make
+from training.agents.tasks import ControlTask
 from training.jobs import describe
-from training.systems import ControlTask
 
 FORMAT = 1
 _KEY = "kkl-gym-agent"

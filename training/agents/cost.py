@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
-from training.systems import ControlTask
+from training.agents.tasks import ControlTask
 
 WORST = 10.0  # of the cost, three scales off in every state; beyond it, networks would learn little else
 

@@ -15,9 +15,8 @@ from kkl_gym.vector import with_mask
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
 from observers import KKLObserver, load, shipped
 from observers.factors import standard_deviations
-from training.agents.tasks import deviation
+from training.agents.tasks import ControlTask, deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
-from training.systems import ControlTask, profile
 from training.trajectories.derivatives import linearised
 
 Information = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"]
@@ -120,7 +119,7 @@ class KalmanFilters:
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Report the estimates, (n, nx), of all rows or of those that a mask names."""
-        return {"x_hat": self._filters.decode(rows)}
+        return {"x_hat": self._filters.x.copy() if rows is None else self._filters.x[rows]}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """Show the estimates that were reported."""
@@ -174,11 +173,10 @@ def make(
 
 
 def observer_of(system: System) -> str:
-    """Name of the map that agents get for a system: the one of its profile, or of its own name."""
-    name = profile(system).agent_observer or system.name
-    if name not in shipped():
+    """Name of the shipped map of a system."""
+    if system.name not in shipped():
         raise ValueError(f"no observer ships for {system.name!r}: name a .safetensors file (--observer FILE)")
-    return name
+    return system.name
 
 
 def estimate_and_spread(system: System) -> Feature:

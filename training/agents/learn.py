@@ -27,9 +27,9 @@ from training.agents.checkpoint import CURVE, Checkpoint
 from training.agents.cost import Cost
 from training.agents.information import OBSERVED, Features, Information, make, observer_of
 from training.agents.policy import linear, perceptron
+from training.agents.seeds import agent_training_seed
+from training.agents.tasks import PREFERRED, ControlTask
 from training.checkpoints import SUFFIX
-from training.seeds import agent_training_seed
-from training.systems import ControlTask, profile
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC, "ppo_lstm": RecurrentPPO}
 FEEDFORWARD = ("ppo", "sac")  # whose policies are perceptrons, which ship
@@ -142,7 +142,7 @@ def fit(
 def hyperparameters(task: ControlTask, algorithm: str | None = None) -> tuple[str, dict[str, Any]]:
     """Find the algorithm and its settings for a task."""
     system = get_system(task.system)
-    name = algorithm or profile(system).algorithm
+    name = algorithm or PREFERRED.get(system.name, "ppo")
     if name not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {name!r}; there are {', '.join(ALGORITHMS)}")
     known = _read(name)

@@ -9,9 +9,9 @@ from PIL import Image
 from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
 from training.agents.play import Episodes
+from training.agents.tasks import ControlTask
 from training.evaluation.levels import show_level
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, drawing, save_moving, style
-from training.systems import ControlTask
 
 SHOWN = 5  # episodes in a figure
 FRAMES = 150  # of an animation, at most

@@ -17,6 +17,7 @@ from training.agents.agent import Agent
 from training.agents.any_environment.player import KEY, Player
 from training.agents.information import INFORMATION
 from training.agents.play import Episodes, play
+from training.agents.seeds import agent_evaluation_seed
 from training.agents.tasks import get_task, scores, successes
 from training.commands.agent_files import Export, Import, find
 from training.commands.environment import EnvironmentOptions, is_environment, show_returns, train_in_environment
@@ -24,7 +25,6 @@ from training.commands.options import NoiseLevel
 from training.evaluation.levels import as_name, show_level
 from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
-from training.seeds import agent_evaluation_seed
 
 Knows = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf", "recurrent"]
 

@@ -7,7 +7,7 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from training.evaluation.coverage import REGIONS, Coverage, coverage, kalman_coverage
+from training.evaluation.coverage import REGIONS, Coverage, coverage
 from training.evaluation.errors import UnseenTrajectories
 from training.evaluation.levels import Level, as_cell, show_level
 
@@ -40,7 +40,7 @@ def judged(
     how: dict[str, Any] = {"measurement_noise": level, "seed": seed, "spans": tuple(spans.values())}
     found = {"KKL": coverage(artifact, system, trajectories, **how)}
     if ekf:
-        found["EKF"] = kalman_coverage(system, trajectories, dt, **how)
+        found["EKF"] = coverage(None, system, trajectories, **how)
     return [
         {"observer": who, "span": span, "measurement_noise": as_cell(level), **_cells(one, system)}
         for who, each in found.items()

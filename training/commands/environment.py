@@ -14,9 +14,9 @@ from kkl_gym import SYSTEMS
 from training.agents.any_environment.player import Player
 from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
 from training.agents.information import STACKED
+from training.agents.seeds import agent_evaluation_seed
 from training.commands.record import EnvironmentArguments
 from training.progress import ProgressBars
-from training.seeds import agent_evaluation_seed
 
 TRANSIENT = 20  # steps of an episode whose estimates are not judged
 

@@ -1,8 +1,7 @@
 """``kkl-gym evaluate``."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,17 +26,14 @@ from training.commands.options import (
 )
 from training.evaluation.errors import (
     Domain,
-    Errors,
     NoStartsError,
     UnseenTrajectories,
     errors,
-    kalman_errors,
     unseen_trajectories,
 )
 from training.evaluation.levels import Level, as_cell, beyond, level_for, show_level
 from training.evaluation.metrics import by_state
-from training.evaluation.parameters import parameter_errors, show_ranges
-from training.evaluation.plants import off_by, show_parameters
+from training.evaluation.plants import off_by, parameter_errors, show_parameters, show_ranges
 from training.progress import ProgressBars, progress_bars
 
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
@@ -155,17 +151,15 @@ class Evaluate:
                 table.add_column(measure, justify="right")
         frames = []
         shown = Path(name).stem if self.ekf else name
-        everyone: dict[str, Callable[..., Errors]] = {shown: partial(errors, artifact, system)}
+        everyone: dict[str, Artifact | None] = {shown: artifact}
         if self.ekf:
-            everyone["EKF, same model" if plant else "exact EKF"] = lambda runs, **how: kalman_errors(
-                system, runs, artifact.filter.dt, **how
-            )
+            everyone["EKF, same model" if plant else "exact EKF"] = None
         levels, left_out = self._levels(artifact, system)
         cases = self._cases(f"evaluating {name}", artifact, system, plant, levels, progress, left_out)
         for starts, driven, trajectories, level in cases:
             skip = min(SKIPPED * system.pace, duration / 2) if driven else None
-            for who, measure_errors in everyone.items():
-                found = measure_errors(trajectories, measurement_noise=level, seed=self.seed, skip=skip)
+            for who, one in everyone.items():
+                found = errors(one, system, trajectories, measurement_noise=level, seed=self.seed, skip=skip)
                 case = [*([who] if self.ekf else []), starts, *(["yes" if driven else "no"] if artifact.nu else [])]
                 case += [*([f"{self.process_noise:g}"] if self.process_noise else []), show_level(level)]
                 smape.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))

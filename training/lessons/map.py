@@ -10,13 +10,11 @@ import torch
 
 from kkl_gym.system import System
 from observers import Artifact, ForwardMap, InverseMap, LinearFilter
-from training.filter_noise import stationary_covariance
 from training.lessons.run import Run
+from training.maps.coordinates import StateScale, stationary_covariance
 from training.maps.forward import ForwardProblem, transients, truncation_step
-from training.maps.inverse import InverseProblem
+from training.maps.inverse import ClosedLoopSampler, ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
 from training.maps.networks import Network, averaged, on_torch
-from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
-from training.maps.scaling import StateScale
 from training.seeds import Stream, generator
 from training.sources.simulated import SimulatedSource
 from training.sources.source import Pairs, Source

@@ -120,7 +120,7 @@ class RecordedSource:
             return found
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """Arguments of :class:`training.maps.samplers.TrajectorySampler`."""
+        """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""
         zero = [self.signals.measured.index(name) for name in self.config.arbitrary_zero]
         return {"measurement_noise": 0.0, "silent": linear.equilibrium[:, zero]}
 

@@ -94,7 +94,7 @@ class SimulatedSource:
         }
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """Arguments of :class:`training.maps.samplers.TrajectorySampler`."""
+        """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""
         return {
             "measurement_noise": self.system.measurement_noise,
             "process_noise_max": self.process_noise,

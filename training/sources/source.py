@@ -100,7 +100,7 @@ class Source(Protocol):
         ...
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """How batches are drawn: arguments of :class:`training.maps.samplers.TrajectorySampler`."""
+        """How batches are drawn: arguments of :class:`training.maps.inverse.TrajectorySampler`."""
         ...
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report) -> Pairs:

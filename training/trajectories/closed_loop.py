@@ -106,7 +106,7 @@ def record_closed_loop(
 
 
 def _part_of_largest(position: float, noise_free_share: float, high_noise_emphasis: float) -> float:
-    """A level over two decades, as in :class:`training.maps.samplers.TrajectorySampler`; none at negative positions."""
+    """A level over two decades, as in :class:`training.maps.inverse.TrajectorySampler`; none at negative positions."""
     if position < 0:
         return 0.0
     return float(100 ** ((position / (1 - noise_free_share)) ** (1 / high_noise_emphasis) - 1))

@@ -1,8 +1,8 @@
 """Process noise that disturbs a system, and measurement noise on its outputs.
 
 Where noise enters training. Process noise enters the trajectories that :mod:`training.trajectories.record` simulates,
-for input-aware maps. Measurement noise enters the filter's state in :mod:`training.maps.samplers.trajectory`, when a
-batch is drawn, with the covariance that :mod:`training.filter_noise` gives it. In closed loop both enter the simulation
+for input-aware maps. Measurement noise enters the filter's state in :mod:`training.maps.inverse`, when a batch is
+drawn, with the covariance that :mod:`training.maps.coordinates` gives it. In closed loop both enter the simulation
 itself, in :mod:`training.trajectories.closed_loop`, because the controller acts on what the observer makes of them.
 """
 

@@ -16,7 +16,7 @@ from kkl_gym.memory import IMAGINED
 from observers.storage import explained, write
 from training.agents.any_environment.information import Shown, show
 from training.agents.any_environment.task import HiddenTask
-from training.seeds import AGENT_EVALUATION_SEED
+from training.agents.seeds import AGENT_EVALUATION_SEED
 
 if TYPE_CHECKING:
     import pandas as pd

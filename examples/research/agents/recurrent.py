@@ -9,7 +9,7 @@ from kkl_gym import get_system
 from training.agents.information import make
 from training.agents.learn import fit, hyperparameters
 from training.agents.play import Policy
-from training.systems import ControlTask
+from training.agents.tasks import ControlTask
 
 
 def learn_recurrent(

@@ -16,10 +16,9 @@ from observers.storage import explained, write
 from training.agents.agent import fingerprint, rules
 from training.agents.information import OBSERVED, make, observer_of
 from training.agents.play import Policy, play
+from training.agents.seeds import AGENT_EVALUATION_SEED
 from training.agents.tasks import TASKS, get_task, scores, successes
 from training.evaluation.levels import Level, as_cell, as_name
-from training.seeds import AGENT_EVALUATION_SEED
-from training.systems import PROFILES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,7 +29,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 ON_REQUEST = ("x_hat_std",)  # not every observer has error bars
 USUAL_KINDS: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind not in ON_REQUEST)
 
-SECOND_NOISE = {name: profile.second_noise for name, profile in PROFILES.items() if profile.second_noise}
+SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # further levels at which agents are trained
 SEEDS = 5
 RECURRENT_SEEDS = 3  # at most; their trainings take longest
 SECOND_NOISE_RECURRENT_SEEDS = 1

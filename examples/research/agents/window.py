@@ -21,10 +21,9 @@ from training.agents.any_environment.information import Stacked, part_of
 from training.agents.any_environment.observing import KEPT, OBSERVER, SETTINGS, Estimation, oldest_first
 from training.agents.any_environment.task import HiddenTask
 from training.config import Config
-from training.maps.inverse import InverseProblem
+from training.lessons.run import Stage, optimise
+from training.maps.inverse import Batch, InverseProblem
 from training.maps.networks import Network
-from training.maps.optimise import Stage, optimise
-from training.maps.samplers import Batch
 from training.presets import RECORDED
 from training.progress import ProgressBars
 from training.records import Record

@@ -17,8 +17,7 @@ from observers import storage
 from training.evaluation.levels import Level
 from training.evaluation.plants import off_by
 from training.jobs import describe
-from training.maps.optimise import Stage, optimise
-from training.maps.step import Loss
+from training.lessons.run import Loss, Stage, optimise
 from training.progress import progress_bars
 from training.seeds import Stream, generator
 from training.trajectories.record import recording_ages, trajectories

@@ -8,7 +8,7 @@ from examples.research.methods.base import Arrays, CausalObserver, Configuration
 from examples.research.methods.unscented import UnscentedKalmanFilter
 from kkl_gym.system import System
 from training.evaluation.levels import Level
-from training.kalman import ExtendedKalmanFilter, KalmanFilter, measurement_covariance
+from training.kalman import ExtendedKalmanFilter, measurement_covariance
 from training.sources.simulated import unknown_start
 
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
@@ -31,7 +31,7 @@ class EKF(Method[Arrays]):
 
     name: ClassVar[str] = "ekf"
     label: ClassVar[str] = "EKF"
-    filter: ClassVar[type[KalmanFilter]] = ExtendedKalmanFilter
+    filter: ClassVar[type[ExtendedKalmanFilter]] = ExtendedKalmanFilter
     diffusion: ClassVar[tuple[float, ...]] = DIFFUSION
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
@@ -54,7 +54,7 @@ class UKF(EKF):
 
     name: ClassVar[str] = "ukf"
     label: ClassVar[str] = "UKF"
-    filter: ClassVar[type[KalmanFilter]] = UnscentedKalmanFilter
+    filter: ClassVar[type[ExtendedKalmanFilter]] = UnscentedKalmanFilter
 
 
 class WrongEKF(WrongParameters, EKF):

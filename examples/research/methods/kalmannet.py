@@ -11,7 +11,7 @@ from examples.research.methods.chunks import Chunks, error, noise_feature, varyi
 from kkl_gym.simulate import SubstepsError, advance_batch
 from kkl_gym.system import System
 from training.evaluation.levels import Level
-from training.maps.pde import on_tensors
+from training.maps.forward import on_tensors
 from training.sources.simulated import unknown_start
 
 ROWS = 64

@@ -23,9 +23,9 @@ from training.agents.cost import WORST, paid
 from training.agents.information import observer_of
 from training.agents.learn import hyperparameters, learn
 from training.agents.play import play
+from training.agents.seeds import AGENT_EVALUATION_SEED
 from training.agents.tasks import TASKS, ControlTask, get_task, scores
 from training.commands.agent import find
-from training.seeds import AGENT_EVALUATION_SEED
 
 TASK = ControlTask("van_der_pol", measurement_noise=0.2, duration=0.5)
 KEY = "kkl-gym-agent"

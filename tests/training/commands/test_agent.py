@@ -11,9 +11,9 @@ import training.agents.picture
 from kkl_gym.compiled import SamplingStep
 from kkl_gym.simulate import advance_batch
 from training.agents.agent import Agent
+from training.agents.seeds import AGENT_EVALUATION_SEED, agent_evaluation_seed
 from training.cli import main
 from training.commands.agent import Evaluate, interval
-from training.seeds import AGENT_EVALUATION_SEED, agent_evaluation_seed
 
 OWN = f"{linear_system.__file__}:Oscillator"
 

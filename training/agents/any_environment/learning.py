@@ -29,9 +29,9 @@ from training.agents.any_environment.observing import KEPT, KKL, OBSERVER, Estim
 from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
 from training.agents.policy import linear, perceptron
+from training.agents.seeds import agent_training_seed
 from training.progress import ProgressBars, progress_bars
 from training.records import Record
-from training.seeds import agent_training_seed
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO,

@@ -1,31 +1,26 @@
 """The optimisation loop."""
 
 import contextlib
-import errno
-import re
-import threading
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-import torch.utils.tensorboard
 from small_runs import CPU, closed_loop, open_loop
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 import training.evaluation.errors
-import training.maps.optimise
+import training.lessons.run
 import training.trajectories.record
 from examples.research.benchmark.jobs import seconds_spent
 from kkl_gym import VanDerPol, get_system
 from observers.storage import UNFINISHED
 from training import checkpoints
+from training.lessons.run import Captured
+from training.maps.coordinates import StateScale
 from training.maps.forward import ForwardProblem
-from training.maps.inverse import InverseProblem
+from training.maps.inverse import ForwardMapSampler, InverseProblem
 from training.maps.networks import Network
-from training.maps.samplers import ForwardMapSampler
-from training.maps.scaling import StateScale
-from training.maps.step import Captured
 from training.progress import progress_bars
 from training.spectrum import Spectrum
 
@@ -59,7 +54,7 @@ class Clock:
 
 
 def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypatch):
-    monkeypatch.setattr(training.maps.optimise.time, "process_time", Clock())
+    monkeypatch.setattr(training.lessons.run.time, "process_time", Clock())
     rates = []
 
     class Line(torch.nn.Module):
@@ -76,7 +71,7 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
                 raise KeyboardInterrupt
             return {"loss": ((module.a - 1.0) ** 2).sum()}
 
-        stage = training.maps.optimise.Stage(
+        stage = training.lessons.run.Stage(
             name="line",
             steps=10**9,
             learning_rate=0.1,
@@ -86,7 +81,7 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
             cpu_seconds=4.0,
         )
         with progress_bars(None) as progress:
-            training.maps.optimise.optimise(stage, module, loss, progress, resume=True)
+            training.lessons.run.optimise(stage, module, loss, progress, resume=True)
         rates.extend(np.abs(np.diff(calls)))
         return len(calls)
 
@@ -120,16 +115,16 @@ def test_batches_in_place_are_those_of_a_plain_loop(optimiser, tmp_path):
 
         return loss
 
-    stage = training.maps.optimise.Stage(
+    stage = training.lessons.run.Stage(
         name="line", steps=40, learning_rate=0.05, folder=tmp_path, fingerprint="", seed=3, optimiser=optimiser
     )
     module, plain = fresh(), fresh()
     with progress_bars(None) as progress:
-        history = training.maps.optimise.optimise(stage, module, loss_of(module), progress, resume=False)
+        history = training.lessons.run.optimise(stage, module, loss_of(module), progress, resume=False)
     generator, loss, total = torch.Generator().manual_seed(3), loss_of(plain), 0.0
-    steps = training.maps.optimise._optimiser(stage, plain)
+    steps = training.lessons.run._optimiser(stage, plain)
     for step in range(40):
-        rate = min(1.0, (step / 40 + 1 / 40) / training.maps.optimise.WARM_UP) * 0.5 * (1 + np.cos(np.pi * step / 40))
+        rate = min(1.0, (step / 40 + 1 / 40) / training.lessons.run.WARM_UP) * 0.5 * (1 + np.cos(np.pi * step / 40))
         steps.param_groups[0]["lr"] = 0.05 * rate
         value = loss(generator)["loss"]
         steps.zero_grad()
@@ -216,46 +211,11 @@ def test_a_captured_stage_on_a_gpu_is_the_same_as_an_eager_one(optimiser, tmp_pa
         system = VanDerPol()
         linear = Spectrum((-1.0, -2.0)).filter(1, 0.01)
         problem = forward_problem(system, linear, np.random.default_rng(0), torch.device("cuda"))
-        stage = training.maps.optimise.Stage(
+        stage = training.lessons.run.Stage(
             name=f"T{captured}", steps=50, learning_rate=1e-3, folder=tmp_path, fingerprint="", seed=0,
             optimiser=optimiser,
         )  # fmt: skip
         with progress_bars(None) as progress:
-            training.maps.optimise.optimise(stage, problem, problem.loss, progress, resume=False)
+            training.lessons.run.optimise(stage, problem, problem.loss, progress, resume=False)
         weights.append(problem.network.linear_layers()[0].weight.detach().cpu())
     torch.testing.assert_close(*weights, rtol=1e-3, atol=1e-4)
-
-
-class FullDisk:
-    """A writer of TensorBoard's whose thread and whose caller both meet a full disk."""
-
-    def __init__(self, folder):
-        pass
-
-    def __enter__(self):
-        for error in (OSError(errno.ENOSPC, "No space left on device"), ValueError("of something else")):
-            thread = threading.Thread(target=self.fail, args=(error,))
-            thread.start()
-            thread.join()
-        self.fail(OSError(errno.ENOSPC, "No space left on device"))
-
-    def __exit__(self, *arguments):
-        pass
-
-    def fail(self, error):
-        raise error
-
-
-def test_a_disk_that_is_full_of_scalars_is_told_once(tmp_path, monkeypatch):
-    seen = []
-    monkeypatch.setattr(threading, "excepthook", seen.append)
-    hook = threading.excepthook
-    monkeypatch.setattr(torch.utils.tensorboard, "SummaryWriter", FullDisk)
-    with (
-        pytest.raises(OSError, match=re.escape(f"No space left on device: '{tmp_path}'")),
-        training.maps.optimise.log_to(tmp_path),
-    ):
-        raise AssertionError
-    (failed,) = seen
-    assert str(failed.exc_value) == "of something else"
-    assert threading.excepthook == hook

@@ -1,11 +1,9 @@
-"""Maps as differentiable functions in float64: values, Jacobians, and the residual of the forward map's equation."""
+"""Maps as differentiable functions in float64: values and Jacobians."""
 
 import numpy as np
 import torch
 
-from kkl_gym.system import System
 from observers import MLP, Artifact, ForwardMap
-from training.maps import pde
 from training.maps.networks import from_mlp
 
 CHUNK = 4096  # points whose Jacobians are taken at once
@@ -57,14 +55,3 @@ def _scaled(mlp: MLP, first: np.ndarray, bias: np.ndarray, *, scale: np.ndarray,
     weights, biases = [first, *mlp.weights[1:]], [bias, *mlp.biases[1:]]
     weights[-1], biases[-1] = scale[:, None] * weights[-1], offset + scale * biases[-1]
     return Smooth(MLP(weights, biases, mlp.activation))
-
-
-def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
-    """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x): (n, nz)."""
-    if artifact.forward is None:
-        raise ValueError("this observer holds no forward map T")
-    at, A, B = (torch.tensor(values) for values in (x, artifact.filter.A, artifact.filter.B))
-    f, h = pde.on_tensors(system.f, at), pde.on_tensors(system.h, at)
-    value, derivative = pde.along(encoder(artifact.forward).network, at, f)
-    P: np.ndarray = pde.residual(value, derivative, h=h, A=A, B=B).numpy()
-    return P

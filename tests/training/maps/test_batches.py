@@ -10,8 +10,8 @@ from linear_system import TwoUnits
 from small_runs import CPU, closed_loop, open_loop, untrained
 
 from observers.decoder import Decoder
-from training.filter_noise import noise_covariance
-from training.maps.samplers import ClosedLoopSampler, TrajectorySampler
+from training.maps.coordinates import noise_covariance
+from training.maps.inverse import ClosedLoopSampler, TrajectorySampler
 from training.spectrum import Spectrum
 from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.record import Motions, record, recording_ages
