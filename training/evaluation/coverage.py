@@ -64,11 +64,10 @@ def kalman_coverage(
     def estimates() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         kalman = kalman_filter(system, dt, trajectories.process_noise, measurement_noise)
         for rows in _chunks(y.shape[1]):
-            kalman.reset(y[0, rows])
-            found = [(kalman.x, kalman.P)]
-            for k in range(1, len(y)):
-                kalman.step(y[k, rows], trajectories.u[k - 1, rows])
-                found.append((kalman.x, kalman.P))
+            state, found = kalman.start(y[0, rows].shape[0]), []
+            for k in range(len(y)):
+                state = kalman.advance(state, y[k, rows], trajectories.u[k - 1, rows])  # the first input is ignored
+                found.append((state.x, state.P))
             x_hat, P = zip(*found, strict=True)
             yield np.array(x_hat), np.array(P)
 

@@ -9,6 +9,7 @@ from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.checks import noise_levels
+from observers.estimator import Running
 from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
@@ -240,11 +241,7 @@ def kalman_estimates(
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     y = measured(system, trajectories, level, seed)
     kalman = kalman_filter(system, dt, trajectories.process_noise, level)
-    x_hat = np.empty_like(trajectories.x)
-    x_hat[0] = kalman.reset(y[0])
-    for k in range(1, len(y)):
-        x_hat[k] = kalman.step(y[k], trajectories.u[k - 1])
-    return x_hat
+    return Running(kalman).along(y, trajectories.u)
 
 
 def kalman_filter(system: System, dt: float, process_noise: float, measurement_noise: Level) -> ExtendedKalmanFilter:

@@ -29,11 +29,10 @@ def test_errors_are_those_of_a_kalman_filter(limits):
         Oscillator(), 0.01, Q=np.zeros((2, 2)), R=0.09 * np.eye(1), start=(np.zeros(2), START)
     )
     y = Oscillator().output(limits.x)
-    kalman.reset(y[0])
-    P = [kalman.P[0]]
-    for sample in y[1:]:
-        kalman.step(sample)
-        P.append(kalman.P[0])
+    state, P = kalman.start(y.shape[1]), []
+    for sample in y:
+        state = kalman.advance(state, sample)
+        P.append(state.P[0])
     P = np.array(P)[limits.ages]
     of_states = np.sqrt(np.diagonal(P, axis1=1, axis2=2)) / limits.x.std((0, 1))
     np.testing.assert_allclose(limits.errors(0.3), of_states, rtol=1e-6)
