@@ -47,13 +47,49 @@ class Estimator(Protocol[State]):
         ...
 
 
-def drive(estimator: Estimator[Any], y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-    """Return the estimates along records y (steps, n, ny) and inputs u (steps - 1, n, nu); (steps, n, nx)."""
-    state, found = estimator.start(y.shape[1]), []
-    for k, sample in enumerate(y):
-        state = estimator.advance(state, sample, None if u is None or not k else u[k - 1])
-        found.append(estimator.estimate(state).x_hat)
-    return np.array(found)
+class Running:
+    """An estimator with its state, sample by sample, in all rows or in some."""
+
+    def __init__(self, estimator: Estimator[Any]) -> None:
+        self.estimator = estimator
+        self.state: Any = None
+
+    def reset(self, y0: np.ndarray) -> np.ndarray:
+        """Begin with first samples (n, ny); returns the estimates (n, nx)."""
+        self.state = self.estimator.advance(self.estimator.start(len(y0)), y0)
+        return self.decode()
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
+        """Begin again in rows (n,), with their first samples (number of True in rows, ny)."""
+        begun, state = self.estimator.advance(self.estimator.start(len(y0)), y0), []
+        for before, after in zip(self.state, begun, strict=True):
+            state.append(before.copy())
+            state[-1][rows] = after
+        self.state = type(self.state)(*state)
+
+    def advance(self, y: np.ndarray, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
+        """Take in samples (n, ny) after inputs (n, nu), in all rows or in some."""
+        state = self.estimator.advance(self.state, y, u)
+        if rows is not None:
+            for before, after in zip(self.state, state, strict=True):
+                after[~rows] = before[~rows]
+        self.state = state
+
+    def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Take in samples and return the estimates (n, nx)."""
+        self.advance(y, u)
+        return self.decode()
+
+    def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """Return the estimates (n, nx), of all rows or of some."""
+        x_hat = self.estimator.estimate(self.state).x_hat
+        return x_hat if rows is None else x_hat[rows]
+
+    def along(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Return the estimates along records y (steps, n, ny) and inputs u (steps - 1, n, nu); (steps, n, nx)."""
+        found = [self.reset(y[0])]
+        found += [self.step(y[k], None if u is None else u[k - 1]) for k in range(1, len(y))]
+        return np.array(found)
 
 
-__all__ = ["Estimate", "Estimator", "drive"]
+__all__ = ["Estimate", "Estimator", "Running"]

@@ -167,6 +167,11 @@ class KKLObserver(RecordEstimates):
         vars(self).update(vars(other))
 
     @property
+    def estimator(self) -> KKL:
+        """The same as an :class:`observers.estimator.Estimator`, whose state the caller keeps."""
+        return self._kkl
+
+    @property
     def z(self) -> np.ndarray:
         """The filter's state [z_y, z_u], a copy of shape (..., nz * (1 + nu)); raises RuntimeError before reset."""
         state = self._begun()

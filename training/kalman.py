@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
+from observers.estimator import Estimate
 from observers.unscented import Gaussian
 from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
 
@@ -27,15 +29,23 @@ def process_intensity(system: System, process_noise: float, dt: float) -> np.nda
     return np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)
 
 
+class Belief(NamedTuple):
+    """Means (n, nx), covariances (n, nx, nx), and whether rows have begun (n,)."""
+
+    x: np.ndarray
+    P: np.ndarray
+    begun: np.ndarray
+
+
 class ExtendedKalmanFilter:
     """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3), in continuous or in discrete time.
 
-    P = Phi P Phi^T + Q dt; Phi and the slope of h are central differences. A filter starts again where its predicted
-    mean leaves the system's declared bounds or its covariance is no longer finite. Entries of samples that are NaN are
-    missing, and correct nothing; neither does an output that is undefined at the mean, or its slope.
+    P = Phi P Phi^T + Q dt; Phi and the slope of h are central differences. It is an
+    :class:`observers.estimator.Estimator`. A filter starts again where its predicted mean leaves the system's declared
+    bounds or its covariance is no longer finite. Entries of samples that are NaN are missing, and correct nothing;
+    neither does an output that is undefined at the mean, or its slope.
 
-    Shapes: ``Q`` (nx, nx), ``R`` (ny, ny) or (n, ny, ny), ``start`` (nx,) and (nx, nx), ``x`` (n, nx), ``P``
-    (n, nx, nx).
+    Shapes: ``Q`` (nx, nx), ``R`` (ny, ny) or (n, ny, ny), ``start`` (nx,) and (nx, nx).
     """
 
     def __init__(
@@ -45,33 +55,22 @@ class ExtendedKalmanFilter:
         self._start = start or unknown_start(system)
         self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
 
-    def reset(self, y0: np.ndarray, start: Gaussian | None = None) -> np.ndarray:
-        """Begin with the start, or one of each row, corrected by the first sample (n, ny); returns (n, nx)."""
-        self.x, self.P = self._corrected(*(start or self._starts(len(y0))), y0)
-        return self.x.copy()
+    def start(self, n: int) -> Belief:
+        """Return n rows before their first sample."""
+        return Belief(*self._starts(n), np.zeros(n, dtype=bool))
 
-    @property
-    def covariance(self) -> np.ndarray:
-        """That of the estimates, (n, nx, nx)."""
-        return self.P
+    def advance(self, state: Belief, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Belief:
+        """Predict over dt, by default that of the samples, in rows that have begun; then correct."""
+        x, P, begun = state.x, state.P, state.begun
+        if begun.any():
+            held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
+            moved, spread = self._predicted(x, P, held, self._dt if dt is None else dt)
+            x, P = np.where(begun[:, None], moved, x), np.where(begun[:, None, None], spread, P)
+        return Belief(*self._corrected(x, P, y), np.ones(len(y), dtype=bool))
 
-    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
-        """Begin again in some rows. Shapes: ``y0`` (number of rows, ny), ``rows`` (n,)."""
-        self.x, self.P = self.x.copy(), self.P.copy()
-        self.x[rows], self.P[rows] = self._corrected(*self._starts(len(y0)), y0)
-
-    def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Predict over one sample and correct. Shapes: ``y`` (n, ny), ``u`` (n, nu); returns (n, nx)."""
-        self.advance(y, u)
-        return self.x.copy()
-
-    def advance(self, y: np.ndarray, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
-        """Do what :meth:`step` does without the estimate, in some rows only if ``rows`` are given."""
-        held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
-        x, P = self._corrected(*self._predicted(held), y)
-        if rows is not None:
-            x, P = np.where(rows[:, None], x, self.x), np.where(rows[:, None, None], P, self.P)
-        self.x, self.P = x, P
+    def estimate(self, state: Belief) -> Estimate:
+        """Return means and covariances."""
+        return Estimate(state.x.copy(), state.P.copy())
 
     def _starts(self, n: int) -> Gaussian:
         x0, P0 = self._start
@@ -87,15 +86,15 @@ class ExtendedKalmanFilter:
         return np.asarray(ASIDE * (high - low) / 2)
 
     @np.errstate(over="ignore", invalid="ignore")  # of filters that are lost, which start again
-    def _predicted(self, u: np.ndarray) -> Gaussian:
-        """Mean and covariance one sample later under held inputs, (nu, n)."""
-        (n, nx), aside = self.x.shape, np.diag(self._aside)[..., None]
-        starts = np.concatenate([self.x.T[:, None], self.x.T[:, None] + aside, self.x.T[:, None] - aside], 1)
+    def _predicted(self, x: np.ndarray, P: np.ndarray, u: np.ndarray, dt: float) -> Gaussian:
+        """Mean and covariance after dt under held inputs, (nu, n)."""
+        (n, nx), aside = x.shape, np.diag(self._aside)[..., None]
+        starts = np.concatenate([x.T[:, None], x.T[:, None] + aside, x.T[:, None] - aside], 1)
         flat = starts.reshape(nx, -1)
-        ends = advance_batch(self._system, flat, np.tile(u, 1 + 2 * nx), np.zeros_like(flat), self._dt)
+        ends = advance_batch(self._system, flat, np.tile(u, 1 + 2 * nx), np.zeros_like(flat), dt)
         ends = ends.reshape(nx, 1 + 2 * nx, n)
         Phi = ((ends[:, 1 : nx + 1] - ends[:, nx + 1 :]) / (2 * self._aside[:, None])).transpose(2, 0, 1)
-        return ends[:, 0].T, Phi @ self.P @ Phi.mT + self._Q * self._dt
+        return ends[:, 0].T, Phi @ P @ Phi.mT + self._Q * dt
 
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
         """Mean and covariance given the samples y, (n, ny); lost filters start again."""

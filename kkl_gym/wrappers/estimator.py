@@ -4,7 +4,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,34 +12,33 @@ import numpy as np
 from kkl_gym.plant import Plant
 from observers import Artifact, KKLObserver, LinearFilter, shipped
 from observers.checks import choice, flag, shown
+from observers.estimator import Estimator, Running
 from observers.factors import standard_deviations
 from observers.names import resolve
 
 
-class Estimator(Protocol):
-    """A batch of observers, as :class:`VectorEstimate` drives them."""
+class Estimates:
+    """Any estimator of states, as :class:`VectorEstimate` drives and shows it; it is not told states at a start."""
 
-    space: gym.spaces.Box
+    def __init__(self, estimator: Estimator[Any], space: gym.spaces.Box) -> None:
+        self._running, self.space = Running(estimator), space
+        self.advance = self._running.advance
 
-    def reset(self, y0: np.ndarray, x0: np.ndarray) -> object:
+    def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past and take in the first samples. Shapes: ``y0`` (n, ny), ``x0`` (n, nx)."""
-        ...
+        self._running.reset(y0)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
-        ...
-
-    def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in samples (..., ny) and the inputs (..., nu) that led to them."""
-        ...
+        self._running.restart(y0, rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """What ``info`` gains. Shapes: ``rows`` (n,); returns (number of rows, ...)."""
-        ...
+        return {"x_hat": self._running.decode(rows)}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """What of a report is the observation. Shapes: returns (number of rows, width)."""
-        ...
+        return report["x_hat"]
 
 
 class KKLEstimator:

@@ -13,7 +13,7 @@ from kkl_gym.identity import how_to_make_one
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import Trails
 from kkl_gym.vector import Infos, KKLVectorEnv, autoreset_mode_of, last_of_episodes, with_mask
-from kkl_gym.wrappers.estimator import Estimator, KKLEstimator, check_untouched, observation
+from kkl_gym.wrappers.estimator import Estimates, KKLEstimator, check_untouched, observation
 from kkl_gym.wrappers.rollouts import NamedEstimator, Samples
 from observers import Artifact
 from observers.checks import integer, shown
@@ -34,7 +34,7 @@ class VectorEstimate(VectorWrapper):
     ``info["final_obs"]`` holds the last estimates.
     """
 
-    def __init__(self, env: VectorEnv, estimator: Estimator) -> None:
+    def __init__(self, env: VectorEnv, estimator: Estimates | KKLEstimator) -> None:
         super().__init__(env)
         self.autoreset_mode = autoreset_mode_in(env)
         self._estimator = estimator

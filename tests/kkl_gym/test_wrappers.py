@@ -14,6 +14,7 @@ import kkl_gym
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
 from kkl_gym.wrappers.estimator import observation
 from observers import Artifact, ArtifactError, KKLObserver, load
+from observers.kkl import KKL
 
 checking_wrapped = pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version:UserWarning")
 ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler
@@ -125,8 +126,8 @@ def test_the_environment_is_left_as_it_was(saved):
 def test_estimate_z_does_without_the_network(monkeypatch):
     """Unless there is a monitor, which needs it; info has no x_hat in any case."""
     asked = []
-    decode = KKLObserver.decode
-    monkeypatch.setattr(KKLObserver, "decode", lambda self, rows=None: asked.append(rows) or decode(self, rows))
+    decode = KKL.decode
+    monkeypatch.setattr(KKL, "decode", lambda self, state: asked.append(state) or decode(self, state))
     for estimate, watched, calls in (("x", False, 5), ("z", False, 0), ("z", True, 5)):
         environment = {"measurement_noise": 0.5} if watched else {}
         env = KKLObservation(KKLEnv("lorenz", **environment), estimate=estimate, monitor=watched)

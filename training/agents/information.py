@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 from kkl_gym import KKLVectorObservation, get_system
 from kkl_gym.system import System
 from kkl_gym.vector import with_mask
+from kkl_gym.wrappers.estimator import Estimates
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
 from observers import KKLObserver, load, shipped
 from observers.factors import standard_deviations
@@ -97,33 +98,13 @@ class Features(VectorWrapper):
         return self._history.reshape(self.num_envs, -1).astype(np.float32)
 
 
-class KalmanFilters:
+def kalman_filters(env: VectorEnv) -> Estimates:
     """Extended Kalman filters that know model, noise level and input, as VectorEstimate drives them."""
-
-    def __init__(self, env: VectorEnv) -> None:
-        plant = plant_of(env)
-        system = plant.system
-        Q = np.diag((EKF_PROCESS_NOISE * np.array(system.scale)) ** 2 / system.pace)
-        R = measurement_covariance(system, plant.measurement_noise)
-        self._filters = ExtendedKalmanFilter(system, plant.dt, Q=Q, R=R)
-        self.space = plant.state_space
-        self.advance = self._filters.advance
-
-    def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
-        """Begin with the first samples, (n, ny); these filters are not told the states x0, (n, nx)."""
-        self._filters.reset(y0)
-
-    def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Begin anew in some rows, with their first samples and without their states."""
-        self._filters.restart(y0, rows)
-
-    def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Report the estimates, (n, nx), of all rows or of those that a mask names."""
-        return {"x_hat": self._filters.x.copy() if rows is None else self._filters.x[rows]}
-
-    def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Show the estimates that were reported."""
-        return report["x_hat"]
+    plant = plant_of(env)
+    system = plant.system
+    Q = np.diag((EKF_PROCESS_NOISE * np.array(system.scale)) ** 2 / system.pace)
+    R = measurement_covariance(system, plant.measurement_noise)
+    return Estimates(ExtendedKalmanFilter(system, plant.dt, Q=Q, R=R), plant.state_space)
 
 
 def make(
@@ -158,7 +139,7 @@ def make(
             with_action=with_action or stacked > 1,
         )
     if information == "ekf":
-        env = task.make(num_envs, lambda env: VectorEstimate(env, KalmanFilters(env)), autoreset_mode)
+        env = task.make(num_envs, lambda env: VectorEstimate(env, kalman_filters(env)), autoreset_mode)
         return Features(env, ["x_hat"], feature=of("x_hat"), width=system.nx)
     observer = observer or observer_of(system)
     if information == "x_hat":

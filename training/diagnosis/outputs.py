@@ -9,7 +9,7 @@ from training.diagnosis.finding import RESOLUTION, Finding, error, point
 from training.diagnosis.records import AS_GOOD, ASKING, ASKING_SHARE, DETERMINED, Filtered, compare
 from training.diagnosis.system import Subject
 from training.evaluation.levels import show_level
-from training.kalman import ExtendedKalmanFilter
+from training.kalman import Belief, ExtendedKalmanFilter
 from training.maps.coordinates import noise_covariance, settling_time
 from training.presets import eigenvalues
 from training.records import Record, Signals
@@ -72,15 +72,15 @@ def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
     R = np.repeat([np.diag(np.maximum(level, floor) ** 2) for level in levels], n, axis=0)
     filters = ExtendedKalmanFilter(system, subject.dt, Q=np.zeros_like(start), R=R)
     y, u = np.tile(system.output(x), (1, len(levels), 1)), np.tile(u, (1, len(levels), 1))
-    filters.reset(y[0], (np.tile(x[0], (len(levels), 1)), np.tile(start, (len(y[0]), 1, 1))))
+    rows = len(y[0])
+    state = Belief(np.tile(x[0], (len(levels), 1)), np.tile(start, (rows, 1, 1)), np.zeros(rows, dtype=bool))
     square = np.empty((len(levels), length, system.nx))
     for k in range(length):
-        if k:
-            filters.advance(y[k], u[k - 1])
-        square[:, k] = filters.P.diagonal(axis1=1, axis2=2).reshape(len(levels), n, -1).mean(1)
+        state = filters.advance(state, y[k], u[k - 1])  # which ignores the input before the first sample
+        square[:, k] = state.P.diagonal(axis1=1, axis2=2).reshape(len(levels), n, -1).mean(1)
     deviation = np.sqrt(start.diagonal())
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.sqrt(square) / x.std((0, 1)), filters.P[:n].mean(0) / np.multiply.outer(deviation, deviation)
+        return np.sqrt(square) / x.std((0, 1)), state.P[:n].mean(0) / np.multiply.outer(deviation, deviation)
 
 
 def _average(errors: np.ndarray, steps: int) -> np.ndarray:

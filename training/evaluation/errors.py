@@ -225,16 +225,13 @@ def follow(
     observer: KKLObserver | ExtendedKalmanFilter, y: np.ndarray, u: np.ndarray, *, covariances: bool = False
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Estimates along records (steps + 1, n, nx), and their covariances if these are asked for."""
-    inputs: np.ndarray | None = u
     if isinstance(observer, KKLObserver):
         inputs = u if observer.artifact.nu else None
-        if not (covariances and observer.tracking):  # whole records are quicker than their steps
-            x_hat = observer.estimate(y, inputs)
-            return x_hat, observer.estimate_covariance(y, inputs) if covariances else None
-    found = []
+        return observer.estimate(y, inputs), observer.estimate_covariance(y, inputs) if covariances else None
+    state, found = observer.start(y.shape[1]), []
     for k in range(len(y)):
-        x_hat = observer.reset(y[0]) if k == 0 else observer.step(y[k], None if inputs is None else inputs[k - 1])
-        found.append((x_hat, observer.covariance) if covariances else (x_hat,))
+        state = observer.advance(state, y[k], u[k - 1])  # which ignores the input before the first sample
+        found.append((state.x, state.P) if covariances else (state.x,))
     x_hat, *beside = map(np.array, zip(*found, strict=True))
     return x_hat, beside[0] if covariances else None
 

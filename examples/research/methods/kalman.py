@@ -1,12 +1,13 @@
 """Kalman filters with the exact model, or a wrong one, as methods of the benchmark."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from examples.research.methods.base import Arrays, CausalObserver, Configuration, Method, Task, WrongParameters
+from examples.research.methods.base import Arrays, Configuration, Method, Task, WrongParameters
 from examples.research.methods.unscented import UnscentedKalmanFilter
 from kkl_gym.system import System
+from observers.estimator import Estimator
 from training.evaluation.levels import Level
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 from training.sources.simulated import unknown_start
@@ -42,7 +43,7 @@ class EKF(Method[Arrays]):
         """Nothing to learn."""
         return {"diffusion": np.array([configuration["diffusion"]])}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
         """The filter for a noise level."""
         Q = diffusion_intensity(trained, system)
         R = measurement_covariance(system, noise)
@@ -75,7 +76,7 @@ class UntunedEKF(Method[Arrays]):
         """Nothing to learn."""
         return {}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
         """The filter, whatever the noise."""
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)

@@ -16,15 +16,14 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
     """
 
     @np.errstate(over="ignore", invalid="ignore")
-    def _predicted(self, u: np.ndarray) -> Gaussian:
-
+    def _predicted(self, x: np.ndarray, P: np.ndarray, u: np.ndarray, dt: float) -> Gaussian:
         def move(points: np.ndarray) -> np.ndarray:
             flat = np.ascontiguousarray(points.reshape(-1, points.shape[-1]).T)
-            moved = advance_batch(self._system, flat, np.tile(u, len(points)), np.zeros_like(flat), self._dt)
+            moved = advance_batch(self._system, flat, np.tile(u, len(points)), np.zeros_like(flat), dt)
             return moved.T.reshape(points.shape)
 
-        mean, covariance, _ = transformed(self.x, self.P, function=move, points=self._points)
-        return mean, covariance + self._Q * self._dt
+        mean, covariance, _ = transformed(x, P, function=move, points=self._points)
+        return mean, covariance + self._Q * dt
 
     @np.errstate(over="ignore", invalid="ignore")
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:

@@ -10,8 +10,8 @@ from training.agents.information import (
     INFORMATION,
     STACKED,
     Features,
-    KalmanFilters,
     estimate_and_spread,
+    kalman_filters,
     make,
     modes,
     observer_of,
@@ -109,7 +109,7 @@ def test_kalman_filters_that_know_the_input_follow_a_driven_state():
         errors.append(np.abs(info["x_hat"] - info["x"]).max())
     assert max(errors[200:]) < 0.1 < errors[0]
     y, unknown = np.ones((N, 1)), np.full((N, 2), np.nan)  # states, at which they are not to look
-    filters, rows = KalmanFilters(env.unwrapped), np.array([True, False, False])
+    filters, rows = kalman_filters(env.unwrapped), np.array([True, False, False])
     filters.reset(y, unknown)
     first = filters.report()["x_hat"]
     filters.advance(-y, np.zeros((N, 1)))
