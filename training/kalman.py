@@ -9,7 +9,7 @@ from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from observers.unscented import Gaussian
 from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
-from training.trajectories.derivatives import evaluate, jacobian
+from training.trajectories.equations import evaluate, jacobian
 
 ASIDE = 1e-4  # of X's half-widths, steps of the central differences
 NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in multiples of the system's default

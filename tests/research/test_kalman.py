@@ -16,7 +16,7 @@ from kkl_gym import get_system
 from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance, simulate
 from training.kalman import ExtendedKalmanFilter, unknown_start
-from training.trajectories.derivatives import jacobian
+from training.trajectories.equations import jacobian
 
 
 def run(observer, y):

@@ -14,7 +14,7 @@ from training.diagnosis.records import observability, of_records
 from training.diagnosis.signals import Judgement, Observability
 from training.diagnosis.subject import Subject
 from training.evaluation.levels import Level
-from training.trajectories.controllers import Controller
+from training.trajectories.policies import Controller
 
 FIRST: dict[str, Callable[[System], Iterator[Finding]]] = {
     "system": equations.declaration,

@@ -9,9 +9,8 @@ from kkl_gym.compiled import SamplingStep, batch_step
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.evaluation.levels import Level
-from training.trajectories.controllers import Controller
-from training.trajectories.policy import under_policy
-from training.trajectories.signals import DRIVEN, random_inputs
+from training.trajectories.motions import DRIVEN, random_inputs, under_policy
+from training.trajectories.policies import Controller
 
 POINTS = 1000  # of X, of 2X and of the bounds
 MOTIONS = 100  # half of them driven, where there are inputs

@@ -23,7 +23,7 @@ from training.sources.source import Pairs, Source
 from training.spectrum import Spectrum
 from training.systems import named_policy
 from training.trajectories.closed_loop import record_closed_loop
-from training.trajectories.record import recording_ages
+from training.trajectories.motions import recording_ages
 
 CLOSED_LOOP_SECONDS = 20.0  # of each motion, at the pace of the shipped systems
 

@@ -30,7 +30,7 @@ from training.sources.output import linear_output
 from training.sources.source import Increments, Pairs, Report, Runs, TooFewRunsError
 from training.sources.windows import samples_as_old, windows
 from training.spectrum import Spectrum
-from training.trajectories.record import recording_ages
+from training.trajectories.motions import recording_ages
 
 FEW = 5  # records, below which none is held out as a whole
 STRETCHES, SAMPLES = 600, 2_000_000  # at most, of stretches to calibrate on and of their samples together

@@ -15,14 +15,22 @@ from training.maps.coordinates import spread
 from training.seeds import Stream, generator
 from training.sources.source import Increments, Pairs, Report, Runs
 from training.systems import named_policy
-from training.trajectories.controllers import Controller
-from training.trajectories.derivatives import output_matrix
-from training.trajectories.expression import field_expression, output_expression, output_facts
-from training.trajectories.noise import draw_process_noise
+from training.trajectories.equations import field_expression, output_expression, output_facts, output_matrix
+from training.trajectories.motions import (
+    DRIVEN,
+    FIRST,
+    KINDS,
+    Motions,
+    check_share,
+    draw_process_noise,
+    random_inputs,
+    record,
+    recording_ages,
+    trajectories,
+    under_policy,
+)
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, uncertain_plant, with_parameters
-from training.trajectories.policy import policy_fingerprint, under_policy
-from training.trajectories.record import FIRST, Motions, check_share, record, recording_ages, trajectories
-from training.trajectories.signals import DRIVEN, KINDS, random_inputs
+from training.trajectories.policies import Controller, policy_fingerprint
 
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned

@@ -8,7 +8,7 @@ import numpy as np
 
 from observers import Artifact, Equations, LinearFilter
 from training.config import Config
-from training.trajectories.record import Pairs
+from training.trajectories.motions import Pairs
 
 Report = Callable[[float], object]
 

@@ -10,8 +10,7 @@ from kkl_gym.system import System
 from training.systems import lorenz, reverse_duffing, rossler, van_der_pol
 from training.systems.profile import Profile
 from training.systems.task import ControlTask
-from training.trajectories.controllers import Controller
-from training.trajectories.policy import checked_policy
+from training.trajectories.policies import Controller, checked_policy
 
 PROFILES: dict[str, Profile] = {
     "reverse_duffing": reverse_duffing.PROFILE,

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from kkl_gym.system import System
 from training.systems.task import ControlTask
-from training.trajectories.controllers import Controller, linear_quadratic
+from training.trajectories.policies import Controller, linear_quadratic
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from kkl_gym.system import System
 from training.spectrum import evenly_spaced
 from training.systems.profile import Profile
 from training.systems.task import ControlTask
-from training.trajectories.controllers import Controller
+from training.trajectories.policies import Controller
 
 
 def homogeneous(system: System) -> Controller:

@@ -21,7 +21,7 @@ from training.maps.optimise import Stage, optimise
 from training.maps.step import Loss
 from training.progress import progress_bars
 from training.seeds import Stream, generator
-from training.trajectories.record import recording_ages, trajectories
+from training.trajectories.motions import recording_ages, trajectories
 
 _KEY = "kkl-gym-method"
 

@@ -12,7 +12,7 @@ from observers import Artifact, InverseMap, KKLObserver
 from observers.compiled import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
-from training.trajectories.derivatives import jacobian
+from training.trajectories.equations import jacobian
 
 BATCHES = 10  # of one step each, by filters that take one sample at a time
 FEWER = 10  # times as few samples, where Python takes a single one

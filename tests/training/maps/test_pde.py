@@ -20,7 +20,7 @@ from training.maps.pde import along, on_tensors, residual
 from training.maps.scaling import StateScale
 from training.maps.smooth import Smooth, encoder
 from training.maps.smooth import residual as residual_of
-from training.trajectories.derivatives import evaluate, jacobian
+from training.trajectories.equations import evaluate, jacobian
 
 A, B = torch.diag(torch.tensor([-1.0, -2.5, -4.0], dtype=torch.float64)), torch.ones(3, 1, dtype=torch.float64)
 

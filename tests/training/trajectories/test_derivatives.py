@@ -13,7 +13,7 @@ from wrong_systems import Branching, Flat, Late, Wide
 
 from kkl_gym import EquationError, elementary, get_system
 from kkl_gym.system import on_states
-from training.trajectories.derivatives import evaluate, jacobian, output_matrix
+from training.trajectories.equations import evaluate, jacobian, output_matrix
 
 
 def test_output_matrix_of_linear_and_other_outputs():

@@ -13,8 +13,7 @@ from training.maps.coordinates import Coordinates, coordinates, settling_time
 from training.maps.networks import Network, tensor
 from training.maps.samplers.batch import Batch
 from training.maps.scaling import StateScale
-from training.trajectories.noise import ALIKE
-from training.trajectories.record import Pairs
+from training.trajectories.motions import ALIKE, Pairs
 
 MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
 AGE_UNIT = 5  # samples, in the age feature log(1 + t / unit)
