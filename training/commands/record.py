@@ -63,7 +63,7 @@ class RecordCommand:
 
     def run(self, console: Console) -> str:
         """Record."""
-        from training.records.minari import dataset_folder, write_dataset
+        from training.records.episodes import dataset_folder, write_dataset
         from training.rollouts import make, policy_of, roll_out
 
         steps = 100_000 if self.episodes is None and self.steps is None else self.steps

@@ -14,7 +14,7 @@ from observers import Artifact
 from training.cli import main
 from training.commands.record import read_argument
 from training.records import Signals, read_records
-from training.records.minari import is_dataset, read_dataset, write_dataset
+from training.records.episodes import is_dataset, read_dataset, write_dataset
 from training.rollouts import make, policy_of, roll_out
 
 minari = pytest.importorskip("minari")
@@ -99,7 +99,7 @@ def test_half_a_data_set_is_none(datasets, monkeypatch):
 KILLED = """
 import os, signal
 from minari.dataset.minari_storage import MinariStorage
-from training.records.minari import write_dataset
+from training.records.episodes import write_dataset
 from training.rollouts import make, policy_of, roll_out
 
 MinariStorage.update_metadata = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
