@@ -123,9 +123,6 @@ class Config:
     arbitrary_zero: tuple[str, ...] = ()
     """Measured signals whose zero is arbitrary, such as angles of encoders that were zeroed anywhere: the map depends
     on how they change, not on where they are (recorded motions)."""
-    untold_noise: NotNegative = 0.0
-    """Standard deviation of further noise in every sample, over the largest level, of which the map is not informed: it
-    keeps networks from learning the noise of few records by heart."""
     held_out: Annotated[float, Field(ge=0, lt=1)] = 0.2
     """Share of the records that is not trained on, on which covariances are calibrated and errors measured; whole
     records where there are five or more, else the end of each."""

@@ -48,12 +48,6 @@ RECORDED: dict[str, Any] = {
     "scaling": "range",  # errors count by their own size, not the state's
 }
 
-# Settings with which maps of records may be fitted again, beside the same filter.
-OF_THE_MAPS = (
-    "samples", "windows", "width", "depth", "activation", "optimiser", "batch", "learning_rate", "inverse_steps",
-    "members", "noise_free_share", "high_noise_emphasis", "untold_noise", "measurement_noise_max", "held_out",
-    "flow_steps", "cpu_seconds", "seed",
-)  # fmt: skip
 OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")
 
 

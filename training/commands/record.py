@@ -13,7 +13,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
-    from training.rollouts.policies import Policy
+    from training.rollouts.playing import Policy
 
 Argument = Annotated[
     tuple[str, Any],

@@ -170,11 +170,11 @@ class Train:
         return name if self.size == "default" else f"{name}-{self.size}"
 
     def _records(self, name: str, changes: Mapping[str, Any], progress: ProgressBars) -> "RecordedSource":
-        from training.sources.recorded import RecordedSource, described
+        from training.sources.recorded import RecordedSource
 
         records = self.data.read(progress)
         source = RecordedSource(records, recorded_preset(records, changes), name, warn=progress.say)
-        for line in described(source):
+        for line in source.described():
             progress.say(line)
         return source
 

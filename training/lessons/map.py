@@ -10,7 +10,6 @@ import torch
 
 from kkl_gym.system import System
 from observers import Artifact, ForwardMap, InverseMap, LinearFilter
-from training.filter_noise import stationary_covariance
 from training.lessons.run import Run
 from training.maps.forward import ForwardProblem, transients, truncation_step
 from training.maps.inverse import InverseProblem
@@ -120,9 +119,6 @@ class _MapLesson:
     def _along(self, pairs: Pairs, linear: LinearFilter, error: np.ndarray | None = None) -> TrajectorySampler:
         """Batches along motions; z may have an error of some covariance beside."""
         config = self.config
-        if config.untold_noise:
-            levels = config.untold_noise * np.broadcast_to(np.asarray(config.measurement_noise_max), linear.B.shape[1])
-            error = np.einsum("j,jab->ab", levels**2, stationary_covariance(linear))
         with self.run.progress.phase("preparing batches"):
             return TrajectorySampler(
                 pairs,

@@ -4,6 +4,7 @@ from training.records.checks import check_dt, check_memory, check_signals
 from training.records.episodes import Episode, Rollouts
 from training.records.files import read_records
 from training.records.record import (
+    ROLES,
     Record,
     Signals,
     jitter,
@@ -14,6 +15,7 @@ from training.records.record import (
 )
 
 __all__ = [
+    "ROLES",
     "Episode",
     "Record",
     "Rollouts",

@@ -57,7 +57,7 @@ def test_a_refit_lowers_the_error(pendulum, tmp_path, capsys):
     told, path = [], tmp_path / "newer.safetensors"
     env = vector("Pendulum-v1", pendulum)
     first = in_use(env)[0]
-    options = {"first": 800, "path": path, "on_refit": told.append, "verbose": 1}
+    options = {"path": path, "on_refit": told.append, "verbose": 1}
     refits = KKLTrainingCallback(1000, **options, inverse_steps=200, width=32)
     refits.init_callback(model := ppo(VecNormalize(env, norm_reward=False)))
     assert refits.artifact is first
@@ -289,12 +289,11 @@ def test_environments_that_are_refused(pendulum, tmp_path):
     ("arguments", "told"),
     [
         ({"every": 10.5}, "every must be"),
-        ({"first": 0}, "first must be"),
         ({"records": ["a"]}, r"records must be a list of training\.records\.Record, got"),
         ({"path": "observer.zip"}, "path must end in"),
         ({"on_refit": 3}, "on_refit must be a function"),
         ({"eigenvalues": (-1.0,), "dt": 0.1}, "eigenvalues, dt cannot change"),
-        ({"neurons": 3}, "there is no setting neurons; there are samples"),
+        ({"neurons": 3}, "neurons"),
     ],
 )
 def test_arguments_that_make_no_sense(arguments, told):

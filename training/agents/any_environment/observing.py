@@ -16,8 +16,7 @@ from training.presets import RECORDED_NOISE, recorded_preset
 from training.progress import ProgressBars
 from training.records import Record
 from training.rollouts.callback import KKLTrainingCallback
-from training.rollouts.playing import Recorder, roll_out
-from training.rollouts.policies import WANDERING, policy_of
+from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
 from training.sources.recorded import RecordedSource, split
 from training.spectrum import evenly_spaced
 from training.train_observer import train
