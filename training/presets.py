@@ -1,4 +1,4 @@
-"""The configurations behind ``--pipeline``, ``--preset`` and ``--size``, and those that records decide."""
+"""Configurations: behind ``--pipeline``, ``--preset`` and ``--size`` for a system, and for records."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
@@ -18,13 +18,8 @@ Size = Literal["default", "large"]
 # A T_inv that stands alone. By default a tracker does what width, slow complex modes and long training do here.
 LARGE: dict[str, Any] = {"width": 128, "trajectories": 4000, "inverse_steps": 18_000}
 PAPER: dict[str, Any] = {
-    "width": 512,
-    "depth": 4,
-    "activation": "silu",
-    "optimiser": "adam",
-    "batch": 4096,
-    "learning_rate": 1e-3,
-}
+    "width": 512, "depth": 4, "activation": "silu", "optimiser": "adam", "batch": 4096, "learning_rate": 1e-3
+}  # fmt: skip
 NOISE_RANGE = 2.0  # largest measurement noise that maps are trained for, over the system's default
 FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
 FASTEST_OF_STEPS = 3.0  # the same in discrete time, where a step may change everything and the last samples say most
@@ -38,15 +33,9 @@ EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
 EPISODE_MEMORIES = 1.5  # of the filter in an episode at least
 RECORDED_NOISE = 0.1  # of an output's standard deviation: the largest noise beside that of the records
 RECORDED: dict[str, Any] = {
-    "samples": 60,
-    "width": 96,
-    "depth": 2,
-    "learning_rate": 3e-3,
-    "inverse_steps": 3000,
-    "members": 3,
-    "noise_free_share": 0.5,
-    "scaling": "range",  # errors count by their own size, not the state's
-}
+    "samples": 60, "width": 96, "depth": 2, "learning_rate": 3e-3, "inverse_steps": 3000, "members": 3,
+    "noise_free_share": 0.5, "scaling": "range",  # errors count by their own size, not the state's
+}  # fmt: skip
 
 OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")
 
@@ -61,11 +50,9 @@ def preset(
 ) -> Config:
     """Return the configuration behind ``--pipeline``, ``--preset`` and ``--size`` for a system.
 
-    "fast" is what ships: about half a minute of CPU time, or ten for the size "large" and five for spinn. "paper" has
-    the sizes of the paper's sec. 8: 500 trajectories of 50 s, SiLU networks of 4 x 512, 200 epochs over 3 million and 5
-    million points, physics weight 0.1, and nz = ny (2 nx + 1) eigenvalues in [-3, -1.5] at the pace of the shipped
-    systems. The paper leaves open the batch (here 4,096), the spacing of the eigenvalues (even) and the decay of the
-    learning rate (a cosine).
+    "fast" is what ships: about half a minute of CPU time, or ten minutes for the size "large" and five for spinn.
+    "paper" has the sizes of the paper's sec. 8, which leaves open the batch (here 4,096), the spacing of the
+    eigenvalues (even) and the decay of the learning rate (a cosine).
 
     Parameters
     ----------
@@ -95,11 +82,8 @@ def preset(
             raise ValueError(f"there is no {what} {value!r}; there are {', '.join(get_args(known))}")
     changes = changes or {}
     given = {key: value for key, value in changes.items() if value is not None}
-    sizes: dict[str, Any] = {
-        "dt": system.dt,
-        "duration": system.duration,
-        "measurement_noise_max": _largest_noise(system),
-    }
+    noise = _largest_noise(system)
+    sizes: dict[str, Any] = {"dt": system.dt, "duration": system.duration, "measurement_noise_max": noise}
     if pipeline == "input-aware":
         spectrum = given.get("eigenvalues") or eigenvalues(system, given.get("dt", system.dt))
         config = override(Config(pipeline, eigenvalues=spectrum, **sizes), profile(system).settings)
@@ -126,23 +110,27 @@ def preset(
             transients=False,
         )
         return override(config, changes)
-    batches = {"forward_steps": 6_000, "inverse_steps": 12_000}
-    chosen = {**sizes, **LARGE, **batches, "box_factor": 2.0, "noise_free_share": 0.35}
-    settings = dict(profile(system).spinn_settings)
-    if "eigenvalues" in settings:
-        settings["eigenvalues"] = _rounded(settings["eigenvalues"])
-    chosen |= {**settings, **given}
+    chosen = {
+        **sizes,
+        **LARGE,
+        "forward_steps": 6_000,
+        "inverse_steps": 12_000,
+        "box_factor": 2.0,
+        "noise_free_share": 0.35,
+    }
+    chosen |= {**profile(system).spinn_settings, **given}
     if "eigenvalues" not in chosen:
         chosen["eigenvalues"] = smooth_spectrum(system, chosen["dt"], chosen["duration"]).eigenvalues
+    elif "eigenvalues" not in given:
+        chosen["eigenvalues"] = _rounded(chosen["eigenvalues"])
     return Config(pipeline, **chosen)
 
 
 def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> Config:
     """Return a configuration for records, which decide dt, the eigenvalues of A, and the largest noise.
 
-    dt is the median step, rounded where steps are uneven. The eigenvalues follow from the rate of the signals and from
-    the length of the records; those of rollouts from dt and the length of episodes. The largest noise is a tenth of the
-    standard deviation of each output.
+    dt is the median step. The eigenvalues follow from the rate of the signals and the length of the records; those of
+    rollouts from dt and the length of episodes. The largest noise is a tenth of each output's standard deviation.
 
     Parameters
     ----------

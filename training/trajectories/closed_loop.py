@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kkl_gym.simulate import advance_batch, followed_rows
+from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.trajectories.motions import ALIKE, EXPLORATION, Pairs, draw_process_noise, noisy_output
@@ -45,7 +45,7 @@ def record_closed_loop(
     """
     largest = np.broadcast_to(artifact.inverse.measurement_noise_max, system.ny)
     groups = np.array_split(np.arange(n), min(n, GROUPS))
-    xs, zs, levels, disturbances = [], [], [], []
+    parts = list[tuple[np.ndarray, ...]]()
     for i, group in enumerate(groups):
         positions = np.full(system.ny, (i + rng.random()) / len(groups))
         if system.ny > 1 and rng.random() >= ALIKE:
@@ -53,15 +53,16 @@ def record_closed_loop(
         level, loud = np.zeros(system.ny), positions >= noise_free_share
         along = (positions[loud] - noise_free_share) / (1 - noise_free_share)  # two decades, as in TrajectorySampler
         level[loud] = largest[loud] * 100 ** (along ** (1 / high_noise_emphasis) - 1)
-        x, z, disturbance = _group(
-            system, artifact, controller, len(group), steps=steps, ages=ages, rng=rng, level=tuple(level.tolist()),
-            process_noise_share=process_noise_share,
-        )  # fmt: skip
-        xs.append(x)
-        zs.append(z)
-        levels.append(np.tile(level, (x.shape[1], 1)))
-        disturbances.append(np.full(x.shape[1], disturbance))
+        disturbance = 0.0
+        if artifact.process_noise_max is not None and rng.random() < process_noise_share:
+            disturbance = system.process_noise * float(np.sqrt(rng.random()))
+        observer = KKLObserver(artifact, tuple(level.tolist()), process_noise=disturbance)
+        x, z = _group(system, observer, controller, len(group), steps=steps, ages=ages, rng=rng)
+        inside = np.isfinite(x[-1]).all(-1)
+        kept = int(inside.sum())
+        parts.append((x[:, inside], z[:, inside], np.full(kept, disturbance), np.tile(level, (kept, 1))))
         report(int(group[-1]) + 1)
+    xs, zs, disturbances, levels = zip(*parts, strict=True)
     kept = sum(map(len, levels))
     if 2 * kept < n:
         raise ValueError(
@@ -75,44 +76,35 @@ def record_closed_loop(
 
 def _group(
     system: System,
-    artifact: Artifact,
+    observer: KKLObserver,
     controller: Controller,
     n: int,
     *,
     steps: int,
     ages: np.ndarray,
     rng: np.random.Generator,
-    level: tuple[float, ...],
-    process_noise_share: float,
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """States and filter states at the ages, of those that stay within the bounds, and their process noise."""
-    dt, u_max = artifact.filter.dt, np.array(system.u_max)
-    low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
-    hold, amplitude, disturbance = int(rng.choice(HOLDS)), EXPLORATION * rng.random((n, 1)), 0.0
-    if artifact.process_noise_max is not None and rng.random() < process_noise_share:
-        disturbance = system.process_noise * float(np.sqrt(rng.random()))
-    observer = KKLObserver(artifact, level, process_noise=disturbance)
-    x = system.draw_starts(rng, n).T.copy()
-    inside, w, u = np.ones(n, dtype=bool), np.zeros_like(x), np.zeros((n, system.nu))
-    xs, zs, recorded = [], [], set(ages.tolist())
-    for k in range(steps + 1):
-        y = noisy_output(system, x.T, measurement_noise=level, rng=rng)
+) -> tuple[np.ndarray, np.ndarray]:
+    """States and filter states at the ages of n trajectories; states are NaN beyond the bounds."""
+    level, u_max = observer.measurement_noise, np.array(system.u_max)
+    hold, amplitude = int(rng.choice(HOLDS)), EXPLORATION * rng.random((n, 1))
+    x0, u = system.draw_starts(rng, n), np.zeros((n, system.nu))
+    w = draw_process_noise(system, observer.process_noise, n=n, steps=steps, rng=rng)
+    zs, recorded = list[np.ndarray](), set(ages.tolist())
+
+    def act(k: int, x: np.ndarray) -> np.ndarray:
+        nonlocal u
+        y = noisy_output(system, np.where(np.isfinite(x), x, system.X_centre), measurement_noise=level, rng=rng)
         if k == 0:
             observer.reset(y)
         else:
             observer.advance(y, u)
         if k in recorded:
-            xs.append(x.T.copy())
             zs.append(observer.z.copy())
         if k % hold == 0:
             action = controller(observer.decode()) + amplitude * rng.uniform(-1, 1, (n, system.nu))
             u = np.clip(action, -1.0, 1.0) * u_max
-        if disturbance:
-            w = np.ascontiguousarray(draw_process_noise(system, disturbance, n=n, steps=1, rng=rng)[0].T)
-        held = np.ascontiguousarray(u.T)
-        after = advance_batch(system, x, held, w, dt)
-        beyond = np.flatnonzero(~((after >= low) & (after <= high)).all(0))
-        after = followed_rows(system, x, held, w, dt=dt, end=after, rows=beyond)
-        inside &= ((after >= low) & (after <= high)).all(0)
-        x = np.where(inside, after, x)
-    return np.stack(xs)[:, inside], np.stack(zs)[:, inside], disturbance
+        return u
+
+    x = simulate(system, x0, steps, observer.artifact.filter.dt, u=act, w=w)
+    act(steps, x[-1])
+    return x[ages], np.stack(zs)
