@@ -18,8 +18,9 @@ from training.commands.maps import tracks_by
 from training.commands.options import HalfWidths, Parameters
 from training.commands.settings import Settings
 from training.config import Pipeline, read_changes
-from training.presets import CLOSED_LOOP, Preset, Size, preset, recorded_preset
+from training.presets import CLOSED_LOOP, Preset, Size, preset
 from training.progress import LOG, ProgressBars, duration, progress_bars
+from training.sources.recorded import recorded_preset
 from training.spectrum import Spectrum
 from training.trajectories.parameters import nominal_share, relative_ranges
 

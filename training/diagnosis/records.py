@@ -15,13 +15,12 @@ from training.evaluation.levels import Level
 from training.filter_noise import noise_covariance, root
 from training.maps.coordinates import coordinates, settling_time, spread
 from training.neighbours import told
-from training.presets import recorded_preset
 from training.progress import ProgressBars, progress_bars
 from training.records import Record, check_signals, pieces, resampled
 from training.rollouts import Policy, make, policy_of, roll_out
 from training.rollouts.playing import RANDOM
 from training.seeds import Stream, generator
-from training.sources.recorded import FEW, split
+from training.sources.recorded import FEW, recorded_preset, split
 from training.sources.windows import along, restarted, samples_as_old, taken
 from training.spectrum import Spectrum
 

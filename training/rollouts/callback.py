@@ -22,9 +22,8 @@ from observers.checks import integer, shown
 from observers.replacement import check_replacement
 from training.config import Config, settings_of
 from training.maps.coordinates import settling_time
-from training.presets import OF_THE_FILTER
 from training.records import ROLES, Record, Signals, check_dt, resampled
-from training.sources.recorded import RecordedSource, check_plant, recorded_errors
+from training.sources.recorded import OF_THE_FILTER, RecordedSource, check_plant, recorded_errors
 from training.train_observer import train
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again

@@ -10,10 +10,9 @@ from rich.console import Console
 from observers import Artifact
 from training.config import Config
 from training.jobs import refuse_checkpoints
-from training.presets import recorded_preset
 from training.progress import ProgressBars, progress_bars
 from training.rollouts.playing import RANDOM, Policy, make, policy_of, roll_out
-from training.sources.recorded import RecordedSource
+from training.sources.recorded import RecordedSource, recorded_preset
 
 
 def learn(

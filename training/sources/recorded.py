@@ -3,7 +3,7 @@
 import functools
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,16 +25,17 @@ from training.records import (
     median_step,
     pieces,
     resampled,
+    sampling_interval,
 )
 from training.seeds import Stream, generator
-from training.sources.source import Increments, Pairs, Report, Runs, TooFewRunsError
+from training.sources.source import OF_MEDIAN, Increments, Pairs, Report, Runs, TooFewRunsError
 from training.sources.windows import samples_as_old, windows
-from training.spectrum import Spectrum
+from training.spectrum import Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
 FEW = 5  # records, below which none is held out as a whole
 STRETCHES, SAMPLES = 600, 2_000_000  # at most, of stretches to calibrate on and of their samples together
-MEMORIES = 2.0  # of the filter's memory, that stretches are long at most
+STRETCH_MEMORIES = 2.0  # of the filter's memory, that stretches are long at most
 FEWEST = 50  # samples that a stretch may begin at
 BEYOND = 0.5  # of the states' range, by which estimates may leave it
 INCREMENTS = 400_000  # at most
@@ -44,8 +45,20 @@ UNTOLD, SQUARES = 0.7, 0.8  # of the output's standard deviation, and of what is
 LITTLE = 0.1  # of that standard deviation: less is taken for noise in any case
 ROUNDING = 1e-6  # of an output's size: below it an entry of C, or what is left, is rounding
 OUTLIER = 6.0  # standard deviations of what is left, by its median
-OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 LEAST_NOISE = 1e-4  # assumed at least, in standard deviations of the outputs: with R = 0 the gain would not fall
+MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # of records: eigenvalues for each output, in multiples of the signals' rate
+RECORD_MEMORIES = 3.0  # of the filter in a record at least, unless its slowest mode were faster than the signals
+# Of rollouts, whose hidden signals an agent wants within steps: how many modes, the slowest and the fastest per step.
+# Few modes that are far apart forget the start soon, and tell single steps from each other.
+EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
+EPISODE_MEMORIES = 1.5  # of the filter in an episode at least
+RECORDED_NOISE = 0.1  # of an output's standard deviation: the largest noise beside that of the records
+RECORDED: dict[str, Any] = {
+    "samples": 60, "width": 96, "depth": 2, "learning_rate": 3e-3, "inverse_steps": 3000, "members": 3,
+    "noise_free_share": 0.5, "scaling": "range",  # errors count by their own size, not the state's
+}  # fmt: skip
+FASTEST_PER_STEP = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
+OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")  # settings
 
 
 class RecordedSource:
@@ -145,7 +158,7 @@ class RecordedSource:
                 f"({FEWEST}): record more, or hold more out (held_out, --held-out)"
             )
         longest = max(len(piece.t) for piece in whole) - 1
-        steps = max(2, min(round(MEMORIES * settling_time(self.linear) / self.dt), longest))
+        steps = max(2, min(round(STRETCH_MEMORIES * settling_time(self.linear) / self.dt), longest))
         most = min(STRETCHES, max(2 * FEWEST, SAMPLES // steps))
         if len(owner) > most:
             chosen = np.linspace(0, len(owner) - 1, most).round().astype(int)
@@ -241,6 +254,62 @@ class RecordedSource:
             f"steps of {step:.4g} s (median), uneven by up to {uneven:.1%}; resampled to {self.dt:g} s",
             f"{len(rates)} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
         ]
+
+
+def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> Config:
+    """Return a configuration for records, which decide dt, the eigenvalues of A, and the largest noise.
+
+    dt is the median step. The eigenvalues follow from the rate of the signals and the length of the records; those of
+    rollouts from dt and the length of episodes. The largest noise is a tenth of each output's standard deviation.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Records of the same signals.
+    changes : mapping of str to object, optional
+        Settings that are to differ.
+
+    Returns
+    -------
+    Config
+        For :func:`training.train` with a :class:`training.RecordedSource`.
+
+    Raises
+    ------
+    ValueError
+        If dt does not suit the records, or an output never changes.
+    """
+    given = {name: value for name, value in (changes or {}).items() if value is not None}
+    chosen: dict[str, Any] = {"dt": sampling_interval(*records), **RECORDED} | given
+    check_dt(records, chosen["dt"])
+    if records[0].environment is not None and not np.isclose(chosen["dt"], median_step(*records), rtol=1e-6):
+        raise ValueError(
+            f"dt = {chosen['dt']:g} s: an observer for {records[0].environment['id']} takes a sample at each step, "
+            f"every {median_step(*records):g} s; leave dt out"
+        )
+    chosen.setdefault("duration", max(50.0, chosen["dt"]))
+    if "eigenvalues" not in given:
+        chosen["eigenvalues"] = _recorded_eigenvalues(records, chosen["dt"])
+    if "measurement_noise_max" not in given:
+        y = np.concatenate([record.y for record in records])
+        levels = tuple(float(f"{RECORDED_NOISE * size:.3g}") for size in np.nanstd(y, 0))
+        if still := [name for name, level in zip(records[0].signals.measured, levels) if not level]:
+            raise ValueError(f"{', '.join(still)} never changes: leave it out of what is measured")
+        chosen["measurement_noise_max"] = levels[0] if len(levels) == 1 else levels
+    return Config("input-aware", **chosen)
+
+
+def _recorded_eigenvalues(records: Sequence[Record], dt: float) -> tuple[float, ...]:
+    if records[0].source:
+        steps = float(np.median([len(record.t) for record in records]))
+        slowest = min(max(EPISODE_SLOWEST, EPISODE_MEMORIES * np.log(1e3) / steps), EPISODE_FASTEST / 4)
+        spaced = evenly_spaced(EPISODE_MODES, -slowest / dt, -EPISODE_FASTEST / dt)
+    else:
+        rate = signal_rate(records)
+        length = np.median([record.duration for record in records])
+        slowest = min(max(SLOWEST * rate, RECORD_MEMORIES * np.log(1e3) / length), rate)
+        spaced = evenly_spaced(MODES, -slowest, -min(FASTEST * rate, FASTEST_PER_STEP / dt))
+    return tuple(float(f"{value:.6g}") for value in spaced)
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:

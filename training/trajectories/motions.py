@@ -63,30 +63,24 @@ class Motions:
 
 
 def random_inputs(
-    system: System, n: int, steps: int, *, dt: float, rng: np.random.Generator, kinds: tuple[str, ...] = KINDS
-) -> np.ndarray:
-    """Draw random inputs within a system's bounds, held over each sampling interval: (steps, n, nu)."""
-    return random_signals(system.u_max, n, steps, dt=dt, pace=system.pace, rng=rng, kinds=kinds)
-
-
-def random_signals(
-    bounds: Sequence[float],
+    system: System,
     n: int,
     steps: int,
     *,
     dt: float,
-    pace: float,
     rng: np.random.Generator,
-    kinds: tuple[str, ...],
+    kinds: tuple[str, ...] = KINDS,
+    bounds: Sequence[float] | None = None,
 ) -> np.ndarray:
-    """Draw random bounded signals, held over each sampling interval: (steps, n, len(bounds))."""
+    """Draw random signals (steps, n, k) within bounds (k,), by default those of the inputs; held between samples."""
+    bounds = system.u_max if bounds is None else bounds
     out = np.zeros((steps, n, len(bounds)))
     t = np.arange(steps) * dt
     for row in range(n):
         kind = kinds[row % len(kinds)]
         for j, bound in enumerate(bounds):
             if kind in ("steps", "pulses"):
-                hold = pace * np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
+                hold = system.pace * np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
                 changes = rng.random(steps) < min(1.0, dt / hold)
                 levels = rng.uniform(-bound, bound, steps + 1)
                 out[:, row, j] = levels[np.cumsum(changes)]
@@ -94,7 +88,7 @@ def random_signals(
                     out[rng.integers(steps + 1) :, row, j] = 0.0
             elif kind == "sine":
                 amplitude, phase = rng.uniform(0, bound), rng.uniform(0, 2 * np.pi)
-                frequency = np.exp(rng.uniform(np.log(0.2), np.log(20.0))) / pace
+                frequency = np.exp(rng.uniform(np.log(0.2), np.log(20.0))) / system.pace
                 out[:, row, j] = amplitude * np.sin(frequency * t + phase)
     return out
 
@@ -136,11 +130,11 @@ def under_policy(
     Shapes: ``x0`` (n, nx), ``own`` (n,), ``w`` (steps, n, nx); returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
     """
     n, u_max = len(x0), np.array(system.u_max)
-    signals = partial(random_signals, n=n, steps=steps, dt=dt, pace=system.pace, rng=rng, kinds=POLICY_KINDS)
-    error = signals(system.scale)
+    signals = partial(random_inputs, system, n, steps, dt=dt, rng=rng, kinds=POLICY_KINDS)
+    error = signals(bounds=system.scale)
     least, largest = np.log(POLICY_ERROR)
     error *= np.exp(rng.uniform(least, largest, n))[:, None]
-    exploration = signals((1.0,) * system.nu)
+    exploration = signals(bounds=(1.0,) * system.nu)
     exploration *= EXPLORATION * rng.random(n)[:, None]
     error[:, own] = exploration[:, own] = 0.0
     u = np.zeros((steps, n, system.nu))

@@ -142,7 +142,10 @@ def test_increments_are_between_samples_that_are_known():
     x, y = run.x.copy(), run.y.copy()
     x[100:200], y[300:400] = np.nan, np.nan
     records = [replace(run, x=x, y=y), both(4)]
-    found, _ = RecordedSource(records, recorded_preset(records), "a", held_out=[both(5)]).increments()
+    finer = replace(swing(9, n=1200, dt=DT / 2), x=np.zeros((1200, 2)), signals=run.signals)
+    source = RecordedSource(records, recorded_preset(records), "a", held_out=[finer])
+    assert np.diff(source.held_out[0].t) == pytest.approx(DT)  # on the same grid
+    found, _ = source.increments()
     known = [k for k in range(599) if not (99 <= k < 200 or 299 <= k < 400)]  # a gap of outputs cuts a record
     np.testing.assert_allclose(found.x[: len(known)], run.x[known], atol=1e-9)
     np.testing.assert_allclose(found.change[: len(known)], np.diff(run.x, axis=0)[known], atol=1e-9)
@@ -150,14 +153,6 @@ def test_increments_are_between_samples_that_are_known():
     sparse = [replace(each, x=np.where(np.arange(600)[:, None] % 8, np.nan, each.x)) for each in records]
     with pytest.raises(ValueError, match="no two samples in a row have all hidden signals"):
         RecordedSource(sparse, recorded_preset(sparse), "a").tracking()
-
-
-def test_what_is_held_out_by_hand_comes_on_the_same_grid():
-    records = [both(seed) for seed in range(3)]
-    finer = replace(swing(9, n=1200, dt=DT / 2), x=np.zeros((1200, 2)), signals=records[0].signals)
-    source = RecordedSource(records, recorded_preset(records), "a", held_out=[finer])
-    assert source.dt == pytest.approx(DT)
-    assert np.diff(source.held_out[0].t) == pytest.approx(DT)
 
 
 def test_outputs_are_sums_of_states_or_an_error():
