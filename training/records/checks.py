@@ -58,9 +58,7 @@ def check_between_records(records: Sequence[Record], warn: Warn) -> None:
             )
     for _, _, column, values in _columns(records):
         spreads = np.array([_spread(each) for each in values])
-        usual = np.median(spreads[spreads > 0]) if (spreads > 0).any() else 1.0
-        if len(records) == 2 and spreads.all():
-            usual = spreads.min()
+        usual = np.quantile(spreads[spreads > 0], 0.5, method="lower") if spreads.any() else 1.0
         for record, ratio in zip(records, spreads / usual):
             if ratio and not 1 / OTHER_SPREAD < ratio < OTHER_SPREAD:
                 warn(
