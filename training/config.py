@@ -33,8 +33,7 @@ STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attrib
 class Config:
     """A training run; together with the system it determines the artifact.
 
-    The defaults are those of the preset "fast" of input-aware maps. A source reads what concerns its motions: of
-    simulated ones their number and kinds, of recorded ones what is held out.
+    The defaults are those of the preset "fast" of input-aware maps. A source reads the settings of its motions.
 
     Raises
     ------
@@ -105,12 +104,12 @@ class Config:
     bounds, or for 10 s random ones within their bounds if it is 0."""
     process_noise_share: Share = 0.35
     """Share of an input-aware map's trajectories with process noise. Each has a level of its own, up to the system's.
-    The map is told the level unless the share is 0."""
+    The map is given the level unless the share is 0."""
     measurement_noise_max: Levels = 1.0
     """Largest standard deviation of the measurement noise that a map is trained for (spinn with transients too), of all
     outputs or of each."""
     noise_free_share: Share = 0.2
-    """Share of the samples without measurement noise, where a map is told its level."""
+    """Share of the samples without measurement noise, where a map is given its level."""
     high_noise_emphasis: Positive = 2.0
     """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
     measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
@@ -205,7 +204,7 @@ def read_changes(path: Path) -> dict[str, Any]:
 
 
 def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
-    """The configuration behind what an artifact says of its training."""
+    """The configuration in an artifact's account of its training, with some settings changed."""
     known = setting_types()
     found = {name: value for name, value in training.items() if name in known and value is not None}
     if not {"pipeline", "eigenvalues"} <= set(found):

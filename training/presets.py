@@ -124,7 +124,7 @@ def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
 
 
 def _largest_noise(system: System) -> float | tuple[float, ...]:
-    """Of all outputs or each: a multiple of what is usual, or of what would be where the system says that none is."""
+    """A multiple of the usual noise, of all outputs or each; of a share of the range where the system declares none."""
     usual = zip(np.broadcast_to(system.measurement_noise, system.ny).tolist(), system.output_range, strict=True)
     levels = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]
     return levels[0] if len(set(levels)) == 1 else tuple(levels)

@@ -149,15 +149,14 @@ def _opened(name: str) -> "MinariDataset":
 
 def _interval(name: str, spec: Any, kwargs: Mapping[str, Any], warn: Callable[[str], object]) -> float:
     """Seconds between samples, of an environment of Gymnasium's own; to make others may run what a file names."""
-    registered = None if spec is None else gym.registry.get(spec.id)
+    registered, reason = None if spec is None else gym.registry.get(spec.id), ""
     if registered is not None and str(registered.entry_point).startswith("gymnasium."):
         try:
             with gym.make(spec.id, **kwargs) as env:
                 return sampling_interval(env)
         except Exception as error:  # whatever is missing
-            warn(f"{name}: a step counts as 1 s, as {spec.id} cannot be made: {error}")
-            return 1.0
-    warn(f"{name} says no sampling interval: a step counts as 1 s")
+            reason = f", and {spec.id} cannot be made ({error})"
+    warn(f"{name} says no sampling interval{reason}: a step counts as 1 s")
     return 1.0
 
 

@@ -41,7 +41,7 @@ BEYOND = 0.5  # of the states' range, by which estimates may leave it
 INCREMENTS = 400_000  # at most
 WINDOW = 10  # samples at least over which innovations are averaged
 # What C x leaves of an output is noise, unless it is nearly all, or squares of states explain a part of it.
-UNTOLD, SQUARES = 0.7, 0.8  # of the output's standard deviation, and of what is left
+UNEXPLAINED, SQUARES = 0.7, 0.8  # of the output's standard deviation, and of what is left
 LITTLE = 0.1  # of that standard deviation: less is taken for noise in any case
 ROUNDING = 1e-6  # of an output's size: below it an entry of C, or what is left, is rounding
 OUTLIER = 6.0  # standard deviations of what is left, by its median
@@ -418,7 +418,7 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
     i, j = np.triu_indices(x.shape[1])
     _, unexplained = _fitted(np.column_stack([x, x[:, i] * x[:, j], np.ones(len(x))]), y, size)
     much = left > np.maximum(LITTLE * moves, ROUNDING * size)
-    wrong = much & ((left > UNTOLD * moves) | (unexplained < SQUARES * left))
+    wrong = much & ((left > UNEXPLAINED * moves) | (unexplained < SQUARES * left))
     signals = records[0].signals
     if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
         raise ValueError(

@@ -20,8 +20,8 @@ from training.trajectories.policies import Controller
 KINDS = ("zero", "steps", "zero", "sine")
 DRIVEN = ("steps", "sine", "pulses")
 CHUNK = 500  # trajectories simulated at once
-FIRST = 100  # trajectories tried before all others
-FEWEST_INSIDE = 0.05  # share of them that must stay within the bounds
+FIRST = 100  # trajectories tried, from which on a share of them must stay within the bounds
+FEWEST_INSIDE = 0.05  # that share
 # Seconds, at the pace of the shipped systems, for which inputs lead starts out of the training box.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
@@ -29,7 +29,7 @@ NEAR = 0.4  # share of the trajectories that start in X itself where others star
 ALIKE = 0.5
 POLICY_KINDS = ("steps", "sine")  # of a policy's errors and explorations
 POLICY_ERROR = (0.02, 0.5)  # of the states that a policy acts on, in multiples of the system's scale
-EXPLORATION = 0.5  # largest amplitude of what is added to a policy's action, in input bounds
+EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in input bounds
 # Every so many trajectories under a policy one is its own, the others are explored. On those alone the input tells the
 # state, which an agent's does not. Under the regulator on x_hat, at the default noise, cart-pole's angle is estimated
 # to 3.4 % of X's half-width with 4 here, to 3.2 % with 12 and to 3.1 % with none; by an exact EKF to 2.7 %.
@@ -200,16 +200,16 @@ def trajectories(
 
     Shapes: returns ``x`` (steps + 1, at most CHUNK, nx), ``u`` (steps, at most CHUNK, nu), ``level`` (at most CHUNK,).
     """
-    simulated = partial(_simulated, system, steps=steps, dt=dt, motions=motions or Motions())
-    led = motions.lead_in_share if motions else 0.0
+    motions = motions or Motions()
     counts = [CHUNK] * (n // CHUNK) + [n % CHUNK]
-    pending, tried = [(row, row < round(led * count)) for count in counts for row in range(count)], 0
-    if n > CHUNK:  # an error now, not after all have been simulated
-        *_, inside = simulated(pending[:FIRST], rng=np.random.default_rng(0))
-        check_share(system, int(inside.sum()), len(inside), steps * dt)
+    pending = [(row, row < round(motions.lead_in_share * count)) for count in counts for row in range(count)]
+    tried = 0
     while pending:
         rows, pending = pending[:CHUNK], pending[CHUNK:]
-        x, u, level, inside = simulated(rows, rng=rng, report=report, before=n - len(pending) - len(rows))
+        before = n - len(pending) - len(rows)
+        x, u, level, inside = _simulated(
+            system, rows, steps=steps, dt=dt, rng=rng, motions=motions, before=before, report=report
+        )
         pending += [row for row, stayed in zip(rows, inside) if not stayed]
         tried += len(rows)
         if pending and tried >= FIRST:
@@ -225,8 +225,8 @@ def _simulated(
     dt: float,
     rng: np.random.Generator,
     motions: Motions,
-    report: Callable[[float], object] = lambda done: None,
-    before: int = 0,
+    before: int,
+    report: Callable[[float], object],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Simulate a chunk of ``rows``, each the number of its input's kind and whether inputs lead its start from X.
 

@@ -12,7 +12,7 @@ from training.trajectories.policies import Controller
 
 # Of motions in training with one uncertain parameter, the share that has its own value; with more, the power of their
 # number, for it is the less likely that all are as said. Chosen on the four systems that ship: at 0.6 and a width of
-# 256 Lorenz's map no longer told its own plant from the others.
+# 256 Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
 EVERY = "all"  # in the place of a parameter's name
