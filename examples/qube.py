@@ -47,10 +47,8 @@ from training.identification.shooting import shoot
 from training.identification.windows import windows
 from training.kalman import ExtendedKalmanFilter
 from training.markdown import table
-from training.presets import recorded_preset
 from training.records import Record, Signals, read_records, resampled
-from training.sources.errors import estimates
-from training.sources.recorded import RecordedSource
+from training.sources.recorded import RecordedSource, estimates, recorded_preset
 from training.train_observer import train
 
 SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))

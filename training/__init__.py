@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from training.lessons.flow import learn_flow
     from training.lessons.map import Maps, learn_map
     from training.lessons.run import Run
-    from training.presets import preset, recorded_preset
+    from training.presets import preset
     from training.rollouts import learn
     from training.rollouts.callback import KKLTrainingCallback
-    from training.sources.recorded import RecordedSource
+    from training.sources.recorded import RecordedSource, recorded_preset
     from training.sources.simulated import SimulatedSource
     from training.sources.source import Source
     from training.train_observer import Result, train
@@ -67,7 +67,7 @@ _MODULES = {
     "nrmse": "evaluation.metrics",
     "observability": "diagnosis",
     "preset": "presets",
-    "recorded_preset": "presets",
+    "recorded_preset": "sources.recorded",
     "smape": "evaluation.metrics",
     "train": "train_observer",
     "unseen_trajectories": "evaluation.errors",

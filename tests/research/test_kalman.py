@@ -17,7 +17,7 @@ from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance, simulate
 from observers.estimator import Running
 from training.kalman import ExtendedKalmanFilter, unknown_start
-from training.trajectories.derivatives import jacobian
+from training.trajectories.equations import jacobian
 
 
 @pytest.fixture(params=[ExtendedKalmanFilter, UnscentedKalmanFilter])

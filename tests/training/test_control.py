@@ -8,8 +8,8 @@ from training.agents.play import play
 from training.agents.tasks import TASKS, ControlTask, get_task, scores, successes
 from training.presets import preset
 from training.systems import PROFILES, Profile, controller, profile
-from training.trajectories.controllers import linear_quadratic
-from training.trajectories.derivatives import linearised
+from training.trajectories.equations import linearised
+from training.trajectories.policies import linear_quadratic
 
 
 def nothing(obs):

@@ -18,7 +18,7 @@ from observers import KKLObserver, load, shipped
 from observers.factors import standard_deviations
 from training.agents.tasks import ControlTask, deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
-from training.trajectories.derivatives import linearised
+from training.trajectories.equations import linearised
 
 Information = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"]
 INFORMATION: tuple[Information, ...] = get_args(Information)

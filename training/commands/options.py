@@ -13,8 +13,8 @@ from observers import Artifact, shipped
 from observers.names import resolve
 from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
-from training.trajectories.controllers import Controller
 from training.trajectories.parameters import EVERY
+from training.trajectories.policies import Controller
 
 SystemName = Annotated[
     tyro.conf.Positional[str],

@@ -13,7 +13,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
-    from training.rollouts.policies import Policy
+    from training.rollouts.playing import Policy
 
 Argument = Annotated[
     tuple[str, Any],
@@ -63,7 +63,7 @@ class RecordCommand:
 
     def run(self, console: Console) -> str:
         """Record."""
-        from training.records.minari import dataset_folder, write_dataset
+        from training.records.episodes import dataset_folder, write_dataset
         from training.rollouts import make, policy_of, roll_out
 
         steps = 100_000 if self.episodes is None and self.steps is None else self.steps

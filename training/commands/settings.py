@@ -9,7 +9,8 @@ import tyro
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS
 from training.config import Config, Pipeline, setting_types
-from training.presets import RECORDED, Preset, preset
+from training.presets import Preset, preset
+from training.sources.recorded import RECORDED
 
 SHOWN = 3  # numbers of a setting that has many
 ELSEWHERE = ("pipeline", "uncertain", "inputs")  # options of their own

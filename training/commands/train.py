@@ -18,8 +18,9 @@ from training.commands.maps import tracks_by
 from training.commands.options import HalfWidths, Parameters
 from training.commands.settings import Settings
 from training.config import Pipeline, read_changes
-from training.presets import CLOSED_LOOP, Preset, Size, preset, recorded_preset
+from training.presets import CLOSED_LOOP, Preset, Size, preset
 from training.progress import LOG, ProgressBars, duration, progress_bars
+from training.sources.recorded import recorded_preset
 from training.spectrum import Spectrum
 from training.trajectories.parameters import nominal_share, relative_ranges
 
@@ -170,11 +171,11 @@ class Train:
         return name if self.size == "default" else f"{name}-{self.size}"
 
     def _records(self, name: str, changes: Mapping[str, Any], progress: ProgressBars) -> "RecordedSource":
-        from training.sources.recorded import RecordedSource, described
+        from training.sources.recorded import RecordedSource
 
         records = self.data.read(progress)
         source = RecordedSource(records, recorded_preset(records, changes), name, warn=progress.say)
-        for line in described(source):
+        for line in source.described():
             progress.say(line)
         return source
 

@@ -13,13 +13,12 @@ from observers.checks import integer, noise_levels, shown
 from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
 from training.evaluation.levels import Level, show_level
 from training.maps.coordinates import coordinates, noise_covariance, root, settling_time, spread
-from training.presets import recorded_preset
 from training.progress import ProgressBars, progress_bars
 from training.records import Record, check_signals, pieces, resampled
 from training.rollouts import Policy, make, policy_of, roll_out
-from training.rollouts.policies import RANDOM
+from training.rollouts.playing import RANDOM
 from training.seeds import Stream, generator
-from training.sources.recorded import FEW, split
+from training.sources.recorded import FEW, recorded_preset, split
 from training.sources.windows import along, restarted, samples_as_old, taken
 from training.spectrum import Spectrum
 

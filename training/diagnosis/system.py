@@ -16,9 +16,8 @@ from kkl_gym.system import NOISE_SHARE, Box, System, rate_under
 from training.diagnosis.finding import Finding, Verdict, number, percent, point
 from training.evaluation.levels import Level
 from training.systems import named_policy
-from training.trajectories.controllers import Controller
-from training.trajectories.policy import under_policy
-from training.trajectories.signals import DRIVEN, random_inputs
+from training.trajectories.motions import DRIVEN, random_inputs, under_policy
+from training.trajectories.policies import Controller
 
 COMPARED = 100  # points of X, and as many of the bounds, at which the kinds of numbers are compared
 POINTS = 1000  # of X, at which outputs, inputs and time constants are looked at

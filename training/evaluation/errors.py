@@ -13,10 +13,8 @@ from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.seeds import Stream, generator
-from training.trajectories.controllers import Controller
-from training.trajectories.noise import draw_process_noise, noisy_output
-from training.trajectories.policy import under_policy
-from training.trajectories.signals import random_inputs
+from training.trajectories.motions import draw_process_noise, noisy_output, random_inputs, under_policy
+from training.trajectories.policies import Controller
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
 
@@ -114,7 +112,7 @@ def unseen_trajectories(
     process_noise : float
         Level of the process noise, in multiples of the system's scale per second.
     policy : callable, optional
-        Acts on the system, see :func:`training.trajectories.policy.under_policy`; by default nothing does.
+        Acts on the system, see :func:`training.trajectories.motions.under_policy`; by default nothing does.
     plant : System, optional
         What moves in the place of the system, such as the same with other parameters
         (:meth:`kkl_gym.System.replace`, :func:`training.evaluation.plants.off_by`).

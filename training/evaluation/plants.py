@@ -8,9 +8,9 @@ from observers.checks import is_finite, noise_levels, shown
 from training.evaluation.errors import TRANSIENT, unseen_trajectories
 from training.evaluation.levels import Level
 from training.seeds import Stream, generator
-from training.trajectories.controllers import Controller
-from training.trajectories.noise import noisy_output
+from training.trajectories.motions import noisy_output
 from training.trajectories.parameters import blind, with_parameters
+from training.trajectories.policies import Controller
 
 
 def off_by(system: System, share: float) -> System:

@@ -20,8 +20,7 @@ from training.maps.coordinates import (
 from training.maps.forward import TensorMap
 from training.maps.networks import Network, compiled, tensor
 from training.trajectories.closed_loop import ClosedLoop
-from training.trajectories.noise import ALIKE
-from training.trajectories.record import Pairs
+from training.trajectories.motions import ALIKE, Pairs
 
 MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
 AGE_UNIT = 5  # samples, in the age feature log(1 + t / unit)

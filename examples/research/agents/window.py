@@ -24,11 +24,11 @@ from training.config import Config
 from training.lessons.run import Stage, optimise
 from training.maps.inverse import Batch, InverseProblem
 from training.maps.networks import Network
-from training.presets import RECORDED
 from training.progress import ProgressBars
 from training.records import Record
 from training.rollouts.callback import rehearsed
 from training.rollouts.playing import Recorder
+from training.sources.recorded import RECORDED
 
 KEY = "kkl-gym-window"
 DEFAULT = Config("input-aware", eigenvalues=(-1.0,), dt=1.0, **RECORDED)  # for the size of its network

@@ -21,7 +21,7 @@ from training.jobs import describe
 from training.lessons.run import Loss, Stage, optimise
 from training.progress import progress_bars
 from training.seeds import Stream, generator
-from training.trajectories.record import recording_ages, trajectories
+from training.trajectories.motions import recording_ages, trajectories
 
 _KEY = "kkl-gym-method"
 

@@ -13,7 +13,7 @@ from observers.compiled import available
 from observers.estimator import Running
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
-from training.trajectories.derivatives import jacobian
+from training.trajectories.equations import jacobian
 
 BATCHES = 10  # of one step each, by filters that take one sample at a time
 FEWER = 10  # times as few samples, where Python takes a single one

@@ -17,7 +17,7 @@ from training.cli import main
 from training.commands.faults import report
 from training.evaluation.faults import FAULTS, simulate_faults
 from training.presets import preset
-from training.trajectories.expression import output_facts
+from training.trajectories.equations import output_facts
 
 COLUMNS = "observer,system,fault,deadline,trajectory,score,delay"
 LIMITS = Limits(

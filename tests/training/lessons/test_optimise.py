@@ -11,7 +11,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 import training.evaluation.errors
 import training.lessons.run
-import training.trajectories.record
+import training.trajectories.motions
 from examples.research.benchmark.jobs import seconds_spent
 from kkl_gym import VanDerPol, get_system
 from observers.storage import UNFINISHED

@@ -14,8 +14,7 @@ from training.maps.coordinates import noise_covariance
 from training.maps.inverse import ClosedLoopSampler, TrajectorySampler
 from training.spectrum import Spectrum
 from training.trajectories.closed_loop import record_closed_loop
-from training.trajectories.record import Motions, record, recording_ages
-from training.trajectories.signals import KINDS
+from training.trajectories.motions import KINDS, Motions, record, recording_ages
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from training.maps.coordinates import StateScale
 from training.maps.forward import ForwardProblem, along, on_tensors, residual, transients, truncation_step
 from training.maps.networks import Network, from_mlp
 from training.spectrum import Spectrum
-from training.trajectories.derivatives import evaluate, jacobian
+from training.trajectories.equations import evaluate, jacobian
 
 
 def test_truncation_leaves_epsilon_of_any_start():

@@ -12,13 +12,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from training.agents.any_environment.information import part_of, show
 from training.agents.any_environment.task import CLEAN_Y, HiddenTask
 from training.maps.coordinates import SETTLED
-from training.presets import RECORDED_NOISE, recorded_preset
 from training.progress import ProgressBars
 from training.records import Record
 from training.rollouts.callback import KKLTrainingCallback
-from training.rollouts.playing import Recorder, roll_out
-from training.rollouts.policies import WANDERING, policy_of
-from training.sources.recorded import RecordedSource, split
+from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
+from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset, split
 from training.spectrum import evenly_spaced
 from training.train_observer import train
 

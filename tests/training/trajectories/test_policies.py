@@ -7,8 +7,7 @@ from unstable_system import Falling
 
 from kkl_gym.simulate import simulate
 from training.systems import controller, named_policy
-from training.trajectories.policy import under_policy
-from training.trajectories.record import POLICYS_OWN, Motions, trajectories
+from training.trajectories.motions import POLICYS_OWN, Motions, trajectories, under_policy
 
 SYSTEM = Falling()
 
@@ -63,30 +62,26 @@ def test_an_unstable_plant_is_held_by_a_policy_alone():
 
 
 @pytest.mark.parametrize(
-    ("body", "message"),
+    ("system", "name", "message"),
     [
-        ("return 3.0 * (x[:, :1] > 0)", r"\[-1, 1\]"),
-        ("return x.nothing", "AttributeError"),
+        (SYSTEM, "{}/bad.py:loud", r"\[-1, 1\]"),
+        (SYSTEM, "{}/bad.py:wrong", "AttributeError"),
+        (SYSTEM, "nothing", "nothing"),
+        (SYSTEM, "nowhere.py:act", "act"),
+        (SYSTEM, "math:pi", "pi"),
+        (Autonomous(), "controller", "no inputs"),
+        (Autonomous(), "numpy:zeros_like", "no inputs"),
     ],
 )
-def test_functions_that_are_no_policy(tmp_path, body, message):
-    (tmp_path / "bad.py").write_text(f"def act(x):\n    {body}\n")
+def test_what_is_no_policy(tmp_path, system, name, message):
+    (tmp_path / "bad.py").write_text(
+        "def loud(x):\n    return 3.0 * (x[:, :1] > 0)\n\ndef wrong(x):\n    return x.nothing\n"
+    )
     with pytest.raises(ValueError, match=message):
-        named_policy(SYSTEM, f"{tmp_path / 'bad.py'}:act")
+        named_policy(system, name.format(tmp_path))
 
 
-@pytest.mark.parametrize("name", ["nothing", "nowhere.py:act", "math:pi"])
-def test_names_of_no_policy(name):
-    with pytest.raises(ValueError, match=name.rpartition(":")[2]):
-        named_policy(SYSTEM, name)
-
-
-def test_systems_that_no_policy_can_hold():
-    with pytest.raises(ValueError, match="no inputs"):
-        named_policy(Autonomous(), "controller")
-    with pytest.raises(ValueError, match="no inputs"):
-        named_policy(Autonomous(), "numpy:zeros_like")
-
+def test_a_system_that_no_regulator_holds():
     class Uncontrolled(Falling):
         name = "uncontrolled"
         X = ((-0.3, 0.3), (-0.5, 0.5), (-1, 1))

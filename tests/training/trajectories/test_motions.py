@@ -5,16 +5,21 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from linear_system import Autonomous, Oscillator
+from linear_system import Oscillator
 
-import training.trajectories.record
+import training.trajectories.motions
 from kkl_gym import ReverseDuffing, VanDerPol
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import LinearFilter
-from training.trajectories.noise import draw_process_noise
-from training.trajectories.record import Motions, record, recording_ages, trajectories
-from training.trajectories.signals import KINDS, random_inputs
+from training.trajectories.motions import (
+    KINDS,
+    Motions,
+    random_inputs,
+    record,
+    recording_ages,
+    trajectories,
+)
 
 
 def test_excited_starts_lie_beyond_the_box_and_the_others_within():
@@ -29,10 +34,6 @@ def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     assert u.shape == (10, n, 0)
     assert inside[200:].all()
     assert 5 < (~inside[:200]).sum() < 150
-    (x, *_), *_ = trajectories(
-        Autonomous(), n=10, steps=10, dt=0.01, rng=np.random.default_rng(0), motions=Motions(lead_in_share=0.5)
-    )
-    assert np.isfinite(x).all()
 
 
 def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
@@ -42,7 +43,7 @@ def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
         seen.append(w)
         return simulate(*arguments, w=w, **named)
 
-    monkeypatch.setattr(training.trajectories.record, "simulate", spy)
+    monkeypatch.setattr(training.trajectories.motions, "simulate", spy)
     (x, u, level), *_ = trajectories(
         system,
         n=n,
@@ -128,14 +129,14 @@ def together(chunks):
 
 def test_what_escapes_is_replaced_by_its_like(monkeypatch):
     n = 57
-    monkeypatch.setattr(training.trajectories.record, "CHUNK", 24)
+    monkeypatch.setattr(training.trajectories.motions, "CHUNK", 24)
     motions, tried = Motions(kinds=KINDS), []
 
     def spy(system, x0, *arguments, **named):
         tried.append(len(x0))
         return simulate(system, x0, *arguments, **named)
 
-    monkeypatch.setattr(training.trajectories.record, "simulate", spy)
+    monkeypatch.setattr(training.trajectories.motions, "simulate", spy)
     x, u, level = together(
         trajectories(Integrator(), n=n, steps=200, dt=0.01, rng=np.random.default_rng(0), motions=motions)
     )
@@ -150,32 +151,26 @@ def test_what_escapes_is_replaced_by_its_like(monkeypatch):
         assert (kinds == kind).sum() == expected.count(kind)
 
 
-def test_without_escapes_the_draws_are_chunk_by_chunk(monkeypatch):
-    monkeypatch.setattr(training.trajectories.record, "CHUNK", 24)
-    system, n, steps, dt = VanDerPol(), 57, 30, 0.01
-    motions = Motions(kinds=KINDS, lead_in_share=0.25, lead_in_input=0.5, process_noise_share=0.4)
-    rng = np.random.default_rng(3)
-    found = list(trajectories(system, n=n, steps=steps, dt=dt, rng=np.random.default_rng(3), motions=motions))
-    assert [x.shape[1] for x, _, _ in found] == [24, 24, 9]
-    for x, u, level in found:
-        count = x.shape[1]
-        x0 = rng.uniform(*system.box(), (count, 2))
-        led = round(0.25 * count)
-        constant = 0.5 * rng.uniform(-1, 1, (led, 1)) * system.u_max
-        x0[:led] = simulate(system, x0[:led], 2000, dt, u=np.broadcast_to(constant, (2000, led, 1)))[-1]
-        assert np.isfinite(x0).all()
-        inputs = random_inputs(system, count, steps, dt=dt, rng=rng)
-        disturbed = rng.random(count) < 0.4
-        expected = system.process_noise * np.where(disturbed, np.sqrt(rng.random(count)), 0.0)
-        w = draw_process_noise(system, expected, n=count, steps=steps, rng=rng)
-        np.testing.assert_array_equal(u, inputs)
-        np.testing.assert_array_equal(level, expected)
-        np.testing.assert_array_equal(x, simulate(system, x0, steps, dt, u=inputs, w=w))
-
-
 def test_parts_of_a_chunk_are_told(monkeypatch):
-    monkeypatch.setattr(training.trajectories.record, "CHUNK", 10)
+    monkeypatch.setattr(training.trajectories.motions, "CHUNK", 10)
     linear, told = LinearFilter(np.diag([-1.0, -2.0]), np.ones((2, 1)), 0.01), []
     rng, ages = np.random.default_rng(0), recording_ages(100, 10)
     record(Oscillator(), linear, n=15, steps=100, ages=ages, rng=rng, report=told.append)
     assert told == [0, 5, 10, 10, 12.5, 15]
+
+
+def test_signals_are_bounded_and_of_three_kinds():
+    u = random_inputs(VanDerPol(), 8, 1000, dt=0.01, rng=np.random.default_rng(0))
+    assert u.shape == (1000, 8, 1)
+    assert np.abs(u).max() <= 5.0
+    assert not u[:, [0, 2, 4, 6]].any()
+    assert all(len(np.unique(u[:, i])) < 1000 / 4 for i in (1, 5))
+    assert all(len(np.unique(u[:, i])) > 1000 / 4 for i in (3, 7))
+
+
+def test_pulses_end_and_leave_free_motion_behind():
+    u = random_inputs(VanDerPol(), 200, 500, dt=0.01, rng=np.random.default_rng(0), kinds=("pulses",))
+    last = np.array([np.flatnonzero(row).max(initial=-1) for row in u[..., 0].T])
+    assert last.min() < 50
+    assert 450 < last.max() < 500
+    assert abs(last.mean() - 250) < 40
