@@ -86,10 +86,10 @@ def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, n
     C = evaluate(jacobian(system.h, nx), at)
     if system.discrete:
 
-        def step(both: Components) -> Components:
+        def moved(both: Components) -> Components:
             return components(system.step, both[:nx], both[nx:])
 
-        both = evaluate(jacobian(step, nx + nu), np.concatenate([at, np.zeros(nu)]))
+        both = evaluate(jacobian(moved, nx + nu), np.concatenate([at, np.zeros(nu)]))
         return both[:, :nx], both[:, nx:], C
     return evaluate(jacobian(system.f, nx), at), np.array(input_matrix(system, x), dtype=float).reshape(nx, nu), C
 
