@@ -5,13 +5,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from kkl_gym.memory import IMAGINED, Memory
-from training.export.torch_parts import put
+from training.export.torch_parts import Module
 
 
-class TorchMemory(nn.Module):
+class TorchMemory(Module):
     """The memory of :class:`kkl_gym.KKLMemory` as a module of Torch: batched, differentiable, on any device.
 
     ``state, shown = memory(state, y, u)`` takes in a step of n rows. ``shown`` is what the wrapper shows: y, the memory
@@ -60,9 +60,8 @@ class TorchMemory(nn.Module):
         signals, self.nu = len(self.others) + len(pairs), nu
         memory = Memory(signals, nu, time_constants=time_constants, input_time_constants=input_time_constants)
         self.widths = [1, signals, signals * len(memory.decay), nu * len(memory.input_decay)]
-        decays = {"decay": memory.decay, "input_decay": memory.input_decay}
-        put(self, {name: values[:, None] for name, values in (decays | {"rise": memory.rise}).items()})
-        put(self, {"mixing": memory.mixing, "time_constants": np.array(memory.time_constants)[:, None]})
+        self.put(decay=memory.decay[:, None], input_decay=memory.input_decay[:, None], rise=memory.rise[:, None])
+        self.put(mixing=memory.mixing, time_constants=np.array(memory.time_constants)[:, None])
 
     def start(self, n: int) -> Tensor:
         """Return the state of n rows that have seen nothing: zeros, (n, width)."""
@@ -88,13 +87,13 @@ class TorchMemory(nn.Module):
             As the wrapper's observation, float32 unless ``y`` is float64.
         """
         begins = state[:, :1] == 0
-        age, before, w, v = state.split(self.widths, 1)
+        age, before, w, v = torch.split(state, self.widths, 1)
         signals = self._signals(y.to(state.dtype), before)
         change = torch.where(begins, 0.0, signals - before)
         u = y.new_zeros(y.shape[0], self.nu) if u is None else u
         acted = torch.where(begins, 0.0, u.to(state.dtype))
-        w = self.decay * w.unflatten(1, (len(self.decay), -1)) + self.rise * change[:, None]
-        v = v.unflatten(1, (len(self.input_decay), self.nu))
+        w = self.decay * w.reshape(w.shape[0], len(self.decay), -1) + self.rise * change[:, None]
+        v = v.reshape(v.shape[0], len(self.input_decay), self.nu)
         v = (v + (1.0 - self.input_decay) * (acted[:, None] - v)).flatten(1)
         steps = age[..., None].clamp(min=1.0)  # at the start w is 0
         with_past = torch.expm1(-(steps + IMAGINED) / self.time_constants) / torch.expm1(-steps / self.time_constants)

@@ -4,15 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from observers import Artifact, KKLObserver
 from observers.inverse import InverseMap
-from training.export.torch_parts import Network, between, evaluated, put
+from training.export.torch_parts import Module, Network, between, evaluated
 from training.export.torch_tracker import TorchTracker
 
 
-class TorchObserver(nn.Module):
+class TorchObserver(Module):
     """An observer's step as a module of Torch: batched, differentiable, on any device.
 
     The state is explicit: ``state, x_hat = observer(state, y, u)`` does for n rows what
@@ -81,13 +81,9 @@ class TorchObserver(nn.Module):
         self.widths = [1, self.ny, linear.size, rest]
         self.h, several = artifact.h, artifact.inverse.noise_gain.ndim == 2
         level = np.broadcast_to(checked.measurement_noise, self.ny if several else 1)
-        arrays = {
-            "update": np.vstack([linear.transition.T, linear.drive]),
-            "equilibrium": linear.equilibrium.T,
-            "measurement_noise": np.reshape(level, (1, -1)),
-            "process_noise": np.reshape(checked.process_noise, (1, 1)),
-        }
-        put(self, arrays | ({} if artifact.C is None else {"C": artifact.C.T}))
+        self.put(update=np.vstack([linear.transition.T, linear.drive]), equilibrium=linear.equilibrium.T)
+        self.put(measurement_noise=np.reshape(level, (1, -1)), process_noise=np.reshape(checked.process_noise, (1, 1)))
+        self.put(**({} if artifact.C is None else {"C": artifact.C.T}))
 
     def start(self, n: int) -> Tensor:
         """Return the state of n rows that have seen nothing: zeros, (n, width)."""
@@ -95,7 +91,7 @@ class TorchObserver(nn.Module):
 
     def estimate(self, state: Tensor) -> Tensor:
         """Return the estimates of states (n, width): (n, nx), with estimated parameters behind them."""
-        x = state.split(self.widths, 1)[3]
+        x = torch.split(state, self.widths, 1)[3]
         if self.tracker is not None:
             x = self.tracker.states(x[:, : self.nx].T).T
         return x.to(self.driven.network.weights[0].dtype)
@@ -117,7 +113,7 @@ class TorchObserver(nn.Module):
         Tensor, shape (n, nx, nx)
             The covariances.
         """
-        samples, _, z, rest = state.split(self.widths, 1)
+        samples, _, z, rest = torch.split(state, self.widths, 1)
         age, (levels, process_noise) = (samples - 1.0) * self.dt, self._levels(measurement_noise, process_noise)
         if self.tracker is None:
             P = self._of_map(z, [each.covariance(age, levels) for each in self._maps]).expand(z.shape[0], -1)
@@ -145,7 +141,7 @@ class TorchObserver(nn.Module):
         u : Tensor, shape (n, nu), optional
             The inputs held since the samples before, by default zero.
         measurement_noise : Tensor, shape (n or 1, 1 or ny), optional
-            Levels for each row in place of those of the observer: one, or one for each output where T_inv takes several.
+            Levels for each row in place of those of the observer: one, or one for each output if T_inv takes several.
         process_noise : Tensor, shape (n or 1, 1), optional
             Likewise.
 
@@ -157,7 +153,7 @@ class TorchObserver(nn.Module):
             The estimates, and behind the states estimated parameters.
         """
         begins = state[:, :1] == 0
-        samples, before, z, rest = torch.where(begins, 0.0, state).split(self.widths, 1)
+        samples, before, z, rest = torch.split(torch.where(begins, 0.0, state), self.widths, 1)
         y, u = y.to(state.dtype), y.new_zeros(y.shape[0], self.nu) if u is None else u
         u, missing, age = u[:, : self.nu].to(state.dtype), y.isnan(), samples * self.dt
         levels = self._levels(measurement_noise, process_noise)
@@ -172,7 +168,7 @@ class TorchObserver(nn.Module):
         z = self._filtered(z, before, u, whole, begins)
         rest = self._inverted(z, age, *levels)
         if self.tracker is not None:
-            learned = self.tracker.learned(tracked)
+            learned = tracked.seen.clamp(max=self.tracker.window)[:, None] * self.dt  # so much z knows for certain
             P = self._of_map(z, [each.covariance(learned, levels[0]) for each in self._maps])
             rest = self.tracker.supervise(tracked, rest.T, P.T).T
         state = torch.cat([samples + 1.0, whole, z, rest], 1)
@@ -212,7 +208,7 @@ class TorchObserver(nn.Module):
         return torch.where((z[:, self.nz :] == 0).all(1, keepdim=True), free[0], driven) if free else driven
 
 
-class TorchMap(nn.Module):
+class TorchMap(Module):
     """T_inv, and the covariance of its error: rows (n, .)."""
 
     def __init__(self, inverse: InverseMap, dtype: torch.dtype) -> None:
@@ -221,20 +217,18 @@ class TorchMap(nn.Module):
         self.process_noise_unit, self.process_noise_max = inverse.process_noise_unit, inverse.process_noise_max
         self.age_unit, self.age_max = inverse.age_unit, inverse.age_max
         told = "measurement_noise" in inverse.features
-        arrays = {
-            "whiten": inverse.whiten.T,
-            "offset": inverse.z_offset @ inverse.whiten.T,
-            "squared_gain": np.atleast_2d(inverse.noise_gain) ** 2,
-            "measurement_noise_unit": np.atleast_1d(inverse.measurement_noise_unit),
-            "measurement_noise_max": np.atleast_1d(inverse.measurement_noise_max if told else np.inf),
-            "x_offset": inverse.x_offset,
-            "x_scale": inverse.x_scale,
-        }
+        self.put(
+            whiten=inverse.whiten.T,
+            offset=inverse.z_offset @ inverse.whiten.T,
+            squared_gain=np.atleast_2d(inverse.noise_gain) ** 2,
+            measurement_noise_unit=np.atleast_1d(inverse.measurement_noise_unit),
+            measurement_noise_max=np.atleast_1d(inverse.measurement_noise_max if told else np.inf),
+            x_offset=inverse.x_offset,
+            x_scale=inverse.x_scale,
+        )
         if (error := inverse.error_covariance) is not None:
-            shape = (len(error.levels), -1)
-            arrays |= {"levels": error.levels, "ages": error.ages, "error": error.covariance.reshape(shape)}
-            self.entries = error.nx**2
-        put(self, arrays)
+            table = error.covariance.reshape(len(error.levels), -1)
+            self.put(levels=error.levels, ages=error.ages, error=table)
 
     def forward(self, z: Tensor, age: Tensor, measurement_noise: Tensor, process_noise: Tensor) -> Tensor:
         """The estimates (n, nx), of filter states (n, size) at ages (n, 1) in seconds."""
@@ -255,4 +249,4 @@ class TorchMap(nn.Module):
     def covariance(self, age: Tensor, measurement_noise: Tensor) -> Tensor:
         """The covariances of its error, (n, nx^2), at ages (n, 1) in seconds."""
         by_age = between(self.share(measurement_noise), self.levels, self.error)
-        return between(age, self.ages, by_age.unflatten(1, (len(self.ages), self.entries)))
+        return between(age, self.ages, by_age.reshape(by_age.shape[0], len(self.ages), -1))

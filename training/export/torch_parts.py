@@ -2,8 +2,8 @@
 
 import functools
 import operator
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch.nn import functional
 from observers.expression import Expression
 from observers.network import MLP
 
-_ACTIVATIONS = {"tanh": torch.tanh, "silu": functional.silu, "relu": torch.relu}
+_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"tanh": torch.tanh, "silu": functional.silu, "relu": torch.relu}
 LEAST_PIVOT = 1e-30  # a variance of scaled states
 # Those that take numbers beside tensors as they are; the others get tensors in their place.
 _OPERATORS = {"+": operator.add, "*": operator.mul, "**": operator.pow, "%": operator.mod}
@@ -25,13 +25,20 @@ _FUNCTIONS: dict[str, Callable[..., Tensor]] = {
 }
 
 
-def put(module: nn.Module, arrays: Mapping[str, np.ndarray]) -> None:
-    """Add arrays to a module as buffers of doubles."""
-    for name, values in arrays.items():
-        module.register_buffer(name, torch.tensor(np.asarray(values, dtype=float)))
+class Module(nn.Module):
+    """A module with buffers of doubles."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+    def put(self, **arrays: np.ndarray) -> None:
+        """Add buffers."""
+        for name, values in arrays.items():
+            self.register_buffer(name, torch.tensor(np.asarray(values, dtype=float)))
 
 
-class Network(nn.Module):
+class Network(Module):
     """A multilayer perceptron: rows (n, inputs) to (n, outputs)."""
 
     def __init__(self, mlp: MLP, dtype: torch.dtype) -> None:
@@ -68,7 +75,7 @@ def evaluated(expression: Expression, **columns: Sequence[Tensor]) -> Tensor:
         return function(*given) if name == "where" or len(given) == 1 else functools.reduce(function, given)
 
     def tensor(given: Any) -> Tensor:
-        return given if isinstance(given, Tensor) else torch.full_like(like, given)
+        return given if isinstance(given, Tensor) else torch.zeros_like(like) + given
 
     return torch.stack([tensor(value(part)).expand_as(like) for part in expression.components])
 

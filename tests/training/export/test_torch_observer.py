@@ -5,8 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from exported_steps import MAPS, apart, doubles, exported_of, in_doubles, mapped, motion, operated, stepped, t_inv, tracked
-from random_tracking import KINDS, signals, tracking
+from exported_steps import (
+    MAPS,
+    apart,
+    doubles,
+    exported_of,
+    in_doubles,
+    mapped,
+    motion,
+    operated,
+    stepped,
+    t_inv,
+    tracked,
+)
+from random_tracking import signals, tracking
 from torch_steps import along, module_of
 
 import kkl_gym
@@ -140,7 +152,7 @@ def test_an_observer_of_floats_throughout_tracks():
 
 def test_bad_arguments():
     artifact = observers.load("lorenz").artifact
-    with pytest.raises(ValueError, match="dtype must be torch.float32 or torch.float64, got torch.float16"):
+    with pytest.raises(ValueError, match=r"dtype must be torch.float32 or torch.float64, got torch.float16"):
         TorchObserver(artifact, dtype=torch.float16)
     with pytest.raises(ValueError, match="beyond the map's range"):
         TorchObserver(artifact, 100.0)
