@@ -8,6 +8,8 @@ if TYPE_CHECKING:
     from training.diagnosis import Observability, observability
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
+    from training.export.torch_memory import TorchMemory
+    from training.export.torch_observer import TorchObserver
     from training.identification.learning import adapt, identify
     from training.lessons.calibrate import calibrate
     from training.lessons.flow import learn_flow
@@ -31,6 +33,8 @@ __all__ = [
     "Run",
     "SimulatedSource",
     "Source",
+    "TorchMemory",
+    "TorchObserver",
     "adapt",
     "calibrate",
     "errors",
@@ -57,6 +61,8 @@ _MODULES = {
     "Run": "lessons.run",
     "SimulatedSource": "sources.simulated",
     "Source": "sources.source",
+    "TorchMemory": "export.torch_memory",
+    "TorchObserver": "export.torch_observer",
     "adapt": "identification.learning",
     "calibrate": "lessons.calibrate",
     "errors": "evaluation.errors",

@@ -67,7 +67,7 @@ EXTRAS = {
     "envs": {"h5py", "minari"},
     "dask": {"distributed"},
     "ray": {"ray"},
-    "onnx": {"onnx", "onnxruntime"},
+    "onnx": {"onnx", "onnxruntime", "onnxscript"},
 }
 
 

@@ -177,19 +177,6 @@ def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
     return scaling | {"low": low, "high": high, "start_mean": mean, "start_covariance": covariance}
 
 
-def table(inverse: InverseMap, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T_inv's covariance in units of ``scale`` (nx,), by level (k,) and age (m,), two of each at least."""
-    error = inverse.error_covariance
-    assert error is not None
-    covariance = error.covariance / np.outer(scale, scale)
-    levels, ages = error.levels, error.ages
-    if len(levels) == 1:
-        levels, covariance = np.array([0.0, 1.0]), np.repeat(covariance, 2, 0)
-    if len(ages) == 1:
-        ages, covariance = np.array([0.0, 1.0]), np.repeat(covariance, 2, 1)
-    return levels, ages, covariance
-
-
 def identifier(name: str) -> str:
     """Make an identifier of C of an observer's name: ``lorenz-spinn`` becomes ``lorenz_spinn``."""
     word = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")

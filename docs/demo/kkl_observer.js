@@ -4,7 +4,7 @@
 //   let xHat = observer.reset([y0]);     // the first sample
 //   xHat = observer.step([y], [u]);      // every dt seconds: the sample, and the input that was held before it
 //
-// `kkl-gym export MAP --format js` writes the file. The filter and the whitening are of doubles, the weights of floats.
+// `python docs/demo/step_file.py MAP lorenz_step.safetensors` writes the file. The filter and the whitening are of doubles, the weights of floats.
 
 /** The arrays of a safetensors file by name, and its metadata. */
 export function readTensors(buffer) {
@@ -329,7 +329,7 @@ const shown = (value) => {
 };
 
 export class Observer {
-  /** Of an ArrayBuffer that `kkl-gym export MAP --format js` wrote. */
+  /** Of an ArrayBuffer that `step_file.py` wrote. */
   constructor(buffer) {
     const { tensors, metadata } = readTensors(buffer);
     this.described = JSON.parse(metadata.kkl_step);

@@ -1,7 +1,7 @@
-"""The step as a file of constants, which ``kkl_observer.js`` runs in browsers and in Node."""
+"""An observer as a file that ``kkl_observer.js`` reads: ``python docs/demo/step_file.py MAP STEP.safetensors``."""
 
 import os
-from importlib.resources import files
+import sys
 from typing import Any
 
 import numpy as np
@@ -9,18 +9,14 @@ import numpy as np
 from observers import storage
 from observers.inverse import InverseMap
 from observers.motion import Motion
-from training.export.exported import Exported, table, tracker_arrays, tracker_numbers
+from training.export import Exported
+from training.export.exported import tracker_arrays, tracker_numbers
 
 KEY = "kkl_step"  # of the metadata
 _MAP_ARRAYS = ("z_offset", "whiten", "x_offset", "x_scale")
 _MAP_SCALARS = ("process_noise_unit", "process_noise_max", "age_unit", "age_max")
 _MOTION_ARRAYS = ("error", "process_noise", "least_measurement_noise")
 _LIMIT_ARRAYS = ("levels", "mean", "low", "high")
-
-
-def javascript() -> str:
-    """The module ``kkl_observer.js``, the same for every observer."""
-    return files("training.export").joinpath("kkl_observer.js").read_text(encoding="utf-8")
 
 
 def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
@@ -34,10 +30,10 @@ def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
     described = exported.described | {"maps": {}}
     for label, inverse in exported.maps.items():
         described["maps"][label] = _described_map(tensors, f"{label}.", inverse, artifact.ny)
-        if inverse.error_covariance is not None:
-            scale = np.ones(artifact.nx) if artifact.motion is None else artifact.motion.x_scale
-            arrays = zip(("levels", "ages", "covariance"), table(inverse, scale), strict=True)
-            tensors |= {f"{label}.{name}": values for name, values in arrays}
+        if (error := inverse.error_covariance) is not None:
+            units = 1.0 if artifact.motion is None else np.outer(artifact.motion.x_scale, artifact.motion.x_scale)
+            arrays = {"levels": error.levels, "ages": error.ages, "covariance": error.covariance / units}
+            tensors |= {f"{label}.{name}": values for name, values in arrays.items()}
     if artifact.C is not None:
         tensors["C"] = np.asarray(artifact.C, dtype=float)
     if artifact.h is not None:
@@ -85,3 +81,9 @@ def _described_motion(tensors: dict[str, np.ndarray], motion: Motion, dt: float)
         described |= {"activation": motion.flow.mlp.activation, "u_scale": motion.flow.u_scale.tolist()}
     tensors |= {f"motion.{name}": np.asarray(values, dtype=float) for name, values in arrays.items()}
     return described
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        raise SystemExit("usage: python docs/demo/step_file.py MAP STEP.safetensors")
+    write_step(sys.argv[2], Exported.read(sys.argv[1]))

@@ -1,6 +1,7 @@
-"""The step in JavaScript, run by Node, against the same in Python."""
+"""The demo's observer in JavaScript, run by Node, against the same in Python."""
 
 import json
+import runpy
 import shutil
 import subprocess
 from dataclasses import replace
@@ -14,16 +15,16 @@ from random_tracking import KINDS, signals, tracking
 
 from observers import KKLObserver, Limits
 from training.export import Exported
-from training.export.step_file import javascript, write_step
 
-REPLAY = Path(__file__).parents[2] / "helpers" / "replay.mjs"
+REPLAY, DEMO = Path(__file__).parent / "helpers" / "replay.mjs", Path(__file__).parents[1] / "docs" / "demo"
+write_step = runpy.run_path(str(DEMO / "step_file.py"))["write_step"]
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="there is no Node.js, node")
 
 
 def replayed(exported, folder, y, u, told=None):
     """What JavaScript makes of a record, in which NaN is missing."""
     write_step(folder / "step.safetensors", exported)
-    (folder / "kkl_observer.mjs").write_text(javascript(), encoding="utf-8")
+    shutil.copy(DEMO / "kkl_observer.js", folder / "kkl_observer.mjs")
     rows = [None if np.isnan(row).all() else [None if np.isnan(value) else value for value in row] for row in y]
     done = subprocess.run(
         ["node", REPLAY, folder / "kkl_observer.mjs", folder / "step.safetensors"],
@@ -145,7 +146,7 @@ REFUSED = f"""
 
 def test_what_is_no_sample_or_input_is_refused(make_artifact, tmp_path):
     write_step(tmp_path / "step.safetensors", exported_of(make_artifact(), tmp_path))
-    (tmp_path / "kkl_observer.mjs").write_text(javascript(), encoding="utf-8")
+    shutil.copy(DEMO / "kkl_observer.js", tmp_path / "kkl_observer.mjs")
     done = subprocess.run(["node", "--input-type=module", "-e", REFUSED], cwd=tmp_path, capture_output=True, text=True)
     samples = ["an object" if "(" in sample else sample.replace("1n", "1") for sample in SAMPLES]
     wanted = [
