@@ -23,11 +23,10 @@ class ExportCommand:
     rollouts. Missing samples are in JavaScript and, of maps that track, in the others. The monitor is in JavaScript
     alone.
 
-    --format onnx writes NAME.onnx, which takes a batch of any size. Levels of noise are inputs of it. It needs the
-    extra onnx. --format c writes NAME.h and NAME.c, which allocate nothing and need the C library alone, and
-    NAME_main.c, a program that reads samples and prints estimates. --format js writes NAME_step.safetensors, the
-    constants, and kkl_observer.js, a module for browsers and Node that reads them. docs/guides/export.md has all from
-    end to end.
+    --format onnx: NAME.onnx, which takes a batch of any size, and levels of noise as inputs. It needs the extra onnx.
+    --format c: NAME.h and NAME.c, which allocate nothing and need the C library alone, and NAME_main.c, a program that
+    reads samples and prints estimates. --format js: NAME_step.safetensors, the constants, and kkl_observer.js, a module
+    for browsers and Node that reads them. docs/guides/export.md goes from end to end.
     """
 
     observer: Annotated[

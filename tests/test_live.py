@@ -1,4 +1,4 @@
-"""``kkl-gym demo --live``: what its window shows, on a canvas in memory."""
+"""``examples/live.py``: what its window shows, on a canvas in memory."""
 
 import time
 
@@ -12,9 +12,9 @@ from matplotlib.backend_bases import KeyEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+import examples.live as module
+from examples.live import Live
 from training.cli import main
-from training.commands import live as module
-from training.commands.live import Live
 from training.commands.options import shown
 
 
