@@ -492,7 +492,7 @@ class KKLObserver(RecordEstimates):
         if not artifact.estimated_parameters:
             raise ValueError(
                 f"this observer for {artifact.system!r} estimates no parameters: train one that does "
-                "with kkl-gym train --uncertain all=0.1 --estimate-parameters"
+                "with kkl-gym train SYSTEM --uncertain 0.1 --set estimate_parameters=true"
             )
         if self._parameters is None:
             self._parameters = Decoders(artifact, slice(artifact.nx, None), **self._levels)

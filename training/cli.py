@@ -137,10 +137,10 @@ def read(arguments: list[str], *, prog: str = PROG, commands: Commands = COMMAND
     """Read a command line, and run nothing."""
     import tyro
 
-    from observers.names import suggestion
-
     called = arguments[:1]
     if called and called[0] not in commands and not called[0].startswith("-"):
+        from observers.names import suggestion  # with numpy, which help need not wait for
+
         _end(prog, f"unknown command {called[0]!r}{suggestion(called[0], commands)}: {', '.join(commands)}", MISUSED)
     if called and called[0].startswith("--tyro"):  # completion of the shell wants to know all
         called = list(commands)

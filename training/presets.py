@@ -28,7 +28,6 @@ PAPER: dict[str, Any] = {
 NOISE_RANGE = 2.0  # largest measurement noise that maps are trained for, over the system's default
 FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
 FASTEST_OF_STEPS = 3.0  # the same in discrete time, where a step may change everything and the last samples say most
-CLOSED_LOOP = 2000  # trajectories of ``kkl-gym train --closed-loop``
 
 MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # of records: eigenvalues for each output, in multiples of the signals' rate
 MEMORIES = 3.0  # of the filter in a record at least, unless its slowest mode were faster than the signals

@@ -250,7 +250,7 @@ def coverage(path: Path, rows: pd.DataFrame) -> None:
 
 
 def draw_faults(path: Path, runs: pd.DataFrame) -> None:
-    """Draw how many runs exceed a threshold of the monitor's score in time, as it varies: sound ones and faulty ones."""
+    """Draw how many runs exceed a threshold of the monitor's score in time, sound ones and faulty ones."""
     observers = list(runs.observer.unique())
     with drawing(path, max(5.0, 2.5 * len(observers)), 3.2) as figure:
         axes: Any = figure.subplots(1, len(observers), sharey=True, squeeze=False)[0]
