@@ -23,7 +23,7 @@ def test_the_page_of_commands_is_new():
     page = runpy.run_path(str(DOCS / "site" / "commands.py"))["page"]()
     assert page == (DOCS / "reference" / "commands.md").read_text(), "make docs writes the page"
     width = "fast 20, paper 512; spinn: fast 128, paper 512; records: 96 |\n"
-    for shown in ("--preset", "`--ekf`, `--no-ekf`", width, "### `kkl-gym agent train`"):
+    for shown in ("--preset", "`--ekf`", width, "### `kkl-gym agent train`"):
         assert shown in page
 
 

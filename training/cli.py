@@ -43,7 +43,7 @@ RESUMES = "--resume goes on from the last checkpoint, if there is one"
 # Hints after an interruption, by the first words of the command.
 AFTER_INTERRUPTION = {("train",): RESUMES, ("identify",): RESUMES, ("agent", "train"): RESUMES}
 
-WIDE = 140  # columns of what is printed into a file or a pipe, where tables of 80 would be cut
+WIDE = 140  # columns of output into a file or a pipe, where tables of 80 would be cut
 PROG = "kkl-gym"
 MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
@@ -98,7 +98,7 @@ def main(
                 module = (error.name or "").partition(".")[0]
                 extras = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
                 sys.exit(": ".join([prog, str(error), *extras]))
-            if isinstance(error, BrokenPipeError):  # who reads what is printed has seen enough, as head does
+            if isinstance(error, BrokenPipeError):  # the reader of the pipe has enough, as head does
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 sys.exit(1)
             if isinstance(error, ValueError | OSError | FloatingPointError):
@@ -153,7 +153,7 @@ def read(arguments: list[str], *, prog: str = PROG, commands: Commands = COMMAND
                 prog=prog,
                 description=DESCRIPTION if commands is COMMANDS else None,
                 args=arguments or ["--help"],
-                config=(tyro.conf.DisallowNone,),
+                config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
             )
     except SystemExit as end:
         if end.code != MISUSED:
@@ -182,15 +182,15 @@ def _without_box(text: str) -> str:
 
 
 def load(module: str, name: str) -> Callable[..., Any]:
-    """Import what is behind a command."""
+    """Import the class of a command."""
     found: Callable[..., Any] = getattr(import_module(module), name)
     return found
 
 
 @cache
 def _described(module: str, name: str) -> Callable[..., Any]:
-    """In the place of a command that is not called: the summary of its class, read without importing the module."""
-    import ast  # here, as is the next, so that an interruption soon finds somebody who notices it
+    """A stand-in for a command that is not called: the summary of its class, read without importing the module."""
+    import ast  # here, as is the next, so that the handler of interruptions is set before slow imports
     from importlib.util import find_spec
     from pathlib import Path
 

@@ -69,7 +69,7 @@ def parsers(prog: str, commands: Commands) -> Iterator[tuple[str, argparse.Argum
         command = load(*behind)
         with warnings.catch_warnings():  # nothing else in tyro lists the options
             warnings.simplefilter("ignore", DeprecationWarning)
-            parser = tyro.extras.get_parser(command, config=(tyro.conf.DisallowNone,))
+            parser = tyro.extras.get_parser(command, config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff))
         # numpydoc's sections are for those who read the code
         yield f"{prog} {name}", parser, re.split(r"\n\n(?=\w+\n---)", inspect.getdoc(command) or "")[0]
         for action in parser._actions:

@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -44,7 +43,7 @@ class Demo:
     seed: int = 0
     """Seed of the starts and the noise."""
     policy: OwnPolicy = None
-    gif: tyro.conf.FlagCreatePairsOff[bool] = False
+    gif: bool = False
     """Draw phase portraits of the first 12 s that move, at the pace of the shipped systems: estimates.gif."""
 
     def run(self, console: Console) -> Path:
@@ -106,7 +105,7 @@ class Episode:
 
     @property
     def measurement_noise(self) -> str:
-        """Its level, for people."""
+        """The level as a text."""
         return show_level(self.env.unwrapped.measurement_noise)  # type: ignore[attr-defined]
 
 

@@ -16,9 +16,9 @@ from kkl_gym.loading import load_class
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers.storage import require_writable, write
-from training.commands.data import DataOptions
+from training.commands.data import DataOptions, names_in
 from training.commands.options import SYSTEM, NoiseLevels, Parameters, merged
-from training.commands.record import PlayOptions, names_in
+from training.commands.record import PlayOptions
 from training.progress import ProgressBars, progress_bars
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Diagnose:
         NoiseLevels,
         tyro.conf.arg(help_behavior_hint="(default: of a system, its own; else 1 % and 10 % of each output's size)"),
     ] = None
-    """Standard deviations of noise on each sample of y, beside none; one for all outputs or, as in 0.1,0.3, of each."""
+    """Standard deviations of noise on each sample of y, beside 0; one for all outputs or, as in 0.1,0.3, for each."""
     dt: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
     """Sampling interval of a system in seconds."""
     duration: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
@@ -69,18 +69,18 @@ class Diagnose:
     environment as for `kkl-gym record`."""
     parameters: Parameters = ()
     seed: int = 0
-    """Of the environment's episodes and of the comparison."""
+    """Seed of the environment's episodes and of the comparison."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the findings are written as well."""
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File for the errors by window and level of noise, of data and environments."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
-    """Of an environment."""
+    """For an environment."""
     records: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
-    """Recorded data; --measured and --hidden are of an environment, too, and named as for `kkl-gym record`."""
+    """For recorded data; --measured and --hidden are for an environment too, named as for `kkl-gym record`."""
 
     def run(self, console: Console) -> "list[Finding]":
-        """Check and print."""
+        """Diagnose and print."""
         named = bool(self.records.measured or self.records.hidden)
         subject = "recorded data" if self.records.data else "an environment" if named else "a system"
         self._refuse(subject)

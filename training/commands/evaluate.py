@@ -66,10 +66,6 @@ class Motions:
     plant_error: Annotated[float | None, tyro.conf.arg(metavar="SHARE", help_behavior_hint="(default: none)")] = None
     """In place of --plant: by what share every parameter of the plant is larger than the observer's; 0.1 is 10 %."""
 
-    def duration_of(self, system: System) -> float:
-        """Seconds of a trajectory."""
-        return system.duration if self.duration is None else self.duration
-
     def plant_of(self, system: System) -> System | None:
         """The plant, where it is not the system."""
         changes = merged("--plant", self.plant)
@@ -82,13 +78,18 @@ class Motions:
 
 @dataclass(frozen=True)
 class Subject:
-    """An observer, its model, the plant where it is another one, and seconds of a trajectory."""
+    """An observer, its model, the plant where it is another one, and the duration if it is not the system's."""
 
     name: str
     artifact: Artifact
     system: System
     plant: System | None
-    duration: float
+    seconds: float | None
+
+    @property
+    def duration(self) -> float:
+        """Seconds of a trajectory."""
+        return self.system.duration if self.seconds is None else self.seconds
 
     @property
     def on(self) -> str:
@@ -100,26 +101,21 @@ class Subject:
 class Evaluate:
     """Measure observers on unseen trajectories: errors, coverage of error bars, or how soon faults are noticed.
 
-    Errors, from starts in X and in 2X without X, with and without noise. The first table has SMAPE in percent, median
-    and interquartile range over the trajectories, over all steps (the paper's measure) and after the transient: the
-    first fifth of a run, or 5 s where it is driven by random steps and sines (of systems of another pace, 500
-    samples). The second has the NRMSE of each state after the transient, the median over the trajectories: its root
-    mean square error in percent of its standard deviation over all of them. SMAPE is of one norm of all states, which
-    means little where their units differ. A third has the errors of estimated parameters, for plants that are drawn
-    from the ranges of the training.
+    Errors are measured from starts in X and in 2X without X, with and without noise. SMAPE, in percent, is of the norm
+    of all states, over all steps (the paper's measure) and after the transient. NRMSE is the root mean square error of
+    each state after the transient, in percent of its standard deviation. The transient is the first fifth of a run, or
+    5 s where random steps and sines drive it (of systems of another pace, 500 samples).
 
-    2X is cut at the system's declared bounds. Trajectories that leave these are counted, and left out. Observers are
-    given the levels of noise if they can use them; a level beyond a map's range is left out. Under a policy, those are
-    driven in which it errs about the state and explores; in the others its inputs give the state away to an observer
-    that has learned the policy.
+    2X is cut at the system's declared bounds. Trajectories that leave these are counted, and left out. A level of noise
+    beyond a map's range is left out. Under a policy, driven runs are those in which it errs about the state and
+    explores; in the others its inputs give the state away to an observer that has learned the policy.
 
     --calibration: how many errors lie in the regions of 50, 90 and 99 % of the covariances, of all states and of each,
     and their mean normalised square (NEES), at six levels of noise.
 
     --faults: from the middle of each run the sensor is biased by a fifth of the output's range, or dead (y = 0), or
-    frozen at its last value. Half of the runs are under random inputs, if the observer takes inputs; all have the
-    system's process noise. A fault should be noticed within a time that is chosen for each shipped system, and is a
-    fifth of the duration for others.
+    frozen at its last value. Half of the runs are driven, if the observer takes inputs. A fault should be noticed
+    within a time that is chosen for each shipped system, and is a fifth of the duration for others.
     """
 
     observers: Observers
@@ -131,11 +127,11 @@ class Evaluate:
     ekf: bool = False
     """Beside each observer, an extended Kalman filter that knows the equations, the inputs and the levels of noise.
     On another plant it knows those of the observer's model."""
-    no_tracking: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Evaluate T_inv alone of observers that track. "NAME, T_inv alone" then stands for each."""
-    calibration: tyro.conf.FlagCreatePairsOff[bool] = False
+    no_tracking: bool = False
+    """T_inv alone of observers that track."""
+    calibration: bool = False
     """In place of errors: coverage of the error bars."""
-    faults: tyro.conf.FlagCreatePairsOff[bool] = False
+    faults: bool = False
     """In place of errors: how soon the monitor notices faults of the sensor."""
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the results of each trajectory are written as well."""
@@ -146,11 +142,10 @@ class Evaluate:
         import pandas as pd  # which takes half a second that help need not wait for
 
         self._check()
-        motions = self.motions
         frames: list[pd.DataFrame] = []
         subjects = [
-            Subject(name, artifact, system, motions.plant_of(system), motions.duration_of(system))
-            for name, artifact, system in read_observers(self.observers, self.system)
+            Subject(*of, self.motions.plant_of(of[-1]), self.motions.duration)
+            for of in read_observers(self.observers, self.system)
         ]
         judge = self._faults if self.faults else self._coverage if self.calibration else self._errors
         with progress_bars(console) as progress:

@@ -36,17 +36,15 @@ class ExportCommand:
     """What to write."""
     precision: Literal["float", "double"] = "float"
     """Type of the network, of samples and of estimates; JavaScript knows doubles alone. The filter is of doubles in any
-    case, as floats would not do: what the network is told of it are small differences. So is the covariance of maps
+    case, because its small differences are inputs of the network. So is the covariance of maps
     that track."""
-    measurement_noise: Annotated[
-        NoiseLevel, tyro.conf.arg(help_behavior_hint="(default: what is usual for the map)")
-    ] = None
+    measurement_noise: Annotated[NoiseLevel, tyro.conf.arg(help_behavior_hint="(default: the map's usual one)")] = None
     """For --format c and js: standard deviation of the noise on each sample that the estimate assumes, or one for each
     output as in 0.1,0.3. The module's tell changes it."""
     process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
     """For --format c and js: level of process noise that the estimate assumes, likewise."""
     out: Path = Path("runs/export")
-    """Folder for what is written."""
+    """Folder for the files."""
 
     def run(self, console: Console) -> list[Path]:
         """Export."""

@@ -97,17 +97,8 @@ class Identify:
                 artifact, model, records, folder, unknown=unknown, settings=settings, resume=resume, console=progress
             )
         dt, seed = settings.pop("dt", None), settings.get("seed", 0)
-        return identify(
-            model,
-            unknown,
-            records,
-            folder,
-            dt=dt,
-            settings=settings,
-            seed=seed,
-            resume=resume,
-            console=progress,
-        )
+        how = {"dt": dt, "settings": settings, "seed": seed, "resume": resume, "console": progress}
+        return identify(model, unknown, records, folder, **how)
 
 
 def limits(unknown: Mapping[str, tuple[float, ...]]) -> dict[str, tuple[float, float]]:

@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 from tyro.constructors import PrimitiveConstructorSpec
 
+from training.commands.data import names_in
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class RecordCommand:
     policy: str = "random"
     """Who acts: random; wandering (random actions, each held for a while); a function from observation to action as
     script.py:function or module:function; an agent.safetensors of `kkl-gym agent train ENV_ID --information state`; or
-    an agent of stable-baselines3 as ppo:FILE.zip, of which loading may run what is in the file."""
+    an agent of stable-baselines3 as ppo:FILE.zip, whose code loading may run."""
     seed: int = 0
     """Of the environment and of random actions."""
     dataset: Annotated[
@@ -117,11 +118,6 @@ def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
         )
     flatten: Any = gym.spaces.flatten
     return lambda observation: player.act(flatten(env.observation_space, observation), env.action_space)
-
-
-def names_in(text: str) -> list[str]:
-    """The names between commas."""
-    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def read_argument(text: str) -> tuple[str, Any]:
