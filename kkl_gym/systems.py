@@ -11,6 +11,7 @@ from kkl_gym.equations import check_equations
 from kkl_gym.loading import load_class
 from kkl_gym.system import Box, Components, System
 from observers.checks import mapping, shown
+from observers.names import matching, suggestion
 
 
 @dataclass(frozen=True)
@@ -207,8 +208,9 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
     Parameters
     ----------
     system : str, System or type of System
-        A shipped name (``"van_der_pol"``), a class of the user's as ``"package.module:Class"`` or
-        ``"path/to/script.py:Class"``, or a :class:`System` (class or instance) itself.
+        A shipped name (``"van_der_pol"``, ``"VanDerPol"`` or ``"KKLVanDerPol-v0"``), a class of the user's as
+        ``"package.module:Class"`` or ``"path/to/script.py:Class"``, a script that defines one system, or a
+        :class:`System` (class or instance) itself.
     parameters : mapping of str to float, optional
         Physical parameters by name.
 
@@ -246,14 +248,14 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
 
 
 def _find(name: str) -> type[System]:
-    if name in SYSTEMS:
-        return SYSTEMS[name]
-    if ":" not in name:
+    if ":" in name or name.endswith(".py"):
+        return load_class(name, System)
+    if (known := matching(name, SYSTEMS)) is None:
         raise ValueError(
-            f"unknown system {shown(name)}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or "
-            "'script.py:Class'"
+            f"unknown system {shown(name)}{suggestion(name, SYSTEMS)}; shipped: {', '.join(SYSTEMS)}; your own: "
+            "'module:Class' or 'script.py:Class'"
         )
-    return load_class(name, System)
+    return SYSTEMS[known]
 
 
 __all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system"]

@@ -147,7 +147,7 @@ class KKL(Estimator[np.ndarray]):
         if not artifact.estimated_parameters:
             raise ValueError(
                 f"this observer for {artifact.system!r} estimates no parameters: train one that does "
-                "with kkl-gym train --uncertain all=0.1 --estimate-parameters"
+                "with kkl-gym train SYSTEM --uncertain 0.1 --set estimate_parameters=true"
             )
         return self._parameters(state[:, self.z], state[:, self.age] * artifact.filter.dt)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
+
+from observers.names import suggestion
 
 Pipeline = Literal["input-aware", "spinn"]
 Optimiser = Literal["adam", "soap"]
@@ -189,18 +192,26 @@ def setting_types() -> dict[str, Any]:
 
 
 def read_changes(path: Path) -> dict[str, Any]:
-    """Settings from a JSON file, for :func:`override`."""
+    """Settings from a TOML or JSON file, for :func:`override`."""
+    language, loads = ("TOML", tomllib.loads) if path.suffix == ".toml" else ("JSON", json.loads)
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # that of JSON, or of a text in another encoding
-        raise ValueError(f"{path} is no JSON: {error}") from None
-    types = setting_types()
-    # A file of settings must not name code to run: a policy is given on the command line.
-    del types["pipeline"], types["closed_loop_trajectories"], types["policy"]
-    if not isinstance(found, dict) or not set(found) <= set(types):
-        unknown = sorted(set(found) - set(types)) if isinstance(found, dict) else type(found).__name__
-        raise ValueError(f"{path} must be an object of settings among {', '.join(sorted(types))}; it has {unknown}")
-    return _validated(found, str(path))
+        settings = loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # that of the language, or of a text in another encoding
+        raise ValueError(f"{path} is no {language}: {error}") from None
+    if not isinstance(settings, dict):
+        raise ValueError(f"{path} must hold settings by name, got a {type(settings).__name__}")
+    return checked_changes(settings, str(path))
+
+
+def checked_changes(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Settings by name, as JSON has their values, each of its type and within its limits."""
+    # A file of settings must not name code to run: --policy does.
+    names = sorted(set(setting_types()) - {"pipeline", "policy"})
+    for name in settings:
+        if name not in names:
+            close = suggestion(name, names)
+            raise ValueError(f"{where}: unknown setting {name!r}{close}; there are {', '.join(names)}")
+    return _validated(settings, where)
 
 
 def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:

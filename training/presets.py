@@ -21,7 +21,6 @@ PAPER: dict[str, Any] = {
 NOISE_RANGE = 2.0  # largest measurement noise that maps are trained for, over the system's default
 FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
 FASTEST_OF_STEPS = 3.0  # the same in discrete time, where a step may change everything and the last samples say most
-CLOSED_LOOP = 2000  # trajectories of ``kkl-gym train --closed-loop``
 
 
 def preset(

@@ -26,7 +26,7 @@ from rich.progress import (
 
 LOG = "log.txt"  # in the folder of a run
 
-FIRST_LINE, NEXT_LINE = 5.0, 60.0  # seconds before the first line of a phase, and between lines
+FIRST_LINE, NEXT_LINE = 60.0, 60.0  # seconds before the first line of a phase, and between lines
 BEAT = 1.0  # seconds between looks at the clock
 
 

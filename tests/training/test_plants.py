@@ -21,7 +21,7 @@ from training.kalman import ExtendedKalmanFilter, unknown_start
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CART_POLE = f"{EXAMPLES / 'cart_pole.py'}:CartPole"
 PENDULUM = f"{EXAMPLES / 'circle_pendulum.py'}:CirclePendulum"
-SMALL = "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch 64 --inverse-steps 9 --runs 100"
+SMALL = "--set trajectories=20 duration=5 samples=20 width=4 depth=1 batch=64 inverse_steps=9 runs=100"
 
 
 @pytest.fixture
@@ -114,12 +114,8 @@ def test_every_command_takes_a_system_on_the_circle(tmp_path, monkeypatch, capsy
     main(["train", PENDULUM, *SMALL.split()])
     assert "does not track" not in capsys.readouterr().out
     path = "runs/circle_pendulum/circle_pendulum.safetensors"
-    sizes = {
-        "evaluate": "--trajectories 4 --duration 6 --measurement-noise 0 --csv errors.csv",
-        "faults": "--trajectories 4 --duration 6 --measurement-noise 0.1",
-    }
-    for command, small in sizes.items():
-        main([command, path, "--system", PENDULUM, *small.split()])
+    for small in ("--measurement-noise 0 --csv errors.csv", "--measurement-noise 0.1 --faults"):
+        main(["evaluate", path, "--system", PENDULUM, "--trajectories", "4", "--duration", "6", *small.split()])
     assert set(pd.read_csv("errors.csv").starts) == {"X", "2X \\ X"}
 
 

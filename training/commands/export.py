@@ -21,10 +21,9 @@ class ExportCommand:
     Both take in a sample and the input before it, and return the estimate, as observers.KKLObserver does. All maps can
     be exported: those that ship, of your own systems, from records and from rollouts.
 
-    --format onnx writes NAME.onnx, which takes a batch of any size. Levels of noise are inputs of it, and calibrated
-    covariances outputs. It needs the extra onnx. --format c writes NAME.h and NAME.c, which allocate nothing and need
-    the C library alone, and NAME_main.c, a program that reads samples and prints estimates. docs/guides/export.md has
-    both from end to end.
+    --format onnx: NAME.onnx, which takes a batch of any size, and levels of noise as inputs. It needs the extra onnx.
+    --format c: NAME.h and NAME.c, which allocate nothing and need the C library alone, and NAME_main.c, a program that
+    reads samples and prints estimates. docs/guides/export.md goes from end to end.
     """
 
     observer: Annotated[
@@ -43,7 +42,7 @@ class ExportCommand:
     process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
     """For --format c: level of process noise that the estimate assumes."""
     out: Path = Path("runs/export")
-    """Folder for what is written."""
+    """Folder for the files."""
 
     def run(self, console: Console) -> list[Path]:
         """Export."""

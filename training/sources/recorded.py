@@ -155,7 +155,7 @@ class RecordedSource:
         if len(owner) < FEWEST:
             raise TooFewRunsError(
                 f"what was held out has {len(owner)} samples with states to begin at, too few to calibrate on "
-                f"({FEWEST}): record more, or hold more out (held_out, --held-out)"
+                f"({FEWEST}): record more, or hold more out (--set held_out=0.3)"
             )
         longest = max(len(piece.t) for piece in whole) - 1
         steps = max(2, min(round(STRETCH_MEMORIES * settling_time(self.linear) / self.dt), longest))

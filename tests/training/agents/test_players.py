@@ -14,7 +14,7 @@ from training.agents.any_environment.player import Player
 from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
 from training.commands.agent import Evaluate, Train
 from training.commands.environment import EnvironmentOptions
-from training.commands.record import RecordCommand
+from training.commands.record import PlayOptions, RecordCommand
 from training.records import read_records
 
 PENDULUM = HIDDEN_VELOCITIES["Pendulum-v1"]
@@ -125,7 +125,7 @@ def test_an_agent_on_the_state_is_recorded_as_a_policy(tmp_path, small, monkeypa
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
     learn_to_play(CART, "state", tmp_path)
     path = tmp_path / "agent.safetensors"
-    options = {"measured": "0,2", "hidden": "1,3", "policy": str(path), "steps": 30}
+    options = {"measured": "0,2", "hidden": "1,3", "policy": str(path), "play": PlayOptions(steps=30)}
     name = RecordCommand("CartPole-v1", **options).run(Console())
     assert name == "cartpole-v1/agent-v0"
     (record, *_) = read_records((f"minari:{name}",))

@@ -59,7 +59,7 @@ def test_a_system_that_ships():
 
 
 def test_the_page_explains_every_line_of_its_example():
-    page = (EXAMPLES.parent / "docs" / "guides" / "check.md").read_text(encoding="utf-8")
+    page = (EXAMPLES.parent / "docs" / "guides" / "diagnose.md").read_text(encoding="utf-8")
     for name in (*FIRST, *THEN):
         assert f"\n| {name} |" in page
 
@@ -92,7 +92,7 @@ def test_a_linear_system_has_its_numbers():
 def test_the_command_prints_a_table_of_findings(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "1000")
     options = ["--dt", "0.05", "--duration", "2", "--policy", "controller", "--json", str(tmp_path / "found.json")]
-    main(["check", f"{linear_system.__file__}:Oscillator", *options])
+    main(["diagnose", f"{linear_system.__file__}:Oscillator", *options])
     shown = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("checking ")]  # if it is slow
     assert shown[-1] == "no problems, no notes"
     for line, finding in zip(shown[:-1], json.loads((tmp_path / "found.json").read_text()), strict=True):
@@ -131,7 +131,7 @@ class Branching(Oscillator):
 def test_an_if_on_the_state_is_a_problem_and_ends_the_command_with_status_1(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "1000")
     with pytest.raises(SystemExit) as end:
-        main(["check", f"{__file__}:Branching", "--parameters", "gain", "2", "--json", str(tmp_path / "found.json")])
+        main(["diagnose", f"{__file__}:Branching", "--parameters", "gain=2", "--json", str(tmp_path / "found.json")])
     assert end.value.code == 1
     shown = capsys.readouterr().out
     assert "gain = 2" in shown

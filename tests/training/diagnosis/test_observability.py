@@ -145,7 +145,7 @@ def test_verdicts(errors, changes, verdict, window):
 
 def shown(arguments, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "250")
-    main(["check", *arguments])
+    main(["diagnose", *arguments])
     return capsys.readouterr().out
 
 

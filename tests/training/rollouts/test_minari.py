@@ -179,8 +179,8 @@ def test_record_and_train(tmp_path, capsys, datasets):
         main(record)
     with pytest.raises(SystemExit):
         main([*record, "--env-kwargs", "g"])
-    train = "train swing --data minari:pendulum-v1/random-v0 --inverse-steps 9 --members 1 --width 4 --samples 4"
-    main([*train.split(), "--windows", "99", "--batch", "64", "--out", str(tmp_path / "run")])
+    train = "train swing --data minari:pendulum-v1/random-v0 --set inverse_steps=9 members=1 width=4 samples=4"
+    main([*train.split(), "windows=99", "batch=64", "--out", str(tmp_path / "run")])
     artifact = Artifact.read(tmp_path / "run" / "swing.safetensors")
     assert artifact.environment == {"id": "Pendulum-v1", "kwargs": {"g": 9}}
     shutil.rmtree(datasets)

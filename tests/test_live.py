@@ -1,4 +1,4 @@
-"""``kkl-gym demo --live``: what its window shows, on a canvas in memory."""
+"""``examples/live.py``: what its window shows, on a canvas in memory."""
 
 import time
 
@@ -12,9 +12,8 @@ from matplotlib.backend_bases import KeyEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from training.cli import main
-from training.commands import live as module
-from training.commands.live import Live
+import examples.live as module
+from examples.live import Live
 from training.commands.options import shown
 
 
@@ -95,12 +94,20 @@ def test_slow_systems_of_ones_own_move_at_the_pace_of_those_that_ship(saved):
     assert drawn(live, figure)[1] == ""
 
 
-def test_the_command(monkeypatch):
+def test_the_script(monkeypatch):
     asked = []
     monkeypatch.setattr(module, "show", lambda one, level, *, seed: asked.append((one.system.name, level, seed)))
-    main(["demo", "--live"])
-    main(["demo", "lorenz", "--live", "--measurement-noise", "0.2", "--seed", "3"])
+    module.main()
+    module.main("lorenz", measurement_noise=0.2, seed=3)
     assert asked == [("van_der_pol", None, 0), ("lorenz", 0.2, 3)]
+    with pytest.raises(ValueError, match="no observer ships for 'slow': name a file"):
+        module.main(f"{__file__}:Slow")
+
+
+def test_a_window_needs_a_display():
+    plt.switch_backend("agg")
+    with pytest.raises(ValueError, match="this needs a window, and matplotlib's backend here is 'agg'"):
+        module.show(shown("van_der_pol", None)[0], None, seed=0)
 
 
 def test_time_passes_in_a_window_unless_it_is_paused(monkeypatch):

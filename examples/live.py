@@ -1,4 +1,7 @@
-"""``kkl-gym demo --live``: one environment and its observer in a window, with sliders and keys."""
+"""Show an environment and its observer in a window, with sliders for noise and input, faults of the sensor, and keys.
+
+For a system of yours: ``python examples/live.py --system script.py --observer runs/NAME/NAME.safetensors``.
+"""
 
 import time
 from collections import deque
@@ -6,11 +9,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import tyro
 
 import kkl_gym
 from observers import Artifact
 from observers.names import resolve
-from training.commands.options import Shown
+from training.commands.options import Shown, shown
 from training.evaluation.faults import BIAS, FAULTS, Fault
 from training.evaluation.levels import Level
 from training.figures import ALARM, ESTIMATE, MEASURED, TRUTH, style
@@ -199,7 +203,7 @@ def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> A
     windows = backend_registry.list_builtin(BackendFilter.INTERACTIVE)  # type: ignore[no-untyped-call]
     if backend.lower() not in windows:
         raise ValueError(
-            f"--live needs a window, and matplotlib's backend here is {backend!r}: run it where there is a display, "
+            f"this needs a window, and matplotlib's backend here is {backend!r}: run it where there is a display, "
             "with tkinter or PyQt installed; MPLBACKEND must not name another backend"
         )
     with style():
@@ -235,3 +239,24 @@ def _wider(interval: tuple[float, float]) -> tuple[float, float]:
     low, high = interval
     margin = 0.15 * (high - low)
     return low - margin, high + margin
+
+
+def main(
+    system: str = "van_der_pol", observer: str | None = None, measurement_noise: float | None = None, seed: int = 0
+) -> None:
+    """Show a system until the window is closed.
+
+    Args:
+        system: a shipped system, or yours as script.py:Class.
+        observer: a shipped map or a .safetensors file; by default the one that ships for the system.
+        measurement_noise: standard deviation of the noise on each sample of y, by default the system's.
+        seed: of starts and noise.
+    """
+    (environment,) = shown(system, observer)
+    if not environment.observed:
+        raise ValueError(f"no observer ships for {environment.system.name!r}: name a file, --observer FILE")
+    show(environment, measurement_noise, seed=seed)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

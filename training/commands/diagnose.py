@@ -1,4 +1,4 @@
-"""``kkl-gym check``."""
+"""``kkl-gym diagnose``."""
 
 import json
 from collections.abc import Iterator
@@ -16,16 +16,16 @@ from kkl_gym.loading import load_class
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers.storage import require_writable, write
-from training.commands.data import DataOptions
-from training.commands.options import NoiseLevels, Parameters
-from training.commands.record import EnvironmentArguments, names_in
+from training.commands.data import DataOptions, names_in
+from training.commands.options import SYSTEM, NoiseLevels, Parameters, merged
+from training.commands.record import PlayOptions
 from training.progress import ProgressBars, progress_bars
 
 if TYPE_CHECKING:
     from training.diagnosis import Finding, Observability
 
 COLOURS = {"ok": "green", "note": "yellow", "problem": "bold red"}
-# What each option is for; --measured and --hidden are for data and environments, and make the one the other.
+# Options that are not for every subject. --measured and --hidden are for data, and make of a name an environment.
 ONLY = {
     "a system": ("dt", "duration", "parameters"),
     "an environment": ("episodes", "steps", "env_kwargs"),
@@ -36,23 +36,22 @@ ONLY = {
 
 
 @dataclass(frozen=True)
-class Check:
-    """Say before any training whether a system can be observed and learned, what is wrong, and what to change.
+class Diagnose:
+    """Report before any training whether a system can be observed and learned, what is wrong, and what to change.
 
     Three kinds of subject: a system (NAME alone); an environment, which is played for it (NAME with --measured and
     --hidden); recorded data (--data, and no NAME). Takes some ten seconds.
 
     Of a system: its equations on all kinds of numbers, its motions, sampling, outputs and noise, and the least error of
     each state. Of data and environments: which hidden signals y and u determine, over which window and under how much
-    noise. The exit status is 1 if there is a problem. docs/guides/check.md explains the lines.
+    noise. The exit status is 1 if there is a problem. docs/guides/diagnose.md explains the lines.
     """
 
     name: Annotated[
         tyro.conf.Positional[str | None],
         tyro.conf.arg(
             metavar="[NAME]",
-            help="A system, one that ships or a class of yours as script.py:Class or module:Class. With --measured and "
-            "--hidden: an environment as gym.make takes it, such as Pendulum-v1.",
+            help=f"{SYSTEM} With --measured and --hidden: an environment as gym.make takes it, such as Pendulum-v1.",
             help_behavior_hint="",
         ),
     ] = None
@@ -60,7 +59,7 @@ class Check:
         NoiseLevels,
         tyro.conf.arg(help_behavior_hint="(default: of a system, its own; else 1 % and 10 % of each output's size)"),
     ] = None
-    """Standard deviations of noise on each sample of y, beside none; one for all outputs or, as in 0.1,0.3, of each."""
+    """Standard deviations of noise on each sample of y, beside 0; one for all outputs or, as in 0.1,0.3, for each."""
     dt: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
     """Sampling interval of a system in seconds."""
     duration: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
@@ -68,24 +67,20 @@ class Check:
     policy: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: random)")] = None
     """What acts: on a system as for `kkl-gym train` ("controller", or a function of yours as script.py:function), in an
     environment as for `kkl-gym record`."""
-    parameters: Parameters = field(default_factory=dict)
-    episodes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: no limit)")] = None
-    """Episodes to play in an environment."""
-    steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 10,000 if no episodes are given)")] = None
-    """Steps to play in an environment, at most."""
-    env_kwargs: EnvironmentArguments = ()
-    """An argument of the environment, once for each; values are JSON, or text."""
+    parameters: Parameters = ()
     seed: int = 0
-    """Of the environment's episodes and of the comparison."""
+    """Seed of the environment's episodes and of the comparison."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the findings are written as well."""
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File for the errors by window and level of noise, of data and environments."""
+    play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
+    """For an environment."""
     records: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
-    """Recorded data; --measured and --hidden are of an environment, too, and named as for `kkl-gym record`."""
+    """For recorded data; --measured and --hidden are for an environment too, named as for `kkl-gym record`."""
 
     def run(self, console: Console) -> "list[Finding]":
-        """Check and print."""
+        """Diagnose and print."""
         named = bool(self.records.measured or self.records.hidden)
         subject = "recorded data" if self.records.data else "an environment" if named else "a system"
         self._refuse(subject)
@@ -118,14 +113,15 @@ class Check:
 
     def _system(self) -> System:
         assert self.name is not None
+        parameters = merged("--parameters", self.parameters)
         try:
-            return get_system(self.name, self.parameters)
-        except EquationError:  # once the system was made; what is wrong with its equations is said below
-            return load_class(self.name, System)().replace(self.parameters)
+            return get_system(self.name, parameters)
+        except EquationError:  # of which the findings tell more
+            return load_class(self.name, System)().replace(parameters)
         except ValueError as error:
             if not str(error).startswith("unknown system"):
                 raise
-            raise ValueError(f"{error}; of an environment, say what is --measured and --hidden") from error
+            raise ValueError(f"{error}; an environment needs --measured and --hidden") from error
 
     def _of_signals(self, progress: ProgressBars) -> "Iterator[Finding]":
         observability = self._observability(progress)
@@ -143,9 +139,9 @@ class Check:
                 measured=names_in(self.records.measured),
                 hidden=names_in(self.records.hidden),
                 policy=self.policy or "random",
-                episodes=self.episodes,
-                steps=self.steps,
-                env_kwargs=dict(self.env_kwargs),
+                episodes=self.play.episodes,
+                steps=self.play.steps,
+                env_kwargs=dict(self.play.env_kwargs),
                 measurement_noise=self.measurement_noise,
                 seed=self.seed,
                 console=progress,
@@ -161,12 +157,9 @@ class Check:
                 if self.name
                 else "name a system, an environment (with --measured and --hidden), or recorded data (--data)"
             )
+        values = vars(self) | vars(self.play) | vars(self.records)
         for of, options in ONLY.items():
-            given = [
-                f"--{option.replace('_', '-')}"
-                for option in options
-                if getattr(self.records if of == "recorded data" else self, option) not in (None, "", (), {})
-            ]
+            given = [f"--{option.replace('_', '-')}" for option in options if values[option] not in (None, "", ())]
             if given and subject not in of:
                 raise ValueError(f"{', '.join(given)}: of no use for {subject}, but for {of} alone")
 
