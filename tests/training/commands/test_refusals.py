@@ -58,7 +58,7 @@ def _records():
         ("train lorenz --parameters rh=30", "no parameter 'rh'"),
         ("train lorenz --out /dev/null/x", "/dev/null/x.*: Not a directory"),
         ("train lorenz --uncertain rho=0.1 --uncertain rho=0.2", "--uncertain names a parameter twice: rho, rho"),
-        (f"{RECORDED} --measured angle", r"spring.csv has no column angle; .*\(--measured\)"),
+        (f"{RECORDED} --measured angle", r"spring.csv: no column angle; .*\(--measured\)"),
         ("train spring --data spring.csv --measured position", "no hidden states were recorded"),
         (f"{RECORDED} --data nowhere.csv", "there is no file nowhere.csv"),
         (f"{RECORDED} --size large --set runs=200", "--size: of no use with --data"),
