@@ -23,7 +23,7 @@ _intrinsic: Any = intrinsic  # whose results take other arguments than the funct
 _POINTER = types.CPointer(types.float64)
 _SIGNATURE = types.void(_POINTER, _POINTER, types.int64, types.float64)
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
-_kernel, _part = kernel(**_OPTIONS), part(**_OPTIONS)
+_kernel, _part, _inlined = kernel(**_OPTIONS), part(**_OPTIONS), part(forceinline=True, **_OPTIONS)
 
 
 @_intrinsic(prefer_literal=True)
@@ -118,7 +118,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
     of_states, of_outputs, of_innovations, of_network = nx * wide, ny * wide, ny * ny, nx + inputs
     nis = nx + square  # where it lies in a row of the tracker
 
-    @_part
+    @_inlined
     def factorise(P: Any, L: Any, inverse: Any) -> None:
         """P = L L^T, and what divides by L's diagonal; not finite where there is no L."""
         for i in range(nx):
@@ -154,7 +154,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                     total += (across[j * nx + i] if turned else across[i * nx + j]) * b[j]
                 G[i * ny + k] = total
 
-    @_part
+    @_inlined
     def spread_out(x: Any, P: Any, L: Any, inverse: Any, at: Any) -> None:
         """Sigma points (nx, lanes); those that fill the registers are the mean."""
         factorise(P, L, inverse)
@@ -166,7 +166,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 at[i * wide + 1 + j] += entry
                 at[i * wide + 1 + nx + j] -= entry
 
-    @_part
+    @_inlined
     def moments(at: Any, n: int, mean: Any, S: Any) -> None:
         """Mean (n,) and covariance (n, n) of points (n, lanes), which become differences from the mean."""
         for i in range(n):
@@ -182,7 +182,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                     total += at[i * wide + p] * at[j * wide + p]
                 S[i * n + j] = S[j * n + i] = middle_squares * at[i * wide] * at[j * wide] + other * total
 
-    @_part
+    @_inlined
     def together(L: Any, at: Any, n: int, across: Any) -> None:
         """Covariance (nx, n) of the points' differences (n, lanes) with the points that L spread out."""
         for j in range(n):
@@ -212,7 +212,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 total += scaling[2, i] * scratch[4, i]
                 at[i * wide + p] = scaling[0, i] + scaling[1, i] * total
 
-    @_part
+    @_inlined
     def within(states: Any, at: Any, count: int) -> None:
         """Cut states (nx, lanes) at their bounds."""
         for i in range(nx):
@@ -221,7 +221,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 s = states[0, i] if s < states[0, i] else s
                 at[i * wide + p] = states[1, i] if s > states[1, i] else s
 
-    @_part
+    @_inlined
     def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
         """Mean and covariance a sample later, and the covariance with the state before."""
         states, flow, substeps, address, h, share = model
@@ -229,7 +229,8 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         spread_out(x, P, L, inverse, at)
         within(states, at, wide)
         if substeps < 0:
-            flow_step(at, u, flow, scratch)
+            for _ in range(-substeps):
+                flow_step(at, u, flow, scratch)
         else:
             call(address, at, u, substeps, h)
         moments(at, nx, mean, moved)
@@ -237,7 +238,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         for i in range(nx):
             moved[i * nx + i] += share * states[2, i]
 
-    @_part
+    @_inlined
     def expect(x: Any, P: Any, h: Any, states: Any, L: Any, y: Any, S: Any, V: Any) -> None:
         """Mean and covariance of the output, and its covariance with the state."""
         address, C = h
@@ -267,7 +268,21 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         moments(to, ny, y, S)
         together(L, to, ny, V)
 
-    @_part
+    @_inlined
+    def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
+        """Mark outputs whose innovations are beyond the gate, unless it is open."""
+        measured, far, open_ = 0, 0, now[nis + 4] >= window or now[nis + 2] < window
+        for k in range(ny):
+            measured += not np.isnan(y[k])
+            if (y[k] - expected[k]) ** 2 > gate * gate * (S[k * ny + k] + r[k]):
+                far += 1
+                if not open_:
+                    y[k] = np.nan
+                    now[nis + 3] += 1.0
+        if measured:
+            now[nis + 4] = now[nis + 4] + 1.0 if far == measured else 0.0
+
+    @_inlined
     def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
         """White innovations, by which V moves the state: x + V white and P - V V^T are what is known then."""
         for k in range(ny):
@@ -285,13 +300,13 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 for m in range(k + 1, j + 1):
                     S[j * ny + m] -= share * S[m * ny + k] * root
 
-    @_part
+    @_inlined
     def shift(x: Any, sign: float, V: Any, white: Any) -> None:
         for i in range(nx):
             for k in range(ny):
                 x[i] += sign * V[i * ny + k] * white[k]
 
-    @_part
+    @_inlined
     def add(P: Any, sign: float, V: Any, W: Any) -> None:
         for i in range(nx):
             for j in range(nx):
@@ -306,10 +321,10 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             total += x[i] + inverse[i]
         return np.isfinite(total)
 
-    @_part
+    @_inlined
     def track(now: Any, y: Any, u: Any, model: Any, h: Any, r: Any, watched: Any, scratch: Any, expected: Any) -> None:
-        """Predict and correct the state of a row's tracker."""
-        window, share, trend_share, square_share, trend_gain, trend_limit = watched
+        """Predict and correct the state of a row's tracker; outputs that are rejected become NaN."""
+        window, share, trend_share, square_share, trend_gain, trend_limit, gate = watched
         states = model[0]
         x, P, start, spread = stack(nx), stack(square), stack(nx), stack(square)
         mean, moved, across, L, inverse = stack(nx), stack(square), stack(square), stack(square), stack(nx)
@@ -334,6 +349,8 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             for i in range(square):
                 moved[i], across[i] = again_moved[i], again_across[i]
             expect(mean, moved, h, states, L, expected, S, V)
+            if turn == 0 and gate < np.inf:
+                reject(now, y, expected, S, r, gate, window)
             whiten(y, expected, S, r, white, V)
             if turn < last:
                 smoothed(moved, L, inverse, across, V, False, G)
@@ -358,8 +375,8 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             if not np.isnan(y[k]):
                 count += 1.0
                 squares += white[k] * white[k]
-                now[nis + 3 + k] += trend_share * (white[k] - now[nis + 3 + k])
-                raised += now[nis + 3 + k] * now[nis + 3 + k]
+                now[nis + 5 + k] += trend_share * (white[k] - now[nis + 5 + k])
+                raised += now[nis + 5 + k] * now[nis + 5 + k]
         if count > 0.0:
             weight = count / ny
             now[nis] += share * weight * (squares / count - now[nis])
@@ -368,7 +385,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             if now[nis + 1] > trend_limit:  # innovations agree with one another
                 grown, now[nis + 1] = inflation, 1.0
                 for k in range(ny):
-                    now[nis + 3 + k] = 0.0
+                    now[nis + 5 + k] = 0.0
         for i in range(nx):
             s = mean[i]
             s = states[0, i] if s < states[0, i] else s
@@ -424,8 +441,9 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 now[nx + i] = P[i]
         if lost:
             now[nis] = now[nis + 1] = 1.0
+            now[nis + 4] = window
             for k in range(ny):
-                now[nis + 3 + k] = 0.0
+                now[nis + 5 + k] = 0.0
 
     @_part
     def fill(y: Any, z: Any, age: float, nz: int, h: Any, states: Any, maps: Any, scratch: Any, x_hat: Any, before: Any,
@@ -465,24 +483,27 @@ def steps(nx: int, ny: int, nu: int) -> Any:
     @_kernel
     def run(
         flags: Any, numbers: Any, states: Any, r: Any, C: Any, linear: Any, maps: Any, flow: Any,
-        state: Any, y: Any, u: Any, record: Any, first: int
+        state: Any, y: Any, u: Any, record: Any
     ) -> None:  # fmt: skip
         """Samples y (steps, n, ny) and inputs u (steps, n, nu) into rows of the state (n, width).
 
-        Of each sample it keeps a part of the rows, from column ``first`` on, in ``record`` (steps, n, k).
+        A record (steps, n, width) keeps the rows at each sample; (steps, n, 0) keeps none.
         """
         tracks, knows_output, nz, substeps, address, output_address, widest = flags
-        h, noise_share, dt, limit = numbers[:4]
-        watched = numbers[4], numbers[5], numbers[6], numbers[7], numbers[8], numbers[9]
-        model, of_output = (states, flow, substeps, address, h, noise_share), (output_address, C)
+        h, samples, dt, limit = numbers[:4]
+        watched = numbers[4:]
+        model, of_output = (states, flow, substeps, address, h, samples), (output_address, C)
         size = linear[0].shape[1]
         base, scratch = size + ny + 1, np.empty((5, widest + UNROLLED), np.float32)
         z, x_hat, filled, expected, held = np.empty(size), np.empty(nx), np.empty(ny), stack(ny), stack(inputs)
+        sample = np.empty(ny)
         for row in range(len(state)):
             now = state[row]
             past, before, tracked = now[:size], now[size : size + ny], now[base:]
             for k in range(len(y)):
-                sample, gap = y[k, row], False
+                gap = False
+                for i in range(ny):
+                    sample[i] = y[k, row, i]
                 for j in range(nu):
                     held[j] = u[k, row, j]
                 if tracks:
@@ -496,17 +517,17 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                     age = now[base - 1]
                     fill(sample, past, age * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
                     follow(past, before, held, filled, linear, z)
-                    fill(sample, z, (age + 1.0) * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
+                    fill(sample, z, (age + samples) * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
                 follow(past, before, held, filled, linear, z)
                 for i in range(size):
                     past[i] = z[i]
                 for i in range(ny):
                     before[i] = filled[i]
-                now[base - 1] += 1.0
+                now[base - 1] += samples
                 if tracks:
                     supervise(tracked, past, now[base - 1] * dt, nz, dt, watched, limit, states, maps, scratch, x_hat)
                 for i in range(record.shape[2]):
-                    record[k, row, i] = now[first + i]
+                    record[k, row, i] = now[i]
 
     return run
 
