@@ -19,7 +19,7 @@ class CompiledStep:
     """
 
     def __init__(self, artifact: Artifact, decoders: Decoders, tracker: Tracker | None) -> None:
-        from observers import kernel
+        from observers import kernel, kernel_functions
 
         nx, ny, nu, linear = artifact.nx, artifact.ny, artifact.nu, artifact.filter
         motion = None if tracker is None else tracker.motion
@@ -30,9 +30,9 @@ class CompiledStep:
         # Machine code is freed with what holds its address.
         self._move = self._measure = None
         if equations is not None:
-            self._move = kernel.motion(equations.field, nx, nu, not equations.substeps)
+            self._move = kernel_functions.motion(equations.field, nx, nu, not equations.substeps)
         if artifact.h is not None:
-            self._measure = kernel.output(artifact.h, nx)
+            self._measure = kernel_functions.output(artifact.h, nx)
         self._steps, self._nothing = kernel.steps(nx, ny, nu), np.empty((1, 0, 0))
         driven, free = _of_map(decoders.driven, nx), _of_map(decoders.free or decoders.driven, nx)
         widest = max(driven[2], free[2], nx + nu)
@@ -49,10 +49,9 @@ class CompiledStep:
             np.zeros(1, int),
         )
         if motion is not None and flow is not None:
-            assert flow.mlp.compiled is not None
             scaling[0, :nx], scaling[1, :nx], scaling[2, :nx] = motion.x_offset, motion.x_scale, flow.gain
             scaling[3, :nu], of_flow = 1.0 / flow.u_scale, flow.linear
-            packed, shape = flow.mlp.compiled.packed, flow.mlp.compiled.shape
+            packed, shape = flow.mlp.packed()
             widest = max(widest, *shape[1:])
         addresses = (0 if pointer is None else pointer.address for pointer in (self._move, self._measure))
         self._equations, self._linear = equations, linear
@@ -101,12 +100,11 @@ class CompiledStep:
 
 def _of_map(decoder: Decoder, nx: int) -> tuple[Any, tuple[np.ndarray, np.ndarray], int]:
     """A map's network, its covariances by age, and its largest width."""
-    machine, error = decoder.compiled, decoder.error
-    assert machine is not None
+    error, network = decoder.error, decoder.network
     ages, table = np.zeros(1), np.zeros((1, nx * nx))
     if error is not None:
         ages, table = error.ages, np.ascontiguousarray(error.covariance.reshape(len(error.ages), -1))
-    return machine.network, (np.array(ages), table), machine.widest
+    return network, (np.array(ages), table), int(max(*network[-1][1:], nx))
 
 
 def _of_filter(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

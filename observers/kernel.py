@@ -14,16 +14,15 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from observers.expression import Expression
-from observers.machine import kernel, part, pointer
-from observers.network_kernel import UNROLLED, decode, evaluate
+from observers.kernel_functions import OPTIONS, lanes
+from observers.machine import kernel, part
+from observers.network import UNROLLED
+from observers.network_kernel import decode, evaluate
 from observers.supervision import INFLATION, RELINEARISATIONS
 
 _intrinsic: Any = intrinsic  # whose results take other arguments than the functions that it decorates
 _POINTER = types.CPointer(types.float64)
-_SIGNATURE = types.void(_POINTER, _POINTER, types.int64, types.float64)
-_OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
-_kernel, _part, _inlined = kernel(**_OPTIONS), part(**_OPTIONS), part(forceinline=True, **_OPTIONS)
+_kernel, _part, _inlined = kernel(**OPTIONS), part(**OPTIONS), part(forceinline=True, **OPTIONS)
 
 
 @_intrinsic(prefer_literal=True)
@@ -47,65 +46,6 @@ def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any)
         return context.get_dummy_value()
 
     return types.void(types.int64, _POINTER, _POINTER, types.int64, types.float64), code
-
-
-def lanes(nx: int) -> int:
-    """Sigma points of nx states, and as many more as fill the processor's registers."""
-    return -(-(2 * nx + 1) // 4) * 4
-
-
-@functools.cache
-def motion(expression: Expression, nx: int, nu: int, discrete: bool) -> Any:
-    """The equations' step of all sigma points, (nx, lanes), in place, in so many Runge-Kutta steps of h."""
-    wide, field = lanes(nx), expression.python("field", nx, nu)
-    given = ", ".join([f"x{i}" for i in range(nx)] + [f"u[{j}]" for j in range(nu)])
-    lines = ["def step(s, u, p, h):", *(f"    x{i} = s[{i * wide} + p]" for i in range(nx))]
-    for stage, (before, share) in enumerate((("", ""), ("a", "0.5 * h * "), ("b", "0.5 * h * "), ("c", "h * "))):
-        moved = [f"x{i} + {share}{before}[{i}]" if before else f"x{i}" for i in range(nx)]
-        lines.append(f"    {'abcd'[stage]} = field({', '.join(moved + [f'u[{j}]' for j in range(nu)])})")
-    lines += [
-        f"    s[{i * wide} + p] = x{i} + h / 6.0 * (a[{i}] + 2.0 * (b[{i}] + c[{i}]) + d[{i}])" for i in range(nx)
-    ]
-    if discrete:
-        lines[1 + nx :] = [f"    a = field({given})", *(f"    s[{i * wide} + p] = a[{i}]" for i in range(nx))]
-    step = _function("\n".join(lines), "step", field=field)
-
-    def move(s: Any, u: Any, substeps: int, h: float) -> None:
-        for _ in range(substeps):
-            for p in range(wide):
-                step(s, u, p, h)
-
-    return pointer(move, _SIGNATURE, **_OPTIONS)
-
-
-@functools.cache
-def output(expression: Expression, nx: int) -> Any:
-    """The outputs, (ny, lanes), of the first sigma points, (nx, lanes)."""
-    wide, ny = lanes(nx), len(expression.components)
-    function = expression.python("function", nx, 0)
-    given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))
-    lines = [
-        "def at(s, out, p):",
-        f"    y = function({given})",
-        *(f"    out[{k * wide} + p] = y[{k}]" for k in range(ny)),
-    ]
-    at = _function("\n".join(lines), "at", function=function)
-
-    def measure(s: Any, out: Any, count: int, h: float) -> None:
-        for p in range(count):
-            at(s, out, p)
-
-    return pointer(measure, _SIGNATURE, **_OPTIONS)
-
-
-def _function(source: str, name: str, **names: str) -> Any:
-    """A function by its source, and by the sources of those that it calls."""
-    namespace: dict[str, Any] = {"np": np}
-    for inner, text in names.items():
-        exec(text, namespace)
-        namespace[inner] = _part(namespace[inner])
-    exec(source, namespace)
-    return _part(namespace[name])
 
 
 @functools.cache
@@ -213,13 +153,17 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 at[i * wide + p] = scaling[0, i] + scaling[1, i] * total
 
     @_inlined
+    def clipped(states: Any, s: float, i: int) -> float:
+        """A state cut at its bounds."""
+        s = states[0, i] if s < states[0, i] else s
+        return states[1, i] if s > states[1, i] else s
+
+    @_inlined
     def within(states: Any, at: Any, count: int) -> None:
         """Cut states (nx, lanes) at their bounds."""
         for i in range(nx):
             for p in range(count):
-                s = at[i * wide + p]
-                s = states[0, i] if s < states[0, i] else s
-                at[i * wide + p] = states[1, i] if s > states[1, i] else s
+                at[i * wide + p] = clipped(states, at[i * wide + p], i)
 
     @_inlined
     def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
@@ -387,20 +331,23 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 for k in range(ny):
                     now[nis + 5 + k] = 0.0
         for i in range(nx):
-            s = mean[i]
-            s = states[0, i] if s < states[0, i] else s
-            now[i] = states[1, i] if s > states[1, i] else s
+            now[i] = clipped(states, mean[i], i)
         for i in range(square):
             now[nx + i] = grown * moved[i]
+
+    @_part
+    def is_driven(z: Any, nz: int) -> bool:
+        """Whether an input has acted, or there is none."""
+        acted = len(z) == nz
+        for i in range(nz, len(z)):
+            acted = acted or z[i] != 0.0
+        return acted
 
     @_part
     def invert(z: Any, age: float, nz: int, maps: Any, scratch: Any, x: Any) -> None:
         """T_inv, of free motion where no input has acted."""
         driven, free, _, _ = maps
-        acted = len(z) == nz
-        for i in range(nz, len(z)):
-            acted = acted or z[i] != 0.0
-        if acted:
+        if is_driven(z, nz):
             decode(z, age, driven, scratch, x)
         else:
             decode(z[:nz], age, free, scratch, x)
@@ -412,10 +359,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         window, lost = watched[0], not now[nis] <= limit
         if not lost and now[nis + 2] >= window:
             return
-        acted = len(z) == nz
-        for i in range(nz, len(z)):
-            acted = acted or z[i] != 0.0
-        ages, table = maps[2] if acted else maps[3]
+        ages, table = maps[2] if is_driven(z, nz) else maps[3]
         seen, at = min(now[nis + 2], window) * dt, 0
         while at < len(ages) - 2 and seen > ages[at + 1]:
             at += 1
@@ -434,9 +378,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         if lost or larger < 0.0:
             invert(z, age, nz, maps, scratch, x_hat)
             for i in range(nx):
-                s = x_hat[i]
-                s = states[0, i] if s < states[0, i] else s
-                now[i] = states[1, i] if s > states[1, i] else s
+                now[i] = clipped(states, x_hat[i], i)
             for i in range(square):
                 now[nx + i] = P[i]
         if lost:
@@ -532,4 +474,4 @@ def steps(nx: int, ny: int, nu: int) -> Any:
     return run
 
 
-__all__ = ["lanes", "motion", "output", "steps"]
+__all__ = ["steps"]

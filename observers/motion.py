@@ -222,12 +222,6 @@ class Motion:
                 "sampling interval, or tracking=False"
             )
 
-    def scaled_step(self, s: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """Return scaled states a sample later. Shapes: ``s`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
-        if self.flow is not None:
-            return self.flow(s, u)
-        return np.asarray((self.step(self.x_offset + self.x_scale * s, u, dt) - self.x_offset) / self.x_scale)
-
     def variances(
         self, measurement_noise: float | tuple[float, ...], process_noise: float
     ) -> tuple[np.ndarray, np.ndarray]:

@@ -9,9 +9,9 @@ import numpy as np
 
 from observers.artifact import Artifact
 from observers.checks import bool_array, check_dt, noise_level, noise_levels, real_array
-from observers.compiled import available
 from observers.factors import standard_deviations
 from observers.kkl import KKL
+from observers.machine import available
 from observers.records import RecordEstimates
 from observers.replacement import check_replacement
 from observers.samples import check_arguments, check_delay, check_gate, check_output, first_state, held_input

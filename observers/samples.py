@@ -7,7 +7,7 @@ import numpy as np
 
 from observers.artifact import Artifact
 from observers.checks import LARGEST, all_finite, flag, integer, is_finite, real_array, shown
-from observers.compiled import available
+from observers.machine import available
 
 MAX_DELAY = 1000  # samples
 
