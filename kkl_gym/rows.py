@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kkl_gym.thresholds import MANY_ROWS
+from observers.thresholds import MANY_ROWS
 
 
 def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

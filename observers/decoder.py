@@ -63,11 +63,11 @@ class Decoder:
         self._offset = -inverse.z_offset @ self._whiten
         self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
         self._needs_age = inverse.features[-1] == "age"
-        self._compiled = available() if compiled is None else compiled
+        self._machine = compiled is not False  # where there is Numba
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the estimate."""
-        if z.ndim == 1 and self._compiled:
+        if z.ndim == 1 and self._machine and available():
             from observers.network_kernel import decode_one
 
             x_hat = np.empty(len(self._inverse.x_offset))

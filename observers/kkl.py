@@ -125,8 +125,8 @@ class KKL(Estimator[np.ndarray]):
         linear, tracker, gaps = self._filter(dt), self.tracker, np.isnan(y)
         samples = linear.dt / self.artifact.filter.dt
         if tracker is not None:
-            tracked, y, expected = tracker.advance(state[:, self.tracked], y, u, samples)
-            y = _filled(y, np.isnan(y), expected, before)
+            tracked, y = tracker.advance(state[:, self.tracked], y, u, samples)
+            y = np.where(np.isfinite(y), y, before)
         elif gaps.any():
             y = _filled(y, gaps, before, before)
             if self.artifact.knows_output:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
+@cache
 def available() -> bool:
     """Whether Numba is installed."""
     try:

@@ -11,7 +11,7 @@ from observers.artifact import Artifact
 from observers.checks import bool_array, check_dt, noise_level, noise_levels, real_array
 from observers.factors import standard_deviations
 from observers.kkl import KKL
-from observers.machine import available
+from observers.late import Pending
 from observers.records import RecordEstimates
 from observers.replacement import check_replacement
 from observers.samples import check_arguments, check_delay, check_gate, check_output, first_state, held_input
@@ -164,11 +164,6 @@ class KKLObserver(RecordEstimates):
             self._state = np.hstack([self._state[:, : kkl.watched.start], kkl.monitor.start(len(self._state))])
         self._kkl, self._measurement_noise, self._process_noise = kkl, measurement_noise, process_noise
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        if self._compiled and not available():
-            self._compiled = None
-
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
 
@@ -200,7 +195,7 @@ class KKLObserver(RecordEstimates):
         )
         if self._state is not None:
             other._state, other._batch = other._kkl.take_over(self._kkl, self._state), self._batch
-            other._inputs, other._waiting = self._inputs, self._waiting
+            other._pending = self._pending
         vars(self).update(vars(other))
 
     @property
@@ -240,8 +235,7 @@ class KKLObserver(RecordEstimates):
         y0, x0 = real_array("y", y0).copy(), None if x0 is None else real_array("x0", x0)  # callers reuse arrays
         check_output(self.artifact, y0, y0.shape[:-1], first=True)
         self._state, self._batch = self._begin(y0, x0), y0.shape[:-1]
-        n = len(self._state)
-        self._inputs, self._waiting = np.zeros((n, self._delay, self.artifact.nu)), np.zeros(n, dtype=int)
+        self._pending = Pending(len(self._state), self._delay, self.artifact.nu)
         return self.decode()
 
     def _begin(self, y0: np.ndarray, x0: np.ndarray | None) -> np.ndarray:
@@ -320,7 +314,7 @@ class KKLObserver(RecordEstimates):
         y0, x0 = real_array("y", y0), None if x0 is None else real_array("x0", x0)
         check_output(self.artifact, y0, (int(rows.sum()),), first=True)
         begun = self._begin(y0, x0)
-        self._state, self._waiting = state.copy(), np.where(rows.ravel(), 0, self._waiting)
+        self._state, self._pending = state.copy(), self._pending.restarted(rows.ravel())
         self._state[rows.ravel()] = begun
 
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None, *, dt: float | None = None) -> np.ndarray:
@@ -393,22 +387,13 @@ class KKLObserver(RecordEstimates):
         if self._delay:
             if dt is not None:
                 raise ValueError("an observer with a delay takes samples at the interval of its map: leave dt out")
-            u, rows = self._late(u, rows)
+            every = np.ones(len(u), dtype=bool)
+            self._pending, u, rows = self._pending.after(u, every if rows is None else rows)
         if rows is None:
             self._state = self._kkl.step(state, y, u, dt)
         elif rows.any():
             self._state = state.copy()
             self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows], dt)
-
-    def _late(self, u: np.ndarray, rows: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Keep inputs (n, nu); returns those before the outputs that now arrive, and the rows in which any does."""
-        rows = np.ones(len(u), dtype=bool) if rows is None else rows
-        due, first = rows & (self._waiting == self._delay), self._inputs[:, 0]
-        self._inputs = np.where(due[:, None, None], np.roll(self._inputs, -1, axis=1), self._inputs)
-        self._waiting = self._waiting + (rows & ~due)
-        at = np.flatnonzero(rows)
-        self._inputs[at, self._waiting[at] - 1] = u[at]
-        return first, due
 
     def _warn_of_gaps(self) -> None:
         if not self.artifact.knows_output and not self._warned:
@@ -509,5 +494,5 @@ class KKLObserver(RecordEstimates):
             state = state[chosen]
             batch = (len(state),)
         if self._delay:
-            state = self._kkl.ahead(state, self._inputs[chosen], self._waiting[chosen])
+            state = self._kkl.ahead(state, self._pending.inputs[chosen], self._pending.count[chosen])
         return state, batch

@@ -16,6 +16,7 @@ class RecordEstimates:
     artifact: Artifact
     _kkl: KKL
     _delay: int
+    _warn_of_gaps: Any
     _begin: Any
 
     def estimate(
@@ -103,6 +104,8 @@ class RecordEstimates:
         if self._delay:
             raise ValueError("a record has no delay: shift its outputs to their times, and make an observer without")
         y = checked_record(self.artifact, y)
+        if np.isnan(y).any():
+            self._warn_of_gaps()
         dts = None if t is None else intervals(t, len(y))
         u = held_inputs(self.artifact, u, y.shape[:-1])
         x0 = None if x0 is None else real_array("x0", x0)

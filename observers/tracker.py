@@ -91,23 +91,23 @@ class Tracker:
 
     def advance(
         self, rows: np.ndarray, y: np.ndarray, u: np.ndarray, samples: float = 1.0
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Predict over so many samples under inputs (n, nu), and correct by outputs (n, ny), NaN where missing.
 
-        Returns the rows, the outputs with NaN where they are rejected too, and the predicted outputs (n, ny), which are
-        not finite where a covariance broke down.
+        Returns the rows, and the outputs with predicted ones where they are missing or rejected, (n, ny), which are not
+        finite where a covariance broke down.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            advanced, y, expected = self._advanced(rows, y, u, samples)
+            advanced, whole = self._advanced(rows, y, u, samples)
         broken = ~np.isfinite(advanced[:, : self.nis].sum(-1))
         if broken.any():
             advanced[broken] = rows[broken]
             advanced[broken, self.nis] = np.inf
-        return advanced, y, expected
+        return advanced, whole
 
     def _advanced(
         self, rows: np.ndarray, y: np.ndarray, u: np.ndarray, samples: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray]:
         def move(x: np.ndarray) -> np.ndarray:
             return self.motion.step(self._within(x), u, self._dt, samples)
 
@@ -135,7 +135,7 @@ class Tracker:
             V, white = whitened(y - expected, S, cross, np.isnan(y))
         P, watched = self._watched(rows[:, self.nis :], add(moved, V, V, -1.0), white, ~np.isnan(y))
         watched[:, 3:5] = rejected
-        return self._packed(shift(mean, V, white), P, watched), y, expected
+        return self._packed(shift(mean, V, white), P, watched), np.where(np.isnan(y), expected, y)
 
     def _gated(
         self, rows: np.ndarray, y: np.ndarray, innovation: np.ndarray, S: np.ndarray

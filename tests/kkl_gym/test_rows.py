@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kkl_gym.rows import clipped, held, judged
-from kkl_gym.thresholds import MANY_ROWS
+from observers.thresholds import MANY_ROWS
 
 
 @pytest.fixture(params=[3, MANY_ROWS + 3])

@@ -3,8 +3,8 @@ import pickle
 import numpy as np
 import pytest
 
-from kkl_gym.thresholds import MANY_ROWS
 from observers import LinearFilter
+from observers.thresholds import MANY_ROWS
 
 DIAGONAL = -np.diag([0.5, 2.0, 7.0])
 PAIR = np.array([[-1.0, 5.0, 0.0], [-5.0, -1.0, 0.5], [0.0, 0.0, -3.0]])

@@ -38,7 +38,7 @@ class Together:
     def step(self, y: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Take in the next samples, all of them present. Shapes: ``u`` (n, nu); returns (n, nx)."""
         if self._tracker is not None:
-            self._rows, _, _ = self._tracker.advance(self._rows, y, u)
+            self._rows, _ = self._tracker.advance(self._rows, y, u)
         self._z, self._y, self._age = self._linear.advance(self._z, self._y, u, y), y, self._age + 1
         return self._decoded()
 
