@@ -158,6 +158,8 @@ class KKLEstimator:
                 found["x_cov"] = self.observer.decode_covariance(rows)
             if self.observer.artifact.estimated_parameters:
                 found["parameters_hat"] = self.observer.parameters_hat[... if rows is None else rows]
+        if self.observer.gate is not None:
+            found["rejected"] = self.observer.rejected if rows is None else self.observer.rejected[rows]
         if self._monitor:
             found["score"] = self.observer.score if rows is None else self.observer.score[rows]
         return found

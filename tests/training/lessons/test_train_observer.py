@@ -371,4 +371,4 @@ def test_an_observer_finds_a_constant_bias(tmp_path):
     for k in range(2000):
         x_hat, *_, info = env.step(np.array([np.sin(k / 50)]))
         errors.append(x_hat - [*info["x"], 0.7])
-    assert np.abs(errors[1000:]).max(0) == pytest.approx([0.0, 0.0, 0.0], abs=0.1)
+    assert np.sqrt(np.mean(np.square(errors[1000:]), 0)).max() < 0.04
