@@ -127,10 +127,6 @@ class SimulatedSource:
             motions=motions,
             report=report,
         )
-        return self.known(pairs)
-
-    def known(self, pairs: Any) -> Any:
-        """Pairs without the parameters that are not to be estimated, and whether these are the system's own."""
         nominal = None
         if self.ranges:
             own = [self.system.parameters[name] for name in self.ranges]
