@@ -1,15 +1,13 @@
 """The lesson of the map: T_inv, with T before it in the paper's way."""
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 
 from kkl_gym.system import System
-from observers import Artifact, ForwardMap, InverseMap, LinearFilter
+from observers import ForwardMap, InverseMap, LinearFilter
 from training.lessons.run import Run
 from training.maps.coordinates import StateScale
 from training.maps.forward import ForwardProblem, transients, truncation_step
@@ -29,11 +27,6 @@ class Maps:
     inverse: InverseMap
     free_inverse: InverseMap | None = None
     forward: ForwardMap | None = None
-
-    def artifact(self, facts: Mapping[str, Any], **made: Any) -> Artifact:
-        """Put them together with what a source says of itself."""
-        parts = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
-        return Artifact(**parts, **facts, **made)
 
 
 def learn_map(source: Source, run: Run) -> Maps:
@@ -70,8 +63,7 @@ class _MapLesson:
         self.source, self.run, self.config = source, run, config
         self.spectrum = Spectrum(config.eigenvalues, config.pairs)
         self.linear = self.spectrum.filter(source.ny, config.dt, source.nu)
-        simulated = isinstance(source, SimulatedSource)
-        self.free = bool(simulated and source.nu and config.free_inverse and config.policy is None)
+        self.free = isinstance(source, SimulatedSource) and source.has_free_map
         self.share = 1 / (1 + self.free + (config.pipeline == "spinn"))
 
     def learned(self) -> Maps:

@@ -165,11 +165,10 @@ def record(
     steps: int,
     ages: np.ndarray,
     rng: np.random.Generator,
-    motions: Motions | None = None,
+    motions: Motions,
     report: Callable[[float], object] = lambda done: None,
 ) -> Pairs:
     """Simulate trajectories and run the filter beside them; ``ages`` (m,)."""
-    motions = motions or Motions(kinds=KINDS)
     if not linear.nu:
         motions = dataclasses.replace(motions, kinds=(), policy=None)
     found, done = list[tuple[np.ndarray, np.ndarray, np.ndarray]](), 0
