@@ -98,13 +98,6 @@ def draw_process_noise(
     return np.asarray(bound * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))
 
 
-def noisy_output(
-    system: System, x: np.ndarray, *, measurement_noise: float | Sequence[float], rng: np.random.Generator
-) -> np.ndarray:
-    """Measure states (..., nx) with Gaussian noise of this standard deviation, of all outputs or each; (..., ny)."""
-    return system.output(x) + np.asarray(measurement_noise) * rng.standard_normal((*x.shape[:-1], system.ny))
-
-
 def under_policy(
     system: System,
     policy: Controller,
