@@ -138,9 +138,6 @@ class Config:
     """Probability that a sound motion of twenty seconds, at the pace of the shipped systems, raises an alarm."""
     truncation: Positive = 1e-6
     """Part epsilon of the filter's start that may be left where the forward map's data begins (paper, sec. 5.2)."""
-    closed_loop_trajectories: Annotated[int, Field(ge=0)] = 0
-    """Trajectories of a controller, or the policy, that acts on the estimate, on which an input-aware map is fitted a
-    second time beside the others; 0 for none."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
     values, as a part of these; "all" stands for each that is not named. Some motions keep the values themselves."""
@@ -177,12 +174,6 @@ class Config:
             raise ValueError(
                 f"policy = {self.policy!r} needs the pipeline 'input-aware' with inputs; got {self.pipeline!r}, "
                 f"inputs = {self.inputs}"
-            )
-        closed_loop = self.closed_loop_trajectories
-        if closed_loop and (closed_loop < 10 or self.pipeline != "input-aware" or not self.inputs):
-            raise ValueError(
-                f"closed_loop_trajectories must be 0 or at least 10, and needs the pipeline 'input-aware' with inputs; "
-                f"got {closed_loop}, {self.pipeline!r}, inputs = {self.inputs}"
             )
         if (self.pipeline == "spinn") != (self.forward_steps > 0):
             raise ValueError(f"pipeline {self.pipeline!r} does not go with forward_steps = {self.forward_steps}")

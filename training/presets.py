@@ -8,7 +8,7 @@ import numpy as np
 from kkl_gym.system import NOISE_SHARE, System
 from training.config import Config, Pipeline, override
 from training.smoothness import smooth_spectrum
-from training.spectrum import evenly_spaced, papers_spectrum
+from training.spectrum import FASTEST_MODE, evenly_spaced, papers_spectrum
 from training.systems import profile
 
 Preset = Literal["fast", "paper"]
@@ -19,8 +19,8 @@ PAPER: dict[str, Any] = {
     "width": 512, "depth": 4, "activation": "silu", "optimiser": "adam", "batch": 4096, "learning_rate": 1e-3
 }  # fmt: skip
 NOISE_RANGE = 2.0  # largest measurement noise that maps are trained for, over the system's default
-FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
-FASTEST_OF_STEPS = 3.0  # the same in discrete time, where a step may change everything and the last samples say most
+# FASTEST_MODE in discrete time, where a step may change everything and the last samples say most.
+FASTEST_OF_STEPS = 3.0
 
 
 def preset(

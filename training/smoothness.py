@@ -10,7 +10,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.maps.coordinates import settling_time
 from training.seeds import Stream, generator
-from training.spectrum import Spectrum, evenly_spaced
+from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
 SMOOTH = 0.85  # least exponent of a smooth T: differences in z fall as distance^0.85 where neighbours come closer
@@ -26,7 +26,6 @@ SLOWEST, FASTEST = 1 / 6, 8.0  # slow ends of the first and the last interval, i
 STEP = 2**0.5  # from one interval to the next
 FORGOTTEN = 30.0  # times 1 / |slow end|, by which a filter has forgotten its start
 SPREAD = 4.0  # fast end of an interval over its slow end
-FASTEST_MODE = 0.5  # bound of |fast end| * dt
 
 
 def check_continuous(system: System) -> None:

@@ -8,6 +8,8 @@ import scipy
 from kkl_gym.system import System
 from observers import LinearFilter
 
+FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
+
 
 @dataclass(frozen=True)
 class Spectrum:

@@ -139,8 +139,9 @@ def motion_of(source: Source, run: Run) -> Motion | None:
 
 def _artifact(maps: Maps, source: Source, run: Run) -> Artifact:
     """The observer, not calibrated yet, with how it was made."""
-    return maps.artifact(
-        source.facts(),
+    return Artifact(
+        **vars(maps),
+        **source.facts(),
         training={
             **dataclasses.asdict(run.config),
             **run.samples,

@@ -39,7 +39,7 @@ in TOML or JSON:
 ```toml
 width = 64
 eigenvalues = [-1.0, -2.0, -4.0]
-closed_loop_trajectories = 2000
+trajectories = 2000
 ```
 
 Where `--preset`, `--pipeline` or `--data` makes a difference, a default names each: "fast 20, paper 512" is 20 for

@@ -9,10 +9,9 @@ from kkl_gym import VanDerPol
 from observers import Artifact, LinearFilter
 from training import preset
 from training.config import override
-from training.maps.inverse import ClosedLoopSampler, TrajectorySampler
+from training.maps.inverse import TrajectorySampler
 from training.maps.networks import Network
 from training.spectrum import papers_spectrum
-from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.motions import KINDS, Motions, record, recording_ages
 
 CPU = torch.device("cpu")
@@ -61,19 +60,3 @@ def untrained(sampler, linear):
     inputs = len(sampler.coordinates.whiten) + told
     network = Network(inputs, 2, width=8, depth=1, activation="tanh")
     return network, Artifact(linear, sampler.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
-
-
-@cache
-def closed_loop(process_noise_share=0.0):
-    """Batches of which half are in closed loop, its trajectories, the observer, and every estimate acted on."""
-    sampler, _, linear = open_loop(process_noise_share)
-    _, artifact = untrained(sampler, linear)
-    seen = []
-
-    def act(x_hat):
-        seen.append(x_hat)
-        return np.tanh(x_hat[:, :1])
-
-    ages, rng = recording_ages(200, 30), np.random.default_rng(1)
-    data = record_closed_loop(VanDerPol(), artifact, act, n=60, steps=200, ages=ages, rng=rng, process_noise_share=0.5)
-    return ClosedLoopSampler(sampler, data, dt=linear.dt, device=CPU), data, artifact, seen

@@ -26,7 +26,6 @@ from training.config import override, read_changes
         ({"measurement_noise_max": (0.1, 0.0)}, r"measurement_noise_max\.each\.1"),
         ({"noise_free_share": float("nan")}, "share"),
         ({"high_noise_emphasis": 0.0}, "high_noise_emphasis"),
-        ({"closed_loop_trajectories": 5}, "closed_loop"),
         ({"policy": "controller", "inputs": False}, "policy"),
     ],
 )

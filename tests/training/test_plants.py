@@ -8,12 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
-from small_runs import toy
 
 import kkl_gym
 from kkl_gym.simulate import simulate
 from observers.estimator import Running
-from training import train
 from training.cli import main
 from training.evaluation.errors import NoStartsError, starts
 from training.kalman import ExtendedKalmanFilter, unknown_start
@@ -117,13 +115,3 @@ def test_every_command_takes_a_system_on_the_circle(tmp_path, monkeypatch, capsy
     for small in ("--measurement-noise 0 --csv errors.csv", "--measurement-noise 0.1 --faults"):
         main(["evaluate", path, "--system", PENDULUM, "--trajectories", "4", "--duration", "6", *small.split()])
     assert set(pd.read_csv("errors.csv").starts) == {"X", "2X \\ X"}
-
-
-def test_a_loop_is_closed_by_a_policy_where_there_is_no_regulator(tmp_path, pendulum):
-    (tmp_path / "mine.py").write_text("def turn(x):\n    return 0.0 * x[:, :1]\n")
-    small = {"inverse_steps": 2, "closed_loop_trajectories": 10, "duration": 1.0}
-    config = toy(pendulum, **small)
-    with pytest.raises(ValueError, match="policy of your own"):
-        train(pendulum, config, tmp_path / "a")
-    config = toy(pendulum, policy=f"{tmp_path / 'mine.py'}:turn", **small)
-    assert list(train(pendulum, config, tmp_path / "b").losses) == ["inverse", "closed-loop"]

@@ -34,7 +34,7 @@ NAME = r"[\w][\w.-]*"  # of an observer, and so of a file
 OF_SYSTEMS = ("pipeline", "preset", "size", "uncertain", "policy", "parameters")  # options
 SIMULATED = (  # settings that say how motions are simulated
     *("trajectories", "duration", "process_noise_share", "free_inverse", "lead_in_input", "runs"),
-    *("closed_loop_trajectories", "estimate_parameters", "false_alarms"),
+    *("estimate_parameters", "false_alarms"),
 )
 MOTIONS = {"equations": "the system's equations", "flow": "a learned flow"}
 OF_RECORDS = ("windows", "arbitrary_zero", "held_out")
@@ -152,7 +152,6 @@ class Train:
         if self.size != "default" and self.pipeline == "spinn":
             raise ValueError(f"--size {self.size} is of the pipeline 'input-aware', not 'spinn'")
         name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
-        name += "-closed-loop" if changes.get("closed_loop_trajectories") else ""
         return name if self.size == "default" else f"{name}-{self.size}"
 
     def _records(self, name: str, changes: Mapping[str, Any], progress: ProgressBars) -> "RecordedSource":

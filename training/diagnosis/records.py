@@ -12,7 +12,7 @@ from observers import LinearFilter
 from observers.checks import integer, noise_levels, shown
 from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
 from training.evaluation.levels import Level, show_level
-from training.maps.coordinates import coordinates, noise_covariance, root, settling_time, spread
+from training.maps.coordinates import SETTLED, coordinates, noise_covariance, root, settling_time, spread
 from training.progress import ProgressBars, progress_bars
 from training.records import Record, check_signals, pieces, resampled
 from training.rollouts import Policy, make, policy_of, roll_out
@@ -231,7 +231,7 @@ def of_records(
     others, asking = (Filtered(pieces(part), linear) for part in split(records, ASKING_SHARE, seed))
     rng = generator(Stream.VALIDATION, seed, 1)
     settled = settling_time(linear) / linear.dt
-    last, memory = int(np.ceil(np.log2(settled))), settled / np.log(1e3)  # beyond which it forgets where a window began
+    last, memory = int(np.ceil(np.log2(settled))), settled / SETTLED  # beyond which it forgets where a window began
     windows, found = [0, *(2**i for i in range(last + 1))], list[Compared]()
     for window in windows:
         samples = asking.samples(window, ASKING), others.samples(window, OTHERS)

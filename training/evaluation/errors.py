@@ -13,7 +13,7 @@ from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.seeds import Stream, generator
-from training.trajectories.motions import draw_process_noise, noisy_output, random_inputs, under_policy
+from training.trajectories.motions import draw_process_noise, random_inputs, under_policy
 from training.trajectories.policies import Controller
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
@@ -237,5 +237,5 @@ def follow(
 def measured(system: System, trajectories: UnseenTrajectories, measurement_noise: Level, seed: int) -> np.ndarray:
     """Outputs of trajectories with noise, (steps + 1, n, ny)."""
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
-    rng = generator(Stream.EVALUATION, seed, 1)
-    return noisy_output(trajectories.plant or system, trajectories.x, measurement_noise=level, rng=rng)
+    y = (trajectories.plant or system).output(trajectories.x)
+    return y + np.asarray(level) * generator(Stream.EVALUATION, seed, 1).standard_normal(y.shape)

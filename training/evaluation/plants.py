@@ -5,10 +5,8 @@ import numpy as np
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.checks import is_finite, noise_levels, shown
-from training.evaluation.errors import TRANSIENT, unseen_trajectories
+from training.evaluation.errors import TRANSIENT, measured, unseen_trajectories
 from training.evaluation.levels import Level
-from training.seeds import Stream, generator
-from training.trajectories.motions import noisy_output
 from training.trajectories.parameters import blind, with_parameters
 from training.trajectories.policies import Controller
 
@@ -62,7 +60,7 @@ def parameter_errors(
     )
     if not runs.inside.any():
         raise ValueError(f"each of {trajectories} runs left bounds = {system.bounds}")
-    y = noisy_output(moving, runs.x, measurement_noise=level, rng=generator(Stream.EVALUATION, seed, 1))
+    y = measured(moving, runs, level, seed)
     found = observer.estimate_parameters(y, runs.u if artifact.nu else None)
     true = [plant.parameters[name] for name in estimated] if plant else runs.x[0, :, nx:]
     late = found[round(TRANSIENT * len(found)) :]

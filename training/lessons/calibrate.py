@@ -1,6 +1,7 @@
 """The lesson of calibration: covariances and limits of a monitor, from one pass of motions nothing was trained on."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ from scipy.special import gammaincinv
 
 from kkl_gym.system import System
 from observers import Artifact, ErrorCovariance, Factors, InverseMap, Limits, Motion
+from observers.checks import noise_levels
 from observers.decoder import Decoders
 from observers.factors import COVERAGE
 from observers.tracker import Tracker
@@ -100,7 +102,8 @@ class _Calibration:
         self.x, self.u = (np.tile(values, (1, count, 1)) for values in (runs.x, runs.u))
         self.y = np.moveaxis(y, 0, 1).reshape(len(y[0]), -1, y.shape[-1])
         process, kind = np.unique(runs.process_noise, return_inverse=True)
-        self.groups = [(_as_level(level), float(each)) for level in self.levels for each in process]
+        levels = [noise_levels("measurement_noise", level, source.ny) for level in self.levels]
+        self.groups = list(itertools.product(levels, process.tolist()))
         self.owner = np.add.outer(len(process) * np.arange(count), kind.ravel()).ravel()
         self.noisy = runs.process_noise > 0
 
@@ -320,12 +323,6 @@ def _covariance(error: np.ndarray, least: np.ndarray) -> np.ndarray:
     covariance = error.T @ error / len(error) + least
     edge = np.quantile(squared_distance(error, covariance), COVERAGE, method="weibull")
     return np.asarray(covariance * edge / chi_square(COVERAGE, error.shape[1]))
-
-
-def _as_level(level: Any) -> Any:
-    """A level as observers take it: a number, or one for each output."""
-    level = np.asarray(level)
-    return tuple(level.tolist()) if level.ndim else float(level)
 
 
 __all__ = ["calibrate", "chi_square", "squared_distance"]

@@ -1,29 +1,22 @@
 """The lesson of the map: T_inv, with T before it in the paper's way."""
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 
 from kkl_gym.system import System
-from observers import Artifact, ForwardMap, InverseMap, LinearFilter
+from observers import ForwardMap, InverseMap, LinearFilter
 from training.lessons.run import Run
 from training.maps.coordinates import StateScale
 from training.maps.forward import ForwardProblem, transients, truncation_step
-from training.maps.inverse import ClosedLoopSampler, ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
+from training.maps.inverse import ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
 from training.maps.networks import Network, averaged, on_torch
 from training.seeds import Stream, generator
 from training.sources.simulated import SimulatedSource
 from training.sources.source import Pairs, Source
 from training.spectrum import Spectrum
-from training.systems import named_policy
-from training.trajectories.closed_loop import record_closed_loop
-from training.trajectories.motions import recording_ages
-
-CLOSED_LOOP_SECONDS = 20.0  # of each motion, at the pace of the shipped systems
 
 
 @dataclass(frozen=True)
@@ -34,11 +27,6 @@ class Maps:
     inverse: InverseMap
     free_inverse: InverseMap | None = None
     forward: ForwardMap | None = None
-
-    def artifact(self, facts: Mapping[str, Any], **made: Any) -> Artifact:
-        """Put them together with what a source says of itself."""
-        parts = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
-        return Artifact(**parts, **facts, **made)
 
 
 def learn_map(source: Source, run: Run) -> Maps:
@@ -75,13 +63,8 @@ class _MapLesson:
         self.source, self.run, self.config = source, run, config
         self.spectrum = Spectrum(config.eigenvalues, config.pairs)
         self.linear = self.spectrum.filter(source.ny, config.dt, source.nu)
-        simulated = isinstance(source, SimulatedSource)
-        self.free = bool(simulated and source.nu and config.free_inverse and config.policy is None)
-        if config.closed_loop_trajectories:  # or the reason why none can be closed, before any work
-            simulated_source = self._simulated()
-            self.feedback = simulated_source.policy or named_policy(simulated_source.system, "controller")
-        stages = 1 + self.free + bool(config.closed_loop_trajectories) + (config.pipeline == "spinn")
-        self.share = 1 / stages
+        self.free = isinstance(source, SimulatedSource) and source.has_free_map
+        self.share = 1 / (1 + self.free + (config.pipeline == "spinn"))
 
     def learned(self) -> Maps:
         if self.config.pipeline == "spinn":
@@ -96,12 +79,7 @@ class _MapLesson:
         inverse = sampler.inverse_map(networks[0], self.linear)
         if len(networks) > 1:
             inverse = dataclasses.replace(inverse, mlp=averaged(networks))
-        maps = Maps(self.linear, inverse, free)
-        if self.config.closed_loop_trajectories:
-            both = self._closed_loop(sampler, maps)
-            self._minimise("closed-loop", networks[0], both)
-            maps = dataclasses.replace(maps, inverse=both.inverse_map(networks[0], self.linear))
-        return maps
+        return Maps(self.linear, inverse, free)
 
     def _names(self) -> list[str]:
         count = self.config.members
@@ -139,42 +117,16 @@ class _MapLesson:
         network = Network(
             inputs.shape[1], x.shape[1], width=config.width, depth=config.depth, activation=config.activation
         ).to(device)
-        self._minimise(name, network, sampler, seed=config.seed * config.members + member)
+        problem = InverseProblem(network, sampler, device)
+        seed, share = config.seed * config.members + member, self.share / config.members
+        self.run.minimise(name, problem, problem.loss, config.inverse_steps, share=share, seed=seed)
         return network
-
-    def _minimise(self, name: str, network: Network, sampler: Sampler, **settings: Any) -> None:
-        config = self.config
-        problem = InverseProblem(network, sampler, self.run.device)
-        share = self.share / config.members
-        self.run.minimise(name, problem, problem.loss, config.inverse_steps, share=share, **settings)
-
-    def _closed_loop(self, sampler: TrajectorySampler, maps: Maps) -> ClosedLoopSampler:
-        """Batches half from motions of a controller that acts on T_inv's estimate."""
-        config, source = self.config, self._simulated()
-        steps = min(source.steps, round(CLOSED_LOOP_SECONDS * source.pace / config.dt))
-        driven = record_closed_loop(
-            source.plant,
-            maps.artifact(source.facts()),
-            self.feedback,
-            n=config.closed_loop_trajectories,
-            steps=steps,
-            ages=recording_ages(steps, config.samples),
-            rng=generator(Stream.TRAINING, config.seed, 2),
-            noise_free_share=config.noise_free_share,
-            high_noise_emphasis=config.high_noise_emphasis,
-            process_noise_share=config.process_noise_share,
-            report=self.run.progress.bar("closing the loop", config.closed_loop_trajectories),
-        )
-        return ClosedLoopSampler(sampler, source.known(driven), dt=config.dt, device=self.run.device)
-
-    def _simulated(self) -> SimulatedSource:
-        if not isinstance(self.source, SimulatedSource):
-            raise ValueError(f"pipeline {self.config.pipeline!r} and closed loops need equations to simulate")
-        return self.source
 
     def _papers(self) -> Maps:
         """T, trained on motions and on its equation, and T_inv on z = T(x)."""
-        source, config, linear, run = self._simulated(), self.config, self.linear, self.run
+        source, config, linear, run = self.source, self.config, self.linear, self.run
+        if not isinstance(source, SimulatedSource):
+            raise ValueError("the pipeline 'spinn' needs the equations of a system; train with 'input-aware'")
         system = source.system
         first = truncation_step(
             system, linear, steps=source.steps, epsilon=config.truncation, box_factor=config.box_factor

@@ -1,7 +1,7 @@
-"""The inverse T_inv: batches along motions, in closed loop or of T(x), and what its training minimises on them."""
+"""The inverse T_inv: batches along motions or of T(x), and what its training minimises on them."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,11 +19,12 @@ from training.maps.coordinates import (
 )
 from training.maps.forward import TensorMap
 from training.maps.networks import Network, compiled, tensor
-from training.trajectories.closed_loop import ClosedLoop
-from training.trajectories.motions import ALIKE, Pairs
+from training.trajectories.motions import Pairs
 
 MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
 AGE_UNIT = 5  # samples, in the age feature log(1 + t / unit)
+# Of samples with several outputs, the share in which all outputs have the same part of their largest noise levels.
+ALIKE = 0.5
 SAMPLES = 100_000  # of z, from which coordinates are found
 PROCESS_NOISE_UNIT = 0.1  # of the highest level, in the process noise feature log(1 + level / unit)
 
@@ -112,15 +113,19 @@ class TrajectorySampler:
         self._noise_root = tensor(root(unit @ noise_covariance(linear, saturated) @ unit.T), device)
         self._error_root = None if error is None else tensor(root(whiten @ error @ whiten.T), device)
         self._age = tensor(data.ages * linear.dt, device)
-        self._oldest = data.ages[-1]
-        self._age_cell = self.age_cell(data.ages, device)
-        self._process_cell = torch.zeros(n, dtype=torch.long, device=device)
+        position = np.log1p(data.ages) / np.log1p(data.ages[-1])
+        age_cell = np.minimum((position * self.AGE_CELLS).astype(int), self.AGE_CELLS - 1)
+        self._age_cell = torch.as_tensor(age_cell, device=device)
+        trajectory_cell, self._trajectory_cells, self.kinds_of_plant = np.zeros(n, int), 1, 1
         if process_noise_max:
-            self._process, self._process_cell = self.process_conditions(data.process_noise, device)
-        self.kinds_of_plant = 1 if data.nominal is None else 2
-        self._nominal_cell = self.nominal_cell(data, device)
-        processes = self.PROCESS_CELLS if process_noise_max else 1
-        self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, processes - 1, self.kinds_of_plant - 1) + 1
+            part = data.process_noise / process_noise_max
+            self._process = tensor(np.log1p(part / PROCESS_NOISE_UNIT), device)
+            trajectory_cell, self._trajectory_cells = (part > 0).astype(int) + (part > 0.5), self.PROCESS_CELLS
+        if data.nominal is not None:  # the system's own parameters
+            trajectory_cell, self.kinds_of_plant = 2 * trajectory_cell + data.nominal, 2
+            self._trajectory_cells *= 2
+        self._trajectory_cell = torch.as_tensor(trajectory_cell, device=device)
+        self.cells = self.AGE_CELLS * (1 + self.LEVELS) * self._trajectory_cells
 
     def __call__(self, generator: torch.Generator) -> Batch:
         """One batch."""
@@ -144,7 +149,8 @@ class TrajectorySampler:
         inputs = torch.cat([modes, *conditions], -1)
         level_cell = 1 + (position.mean(1) * self.LEVELS).long().clamp(0, self.LEVELS - 1)
         level_cell = torch.where((level > 0).any(1), level_cell, 0)
-        cell = self.cell(self._age_cell[ages], level_cell, self._process_cell[rows], self._nominal_cell[rows])
+        cell = self._age_cell[ages] * (1 + self.LEVELS) + level_cell
+        cell = cell * self._trajectory_cells + self._trajectory_cell[rows]
         batch = self.AGES_PER_BATCH * self._per_age
         return Batch(
             inputs.reshape(batch, -1),
@@ -166,28 +172,6 @@ class TrajectorySampler:
         position = position.clamp(min=0.0) ** (1 / self._high_noise_emphasis)
         level = self._level_max * 100 ** (position - 1)  # over two decades
         return position, torch.where(loud, level, torch.zeros_like(level))
-
-    def process_conditions(self, process_noise: np.ndarray, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-        """Process noise features of levels (n,), and their parts in the number of the cell."""
-        part = process_noise / self.process_noise_max
-        cell = (part > 0).astype(int) + (part > 0.5)
-        return tensor(np.log1p(part / PROCESS_NOISE_UNIT), device), torch.as_tensor(cell, device=device)
-
-    def cell(self, age: Any, level: Any, process: Any, nominal: Any) -> Any:
-        """Number of the cell where those of age, measurement noise, process noise and parameters meet."""
-        number = (age * (1 + self.LEVELS) + level) * (self.PROCESS_CELLS if self.process_noise_max else 1) + process
-        return number * self.kinds_of_plant + nominal
-
-    def nominal_cell(self, data: Pairs, device: torch.device) -> torch.Tensor:
-        """1 for trajectories of the system's own parameters where these differ, (n,); else 0."""
-        nominal = np.zeros(data.x.shape[1]) if data.nominal is None else data.nominal
-        return torch.as_tensor(nominal.astype(int), device=device)
-
-    def age_cell(self, ages: np.ndarray, device: torch.device) -> torch.Tensor:
-        """Cells of ages in samples."""
-        position = np.log1p(ages) / np.log1p(self._oldest)
-        cell = np.minimum((position * self.AGE_CELLS).astype(int), self.AGE_CELLS - 1)
-        return torch.as_tensor(cell).to(device)
 
     def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
         """The map that a network trained on these batches makes."""
@@ -217,56 +201,6 @@ class TrajectorySampler:
 def _float_or_tuple(values: np.ndarray) -> float | tuple[float, ...]:
     """A number for one output, a tuple for several, as inverse maps hold them."""
     return tuple(values.tolist()) if len(values) > 1 else float(values[0])
-
-
-class ClosedLoopSampler:
-    """Batches half from open-loop trajectories, half from closed-loop ones with the noise that these already hold."""
-
-    def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, *, dt: float, device: torch.device) -> None:
-        self.open_loop, self.coordinates = open_loop, open_loop.coordinates
-        self.parameters, self.kinds_of_plant = open_loop.parameters, open_loop.kinds_of_plant
-        level, gain = data.measurement_noise, np.atleast_2d(open_loop.noise_gain)
-        shrink = 1.0 + ((level[..., None] * gain) ** 2).sum(1)
-        self._modes = tensor(open_loop.coordinates(data.z) / shrink, device)
-        self._x = tensor(open_loop.scale(data.x), device)
-        self._level = tensor(np.log1p(level / open_loop.measurement_noise_unit), device)
-        self._age = tensor(np.log1p(np.minimum(data.ages * dt, open_loop.age_max) / open_loop.age_unit), device)
-        self._weight = tensor(open_loop.scale.weight(data.x), device)
-        self._age_cell = open_loop.age_cell(data.ages, device)
-        position = np.log10(np.maximum(level / open_loop.measurement_noise_max, 1e-9)) / 2 + 1
-        position = np.maximum(position, 0.0).mean(-1)  # over two decades, as there
-        level_cell = np.where(level.any(-1), 1 + np.minimum(position * open_loop.LEVELS, open_loop.LEVELS - 1), 0)
-        self._level_cell = torch.as_tensor(level_cell.astype(int), device=device)
-        self._process_cell = torch.zeros_like(self._level_cell)
-        if open_loop.process_noise_max:
-            self._process, self._process_cell = open_loop.process_conditions(data.process_noise, device)
-        self._nominal_cell = open_loop.nominal_cell(data, device)
-        self.cells = 2 * open_loop.cells
-
-    def __call__(self, generator: torch.Generator) -> Batch:
-        """One batch."""
-        inputs, x, weight, cell = self.open_loop(generator)
-        m, n, _ = self._x.shape
-        half, device = len(x) // 2, self._x.device
-        ages = torch.randint(m, (half,), generator=generator, device=device)
-        rows = torch.randint(n, (half,), generator=generator, device=device)
-        conditions = [self._level[rows], self._age[ages][:, None]]
-        if self.open_loop.process_noise_max:
-            conditions.insert(1, self._process[rows][:, None])
-        closed = torch.cat([self._modes[ages, rows], *conditions], -1)
-        closed_cell = self.open_loop.cell(
-            self._age_cell[ages], self._level_cell[rows], self._process_cell[rows], self._nominal_cell[rows]
-        )
-        return Batch(
-            torch.cat([inputs[:half], closed]),
-            torch.cat([x[:half], self._x[ages, rows]]),
-            torch.cat([weight[:half], self._weight[ages, rows]]),
-            torch.cat([cell[:half], self.open_loop.cells + closed_cell]),
-        )
-
-    def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
-        """The map that a network trained on these batches makes."""
-        return self.open_loop.inverse_map(network, linear)
 
 
 class ForwardMapSampler:
@@ -324,7 +258,7 @@ class ForwardMapSampler:
         )
 
 
-Sampler = TrajectorySampler | ClosedLoopSampler | ForwardMapSampler
+Sampler = TrajectorySampler | ForwardMapSampler
 
 
 class InverseProblem(nn.Module):

@@ -13,7 +13,7 @@ import numpy as np
 from observers import Artifact, Equations, KKLObserver, LinearFilter
 from observers.checks import shown
 from training.config import Config
-from training.maps.coordinates import settling_time
+from training.maps.coordinates import SETTLED, settling_time
 from training.records import (
     ROLES,
     Record,
@@ -30,7 +30,7 @@ from training.records import (
 from training.seeds import Stream, generator
 from training.sources.source import OF_MEDIAN, Increments, Pairs, Report, Runs, TooFewRunsError
 from training.sources.windows import samples_as_old, windows
-from training.spectrum import Spectrum, evenly_spaced
+from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
 FEW = 5  # records, below which none is held out as a whole
@@ -57,7 +57,6 @@ RECORDED: dict[str, Any] = {
     "samples": 60, "width": 96, "depth": 2, "learning_rate": 3e-3, "inverse_steps": 3000, "members": 3,
     "noise_free_share": 0.5, "scaling": "range",  # errors count by their own size, not the state's
 }  # fmt: skip
-FASTEST_PER_STEP = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
 OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")  # settings
 
 
@@ -302,13 +301,13 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
 def _recorded_eigenvalues(records: Sequence[Record], dt: float) -> tuple[float, ...]:
     if records[0].source:
         steps = float(np.median([len(record.t) for record in records]))
-        slowest = min(max(EPISODE_SLOWEST, EPISODE_MEMORIES * np.log(1e3) / steps), EPISODE_FASTEST / 4)
+        slowest = min(max(EPISODE_SLOWEST, EPISODE_MEMORIES * SETTLED / steps), EPISODE_FASTEST / 4)
         spaced = evenly_spaced(EPISODE_MODES, -slowest / dt, -EPISODE_FASTEST / dt)
     else:
         rate = signal_rate(records)
         length = np.median([record.duration for record in records])
-        slowest = min(max(SLOWEST * rate, RECORD_MEMORIES * np.log(1e3) / length), rate)
-        spaced = evenly_spaced(MODES, -slowest, -min(FASTEST * rate, FASTEST_PER_STEP / dt))
+        slowest = min(max(SLOWEST * rate, RECORD_MEMORIES * SETTLED / length), rate)
+        spaced = evenly_spaced(MODES, -slowest, -min(FASTEST * rate, FASTEST_MODE / dt))
     return tuple(float(f"{value:.6g}") for value in spaced)
 
 

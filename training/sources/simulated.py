@@ -29,14 +29,7 @@ from training.trajectories.motions import (
     trajectories,
     under_policy,
 )
-from training.trajectories.parameters import (
-    blind,
-    nominal_share,
-    relative_ranges,
-    uncertain_plant,
-    with_bias,
-    with_parameters,
-)
+from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 from training.trajectories.policies import Controller, policy_fingerprint
 
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
@@ -69,19 +62,18 @@ class SimulatedSource:
 
     def __init__(self, system: System, config: Config) -> None:
         self.config, self.system = config, system
-        policy = None if config.policy is None else named_policy(system, config.policy)
+        self.policy = None if config.policy is None else blind(named_policy(system, config.policy), system.nx)
         if np.any(config.bias):
-            policy = policy and blind(policy, system.nx)
             system = with_bias(system, config.bias)
         self.model = system
         self.ranges = relative_ranges(system, config.uncertain)
-        self.plant = uncertain_plant(system, self.ranges)
+        self.plant = with_parameters(system, self.ranges, in_training=True)
         self.estimated = tuple(self.ranges) if config.estimate_parameters else ()
-        self.policy = policy
         self.name = self.system.name
         self.nx, self.ny, self.dt, self.pace = system.nx, system.ny, config.dt, system.pace
         aware = config.pipeline == "input-aware"
         self.nu = system.nu if aware and config.inputs else 0
+        self.has_free_map = bool(self.nu and config.free_inverse and not self.policy)
         self.process_noise_share = config.process_noise_share if aware else 0.0
         self.process_noise = float(system.process_noise) if self.process_noise_share else 0.0
         self.steps = max(1, round(config.duration / config.dt))
@@ -122,12 +114,11 @@ class SimulatedSource:
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
         """Motions to train on with a filter beside them; free ones start in part where inputs have led."""
-        config, policy = self.config, self.policy
+        config = self.config
         if free:
             motions = Motions(lead_in_share=LEAD_IN_SHARE, lead_in_input=config.lead_in_input)
         else:
-            both = self.nu and config.free_inverse and not policy  # then free motions have a map of their own
-            motions = Motions(kinds=DRIVEN if both else KINDS, policy=policy and blind(policy, self.nx))
+            motions = Motions(kinds=DRIVEN if self.has_free_map else KINDS, policy=self.policy)
         motions = replace(motions, process_noise_share=self.process_noise_share, box_factor=config.box_factor)
         pairs = record(
             self.plant,
@@ -139,10 +130,6 @@ class SimulatedSource:
             motions=motions,
             report=report,
         )
-        return self.known(pairs)
-
-    def known(self, pairs: Any) -> Any:
-        """Pairs without the parameters that are not to be estimated, and whether these are the system's own."""
         nominal = None
         if self.ranges:
             own = [self.model.parameters[name] for name in self.ranges]
@@ -166,7 +153,7 @@ class SimulatedSource:
                 dt=self.dt,
                 rng=rng,
                 driven=bool(self.nu),
-                policy=self.policy and blind(self.policy, self.nx),
+                policy=self.policy,
                 process_noise=level,
                 report=part,
                 box_factor=BEYOND,

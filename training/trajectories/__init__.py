@@ -1,1 +1,1 @@
-"""Simulated motions: inputs, noise, policies, closed loops, and what follows from a system's equations."""
+"""Simulated motions: inputs, noise, policies, and what follows from a system's equations."""

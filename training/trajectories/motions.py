@@ -1,13 +1,12 @@
 """Simulated motions under random inputs, policies and noise, and the filter's states beside them.
 
-Process noise enters these motions. Measurement noise enters the filter's state when a batch is drawn
-(:mod:`training.maps.samplers.trajectory`); in closed loop both enter the simulation, because the controller acts on
-what the observer makes of them.
+Process noise enters these motions; measurement noise enters the filter's state when :mod:`training.maps.inverse` draws
+a batch.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -25,8 +24,6 @@ FEWEST_INSIDE = 0.05  # that share
 # Seconds, at the pace of the shipped systems, for which inputs lead starts out of the training box.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
-# Of trajectories with several outputs, the share in which all outputs have the same part of their largest noise levels.
-ALIKE = 0.5
 POLICY_KINDS = ("steps", "sine")  # of a policy's errors and explorations
 POLICY_ERROR = (0.02, 0.5)  # of the states that a policy acts on, in multiples of the system's scale
 EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in input bounds
@@ -47,7 +44,7 @@ class Pairs:
     x: np.ndarray
     z: np.ndarray
     process_noise: np.ndarray
-    nominal: np.ndarray | None = field(default=None, kw_only=True)
+    nominal: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -99,13 +96,6 @@ def draw_process_noise(
     """Process noise (steps, n, nx) of levels (n,), uniform in a box and held over each sampling interval."""
     bound = np.multiply.outer(level, system.scale)
     return np.asarray(bound * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))
-
-
-def noisy_output(
-    system: System, x: np.ndarray, *, measurement_noise: float | Sequence[float], rng: np.random.Generator
-) -> np.ndarray:
-    """Measure states (..., nx) with Gaussian noise of this standard deviation, of all outputs or each; (..., ny)."""
-    return system.output(x) + np.asarray(measurement_noise) * rng.standard_normal((*x.shape[:-1], system.ny))
 
 
 def under_policy(
@@ -168,11 +158,10 @@ def record(
     steps: int,
     ages: np.ndarray,
     rng: np.random.Generator,
-    motions: Motions | None = None,
+    motions: Motions,
     report: Callable[[float], object] = lambda done: None,
 ) -> Pairs:
     """Simulate trajectories and run the filter beside them; ``ages`` (m,)."""
-    motions = motions or Motions(kinds=KINDS)
     if not linear.nu:
         motions = dataclasses.replace(motions, kinds=(), policy=None)
     found, done = list[tuple[np.ndarray, np.ndarray, np.ndarray]](), 0

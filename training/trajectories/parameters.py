@@ -45,17 +45,8 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
     return ranges
 
 
-def uncertain_plant(system: System, ranges: Ranges) -> System:
-    """A system whose parameters differ from motion to motion, as a training for all of them wants it.
-
-    Some motions have the system's own parameters, which are the likeliest: two in three where one parameter is
-    uncertain. In the others parameters lie more often near the ends of their ranges, where plants are hardest to serve.
-    """
-    return with_parameters(system, ranges, in_training=True)
-
-
 def nominal_share(ranges: Ranges) -> float:
-    """Share of the motions of :func:`uncertain_plant` that have the system's own parameters."""
+    """Share of the motions in training that have the system's own parameters."""
     return NOMINAL_SHARE ** len(ranges)
 
 
@@ -64,6 +55,10 @@ def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False
 
     An observer of such a system estimates parameters, a motion of it has parameters of its own, and derivatives by its
     states are derivatives by parameters as well.
+
+    In training some motions have the system's own parameters, which are the likeliest: two in three where one parameter
+    is uncertain. In the others parameters lie more often near the ends of their ranges, where plants are hardest to
+    serve.
     """
     for name, limits in ranges.items():
         if name not in system.parameters:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from small_runs import CPU, closed_loop, open_loop
+from small_runs import CPU, open_loop
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 import training.evaluation.errors
@@ -186,12 +186,11 @@ def test_losses_ask_tensors_for_no_numbers_and_have_one_shape():
     """Fake tensors have no values: to read one, or to make a shape of them, raises."""
     system = VanDerPol()
     sampler, *_ = open_loop(0.5)
-    closed, *_ = closed_loop(0.5)
     paper = ForwardMapSampler(
         lambda x: x.repeat(1, 2), np.eye(4), points=np.random.default_rng(0).normal(size=(100, 2)), batch=64, device=CPU
     )
     problems = [forward_problem(system, Spectrum((-1.0, -2.0)).filter(1, 0.01), np.random.default_rng(0))]
-    for each in (sampler, closed, paper):
+    for each in (sampler, paper):
         inputs = each(torch.Generator())[0].shape[1]
         problems.append(InverseProblem(Network(inputs, 2, width=8, depth=1, activation="tanh"), each, CPU))
     for problem in problems:

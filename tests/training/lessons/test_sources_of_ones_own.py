@@ -22,7 +22,8 @@ class Spring:
     def __init__(self, known, **changes):
         self.known = known
         small = {"dt": DT, "inverse_steps": 400, "width": 16, "batch": 256, "flow_steps": 20}
-        self.config = Config("input-aware", eigenvalues=(-0.5, -1.0, -2.0, -4.0, -8.0), **small | changes)
+        small |= {"pipeline": "input-aware", "eigenvalues": (-0.5, -1.0, -2.0, -4.0, -8.0)}
+        self.config = Config(**small | changes)
 
     def motions(self, n, steps, seed):
         x = [np.random.default_rng(seed).uniform(-1, 1, (n, 2))]
@@ -86,7 +87,7 @@ def test_lessons_run_by_themselves():
     np.testing.assert_allclose(motion.step(x, np.zeros((50, 0)), DT), x @ PHI.T, atol=1e-5)
 
 
-def test_a_loop_is_closed_in_simulation_alone():
-    source = Spring(True, closed_loop_trajectories=10)
-    with Run.alone(source.config) as run, pytest.raises(ValueError, match="closed loops need equations"):
+def test_the_papers_pipeline_needs_equations_to_simulate():
+    source = Spring(True, pipeline="spinn", forward_steps=1)
+    with Run.alone(source.config) as run, pytest.raises(ValueError, match="'spinn' needs the equations of a system"):
         learn_map(source, run)

@@ -228,27 +228,6 @@ def test_an_unstable_plant_is_trained_under_a_policy(tmp_path):
         trained(Falling(), tmp_path / "run", resume=True, **small | {"policy": f"{script}:hold"})
 
 
-def test_closing_the_loop_is_a_second_stage(tmp_path, monkeypatch):
-    record, shares = training.lessons.map.record_closed_loop, []
-
-    def spy(*arguments, **named):
-        shares.append({name: value for name, value in named.items() if name.endswith(("_share", "_emphasis"))})
-        return record(*arguments, **named)
-
-    monkeypatch.setattr(training.lessons.map, "record_closed_loop", spy)
-    small = {"duration": 1.0, "closed_loop_trajectories": 10, "inverse_steps": 5}
-    noise = {"noise_free_share": 0.35, "high_noise_emphasis": 1.5, "process_noise_share": 0.25}
-    result, _ = trained(Slow(), tmp_path, **small, **noise)
-    assert list(result.losses) == ["free", "inverse", "closed-loop"]
-    assert shares == [noise]
-    again, _ = trained(Slow(), tmp_path, resume=True, **small, **noise)
-    for expected, found in zip(parts(result.artifact), parts(again.artifact), strict=True):
-        np.testing.assert_array_equal(expected, found)
-    monkeypatch.delattr(training.lessons.map, "TrajectorySampler")
-    with pytest.raises(ValueError, match="no inputs"):  # before any work
-        trained(Autonomous(), **small)
-
-
 def test_the_settings_of_noise_reach_motions_and_batches(monkeypatch):
     sampler, seen = training.lessons.map.TrajectorySampler, {}
 
@@ -304,7 +283,7 @@ def test_two_outputs_have_noise_of_their_own(tmp_path):
         pace = 1.0
 
     system = Both()
-    result, _ = trained(system, duration=2.0, closed_loop_trajectories=10, inverse_steps=10)
+    result, _ = trained(system, duration=2.0, inverse_steps=10)
     write_report(tmp_path / "report.png", result, system)
     result.artifact.save(tmp_path / "a.safetensors")
     read = Artifact.read(tmp_path / "a.safetensors")

@@ -10,7 +10,6 @@ import pytest
 from rich.console import Console
 from small_runs import CPU, toy
 
-import training.lessons.map
 from kkl_gym import VanDerPol
 from kkl_gym.system import System
 from training import SimulatedSource, errors, train, unseen_trajectories
@@ -88,31 +87,6 @@ def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate():
     assert 0.4 < pairs.nominal.mean() < 0.9
     np.testing.assert_allclose(mu, np.broadcast_to(mu[0], mu.shape), rtol=1e-9)
     assert 2.7 <= mu.min() < 2.8 < 3.2 < mu.max() <= 3.3
-
-
-def test_in_closed_loop_the_plant_is_uncertain_and_the_controller_nominal(monkeypatch, tmp_path):
-    seen, acted = {}, []
-
-    def spy(plant, artifact, controller, **named):
-        seen["plant"] = plant
-
-        def noted(x_hat):
-            acted.append(x_hat.shape[1])
-            return controller(x_hat)
-
-        seen["data"] = original(plant, artifact, noted, **named)
-        return seen["data"]
-
-    original = training.lessons.map.record_closed_loop
-    monkeypatch.setattr(training.lessons.map, "record_closed_loop", spy)
-    few = {"closed_loop_trajectories": 12, "inverse_steps": 3, "duration": 2.0, "free_inverse": False}
-    config = toy(VanDerPol(), uncertain={"all": 0.1}, estimate_parameters=True, **few)
-    found = train(VanDerPol(), config, tmp_path, device=CPU).artifact
-    assert seen["plant"].state_names == ("x1", "x2", "mu")
-    assert set(acted) == {2}
-    mu = seen["data"].x[0, :, 2]
-    assert 0.05 < mu.std() < 0.3
-    assert (found.nx, found.estimated_parameters) == (2, ("mu",))
 
 
 def test_under_a_policy_it_sees_the_states_alone(tmp_path):

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import torch
 from linear_system import TwoUnits
-from small_runs import CPU, closed_loop, open_loop, untrained
+from small_runs import CPU, open_loop, untrained
 
 from observers.decoder import Decoder
 from training.maps.coordinates import noise_covariance
-from training.maps.inverse import ClosedLoopSampler, TrajectorySampler
+from training.maps.inverse import TrajectorySampler
 from training.spectrum import Spectrum
-from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.motions import KINDS, Motions, record, recording_ages
 
 
@@ -136,16 +135,14 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(made, largest):
     np.testing.assert_allclose(measured / count, expected / count, atol=0.03)
 
 
-def assert_shown(batch, row, artifact, data, exact=False):
-    """A row of a batch holds what the observer gives its network; returns its trajectory."""
+def assert_shown(batch, row, artifact, data):
+    """A row without measurement noise holds what the observer gives its network; returns its trajectory."""
     inverse = artifact.inverse
     state = batch.x[row].numpy() * inverse.x_scale + inverse.x_offset
     slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
-    ny = artifact.ny
-    level = np.zeros(ny) if exact else data.measurement_noise[trajectory]
     process = float(data.process_noise[trajectory]) if "process_noise" in inverse.features else 0.0
-    level_of = tuple(level) if ny > 1 else float(level[0])
-    decoder = Decoder(inverse, slice(None), measurement_noise=level_of, process_noise=process)
+    level = (0.0,) * artifact.ny if artifact.ny > 1 else 0.0
+    decoder = Decoder(inverse, slice(None), measurement_noise=level, process_noise=process)
     x_hat = decoder(data.z[slot, trajectory], float(data.ages[slot] * artifact.filter.dt))
     shown = inverse.x_offset + inverse.x_scale * inverse.mlp(batch.inputs[row].numpy())
     np.testing.assert_allclose(shown, x_hat, rtol=1e-3, atol=1e-4 * inverse.x_scale.max())
@@ -160,49 +157,9 @@ def test_batches_are_what_the_observer_shows_its_network(made):
     modes, ny = len(sampler.coordinates.whiten), artifact.ny
     quiet = (batch.inputs[:, modes : modes + ny] == 0).all(1)
     for row in torch.nonzero(quiet)[::50, 0].tolist():
-        trajectory, cell = assert_shown(batch, row, artifact, data, exact=True), batch.cell[row]
+        trajectory, cell = assert_shown(batch, row, artifact, data), batch.cell[row]
         if sampler.process_noise_max:
             level = data.process_noise[trajectory]
             assert cell % 3 == int(level > 0) + int(level > 0.025)
             cell = cell // 3
         assert cell % 7 == 0
-
-
-def closed_loop_of_two_outputs():
-    sampler, _, linear = of_two_outputs()
-    _, artifact = untrained(sampler, linear)
-    rest, ages, rng = lambda x_hat: np.zeros((len(x_hat), 1)), np.array([0, 5, 10]), np.random.default_rng(0)
-    data = record_closed_loop(TwoUnits(), artifact, rest, n=50, steps=10, ages=ages, rng=rng)
-    return ClosedLoopSampler(sampler, data, dt=linear.dt, device=CPU), data, artifact, None
-
-
-@pytest.mark.parametrize("made", [functools.partial(closed_loop, 0.5), closed_loop_of_two_outputs])
-def test_closed_loop_batches_are_what_the_observer_shows_its_network(made):
-    sampler, data, artifact, _ = made()
-    batch = sampler(torch.Generator().manual_seed(0))
-    assert {len(part) for part in batch} == {4096}
-    beside = sampler.open_loop
-    assert (batch.cell[:2048] < beside.cells).all()
-    assert ((batch.cell[2048:] >= beside.cells) & (batch.cell[2048:] < sampler.cells)).all()
-    for row in range(2048, 4096, 200):
-        trajectory, cell = assert_shown(batch, row, artifact, data), batch.cell[row] - beside.cells
-        if beside.process_noise_max:
-            level = data.process_noise[trajectory]
-            assert cell % 3 == int(level > 0) + int(level > 0.025)
-            cell = cell // 3
-        assert (cell % 7 == 0) == (data.measurement_noise[trajectory] == 0).all()
-
-
-def test_closed_loop_motions_of_the_systems_own_parameters_are_in_cells_apart(sampler):
-    _, open_data, linear = sampler
-    _, data, _, _ = closed_loop(0.5)
-    nominal = np.arange(data.x.shape[1]) % 2 == 0
-    data = dataclasses.replace(data, x=data.x * 0 + np.where(nominal, 1.0, 1e6)[:, None], nominal=nominal)
-    apart = dataclasses.replace(open_data, nominal=np.arange(open_data.x.shape[1]) % 2 == 0)
-    beside = TrajectorySampler(apart, linear, measurement_noise_max=0.5, batch=4096, device=CPU)
-    both = ClosedLoopSampler(beside, data, dt=linear.dt, device=CPU)
-    _, x, _, cell = both(torch.Generator().manual_seed(0))
-    x, cell = x[2048:, 0], cell[2048:]
-    assert (both.kinds_of_plant, both.cells) == (2, 2 * beside.cells)
-    assert ((cell >= beside.cells) & (cell < both.cells)).all()
-    torch.testing.assert_close(cell % 2, (x < x.mean()).long())

@@ -98,7 +98,7 @@ def test_recording_gives_up_on_a_system_that_always_escapes():
 
     linear = LinearFilter(np.diag([-1.0]), np.ones((1, 1)), 0.01)
     with pytest.raises(ValueError, match="stayed within bounds"):
-        record(Runaway(), linear, n=5, steps=200, ages=np.array([0]), rng=np.random.default_rng(0))
+        record(Runaway(), linear, n=5, steps=200, ages=np.array([0]), rng=np.random.default_rng(0), motions=Motions())
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def test_parts_of_a_chunk_are_told(monkeypatch):
     monkeypatch.setattr(training.trajectories.motions, "CHUNK", 10)
     linear, told = LinearFilter(np.diag([-1.0, -2.0]), np.ones((2, 1)), 0.01), []
     rng, ages = np.random.default_rng(0), recording_ages(100, 10)
-    record(Oscillator(), linear, n=15, steps=100, ages=ages, rng=rng, report=told.append)
+    record(Oscillator(), linear, n=15, steps=100, ages=ages, rng=rng, motions=Motions(), report=told.append)
     assert told == [0, 5, 10, 10, 12.5, 15]
 
 

@@ -11,7 +11,7 @@ from linear_system import Oscillator
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from kkl_gym.systems import Lorenz, VanDerPol
-from training.trajectories.parameters import NOMINAL_SHARE, relative_ranges, uncertain_plant, with_bias, with_parameters
+from training.trajectories.parameters import NOMINAL_SHARE, relative_ranges, with_bias, with_parameters
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def test_in_discrete_time():
 def test_trainings_have_the_nominal_parameters_or_some_towards_the_ends():
     system = Lorenz()
     ranges = relative_ranges(system, {"sigma": 0.1, "beta": 0.3})
-    drawn = uncertain_plant(system, ranges).draw_starts(np.random.default_rng(0), 20_000)[:, 3:]
+    drawn = with_parameters(system, ranges, in_training=True).draw_starts(np.random.default_rng(0), 20_000)[:, 3:]
     own = [system.sigma, system.beta]
     nominal = (drawn == own).all(-1)
     assert nominal.mean() == pytest.approx(NOMINAL_SHARE**2, abs=0.02)
@@ -92,7 +92,6 @@ def test_trainings_have_the_nominal_parameters_or_some_towards_the_ends():
     for part in (0.5, 0.9):  # of the half-width; the sine of an even angle stays below it so often
         assert (np.abs(share) < part).mean(0) == pytest.approx(2 * np.arcsin(part) / np.pi, abs=0.02)
     assert np.corrcoef(share.T)[0, 1] == pytest.approx(0, abs=0.03)
-    assert uncertain_plant(system, {}) is system
 
 
 def test_a_bias_of_an_output_is_a_state_that_stands_still():
