@@ -5,8 +5,7 @@ import pytest
 
 from observers import Artifact, ArtifactError, shipped
 from observers.names import resolve
-from training.agents.agent import Agent, AgentError
-from training.commands.agent import find
+from training.agents.agent import Agent, AgentError, find
 from training.systems import PROFILES
 
 FILES = [(resolve(name), Artifact, ArtifactError) for name in shipped()]

@@ -9,7 +9,7 @@ from kkl_gym.loading import load_function
 from kkl_gym.system import System
 from training.systems import lorenz, reverse_duffing, rossler, van_der_pol
 from training.systems.profile import Profile
-from training.systems.task import ControlTask
+from training.systems.task import Task, control_task
 from training.trajectories.controllers import Controller
 from training.trajectories.policy import checked_policy
 
@@ -49,4 +49,4 @@ def named_policy(system: System, name: str) -> Controller:
         ) from error
 
 
-__all__ = ["PROFILES", "ControlTask", "Profile", "controller", "named_policy", "profile"]
+__all__ = ["PROFILES", "Profile", "Task", "control_task", "controller", "named_policy", "profile"]

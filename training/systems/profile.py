@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from kkl_gym.system import System
-from training.systems.task import ControlTask
+from training.systems.task import Task
 from training.trajectories.controllers import Controller, linear_quadratic
 
 
@@ -23,7 +23,7 @@ class Profile:
     spinn_settings: Mapping[str, Any] = field(default_factory=dict)
     controller: Callable[[System], Controller] = linear_quadratic
     fault_deadline: float | None = None
-    task: ControlTask | None = None
+    task: Task | None = None
     algorithm: Literal["ppo", "sac"] = "ppo"
     agent_observer: str | None = None
     second_noise: float | None = None

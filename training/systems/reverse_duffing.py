@@ -8,7 +8,7 @@ import numpy as np
 from kkl_gym.system import System
 from training.spectrum import evenly_spaced
 from training.systems.profile import Profile
-from training.systems.task import ControlTask
+from training.systems.task import control_task
 from training.trajectories.controllers import Controller
 
 
@@ -36,7 +36,7 @@ PROFILE = Profile(
     controller=homogeneous,
     fault_deadline=10.0,  # about a period at amplitude 1
     # Marginally stable: whoever does not know the state cannot take energy out.
-    task=ControlTask("reverse_duffing", period=0.1),
+    task=control_task("reverse_duffing", period=0.1),
     algorithm="sac",
     printed={"spinn": 1.96, "ae": 55.4, "dmf": 46.2, "node": 159.8},
 )

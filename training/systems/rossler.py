@@ -5,7 +5,7 @@ Its equation is :class:`kkl_gym.systems.Rossler`.
 
 from training.spectrum import evenly_spaced
 from training.systems.profile import Profile
-from training.systems.task import ControlTask
+from training.systems.task import control_task
 
 PROFILE = Profile(
     eigenvalues=evenly_spaced(13, -0.4, -8.0),
@@ -21,6 +21,6 @@ PROFILE = Profile(
     },
     spinn_settings={"eigenvalues": evenly_spaced(9, -3.0, -20.0)},
     fault_deadline=2.0,
-    task=ControlTask("rossler", period=0.1, duration=30.0),
+    task=control_task("rossler", period=0.1, duration=30.0),
     printed={"spinn": 4.77, "ae": 79.9, "dmf": 23.5, "node": 24.7},
 )

@@ -5,7 +5,7 @@ Its equation is :class:`kkl_gym.systems.VanDerPol`.
 
 from training.spectrum import evenly_spaced
 from training.systems.profile import Profile
-from training.systems.task import ControlTask
+from training.systems.task import control_task
 
 PROFILE = Profile(
     # Of input-aware maps. Fast ones follow the jumps of y, slow ones average its noise. Their
@@ -24,7 +24,7 @@ PROFILE = Profile(
     },
     fault_deadline=8.9,  # a period
     # The target is unstable. Starts keep to |x1| < 3: beyond it a slow manifold holds the motion, whatever one does.
-    task=ControlTask("van_der_pol", start_box=((-3, 3), (-6, 6))),
+    task=control_task("van_der_pol", start_box=((-3, 3), (-6, 6))),
     second_noise=0.2,
     printed={"spinn": 0.35, "ae": 200.0, "dmf": 98.2, "node": 11.9},
 )

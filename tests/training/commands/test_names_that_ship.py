@@ -37,7 +37,7 @@ def test_maps_has_a_row_for_each_file_and_cuts_no_name():
         ("export NAME --format js", None),
         ("demo lorenz --observer NAME --duration 1", None),
         ("demo lorenz --observer NAME --live", "training.commands.live.show"),
-        ("agent train lorenz --observer NAME --timesteps 1", "training.agents.learn.learn"),
+        ("agent train lorenz --observer NAME --timesteps 1", "training.agents.learning.learn"),
     ],
 )
 def test_a_name_that_ships_works_in_every_command(command, work, name, monkeypatch):
