@@ -16,7 +16,7 @@ from training.agents.agent import Agent, find
 from training.agents.information import Information
 from training.agents.play import Episodes, play
 from training.agents.tasks import TOLERANCE, scores, successes
-from training.commands.agent_task import TaskOptions
+from training.commands.agent_task import Measured, TaskOptions
 from training.commands.options import NoiseLevel
 from training.evaluation.levels import show_level
 from training.jobs import locked
@@ -184,7 +184,7 @@ class Import:
     """The agent's file."""
     observer: Annotated[str | None, tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: the system's)")] = None
     """The shipped map or .safetensors file that it was trained on."""
-    measured: str = ""
+    measured: Measured = ""
     """Entries of the flattened observation that the agent may see, as in 0,1."""
 
     def run(self, console: Console) -> None:

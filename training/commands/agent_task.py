@@ -10,13 +10,16 @@ from training.commands.record import EnvironmentArguments
 from training.systems import Task
 
 
+Measured = Annotated[
+    str, tyro.conf.arg(metavar="INDICES", help_behavior_hint="(default: the positions, of environments known here)")
+]
+
+
 @dataclass(frozen=True)
 class TaskOptions:
     """Options of a task; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
 
-    measured: Annotated[
-        str, tyro.conf.arg(metavar="INDICES", help_behavior_hint="(default: the positions, of environments known here)")
-    ] = ""
+    measured: Measured = ""
     """Entries of the flattened observation that agents may see, with commas between them, as in 0,1. Of systems y is
     measured."""
     hidden: Annotated[str, tyro.conf.arg(metavar="INDICES", help_behavior_hint="(default: all others)")] = ""

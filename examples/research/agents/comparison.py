@@ -156,7 +156,6 @@ class ComparedAgent(Job):
                 seed=self.seed,
                 observer=self._observer,
                 aggregate=self.aggregate if task.system is None and self.kind in REFITTED else 0,
-                resume=True,
                 estimation=estimation,
             )
             learned = str(self.folder / OBSERVER) if task.system is None and self.kind in REFITTED else self._observer

@@ -112,7 +112,6 @@ def test_refused(arguments, message, capsys):
         "evaluate lorenz --csv file/errors.csv",
         "faults lorenz --out file",
         "demo --out file",
-        "agent evaluate van_der_pol --out file",
         "check lorenz --json file/found.json",
     ],
 )
