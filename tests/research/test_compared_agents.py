@@ -74,7 +74,7 @@ def test_agents_in_an_environment_are_compared_beside_earlier_ones(tmp_path, mon
     for name, rows in kept.items():
         assert (tmp_path / "out" / name).read_text().splitlines()[1 : 1 + len(rows)] == rows
     table = (tmp_path / "out" / "table.md").read_text()
-    assert "| Ball-v0 | 11.25 (1.00), 1 | – | – | 6 (0.49), 1 | 1 |" in table
+    assert "| Ball-v0 | 11.25 (1.00), 1 | – | 6 (0.49), 1 | 1 |" in table
     assert "Agents on z, traces and stacked observations: `frames` 4." in table
     for name in ("scores.png", "curves.png"):
         assert (tmp_path / "out" / name).stat().st_size > 1000

@@ -61,6 +61,7 @@ class Checkpoint(BaseCallback):
             self.resumed, self.restarts = (int(saved[name]) + goes_on for name in ("resumed", "restarts"))
             self._curve = [tuple(row) for row in saved["curve"].tolist()]
             self._began -= self._curve[-1][1] if self._curve else 0.0
+        self.saved = None  # which may be large
 
     def saved_records(self, like: Record) -> list[Record]:
         """Return the records that were saved, which are ``like`` another one but for their samples."""

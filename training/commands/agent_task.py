@@ -9,7 +9,6 @@ from training.agents.tasks import get_task
 from training.commands.record import EnvironmentArguments
 from training.systems import Task
 
-
 Measured = Annotated[
     str, tyro.conf.arg(metavar="INDICES", help_behavior_hint="(default: the positions, of environments known here)")
 ]
