@@ -125,9 +125,9 @@ class SB3VecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
         """Return for each row whether a wrapper of this class is around the vector environment."""
         env: Any = self.env
-        while not (found := isinstance(env, wrapper_class)) and hasattr(env, "env"):
+        while not (wrapped := isinstance(env, wrapper_class)) and hasattr(env, "env"):
             env = env.env
-        return [found for _ in self._get_indices(indices)]
+        return [wrapped for _ in self._get_indices(indices)]
 
 
 def _row(info: dict[str, Any], row: int, keys: Sequence[str]) -> dict[str, Any]:

@@ -54,9 +54,9 @@ class Checkpoint(BaseCallback):
             if isinstance(model, OffPolicyAlgorithm):
                 _restore_buffer(model, saved)
             for name, moments in saved["moments"].items():
-                found = getattr(model.get_vec_normalize_env(), name)
-                found.mean, found.var = (moments[key].numpy() for key in ("mean", "var"))
-                found.count = float(moments["count"])
+                running = getattr(model.get_vec_normalize_env(), name)
+                running.mean, running.var = (moments[key].numpy() for key in ("mean", "var"))
+                running.count = float(moments["count"])
             goes_on = model.num_timesteps < steps
             self.resumed, self.restarts = (int(saved[name]) + goes_on for name in ("resumed", "restarts"))
             self._curve = [tuple(row) for row in saved["curve"].tolist()]

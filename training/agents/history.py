@@ -35,7 +35,7 @@ class History(VectorWrapper):
         """Reset all environments and filters."""
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self._state = self._first(obs)
-        return self._shown(), info
+        return self._observation(), info
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Step environments and filters."""
@@ -47,18 +47,18 @@ class History(VectorWrapper):
             y[row] = info["final_obs"][row]
         self._state = self._keep @ self._state + self._take * np.concatenate([y, u], axis=1)[:, None]
         if len(ended):
-            last, final = self._shown(), np.full(self.num_envs, None, dtype=object)
+            last, final = self._observation(), np.full(self.num_envs, None, dtype=object)
             for row in ended:
                 final[row] = last[row].copy()
             info["final_obs"] = final
             self._state[ended] = self._first(obs[ended])
-        return self._shown(), reward, terminated, truncated, info
+        return self._observation(), reward, terminated, truncated, info
 
     def _first(self, obs: np.ndarray) -> np.ndarray:
         signal = np.concatenate([obs, np.zeros((len(obs), self._nu))], axis=1)
         return np.repeat(signal[:, None], len(self._take), axis=1)
 
-    def _shown(self) -> np.ndarray:
+    def _observation(self) -> np.ndarray:
         return self._state.reshape(len(self._state), -1).astype(np.float32)
 
 

@@ -30,7 +30,7 @@ Values = Mapping[str, np.ndarray]
 Feature = Callable[[Values], np.ndarray]
 
 
-class Shown(VectorWrapper):
+class FeatureObservation(VectorWrapper):
     """Shows a function of the observation ``obs`` and of entries of ``info``, float32."""
 
     def __init__(self, env: VectorEnv, feature: Feature, width: int, keys: Sequence[str] = ()) -> None:
@@ -44,7 +44,7 @@ class Shown(VectorWrapper):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Reset the environments."""
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        return self._show(obs, info), info
+        return self._features(obs, info), info
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Step the environments."""
@@ -54,15 +54,15 @@ class Shown(VectorWrapper):
             last, final = obs.copy(), np.full(self.num_envs, None, dtype=object)
             for row in np.flatnonzero(ended):
                 last[row] = info["final_obs"][row]
-            there = info.get("final_info", {})
-            then = {key: np.where(column(ended, info[key]), there[key], info[key]) for key in self._keys}
-            features = self._show(last, then)
+            final_info = info.get("final_info", {})
+            values = {key: np.where(column(ended, info[key]), final_info[key], info[key]) for key in self._keys}
+            features = self._features(last, values)
             for row in np.flatnonzero(ended):
                 final[row] = features[row].copy()
             info["final_obs"] = final
-        return self._show(obs, info), reward, terminated, truncated, info
+        return self._features(obs, info), reward, terminated, truncated, info
 
-    def _show(self, obs: np.ndarray, info: Values) -> np.ndarray:
+    def _features(self, obs: np.ndarray, info: Values) -> np.ndarray:
         return self._feature({"obs": obs} | {key: info[key] for key in self._keys}).astype(np.float32)
 
 
@@ -98,16 +98,16 @@ def state(task: Task, num_envs: int) -> VectorEnv:
     if task.system is None:
         return vector(task.without_noise, num_envs)
     system = get_system(task.system)
-    return Shown(vector(task, num_envs), lambda at: deviation(system, at["x"]), system.nx, ["x"])
+    return FeatureObservation(vector(task, num_envs), lambda at: deviation(system, at["x"]), system.nx, ["x"])
 
 
 def outputs(task: Task, env: VectorEnv) -> VectorEnv:
     """Show what is measured in a task's environments."""
     if task.system is None:
         entries = list(task.measured)
-        return Shown(env, lambda at: at["obs"][:, entries], len(entries))
+        return FeatureObservation(env, lambda at: at["obs"][:, entries], len(entries))
     system = get_system(task.system)
-    return Shown(env, output_deviation(system), system.ny, ["y"])
+    return FeatureObservation(env, output_deviation(system), system.ny, ["y"])
 
 
 def estimates(task: Task, information: Information, num_envs: int, observer: str) -> VectorEnv:
@@ -137,8 +137,8 @@ def estimates(task: Task, information: Information, num_envs: int, observer: str
         return np.concatenate([x_hat, sizes], axis=1)
 
     if information == "x_hat":
-        return Shown(env, feature, width, ["x_hat"])
-    return Shown(env, feature, width + artifact.nx, ["x_hat", "x_cov"])
+        return FeatureObservation(env, feature, width, ["x_hat"])
+    return FeatureObservation(env, feature, width + artifact.nx, ["x_hat", "x_cov"])
 
 
 def observer_of(system: System) -> str:
@@ -174,4 +174,4 @@ def _modes(env: VectorEnv, artifact: Artifact, system: System | None) -> VectorE
         return np.concatenate(parts, axis=1)
 
     width = matrix.shape[1] + aged + (artifact.ny if system is None else 0)
-    return Shown(env, feature, width, ["z", "sample", "y"])
+    return FeatureObservation(env, feature, width, ["z", "sample", "y"])

@@ -119,7 +119,8 @@ def learn(
     if task.system is not None and information in OBSERVED and observer is None and estimation is KKL:
         observer = observer_of(get_system(task.system))
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
-    fits = task.system is None and information in ESTIMATED and observer is None  # an observer on the way
+    # Whether an observer is learned on the way.
+    fits = task.system is None and information in ESTIMATED and observer is None
     if fits and information != "x_hat":
         raise ValueError(f"{information}: train an observer with error bars first, and name it (--observer FILE)")
     if fits and not estimated_entries(task, size):
@@ -128,8 +129,8 @@ def learn(
         raise ValueError("observer_steps is for agents on x_hat that are given no observer")
     first = _first_steps(task, steps, rehearsal, observer_steps) if fits else 0
     how = {"algorithm": name, **settings, "seed": seed, "observer_steps": first, "aggregate": aggregate}
-    seen = None if observer is None else [observer, fingerprint(observer)]
-    identity = json.dumps([asdict(task), information, seen, rules(task), how], sort_keys=True)
+    observed = None if observer is None else [observer, fingerprint(observer)]
+    identity = json.dumps([asdict(task), information, observed, rules(task), how], sort_keys=True)
     checkpoint = Checkpoint(folder / f"agent{SUFFIX}", hashlib.sha256(identity.encode()).hexdigest(), resume=resume)
     resumes = checkpoint.saved is not None
     if resumes and (folder / FILE).exists():

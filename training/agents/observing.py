@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from kkl_gym.wrappers.vector import VectorEnv
 from training.agents.environments import CLEAN, CLEAN_Y, single, vector
-from training.agents.information import Information, Shown, make
+from training.agents.information import FeatureObservation, Information, make
 from training.maps.coordinates import SETTLED
 from training.presets import RECORDED_NOISE, recorded_preset
 from training.progress import ProgressBars
@@ -65,7 +65,7 @@ class Privileged:
         """Make the environments."""
         env = vector(self._task, self._rows, each=self._each)
         entries = [*self._task.measured, *hidden_entries(self._task, gym.spaces.flatdim(env.single_observation_space))]
-        return Shown(env, lambda at: at["obs"][:, entries], len(entries))
+        return FeatureObservation(env, lambda at: at["obs"][:, entries], len(entries))
 
     def _each(self) -> gym.Env[Any, Any]:
         env = single(self._task)

@@ -85,11 +85,11 @@ def from_sb3(
     with explained(path, AgentError):
         weights, described = _content(path)
         names = [name.removesuffix(".weight") for name in weights if name.endswith(".weight")]
-        found = {known: [name for name in names if layer.fullmatch(name)] for known, layer in _LAYERS.items()}
-        algorithm = next((known for known, layers in found.items() if len(layers) > 1), None)
+        layers_of = {known: [name for name in names if layer.fullmatch(name)] for known, layer in _LAYERS.items()}
+        algorithm = next((known for known, layers in layers_of.items() if len(layers) > 1), None)
         if algorithm is None:
             raise AgentError(f"it holds no perceptron of {', '.join(ALGORITHMS)}, but {', '.join(names)}")
-        layers = found[algorithm]
+        layers = layers_of[algorithm]
         network = MLP(
             [weights[f"{name}.weight"].numpy() for name in layers],
             [weights[f"{name}.bias"].numpy() for name in layers],

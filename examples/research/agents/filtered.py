@@ -7,7 +7,7 @@ import numpy as np
 from kkl_gym import get_system
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, plant_of
 from training.agents.environments import vector
-from training.agents.information import Information, Shown
+from training.agents.information import FeatureObservation, Information
 from training.agents.observing import Estimation
 from training.agents.tasks import deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
@@ -50,7 +50,7 @@ def show_filtered(task: Task, information: Information, rows: int, observer: str
     assert task.system is not None
     system = get_system(task.system)
     env = vector(task, rows, lambda env: VectorEstimate(env, KalmanFilters(env)))
-    return Shown(env, lambda at: deviation(system, at["x_hat"]), system.nx, ["x_hat"])
+    return FeatureObservation(env, lambda at: deviation(system, at["x_hat"]), system.nx, ["x_hat"])
 
 
 EKF = Estimation(show=show_filtered)

@@ -108,7 +108,7 @@ def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
 
 def cells(rows: "pd.DataFrame") -> dict[tuple[str, str], Cell]:
     """Cells by task and kind, of the rows that :func:`in_tasks` gives."""
-    found = {}
+    by_kind = {}
     for (task, kind), group in rows.groupby(["task", "shown"], sort=False):
         values, idle = group["return"].to_numpy(), float(group.idle.iloc[0])
         best = rows[(rows.task == task) & (rows.shown == "state")]["return"].to_numpy()
@@ -116,8 +116,8 @@ def cells(rows: "pd.DataFrame") -> dict[tuple[str, str], Cell]:
         ends, scores = (np.nan, np.nan, np.nan), np.full(len(values), np.nan)
         if len(best) and np.isfinite(idle):
             ends, scores = interval(values, best, idle), normalised(values, float(middle(best)), idle)
-        found[str(task), str(kind)] = Cell(values, scores, ends, group.success.mean(), group.seconds.mean())
-    return found
+        by_kind[str(task), str(kind)] = Cell(values, scores, ends, group.success.mean(), group.seconds.mean())
+    return by_kind
 
 
 def write_table(path: Path, results: "pd.DataFrame", partial: str = "", settings: str = "") -> None:
@@ -132,7 +132,7 @@ def write_table(path: Path, results: "pd.DataFrame", partial: str = "", settings
 
 def _table_of_systems(
     results: "pd.DataFrame",
-    found: Mapping[tuple[str, str], Cell],
+    by_kind: Mapping[tuple[str, str], Cell],
     tasks: Sequence[str],
     labels: Mapping[str, str],
     partial: str,
@@ -144,7 +144,7 @@ def _table_of_systems(
         ends = "" if np.isnan(low) else f" [{low:.2f}, {high:.2f}]"
         return f"{score:.2f}{ends}, {100 * cell.success:.0f} %, {len(cell.values)}"
 
-    table = [[label, *(text(found.get((task, kind))) for task in tasks)] for kind, label in labels.items()]
+    table = [[label, *(text(by_kind.get((task, kind))) for task in tasks)] for kind, label in labels.items()]
     minutes = results[results.shown != IDLE].groupby("shown").seconds.mean() / 60
     spent = ", ".join(f"{label} {minutes[kind]:.1f}" for kind, label in labels.items() if kind in minutes)
     return [
@@ -162,7 +162,7 @@ def _table_of_systems(
 
 def _table_of_environments(
     results: "pd.DataFrame",
-    found: Mapping[tuple[str, str], Cell],
+    by_kind: Mapping[tuple[str, str], Cell],
     tasks: Sequence[str],
     labels: Mapping[str, str],
     partial: str,
@@ -177,7 +177,7 @@ def _table_of_environments(
 
     rows, spent = [], []
     for task, (environment, _) in zip(tasks, tasks_in(results), strict=True):
-        own = [found.get((task, kind)) for kind in labels]
+        own = [by_kind.get((task, kind)) for kind in labels]
         random = results[(results.environment == environment) & (results.shown == IDLE)]["return"]
         rows.append([task, *map(text, own), f"{random.iloc[0]:.4g}" if len(random) else "–"])
         spent.append([task, *("–" if cell is None else f"{cell.seconds:.0f}" for cell in own)])
@@ -200,13 +200,13 @@ def _table_of_environments(
 def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
     """Draw the normalised scores of all tasks, a panel each, with a row for each kind of agents."""
     rows, kinds = in_tasks(results), _labels(results)
-    found, tasks = cells(rows), list(dict.fromkeys(rows.task))
+    by_kind, tasks = cells(rows), list(dict.fromkeys(rows.task))
     columns = min(PANELS_IN_A_ROW, max(1, len(tasks)))
     lines = -(-len(tasks) // columns)
     with drawing(path, max(NARROWEST, 2.6 * columns + 1.5), 2.6 * lines + 0.6) as figure:
         axes = figure.subplots(max(1, lines), columns, sharey=True, squeeze=False).ravel()
         for ax, task in zip(axes, tasks):
-            _draw_panel(ax, [found.get((task, kind)) for kind in kinds][::-1])
+            _draw_panel(ax, [by_kind.get((task, kind)) for kind in kinds][::-1])
             ax.set(title=task, xlabel="normalised score")
             ax.set_yticks(range(len(kinds)), list(kinds.values())[::-1])
         for ax in axes[len(tasks) :]:

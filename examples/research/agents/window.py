@@ -18,7 +18,7 @@ from kkl_gym.wrappers.vector import VectorEnv
 from observers import MLP, storage
 from training.agents.environments import single, vector
 from training.agents.history import stacked
-from training.agents.information import Information, Shown, Values, outputs
+from training.agents.information import FeatureObservation, Information, Values, outputs
 from training.agents.observing import (
     KEPT,
     OBSERVER,
@@ -59,7 +59,7 @@ def read(path: Path | str) -> MLP:
         return storage.get_mlp(tensors, "", described["activation"])
 
 
-class WindowObservation(Shown):
+class WindowObservation(FeatureObservation):
     """Shows y and the estimates from stacked observations, under noise the estimates alone, and records the steps."""
 
     def __init__(self, task: Task, rows: int, network: MLP) -> None:
