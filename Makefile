@@ -94,10 +94,9 @@ CERTIFIED := $(LARGE) $(SYSTEMS:%=%-spinn)
 
 certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 	$(BIN)/python -m examples.research certify $(CERTIFIED)
-	$(BIN)/kkl-gym faults
-	mkdir -p docs/results/certificates docs/results/faults
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) --faults --csv docs/results/faults/faults.csv
+	mkdir -p docs/results/certificates
 	cp runs/certificates/table.md $(CERTIFIED:%=runs/certificates/%.json) docs/results/certificates
-	cp $(addprefix runs/faults/,faults.csv table.md) docs/results/faults
 	$(MAKE) figures
 
 # The one on y is what `kkl-gym agent train van_der_pol --information y` makes, for the picture of two agents side by side.

@@ -18,7 +18,7 @@ from kkl_gym import KKLObservation
 from observers import Artifact
 from training.agents.environments import MeasurementNoise
 from training.rollouts import make, roll_out
-from training.sources.errors import recorded_errors
+from training.sources.recorded import recorded_errors
 
 AFTER = 20  # steps, of which errors are left out
 GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # a linear-quadratic regulator of the double pendulum
@@ -150,9 +150,9 @@ def main(
         rollouts = roll_out(unseen, acting, steps=held_out, seed=seed + 10_000, **names)
         records = [record for record in rollouts.records() if len(record.t) > AFTER + 1]
         errors = recorded_errors(artifact, records, AFTER * artifact.filter.dt)
-        shown = ", ".join(f"{name} {error:.2%}" for name, error in errors.relative.items())
+        shown = ", ".join(f"{name} {error:.2%}" for name, error in errors.items())
         print(f"held-out rollouts, {label}: rms error over standard deviation, after {AFTER} steps: {shown}")
-        found[label] = max(errors.relative.values())
+        found[label] = max(errors.values())
     if noise:
         print(f"noise {noise:g}: mean return where the controller acts on")
         for label, observer in (

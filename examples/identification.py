@@ -22,7 +22,7 @@ from observers.names import resolve
 from training.evaluation.errors import errors, unseen_trajectories
 from training.identification import identify
 from training.records import Record
-from training.trajectories.noise import draw_process_noise
+from training.trajectories.motions import draw_process_noise
 
 FIRST_GUESSES = {
     "reverse_duffing": {"b": 0.6},  # beside a, which y does not tell from b

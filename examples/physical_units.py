@@ -2,7 +2,7 @@
 
 Nothing is said of scales, sampling or noise: the defaults follow from the equations and the training box::
 
-    kkl-gym check examples/physical_units.py:StirredTank
+    kkl-gym diagnose examples/physical_units.py:StirredTank
     kkl-gym train examples/physical_units.py:StirredTank
     kkl-gym evaluate runs/stirred_tank/stirred_tank.safetensors --system examples/physical_units.py:StirredTank --ekf
 """

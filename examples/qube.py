@@ -39,6 +39,7 @@ from scipy.signal import savgol_filter
 
 from kkl_gym.simulate import simulate
 from observers import Artifact
+from observers.estimator import Running
 from observers.storage import write
 from training.figures import ESTIMATE, RIVAL, TARGET, TRUTH, drawing
 from training.identification.motions import Shooting
@@ -46,10 +47,8 @@ from training.identification.shooting import shoot
 from training.identification.windows import windows
 from training.kalman import ExtendedKalmanFilter
 from training.markdown import table
-from training.presets import recorded_preset
 from training.records import Record, Signals, read_records, resampled
-from training.sources.errors import estimates
-from training.sources.recorded import RecordedSource
+from training.sources.recorded import RecordedSource, estimates, recorded_preset
 from training.train_observer import train
 
 SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))
@@ -243,17 +242,15 @@ def guided(observer: Artifact, model: Sticking, zero: float, records: Sequence[R
         R=np.array([[0.005**2]]),
         start=(np.zeros(5), np.diag(SURE) ** 2),
     )
-    kalman_filter.reset(y[0])
-    found = []
+    state, found = kalman_filter.start(y.shape[1]), []
     for k, (cosine, sine, alpha_dot, theta_dot) in enumerate(np.moveaxis(signals, -1, 1)):
-        if k:
-            kalman_filter.advance(y[k])
-        alpha = kalman_filter.x[:, 1]
+        state = kalman_filter.advance(state, y[k])
+        alpha = state.x[:, 1]
         lost = (np.hypot(np.cos(alpha) - cosine, np.sin(alpha) - sine) > APART) | (k * DT <= STARTED)
         x = np.stack([y[k, :, 0], np.arctan2(sine, cosine), theta_dot, alpha_dot, 0.0 * alpha], -1)
-        kalman_filter.x = np.where(lost[:, None], x, kalman_filter.x)
-        kalman_filter.P = np.where(lost[:, None, None], np.diag(SURE) ** 2, kalman_filter.P)
-        found.append(kalman_filter.x)
+        P = np.where(lost[:, None, None], np.diag(SURE) ** 2, state.P)
+        state = state._replace(x=np.where(lost[:, None], x, state.x), P=P)
+        found.append(state.x)
     return recorded_signals(np.stack([y[..., 0], np.array(found)[..., 1] + zero], -1), records)
 
 
@@ -285,8 +282,7 @@ def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
         R=np.array([[0.003**2]]),
         start=(np.array([0.0, np.pi, 0.0, 0.0]), np.diag([1.0, 1.8, 4.0, 12.0]) ** 2),
     )
-    x = np.stack([kalman_filter.reset(y[0]), *(kalman_filter.step(each) for each in y[1:])])
-    return recorded_signals(x[..., :2], records)
+    return recorded_signals(Running(kalman_filter).along(y)[..., :2], records)
 
 
 def differences(record: Record) -> np.ndarray:

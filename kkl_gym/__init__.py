@@ -4,7 +4,7 @@ import gymnasium as gym
 
 from kkl_gym.envs import KKLEnv
 from kkl_gym.equation_errors import EquationError
-from kkl_gym.own import OWN_ID
+from kkl_gym.sensor import Sensor
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, VanDerPol, get_system
 from kkl_gym.vector import KKLVectorEnv
@@ -14,26 +14,22 @@ from kkl_gym.wrappers.vector import KKLVectorObservation, VectorActionRepeat
 
 __version__ = "0.1.0"
 
+OWN_ID = "kkl_gym/Own-v0"  # takes a system of the user's
 ENV_IDS = {cls.name: f"KKL{cls.__name__}-v0" for cls in SYSTEMS.values()}
 
 # About nine tenths of what the shipped agents reach on x_hat. Without acting it is 1,850 to 2,700.
 _REWARD_THRESHOLDS = {"reverse_duffing": 4100.0, "van_der_pol": 3900.0, "rossler": 4300.0, "lorenz": 4400.0}
 
-for _name, _id in ENV_IDS.items():
+for _name, _id in [*ENV_IDS.items(), (None, OWN_ID)]:
     if _id not in gym.registry:  # a second import, as after importlib.reload, changes nothing
         gym.register(
             _id,
             entry_point="kkl_gym.envs:KKLEnv",
             vector_entry_point="kkl_gym.vector:KKLVectorEnv",
-            kwargs={"system": _name},
-            reward_threshold=_REWARD_THRESHOLDS.get(_name),
+            kwargs={} if _name is None else {"system": _name},
+            reward_threshold=_REWARD_THRESHOLDS.get(_name or ""),
             max_episode_steps=5000,
         )
-
-if OWN_ID not in gym.registry:
-    gym.register(
-        OWN_ID, entry_point="kkl_gym.own:single", vector_entry_point="kkl_gym.own:vector", max_episode_steps=5000
-    )
 
 __all__ = [
     "ENV_IDS",
@@ -50,6 +46,7 @@ __all__ = [
     "Lorenz",
     "ReverseDuffing",
     "Rossler",
+    "Sensor",
     "System",
     "VanDerPol",
     "VectorActionRepeat",

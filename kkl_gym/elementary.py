@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym.tracing import Symbol
+
 _NUMBERS = (float, int, np.generic)
 _NUMERIC = (np.ndarray, *_NUMBERS)
 _SYMPY_NAMES = {"abs": "Abs", "maximum": "Max", "minimum": "Min"}
@@ -63,6 +65,9 @@ def _named(function: Any, call: str, meaning: str, on_numbers: Callable[..., Any
 
 def _elsewhere(name: str, *args: Any) -> Any:
     """A function of symbols or tensors, by the library that they are of."""
+    for arg in args:
+        if isinstance(arg, Symbol):
+            return arg.call(name, *args)
     if sympy := _library("sympy", "Basic", args):
         return getattr(sympy, _SYMPY_NAMES.get(name, name))(*args)
     if torch := _library("torch", "Tensor", args):
@@ -141,6 +146,8 @@ def where(condition: Any, a: Any, b: Any) -> Any:
         return a if condition else b
     if isinstance(condition, np.ndarray) and condition.dtype == bool:
         return np.where(condition, a, b)
+    if isinstance(condition, Symbol):
+        return condition.call("where", condition, a, b)
     if sympy := _library("sympy", "Basic", (condition,)):
         return sympy.Piecewise((a, condition), (b, True))
     if (torch := _library("torch", "Tensor", (condition,))) and condition.dtype == torch.bool:

@@ -21,6 +21,7 @@ from kkl_gym.rendering import (
     render_metadata,
     samples_a_frame,
 )
+from kkl_gym.sensor import Readings, Sensor
 from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, Components, System
 from observers.checks import integer, mapping, real_array, shown
@@ -45,11 +46,12 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
 
     **Observation.** float32: the true state x (``observe="state"``) or the noisy output y (``observe="output"``),
     clipped to the system's declared bounds (for y, to the outputs that those bounds allow, widened by six standard
-    deviations of the noise).
+    deviations of the noise). Where the ``sensor`` has no sample, y is the last one.
 
-    **Info.** Arrays, of the same keys at reset and at steps: ``y`` the noisy output, ``x`` the true state and ``u`` the
-    physical input that acted, zero at reset; float64, never clipped. ``sample``, an integer of shape (), counts the
-    sampling intervals since reset. ``escaped``, boolean of shape (), says whether the state left its declared bounds.
+    **Info.** Arrays, of the same keys at reset and at steps: ``y`` the noisy output, NaN where the ``sensor`` has no
+    sample, ``x`` the true state and ``u`` the physical input that acted, zero at reset; float64, never clipped.
+    ``sample``, an integer of shape (), counts the sampling intervals since reset. ``escaped``, boolean of shape (),
+    says whether the state left its declared bounds.
 
     **Reward.** 1 / (1 + 4 c) in (0, 1] with c = mean(((x - target) / scale)^2): 1 at the system's target.
 
@@ -75,6 +77,8 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     start_box : tuple of (float, float), length nx, optional
         (low, high) of each state, where episodes start; None is the system's training box, or where the system draws
         its starts.
+    sensor : Sensor or mapping of its parameters, optional
+        What becomes of the output on the way to the observer. None is an ideal sensor, but for the measurement noise.
     render_mode : {None, "rgb_array", "human"}
         Whether :meth:`render` draws. With "human" a window shows the motion as fast as it is, from :meth:`reset` on
         until :meth:`close`; it needs the extra ``human``. An observer around the environment shows its estimate there.
@@ -83,7 +87,8 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     ------
     ValueError
         On an unknown system or parameter, dt <= 0, a noise level that is negative or beyond 1e12, an unknown
-        ``observe`` or ``render_mode``, and a ``start_box`` that does not lie within the declared bounds.
+        ``observe`` or ``render_mode``, an invalid ``sensor``, and a ``start_box`` that does not lie within the declared
+        bounds.
 
     Examples
     --------
@@ -110,6 +115,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         observe: Literal["state", "output"] = "state",
         parameters: Mapping[str, float] | None = None,
         start_box: Box | None = None,
+        sensor: Sensor | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
     ) -> None:
         self.plant = Plant(
@@ -120,6 +126,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             observe=observe,
             parameters=parameters,
             start_box=start_box,
+            sensor=sensor,
         )
         check_render_mode(render_mode, ARRAYS_AND_WINDOWS)
         self.render_mode, self.metadata = render_mode, render_metadata(self.plant.dt, ARRAYS_AND_WINDOWS)
@@ -134,17 +141,20 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         self._bounds, self._u_max = self.system.bounds, self.system.u_max
         self._limits = [*zip(self.observation_space.low.tolist(), self.observation_space.high.tolist(), strict=True)]
         self._noise: list[tuple[list[float], list[float]]] = []
+        self._readings = None if self.sensor is None else Readings(self.sensor, self.plant.ny, self.plant.dt, 1)
+        self._held: list[float] = []  # the last samples that the sensor has delivered
         self._x: tuple[float, ...] | None = None
         self._u: list[float] | None = None  # kept, as the trail is, for rendering
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
+        self.emitted = b""  # the last observation, as observers around it compare what reaches them
         self.drawn_by = 0  # the observer around it, by number, that draws the window; 0 is the environment itself
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode.
+        """Start an episode; observation and info are as described above.
 
         Parameters
         ----------
@@ -152,13 +162,6 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             Of starts and noise; None goes on with the generator as it is.
         options : dict, optional
             ``"x0"``, shape (nx,), is the start, which is otherwise uniform in ``start_box``; None is none.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            As described above.
-        info : dict
-            As described above.
 
         Raises
         ------
@@ -178,7 +181,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         if start is None:
             start = self.plant.draw_start(self.np_random)
         self._x = tuple(start.tolist())
-        self._y = self._measure(self._next_noise()[1])
+        self._y = self._measure(self._next_noise()[1], start=True)
         self._samples += self._sample
         self._sample = 0
         if self._samples >= SOON:
@@ -192,25 +195,12 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return self._observation(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold the input over one sampling interval.
+        """Hold the input over one sampling interval; what comes back is described above.
 
         Parameters
         ----------
         action : array_like, shape (nu,)
             Inputs over their bounds; values outside [-1, 1] are clipped.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            As described above.
-        reward : float
-            As described above.
-        terminated : bool
-            Whether the state left its declared bounds.
-        truncated : bool
-            False; a time limit is a wrapper's.
-        info : dict
-            As described above.
 
         Raises
         ------
@@ -230,7 +220,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             escaped = not self._inside(x)
         if not escaped:
             self._x = tuple(x)
-            self._y = self._measure(v)
+            self._y = self._measure(v, start=False)
         self._sample += 1
         if self.render_mode is not None:
             self._trail.append(self._x)
@@ -261,18 +251,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return self.draw()
 
     def draw(self, estimates: Collection[Sequence[float]] = ()) -> np.ndarray | None:
-        """Draw the phase portrait with estimated states beside the true ones.
-
-        Parameters
-        ----------
-        estimates : collection of sequences of float, length nx
-            Estimates so far, the latest last.
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3), or None
-            As :meth:`render`, and the same exceptions are raised.
-        """
+        """Draw the phase portrait as :meth:`render`, with estimates so far, the latest last, beside the states."""
         if self.render_mode is None:
             return None
         if self._x is None:
@@ -288,13 +267,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return None
 
     def animate(self, estimates: Collection[Sequence[float]] = ()) -> None:
-        """Draw the window's next frame, if one is due at this sample.
-
-        Parameters
-        ----------
-        estimates : collection of sequences of float, length nx
-            As for :meth:`draw`.
-        """
+        """Draw the window's next frame, if one is due at this sample, with estimates as :meth:`draw` takes them."""
         if self._sample % samples_a_frame(self.dt) == 0:
             self.draw(estimates)
 
@@ -344,12 +317,18 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             u.append(u_max if a > 1.0 else -u_max if a < -1.0 else a * u_max)
         return u
 
-    def _measure(self, v: list[float]) -> list[float]:
+    def _measure(self, v: list[float], *, start: bool) -> list[float]:
+        white = v if self._readings is None else [0.0] * self.plant.ny
         try:
-            return [float(hi + vi) for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
+            y = [float(hi + vi) for hi, vi in zip(self.system.h(self._x), white)]  # type: ignore[arg-type]
         except Exception:
             components(self.system.h, self._x)  # says what went wrong
             raise
+        if self._readings is None:
+            return y
+        y = self._readings.read(np.array(y)[:, None], np.array(v)[:, None], start=start)[:, 0].tolist()
+        self._held = [last if yi != yi else yi for yi, last in zip(y, y if start else self._held)]
+        return y
 
     def _inside(self, x: Any) -> bool:
         try:
@@ -362,8 +341,12 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
 
     def _observation(self, info: dict[str, Any]) -> np.ndarray:
         if self.observe == "state":  # within the bounds by construction
-            return info["x"].astype(_FLOAT32)
-        return np.array([max(low, min(high, y)) for y, (low, high) in zip(self._y, self._limits)], dtype=_FLOAT32)
+            obs: np.ndarray = info["x"].astype(_FLOAT32)
+        else:
+            y = self._y if self._readings is None else self._held
+            obs = np.array([max(low, min(high, yi)) for yi, (low, high) in zip(y, self._limits)], dtype=_FLOAT32)
+        self.emitted = obs.tobytes()
+        return obs
 
     def _info(self, u: list[float], escaped: bool) -> dict[str, Any]:
         return {

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from kkl_gym import elementary
+from kkl_gym.tracing import Symbol
 from kkl_gym.user_lines import called_function, line_of, path_of, steps_within
 
 _SERVING = "floats, arrays, tensors and symbols"
@@ -91,8 +92,8 @@ def held(x: Any) -> str:
     for library, kind, plural in (("torch", "Tensor", "tensors"), ("numpy", "ndarray", "arrays")):
         if is_of(library, kind, first):
             return f"x held {plural} of shape {tuple(first.shape)}"
-    if is_of("sympy", "Basic", first):
-        return "x held sympy symbols"
+    if is_of("sympy", "Basic", first) or isinstance(first, Symbol):
+        return "x held symbols"
     shortened = [f"{value:.6g}" if isinstance(value, Number) else reprlib.repr(value) for value in x]
     return f"x = ({', '.join(shortened)})"
 

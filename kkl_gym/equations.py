@@ -24,6 +24,7 @@ from kkl_gym.equation_errors import (
     shown,
     signature,
 )
+from kkl_gym.tracing import Symbol
 from kkl_gym.user_lines import steps_within, user_line
 
 _POWERS = "take fractional powers of negative numbers by kkl_gym.elementary.sqrt, or of abs(x)"
@@ -202,6 +203,8 @@ def _fits(value: Any, like: Any) -> bool:
         return True
     if is_of("torch", "Tensor", like):
         return is_of("torch", "Tensor", value) and not value.is_complex() and _broadcasts(value, like)
+    if isinstance(like, Symbol):
+        return isinstance(value, Symbol)
     if is_of("sympy", "Basic", like):
         return is_of("sympy", "Expr", value)
     return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and _broadcasts(value, like)

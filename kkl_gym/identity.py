@@ -3,10 +3,12 @@
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import gymnasium as gym
 
+from kkl_gym.sensor import Sensor
 from observers import Artifact, ArtifactError
 from observers.checks import is_finite, shown
 
@@ -38,6 +40,8 @@ def _identity(spec: Any, env: Env) -> dict[str, Any]:
             "gym.make(ID)"
         )
     kwargs = {name: value for name, value in spec.kwargs.items() if name not in APPEARANCE}
+    if isinstance(sensor := kwargs.get("sensor"), Sensor):
+        kwargs["sensor"] = asdict(sensor)
     try:
         return {"id": spec.id, "kwargs": json.loads(json.dumps(kwargs))}
     except TypeError as error:

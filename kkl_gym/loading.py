@@ -16,14 +16,17 @@ Class = TypeVar("Class")
 
 
 def load_class(name: str, base: type[Class]) -> type[Class]:
-    """Find a subclass by where it is written."""
-    where, _, class_name = name.rpartition(":")
+    """Find a subclass by where it is written; a script that defines one alone needs no name of it."""
+    where, _, class_name = name.rpartition(":") if ":" in name else (name, "", "")
     failure = f"cannot load the {base.__name__.lower()} {name!r}"
     module = _imported(where, failure)
+    own = [key for key, value in vars(module).items() if _is_own(value, base, module.__name__)]
+    if not class_name and len(own) == 1:
+        (class_name,) = own
     found = getattr(module, class_name, None)
     if found is None:
-        others = [key for key, value in vars(module).items() if _is_own(value, base, module.__name__)]
-        raise ValueError(f"{failure}: {where} defines no {class_name}; it defines {', '.join(others) or 'none'}")
+        lacks = f"defines no {class_name}" if class_name else f"needs one class, named as in {where}:Class"
+        raise ValueError(f"{failure}: {where} {lacks}; it defines {', '.join(own) or 'none'}")
     if not (inspect.isclass(found) and issubclass(found, base) and found is not base):
         package = base.__module__.rpartition(".")[0]
         raise ValueError(f"{name!r} is {found!r}, not a subclass of {package}.{base.__name__}")

@@ -71,9 +71,9 @@ def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]
 
 
 class Reader:
-    """Reads named signals from observations and from what ``info`` holds. Shapes: ``low``, ``high`` (n,)."""
+    """Reads named signals from observations and ``info``; they may be NaN if ``missing``. Shapes: ``low`` (n,)."""
 
-    def __init__(self, space: Space, names: Sequence[str], *, source: str) -> None:
+    def __init__(self, space: Space, names: Sequence[str], *, source: str, missing: bool = False) -> None:
         there, self._source = observed(space), source
         functions = [None if name in there else _FUNCTION.fullmatch(name) for name in names]
         entries = [name if function is None else function[2] for name, function in zip(names, functions)]
@@ -87,9 +87,9 @@ class Reader:
         if chosen and isinstance(space, spaces.Dict):  # of the keys that are read alone: others may be images
             owners = [key for key, part in space.items() for _ in range(_size(part))]
             read = spaces.Dict({key: space[key] for key in dict.fromkeys(owners[i] for i in chosen)})
-            self._outputs = Outputs(read, [observed(read).index(column) for column in columns], (), source=source)
-        elif chosen:
-            self._outputs = Outputs(space, chosen, (), source=source)
+            space, chosen = read, [observed(read).index(column) for column in columns]
+        if chosen:
+            self._outputs = Outputs(space, chosen, (), source=source, missing=missing)
         if self._outputs is not None:
             low, high = self._outputs.low, self._outputs.high
         columns += infos

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 from kkl_gym.equation_errors import held, returned
+from kkl_gym.sensor import Sensor, sensor_of
 from kkl_gym.simulate import check_interval
 from kkl_gym.system import Box, System
 from kkl_gym.systems import get_system
@@ -29,6 +30,7 @@ class Plant:
         observe: str,
         parameters: Mapping[str, float] | None,
         start_box: Box | None,
+        sensor: Sensor | Mapping[str, Any] | None = None,
     ) -> None:
         self.system = get_system(system, parameters)
         self.dt = check_dt(self.system.dt if dt is None else dt)
@@ -45,23 +47,39 @@ class Plant:
         self.start_box = _start_box(self.system, start_box)
         self._draws = start_box is None and type(self.system).draw_starts is not System.draw_starts
         self.state_space = _float32_box(*zip(*self.system.bounds, strict=True))
-        self.output_space = _float32_box(*output_bounds(self.system, 6.0 * np.asarray(self.measurement_noise)))
+        self.sensor = sensor_of(sensor)
+        noise = np.asarray(self.measurement_noise)
+        low, high = output_bounds(self.system, 0.0 if self.sensor else 6.0 * noise)
+        self.output_space = _float32_box(*(self.sensor.bounds(low, high, noise) if self.sensor else (low, high)))
         self.observation_space = self.state_space if observe == "state" else self.output_space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.system.nu,), np.float32)
-        self._ny = self.system.ny  # which evaluates h, and vectors draw noise row by row
-        self._v_scale = np.broadcast_to(np.asarray(self.measurement_noise), (self._ny,))
+        self.ny = self.system.ny  # kept, as the property evaluates h
+        self._v_scale = np.broadcast_to(noise, (self.ny,))
+        self._random = self.sensor is not None and self.sensor.is_random
+        if self._random:  # of what a sensor draws nothing is scaled
+            self._v_scale = np.append(self._v_scale, np.ones(2 * self.ny))
+        self.nv = len(self._v_scale)
         self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)
         self.weights = 1.0 / (self.system.nx * np.square(self.system.scale))
 
     def draw_noise(
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw ``NOISE_BLOCK`` samples, (NOISE_BLOCK, nx) and (NOISE_BLOCK, ny), which :meth:`noise` scales."""
-        n, nx, ny = NOISE_BLOCK, len(self._w_range), self._ny
-        return rng.random((n, nx), out=w), rng.standard_normal((n, ny), out=v)
+        """Draw ``NOISE_BLOCK`` samples, (NOISE_BLOCK, nx) and (NOISE_BLOCK, nv), which :meth:`noise` scales.
+
+        A sensor draws from a generator of its own, so that motions and white noise of a seed are the same without it.
+        """
+        n, ny = NOISE_BLOCK, self.ny
+        w = rng.random((n, len(self._w_range)), out=w)
+        if not self._random:
+            return w, rng.standard_normal((n, ny), out=v)
+        v, of_sensor = np.empty((n, self.nv)) if v is None else v, rng.spawn(1)[0]
+        v[:, :ny] = rng.standard_normal((n, ny))
+        v[:, ny : 2 * ny], v[:, 2 * ny :] = of_sensor.standard_normal((n, ny)), of_sensor.random((n, ny))
+        return w, v
 
     def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Scale what was drawn, (..., nx) and (..., ny)."""
+        """Scale what was drawn, (..., nx) and (..., nv)."""
         return (drawn_w - 0.5) * self._w_range, drawn_v * self._v_scale
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
@@ -120,6 +138,11 @@ class OfPlant:
     def measurement_noise(self) -> float | tuple[float, ...]:
         """Standard deviation of the measurement noise, of all outputs or each."""
         return self.plant.measurement_noise
+
+    @property
+    def sensor(self) -> Sensor | None:
+        """The sensor, None if it is ideal."""
+        return self.plant.sensor
 
 
 def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]:

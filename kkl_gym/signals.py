@@ -25,7 +25,10 @@ class Outputs:
     Tuple one after the other, Discrete ones one-hot. Of a Dict, keys that are not measured are not looked at.
     """
 
-    def __init__(self, space: Space, measured: Entries | None, angles: Angles, *, source: str) -> None:
+    def __init__(
+        self, space: Space, measured: Entries | None, angles: Angles, *, source: str, missing: bool = False
+    ) -> None:
+        self._missing = missing  # whether NaN may stand for an entry that is missing
         self.measured = None if measured is None else _entries("measured", measured)
         self.angles = _angles(angles)
         if self.measured == ():
@@ -38,7 +41,7 @@ class Outputs:
             self._parts = {key: part for key, part in self._parts.items() if key in self.measured}
         for key, part in self._parts.items():
             _check(part, self._source if key is None else f"{self._source}, {key!r},")
-        owners = [key for key, part in self._parts.items() for _ in _limits(part)[0]]
+        owners = [key for key, part in self._parts.items() for _ in range(spaces.flatdim(part))]
         if not owners:
             raise ValueError(f"{self._source} holds no numbers: there is nothing to remember")
         low, high = (np.concatenate(side) for side in zip(*map(_limits, self._parts.values())))
@@ -82,7 +85,7 @@ class Outputs:
         y = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
         if not self._whole:
             y = y[..., self._take]
-        if not all_finite(y):
+        if not all_finite(np.where(np.isnan(y), 0.0, y) if self._missing else y):
             at = np.argwhere(~(np.abs(y) <= LARGEST))[0]
             row = f", row {at[0]}" if batch else ""
             raise ValueError(
@@ -102,7 +105,7 @@ class Inputs:
         self._space, self._source = space, f"the action of {source}"
         _check(space, self._source)
         self.low, self.high = _limits(space)
-        boxes = [isinstance(leaf, spaces.Box) for leaf in _leaves(space) for _ in _limits(leaf)[0]]
+        boxes = [isinstance(leaf, spaces.Box) for leaf in _leaves(space) for _ in range(spaces.flatdim(leaf))]
         # Bounds that no action may reach, as the largest float is, are none.
         scaled = np.array(boxes, dtype=bool) & (abs(self.low) <= LARGEST) & (abs(self.high) <= LARGEST)
         low, high = np.where(scaled, self.low, -1.0), np.where(scaled, self.high, 1.0)
@@ -200,15 +203,10 @@ def _check(space: Space, source: str) -> None:
 
 def _limits(space: Space) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of a space's signals."""
-    low, high = [], []
-    for leaf in _leaves(space):
-        if isinstance(leaf, spaces.Box):
-            low.append(leaf.low.ravel().astype(float))
-            high.append(leaf.high.ravel().astype(float))
-        else:
-            low.append(np.zeros(spaces.flatdim(leaf)))
-            high.append(np.ones(spaces.flatdim(leaf)))
-    return np.concatenate(low or [np.zeros(0)]), np.concatenate(high or [np.zeros(0)])
+    if spaces.flatdim(space) == 0:  # of which Gymnasium makes no box
+        return np.zeros(0), np.zeros(0)
+    flat: Any = spaces.flatten_space(space)
+    return flat.low.astype(float), flat.high.astype(float)
 
 
 def _signals(source: str, space: Space, value: Any, batch: tuple[int, ...]) -> np.ndarray:

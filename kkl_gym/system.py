@@ -185,22 +185,9 @@ class System:
         return _typical_rate(self)
 
     def f(self, x: Components) -> Components:
-        """Drift f(x).
+        """Drift f(x): from nx components as many, each of the kind that the components of ``x`` are, or a number.
 
-        Parameters
-        ----------
-        x : sequence of length nx
-            Components of the state: floats, arrays, tensors or symbols.
-
-        Returns
-        -------
-        sequence of length nx
-            Components of f(x), each of the kind that the components of ``x`` are, or a number.
-
-        Raises
-        ------
-        NotImplementedError
-            If the subclass does not define it.
+        Components are floats, arrays, tensors or symbols. Every subclass defines it, or :meth:`step`.
         """
         if not self.discrete:
             raise NotImplementedError(f"{type(self).__name__} does not define f")
@@ -255,68 +242,19 @@ class System:
         return rng.uniform(*self.box(factor), (n, self.nx))
 
     def g(self, x: Components) -> Sequence[Components]:
-        """Input matrix g(x); default: the constant ``G``.
-
-        Parameters
-        ----------
-        x : sequence of length nx
-            Components of the state.
-
-        Returns
-        -------
-        sequence of sequences, shape (nx, nu)
-            Rows of g(x).
-        """
+        """Input matrix g(x), (nx, nu) in rows, from components as :meth:`f` takes them; default: the constant ``G``."""
         return self.G or ((),) * self.nx
 
     def h(self, x: Components) -> Components:
-        """Output map h(x).
-
-        Parameters
-        ----------
-        x : sequence of length nx
-            Components of the state.
-
-        Returns
-        -------
-        sequence of length ny
-            Components of h(x).
-
-        Raises
-        ------
-        NotImplementedError
-            If the subclass does not define it.
-        """
+        """Output map h(x): ny components, from components as :meth:`f` takes them. Every subclass defines it."""
         raise NotImplementedError(f"{type(self).__name__} does not define h")
 
     def output(self, x: np.ndarray) -> np.ndarray:
-        """Outputs h(x) of many states.
-
-        Parameters
-        ----------
-        x : ndarray, shape (..., nx)
-            States.
-
-        Returns
-        -------
-        ndarray, shape (..., ny)
-            Outputs without noise.
-        """
+        """Outputs h(x), without noise, of many states. Shapes: ``x`` (..., nx); returns (..., ny)."""
         return on_states(self.h, x)
 
     def drift(self, x: np.ndarray) -> np.ndarray:
-        """Drift f(x) of many states.
-
-        Parameters
-        ----------
-        x : ndarray, shape (..., nx)
-            States.
-
-        Returns
-        -------
-        ndarray, shape (..., nx)
-            Their derivatives without input and noise.
-        """
+        """Drift f(x) of many states, without input and noise. Shapes: ``x`` (..., nx); returns (..., nx)."""
         return on_states(self.f, x)
 
     def rate(self, x: Components) -> Any:
@@ -339,18 +277,7 @@ class System:
         return slope(self.f, x, self.X)
 
     def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of the training box, or of a multiple of it about ``X_centre``, cut at the bounds.
-
-        Parameters
-        ----------
-        factor : float
-            How many times as wide the box is to be.
-
-        Returns
-        -------
-        low, high : ndarray, shape (nx,)
-            The corners.
-        """
+        """Corners (nx,) of the training box, or of a multiple of it about ``X_centre``, cut at the bounds."""
         low, high = np.array(self.X, dtype=float).T
         if factor != 1:
             centre, (lowest, highest) = np.array(self.X_centre), np.array(self.bounds, dtype=float).T

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 from kkl_gym.equations import check_equations
 from kkl_gym.loading import load_class
 from kkl_gym.system import Box, Components, System
-from observers import Artifact
 from observers.checks import mapping, shown
+from observers.names import matching, suggestion
 
 
 @dataclass(frozen=True)
@@ -208,8 +208,9 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
     Parameters
     ----------
     system : str, System or type of System
-        A shipped name (``"van_der_pol"``), a class of the user's as ``"package.module:Class"`` or
-        ``"path/to/script.py:Class"``, or a :class:`System` (class or instance) itself.
+        A shipped name (``"van_der_pol"``, ``"VanDerPol"`` or ``"KKLVanDerPol-v0"``), a class of the user's as
+        ``"package.module:Class"`` or ``"path/to/script.py:Class"``, a script that defines one system, or a
+        :class:`System` (class or instance) itself.
     parameters : mapping of str to float, optional
         Physical parameters by name.
 
@@ -247,26 +248,14 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
 
 
 def _find(name: str) -> type[System]:
-    if name in SYSTEMS:
-        return SYSTEMS[name]
-    if ":" not in name:
+    if ":" in name or name.endswith(".py"):
+        return load_class(name, System)
+    if (known := matching(name, SYSTEMS)) is None:
         raise ValueError(
-            f"unknown system {shown(name)}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or "
-            "'script.py:Class'"
+            f"unknown system {shown(name)}{suggestion(name, SYSTEMS)}; shipped: {', '.join(SYSTEMS)}; your own: "
+            "'module:Class' or 'script.py:Class'"
         )
-    return load_class(name, System)
+    return SYSTEMS[known]
 
 
-def system_of(artifact: Artifact, given: str | None) -> System:
-    """The system that an artifact was made for, checked against it."""
-    artifact.require_system()
-    if given is None and artifact.system not in SYSTEMS:
-        raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")
-    base = get_system(given or artifact.system)
-    if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
-        base = base.replace(artifact.parameters)
-    artifact.check(base.name, base.parameters, dt=artifact.filter.dt, ny=base.ny, nu=base.nu)
-    return base
-
-
-__all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system", "system_of"]
+__all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system"]

@@ -1,13 +1,12 @@
 """Where in a user's code an exception comes from."""
 
-import ast
-import builtins
+import dis
 import itertools
 import linecache
+import re
 import sys
 from pathlib import Path
 from types import CodeType, TracebackType
-from typing import Any
 
 # Wherever they are installed; the rest of what is installed is known by its folder.
 _LIBRARIES = sys.stdlib_module_names - {"__main__"} | {"kkl_gym", "observers", "training"}
@@ -43,27 +42,11 @@ def path_of(code: CodeType) -> str:
 def called_function(step: TracebackType) -> str:
     """Name of the function that was being called at a step; empty where it was no call, or there is no source."""
     code = step.tb_frame.f_code
-    line, end_line, column, end_column = next(itertools.islice(code.co_positions(), step.tb_lasti // 2, None))
-    if line is None or end_line is None:
+    line, _, column, _ = next(itertools.islice(code.co_positions(), step.tb_lasti // 2, None))
+    if "CALL" not in dis.opname[code.co_code[step.tb_lasti]] or line is None or column is None:
         return ""
-    source = [linecache.getline(code.co_filename, n).encode() for n in range(line, end_line + 1)]
-    source[-1] = source[-1][:end_column]
-    source[0] = source[0][column:]
-    try:
-        expression = ast.parse(b"(" + b"".join(source) + b")", mode="eval").body
-    except (SyntaxError, ValueError):  # a statement
-        return ""
-    function = _value(expression.func, step) if isinstance(expression, ast.Call) else None
-    return getattr(function, "__name__", "")
-
-
-def _value(node: ast.expr, step: TracebackType) -> Any:
-    """What a dotted name stood for at a step."""
-    if isinstance(node, ast.Attribute):
-        return getattr(_value(node.value, step), node.attr, None)
-    frame = step.tb_frame
-    names = {**vars(builtins), **frame.f_globals, **frame.f_locals}
-    return names.get(node.id) if isinstance(node, ast.Name) else None
+    called = re.match(r"[\w.]*", linecache.getline(code.co_filename, line).encode()[column:].decode())
+    return called[0].rpartition(".")[2] if called else ""
 
 
 def _steps(error: BaseException) -> list[TracebackType]:

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.compiled import CompiledDecoder
+from observers.compiled import CompiledDecoder, available
 from observers.inverse import InverseMap
-from observers.thresholds import MANY_ROWS
 
 
 class Decoders:
@@ -16,8 +15,8 @@ class Decoders:
 
     def __init__(self, artifact: Artifact, outputs: slice, **options: Any) -> None:
         free = artifact.free_inverse
-        self._driven = Decoder(artifact.inverse, outputs, **options)
-        self._free = None if free is None else Decoder(free, outputs, **options)
+        self.driven = Decoder(artifact.inverse, outputs, **options)
+        self.free = None if free is None else Decoder(free, outputs, **options)
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the estimates, (..., nx), of filter states (..., size) at ages in seconds."""
@@ -28,12 +27,10 @@ class Decoders:
         return self._by_row(z, age, Decoder.covariance)
 
     def _by_row(self, z: np.ndarray, age: Any, of: Any) -> np.ndarray:
-        driven, free = self._driven, self._free
+        driven, free = self.driven, self.free
         if free is None:
             return np.asarray(of(driven, z, age))
         nz = free.size  # behind it lies z_u, exactly 0 until an input acts
-        if z.ndim == 1:
-            return np.asarray(of(driven, z, age) if any(z[nz:].tolist()) else of(free, z[:nz], age))
         moved = z[..., nz:].any(-1)
         if moved.all():
             return np.asarray(of(driven, z, age))
@@ -56,23 +53,22 @@ class Decoder:
         *,
         measurement_noise: float | tuple[float, ...],
         process_noise: float,
-        compiled: bool = False,
+        compiled: bool | None = None,
     ) -> None:
         error = inverse.error_covariance
-        self._error = None if error is None else error.at_level(inverse.shares(measurement_noise)[0])
+        self.error = None if error is None else error.at_level(inverse.shares(measurement_noise)[0])
         self._inverse = inverse = inverse.part(outputs)
         self.size = inverse.whiten.shape[1]
         self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
         self._offset = -inverse.z_offset @ self._whiten
         self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
-        self._needs_age, self._singly = inverse.features[-1] == "age", compiled
+        self._needs_age, self._choice = inverse.features[-1] == "age", compiled
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the estimate."""
-        if z.ndim == 1 and self._singly and self._compiled is not None:
-            return self._compiled.single(z, float(age))
-        if z.ndim == 2 and len(z) >= MANY_ROWS and self._compiled is not None:
-            return self._compiled.batch(z, age)
+        machine = None if self._choice is False else self.compiled
+        if machine is not None and z.ndim <= 2 and (z.ndim == 1 or machine.has_layers):
+            return machine.single(z, float(age)) if z.ndim == 1 else machine.batch(z, age)
         inverse, conditions = self._inverse, self._conditions
         modes = z @ self._whiten
         modes += self._offset
@@ -87,31 +83,28 @@ class Decoder:
 
     def covariance(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the covariance of the estimate's error, (..., nx, nx)."""
-        assert self._error is not None
-        return self._error(age, z.shape[:-1])
+        assert self.error is not None
+        return self.error(age, z.shape[:-1])
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # made again where it goes
+        return {name: value for name, value in self.__dict__.items() if name != "compiled"}  # made again where it goes
 
     @functools.cached_property
-    def _compiled(self) -> CompiledDecoder | None:
-        inverse, mlp = self._inverse, self._inverse.mlp
-        if len(mlp.layers) < 2:
+    def compiled(self) -> CompiledDecoder | None:
+        """The same as machine code; None without Numba."""
+        if not available():
             return None
-        age = (inverse.age_unit, inverse.age_max) if self._needs_age else None
-        try:
-            return CompiledDecoder(
-                mlp.layers,
-                mlp.activation,
-                whiten=self._whiten,
-                offset=self._offset,
-                conditions=self._conditions,
-                age=age,
-                x_offset=inverse.x_offset,
-                x_scale=inverse.x_scale,
-            )
-        except ImportError:
-            return None
+        inverse = self._inverse
+        return CompiledDecoder(
+            inverse.mlp.layers,
+            inverse.mlp.activation,
+            whiten=self._whiten,
+            offset=self._offset,
+            conditions=self._conditions,
+            age=(inverse.age_unit, inverse.age_max) if self._needs_age else None,
+            x_offset=inverse.x_offset,
+            x_scale=inverse.x_scale,
+        )
 
 
 __all__ = ["Decoder", "Decoders"]

@@ -12,12 +12,14 @@ from observers.checks import is_finite
 
 MOST_LEVELS = 24  # of expressions within one another
 MOST_PARTS = 2000  # of all components together: numbers, states and functions
+_POWERS = 8  # up to which an exponent becomes products
+_MOST_NESTED = 16  # sums and the like within one another
 
 
 class _Rule(NamedTuple):
-    """What a name stands for: a function of numbers or conditions, which gives one of these."""
+    """What a name stands for: a function of numbers or conditions, as Python source that NumPy and Numba take."""
 
-    function: Callable[..., Any]
+    source: str
     takes: tuple[bool, ...]  # for each argument, whether it is a condition
     more: bool = False  # whether it goes on with any number of arguments like the last
     gives: bool = False  # whether it is a condition itself
@@ -25,24 +27,21 @@ class _Rule(NamedTuple):
 
 _RULES: dict[str, _Rule] = {
     **{
-        name: _Rule(getattr(np, name), (False,))
+        name: _Rule(f"np.{name}({{}})", (False,))
         for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "abs", "sign", "floor")
     },
-    "+": _Rule(np.add, (False, False), more=True),
-    "*": _Rule(np.multiply, (False, False), more=True),
-    "**": _Rule(np.power, (False, False)),
-    "%": _Rule(np.mod, (False, False)),
-    "atan2": _Rule(np.arctan2, (False, False)),
-    "minimum": _Rule(np.minimum, (False, False), more=True),
-    "maximum": _Rule(np.maximum, (False, False), more=True),
-    "where": _Rule(np.where, (True, False, False)),
-    "<": _Rule(np.less, (False, False), gives=True),
-    "<=": _Rule(np.less_equal, (False, False), gives=True),
-    ">": _Rule(np.greater, (False, False), gives=True),
-    ">=": _Rule(np.greater_equal, (False, False), gives=True),
-    "and": _Rule(np.logical_and, (True, True), more=True, gives=True),
-    "or": _Rule(np.logical_or, (True, True), more=True, gives=True),
-    "not": _Rule(np.logical_not, (True,), gives=True),
+    "+": _Rule("({} + {})", (False, False), more=True),
+    "*": _Rule("({} * {})", (False, False), more=True),
+    "**": _Rule("np.power({}, {})", (False, False)),
+    "%": _Rule("np.mod({}, {})", (False, False)),
+    "atan2": _Rule("np.arctan2({}, {})", (False, False)),
+    "minimum": _Rule("np.minimum({}, {})", (False, False), more=True),
+    "maximum": _Rule("np.maximum({}, {})", (False, False), more=True),
+    "where": _Rule("np.where({}, {}, {})", (True, False, False)),
+    **{name: _Rule(f"({{}} {name} {{}})", (False, False), gives=True) for name in ("<", "<=", ">", ">=")},
+    "and": _Rule("np.logical_and({}, {})", (True, True), more=True, gives=True),
+    "or": _Rule("np.logical_or({}, {})", (True, True), more=True, gives=True),
+    "not": _Rule("np.logical_not({})", (True,), gives=True),
 }
 
 
@@ -77,21 +76,43 @@ class Expression:
 
     def __call__(self, x: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Evaluate it. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., number of components)."""
-        rows = {"x": np.moveaxis(np.asarray(x, dtype=float), -1, 0)}
-        if u is not None:
-            rows["u"] = np.moveaxis(np.asarray(u, dtype=float), -1, 0)
-        out = np.empty((*rows["x"].shape[1:], len(self.components)))
+        x = np.asarray(x, dtype=float)
+        rows = [x[..., i] for i in range(self.states)]
+        if self.inputs:
+            u = np.asarray(u, dtype=float)
+            rows += [u[..., j] for j in range(self.inputs)]
+        out = np.empty((*x.shape[:-1], len(self.components)))
         with np.errstate(all="ignore"):
-            for i, part in enumerate(self.components):
-                out[..., i] = _evaluated(part, rows)
+            for i, value in enumerate(self._function(*rows)):
+                out[..., i] = value
         return out
 
+    @functools.cached_property
+    def _function(self) -> Callable[..., tuple[Any, ...]]:
+        namespace: dict[str, Any] = {"np": np}
+        exec(self.python("function", self.states, self.inputs), namespace)
+        function: Callable[..., tuple[Any, ...]] = namespace["function"]
+        return function
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"components": self.components}  # functions by source cannot be pickled
+
+    def python(self, name: str, nx: int, nu: int) -> str:
+        """Source of a function of nx states and nu inputs, each an argument, that returns a tuple of the components."""
+        given = ", ".join([*(f"x{i}" for i in range(nx)), *(f"u{j}" for j in range(nu))])
+        return f"def {name}({given}):\n    return ({''.join(_source(part) + ', ' for part in self.components)})"
+
     @property
+    def operations(self) -> int:
+        """Number of operations in all components."""
+        return sum(map(_operations, self.components))
+
+    @functools.cached_property
     def states(self) -> int:
         """Number of states that it needs."""
         return max(_count(part, "x") for part in self.components)
 
-    @property
+    @functools.cached_property
     def inputs(self) -> int:
         """Number of inputs that it needs."""
         return max(_count(part, "u") for part in self.components)
@@ -121,14 +142,33 @@ def _checked(part: Any, condition: bool, levels: int, left: list[int]) -> Any:
     return name, *(_checked(each, kind, levels - 1, left) for each, kind in zip(arguments, kinds, strict=True))
 
 
-def _evaluated(part: Any, rows: dict[str, np.ndarray]) -> Any:
+def _source(part: Any) -> str:
     if isinstance(part, float):
-        return np.float64(part)  # Python's own powers raise errors
+        return f"({part!r})"
     name, *arguments = part
     if name in ("x", "u"):
-        return rows[name][arguments[0]]
-    function, values = _RULES[name].function, [_evaluated(each, rows) for each in arguments]
-    return functools.reduce(function, values) if len(values) > 1 and name != "where" else function(*values)
+        return f"{name}{arguments[0]}"
+    sources = [_source(each) for each in arguments]
+    if name == "**" and isinstance(exponent := arguments[1], float) and not isinstance(arguments[0], float):
+        if exponent.is_integer() and abs(exponent) <= _POWERS:
+            return f"({sources[0]} ** {int(exponent)})"
+        if exponent == 0.5:
+            return f"np.sqrt({sources[0]})"
+    return _joined(_RULES[name].source, sources, len(_RULES[name].takes))
+
+
+def _joined(source: str, sources: list[str], arity: int) -> str:
+    """A function of any number of arguments by one of ``arity``; many are halved, or Python could not nest them."""
+    if len(sources) > _MOST_NESTED:
+        half = len(sources) // 2
+        sources = [_joined(source, sources[:half], arity), _joined(source, sources[half:], arity)]
+    return functools.reduce(source.format, sources[arity:], source.format(*sources[:arity]))
+
+
+def _operations(part: Any) -> int:
+    if isinstance(part, float) or part[0] in ("x", "u"):
+        return 0
+    return len(part) - 1 + sum(map(_operations, part[1:]))
 
 
 def _count(part: Any, letter: str) -> int:

@@ -116,17 +116,17 @@ class CovarianceByAge:
     """Covariances (m, nx, nx) at ages (m,) in seconds, interpolated between them."""
 
     def __init__(self, ages: np.ndarray, covariance: np.ndarray) -> None:
-        self._ages, self._covariance = ages, covariance
+        self.ages, self.covariance = ages, covariance
 
     def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
         """Return the covariances at ages (...,), which broadcast to ``shape``; returns (..., nx, nx)."""
         ages = np.broadcast_to(np.asarray(age, dtype=float), shape or np.shape(age))
-        i = np.clip(np.searchsorted(self._ages, ages, side="right"), 1, max(1, len(self._ages) - 1))
-        if len(self._ages) == 1:
-            return np.array(np.broadcast_to(self._covariance[0], (*ages.shape, *self._covariance.shape[1:])))
-        low, high = self._ages[i - 1], self._ages[i]
+        i = np.clip(np.searchsorted(self.ages, ages, side="right"), 1, max(1, len(self.ages) - 1))
+        if len(self.ages) == 1:
+            return np.array(np.broadcast_to(self.covariance[0], (*ages.shape, *self.covariance.shape[1:])))
+        low, high = self.ages[i - 1], self.ages[i]
         share = np.clip((ages - low) / (high - low), 0.0, 1.0)[..., None, None]
-        return np.asarray((1 - share) * self._covariance[i - 1] + share * self._covariance[i])
+        return np.asarray((1 - share) * self.covariance[i - 1] + share * self.covariance[i])
 
 
 def check_positive_definite(covariance: np.ndarray) -> None:

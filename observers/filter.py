@@ -1,13 +1,8 @@
 """The linear half of the observer, z' = A z + B y, integrated exactly between samples."""
 
-import functools
-from typing import Any
-
 import numpy as np
 
 from observers.checks import check_dt, integer, real_array
-from observers.sparse import SparseUpdate
-from observers.thresholds import MANY_ROWS
 
 MOST_INPUTS = 64  # that a filter takes; every one of them adds nz values to its state
 MOST_VALUES = 1024  # of its state, and of the output; beyond them memory and the decomposition of A would be felt
@@ -124,18 +119,10 @@ class LinearFilter:
     def advance(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
         """Return the state one sample later.
 
-        A batch (n, size) of many rows goes through Numba where it is installed, which rounds a little differently.
-
         Shapes: ``z`` (..., size), ``y`` (..., ny) at the same time, ``u`` (..., nu) held until the next sample,
         ``y_next`` (..., ny) there; returns (..., size). Raises ValueError if they do not go together.
         """
-        if z.ndim == 2 and len(z) >= MANY_ROWS and self._sparse is not None:
-            return self._sparse(z, y, u, y_next)
         return np.concatenate((z, y, u, y_next), axis=-1) @ self._update
-
-    def advance_single(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
-        """As :meth:`advance` for a single sample, by Numba where it is installed and the modes hardly mix."""
-        return self.advance(z, y, u, y_next) if self._sparse is None else self._sparse.single(z, y, u, y_next)
 
     def run(self, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
         """Return the states at samples ``ages`` (m,) of a record, counted from its start, without repetition.
@@ -151,13 +138,3 @@ class LinearFilter:
             if k in slot:
                 out[slot[k]] = z
         return out
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_sparse"}  # Numba is not everywhere
-
-    @functools.cached_property
-    def _sparse(self) -> SparseUpdate | None:
-        try:
-            return SparseUpdate(self.transition, self.drive)
-        except (ImportError, ValueError):
-            return None

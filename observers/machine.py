@@ -8,8 +8,6 @@ from typing import Any, TypeVar
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
-FAST = {"contract", "reassoc", "nsz", "arcp"}  # what may be done to sums; NaN and infinity keep their meaning
-
 
 def kernel(**options: Any) -> Callable[[_F], _F]:
     """Compile a function that Python calls, and keep its machine code on disk for later processes."""
@@ -26,12 +24,27 @@ def kernel(**options: Any) -> Callable[[_F], _F]:
     return compiled
 
 
+def pointer(function: Callable[..., Any], signature: Any, **options: Any) -> Any:
+    """Compile a function that kernels call by its ``address``; it lasts as long as what is returned."""
+    from numba.core.ccallback import CFunc
+
+    named = _named(function, options)
+    made: Any = CFunc(named, (signature.args, signature.return_type), locals={}, options=options)
+    with suppress(RuntimeError):  # no folder can be written
+        made._cache = _forgiving()(named)
+    made.compile()
+    return made
+
+
 @cache
 def _forgiving() -> Any:
     """Numba's cache, except that files which cannot be read or written cost a compilation and raise nothing."""
     from numba.core.caching import FunctionCache
 
     class Forgiving(FunctionCache):
+        def _index_key(self, sig: Any, codegen: Any) -> Any:  # by the name, which is that of the content
+            return sig, codegen.magic_tuple(), self._py_func.__qualname__
+
         def load_overload(self, *arguments: Any) -> Any:
             try:
                 return super().load_overload(*arguments)  # type: ignore[no-untyped-call]
@@ -63,17 +76,16 @@ def part(**options: Any) -> Callable[[_F], _F]:
 
 
 def _named(function: _F, options: dict[str, Any]) -> _F:
-    """Name a function by its content.
+    """Name a function by its content, and that of the functions that it calls.
 
     Machine code of several processes is linked by name, so that functions that differ must not share one. Nor do they
     share a file, which two processes may write at once.
     """
-    code, cells = function.__code__, [cell.cell_contents for cell in function.__closure__ or ()]
+    code = function.__code__
+    used = [cell.cell_contents for cell in function.__closure__ or ()]
+    used += [function.__globals__[name] for name in code.co_names if name in function.__globals__]
+    names = [getattr(each, "__qualname__", getattr(each, "__name__", each)) for each in used]
     how = [(name, sorted(value) if isinstance(value, set) else value) for name, value in sorted(options.items())]
-    content = code.co_code, code.co_consts, code.co_names, [getattr(each, "__qualname__", each) for each in cells], how
+    content = code.co_code, code.co_consts, code.co_names, names, how
     function.__qualname__ = f"{code.co_qualname}_{hashlib.sha256(repr(content).encode()).hexdigest()[:16]}"
     return function
-
-
-fast_kernel = kernel(fastmath=FAST, error_model="numpy")
-fast_part = part(fastmath=FAST, error_model="numpy")

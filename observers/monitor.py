@@ -129,31 +129,33 @@ class Monitor:
         self._silent = np.round(limits.warm_up / dt)
         self._sound = np.maximum(np.square(level), self._limits[1])  # where the running mean square begins
 
-    def reset(self, batch: tuple[int, ...]) -> None:
-        """Begin anew, with a batch of a shape (...,)."""
-        ny = len(self._sound)
-        self._mean = np.zeros((*batch, ny))
-        self._square = np.broadcast_to(self._sound, (*batch, ny)).copy()
-        self._age = np.zeros(batch, dtype=int)
-
-    def restart(self, rows: np.ndarray) -> None:
-        """Begin anew in some rows. Shapes: ``rows`` (...,), of bool."""
-        self._mean[rows], self._square[rows], self._age[rows] = 0.0, self._sound, 0
-
-    def update(self, residual: np.ndarray, seen: np.ndarray | None = None) -> None:
-        """Take in residuals y - h(x_hat), (..., ny), of which ``seen`` ones, (..., ny) or (..., 1), or all count."""
-        share = self._share if seen is None else self._share * seen
-        self._mean += share * (residual - self._mean)
-        self._square += share * (residual**2 - self._square)
-        self._age += 1 if seen is None else seen.any(-1)
-
     @property
-    def score(self) -> np.ndarray:
-        """How close to an alarm: above 1 a limit is exceeded, (...,); 0 while nothing is judged yet."""
-        mean, low, high = self._limits
-        worst = np.maximum(np.abs(self._mean) / mean, self._square / high)
-        worst = np.maximum(worst, low / np.maximum(self._square, 1e-300))
-        return np.where(self._age > self._silent, worst.max(-1), 0.0)
+    def width(self) -> int:
+        """Number of values in a row of the state: running means (ny), running mean squares (ny), samples judged."""
+        return 2 * len(self._sound) + 1
+
+    def start(self, n: int) -> np.ndarray:
+        """Return n rows, (n, width), before the first sample, as :class:`observers.estimator.Estimator` has states."""
+        ny = len(self._sound)
+        return np.tile(np.concatenate([np.zeros(ny), self._sound, [0.0]]), (n, 1))
+
+    def update(self, rows: np.ndarray, residual: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        """Return rows after residuals y - h(x_hat), (n, ny), of which those ``seen``, (n, ny), count."""
+        mean, square, samples = self._parts(rows)
+        share = self._share * seen
+        mean, square = mean + share * (residual - mean), square + share * (residual**2 - square)
+        return np.concatenate([mean, square, samples + seen.any(-1, keepdims=True)], axis=-1)
+
+    def score(self, rows: np.ndarray) -> np.ndarray:
+        """Return how close to an alarm rows are, (n,): above 1 a limit is exceeded; 0 while nothing is judged yet."""
+        (mean, square, samples), (most, low, high) = self._parts(rows), self._limits
+        worst = np.maximum(np.abs(mean) / most, square / high)
+        worst = np.maximum(worst, low / np.maximum(square, 1e-300))
+        return np.where(samples[..., 0] > self._silent, worst.max(-1), 0.0)
+
+    def _parts(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        ny = len(self._sound)
+        return rows[..., :ny], rows[..., ny : 2 * ny], rows[..., 2 * ny :]
 
 
 __all__ = ["Limits", "Monitor"]

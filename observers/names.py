@@ -1,6 +1,8 @@
 """Names of the maps that ship, and the files behind them."""
 
 import os
+from collections.abc import Iterable
+from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 
@@ -27,15 +29,31 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
     if text.endswith(".safetensors"):
         return Path(text)
     names = shipped()
-    if text not in names:
+    if (name := matching(text, names)) is None:
         raise ArtifactError(
-            f"unknown observer {shown(text)}; shipped: {', '.join(names) or 'none'}; a file's name ends in .safetensors"
+            f"unknown observer {shown(text)}{suggestion(text, names)}; shipped: {', '.join(names) or 'none'}; "
+            "a file's name ends in .safetensors"
         )
-    return _maps() / f"{text}.safetensors"
+    return _maps() / f"{name}.safetensors"
+
+
+def matching(text: str, names: Iterable[str]) -> str | None:
+    """The name that a text is, or is but for capitals and underscores, or as an environment's id; None for others."""
+    return {_plain(name): name for name in names}.get(_plain(text.removeprefix("KKL").removesuffix("-v0")))
+
+
+def suggestion(text: str, names: Iterable[str]) -> str:
+    """For error messages: the name closest to a text, if one is close."""
+    close = get_close_matches(text, list(names), n=1)
+    return f", did you mean {close[0]!r}?" if close else ""
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "")
 
 
 def _maps() -> Path:
     return Path(str(files("observers").joinpath("maps")))
 
 
-__all__ = ["resolve", "shipped"]
+__all__ = ["matching", "resolve", "shipped", "suggestion"]

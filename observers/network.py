@@ -125,7 +125,7 @@ class MLP:
     def compiled(self) -> CompiledNetwork | None:
         """The same network as machine code; None without Numba."""
         try:
-            return CompiledNetwork(self.layers, self.activation)
+            return CompiledNetwork(self.layers, self.activation, self.inputs)
         except ImportError:
             return None
 

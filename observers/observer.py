@@ -1,6 +1,6 @@
 """The observer at run time: filter the output, invert the map."""
 
-import copy
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,14 +9,11 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.checks import bool_array, noise_level, noise_levels, real_array
 from observers.compiled import available
-from observers.decoder import Decoders
 from observers.factors import standard_deviations
-from observers.monitor import Monitor
+from observers.kkl import KKL
+from observers.records import RecordEstimates
 from observers.replacement import check_replacement
-from observers.replay import RecordEstimates, filled
 from observers.samples import check_arguments, check_output, first_state, held_input
-from observers.thresholds import SOON
-from observers.tracker import Tracker
 
 
 class KKLObserver(RecordEstimates):
@@ -51,9 +48,9 @@ class KKLObserver(RecordEstimates):
         Whether to track; False takes T_inv alone, without any model at run time. None tracks where the artifact holds a
         motion.
     compiled : bool, optional
-        Whether single samples run compiled by Numba (the extra ``fast``), several times as fast; compilation takes
-        seconds, once. True compiles here and after unpickling, False uses NumPy, None uses NumPy until a :meth:`reset`
-        after 1,000 samples. The two agree to rounding. Batches of 128 rows or more use Numba where it is installed.
+        Whether Numba compiles the step (the extra ``fast``). None compiles where Numba is installed, True insists on
+        it, False takes NumPy. The first process on a machine compiles for some seconds, later ones read the machine
+        code from disk. Numba and NumPy agree to rounding.
 
     Raises
     ------
@@ -76,18 +73,13 @@ class KKLObserver(RecordEstimates):
         compiled: bool | None = None,
     ) -> None:
         check_arguments(artifact, monitor, compiled, tracking)
-        self.artifact = artifact
-        self._monitored, self._tracking = bool(monitor), None if tracking is None else bool(tracking)
-        self._compile, self._compiled = compiled, bool(compiled)
-        self._samples = 0  # single ones
-        self._z: np.ndarray | None = None
-        self._tracker: Tracker | None = None
-        self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
+        self.artifact, self._monitored = artifact, bool(monitor)
+        self._tracking, self._compiled = None if tracking is None else bool(tracking), compiled
+        self._kkl: KKL
+        self._state: np.ndarray | None = None  # (n, width), never changed in place
+        self._batch: tuple[int, ...] = ()
         self._process_noise = self._level(process_noise)
         self.measurement_noise = artifact.measurement_noise if measurement_noise is None else measurement_noise
-        self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
-        if self._compiled:
-            self._warm_up()
 
     @property
     def measurement_noise(self) -> float | tuple[float, ...]:
@@ -103,13 +95,7 @@ class KKLObserver(RecordEstimates):
                 f"measurement_noise = {level} is beyond the map's range, 0 to {inverse.measurement_noise_max}; "
                 f"pass measurement_noise={within} to use it all the same"
             )
-        limits = self.artifact.limits
-        monitor = Monitor(limits, level, self.artifact.filter.dt) if self._monitored and limits else None
-        if monitor is not None and self._z is not None:
-            monitor.reset(self._z.shape[:-1])
-        self._measurement_noise, self._monitor = level, monitor
-        self._x_hat = None
-        self._set_levels()
+        self._set_levels(level, self._process_noise)
 
     @property
     def process_noise(self) -> float:
@@ -118,8 +104,7 @@ class KKLObserver(RecordEstimates):
 
     @process_noise.setter
     def process_noise(self, level: float | None) -> None:
-        self._process_noise, self._x_hat = self._level(level), None
-        self._set_levels()
+        self._set_levels(self._measurement_noise, self._level(level))
 
     def _level(self, process_noise: float | None) -> float:
         if process_noise is None:
@@ -129,49 +114,26 @@ class KKLObserver(RecordEstimates):
     @property
     def tracking(self) -> bool:
         """Whether the observer tracks; else its estimate is T_inv's alone."""
-        return self._tracker is not None
+        return self._kkl.tracker is not None
 
-    def _set_levels(self) -> None:
-        """Make maps and tracker for the levels of noise."""
-        artifact, levels = self.artifact, self._levels
-        self._states = Decoders(artifact, slice(artifact.nx), **levels)
-        self._parameters: Decoders | None = None  # made where they are asked for
-        before, self._tracker = self._tracker, None
-        if artifact.motion is not None and self._tracking is not False:
-            self._tracker = Tracker(artifact, self._states, **levels)
-            if before is not None and self._z is not None:
-                self._tracker.take_over(before)
-
-    @property
-    def _levels(self) -> dict[str, Any]:
-        return {
-            "measurement_noise": self._measurement_noise,
-            "process_noise": self._process_noise,
-            "compiled": self._compiled,
-        }
+    def _set_levels(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
+        """Take maps, tracker and monitor for levels of noise; the monitor starts again."""
+        kkl = KKL(
+            self.artifact,
+            measurement_noise=measurement_noise,
+            process_noise=process_noise,
+            tracking=self.artifact.motion is not None and self._tracking is not False,
+            monitored=self._monitored,
+            compiled=self._compiled,
+        )
+        if self._state is not None and kkl.monitor is not None:
+            self._state = np.hstack([self._state[:, : kkl.watched.start], kkl.monitor.start(len(self._state))])
+        self._kkl, self._measurement_noise, self._process_noise = kkl, measurement_noise, process_noise
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        if not available():
-            self._compiled, self._compile = False, None if self._compile else self._compile
-        elif self._compiled and (self._compile or self._z is None or self._z.ndim == 1):
-            self._warm_up()  # in another process there is no machine code yet
-
-    def _warm_up(self) -> None:
-        """Make the machine code for single samples now, by a sample that is forgotten."""
-        linear, tracker = self.artifact.filter, copy.copy(self._tracker)
-        y, u = np.zeros(self.artifact.ny), np.zeros(linear.nu)
-        self._states(linear.advance_single(np.zeros(linear.size), y, u, y), 0.0)
-        if tracker is not None:
-            tracker.reset(y)
-            tracker.advance(y, u)
-
-    def __copy__(self) -> "KKLObserver":
-        """Another that stands where this one does, and goes its own way: what is changed in place is copied too."""
-        other = object.__new__(type(self))
-        mine = {"_monitor": copy.deepcopy(self._monitor), "_tracker": copy.copy(self._tracker)}
-        vars(other).update(vars(self) | mine)
-        return other
+        if self._compiled and not available():
+            self._compiled = None
 
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
@@ -192,23 +154,28 @@ class KKLObserver(RecordEstimates):
             observer is then as it was.
         """
         check_replacement(self.artifact, artifact)
-        other = self._twin(artifact, monitor=self._monitored)
-        other._compile, other._samples = self._compile, self._samples
-        if self._z is not None:
-            other._z, other._y, other._age = self._z, self._y, self._age
-            if other._tracker is not None and self._tracker is not None:
-                other._tracker.take_over(self._tracker)
-            elif other._tracker is not None:
-                other._tracker.reset(self._y)
-                other._tracker.supervise(self._z, self._age)
-            if other._monitor is not None:
-                other._monitor.reset(self._z.shape[:-1])
+        other = KKLObserver(
+            artifact,
+            self._measurement_noise,
+            process_noise=self._process_noise,
+            monitor=self._monitored,
+            tracking=self._tracking,
+            compiled=self._compiled,
+        )
+        if self._state is not None:
+            other._state, other._batch = other._kkl.take_over(self._kkl, self._state), self._batch
         vars(self).update(vars(other))
+
+    @property
+    def estimator(self) -> KKL:
+        """The same as an :class:`observers.estimator.Estimator`, whose state the caller keeps."""
+        return self._kkl
 
     @property
     def z(self) -> np.ndarray:
         """The filter's state [z_y, z_u], a copy of shape (..., nz * (1 + nu)); raises RuntimeError before reset."""
-        return self._moment(None)[0].copy()
+        state = self._begun()
+        return state[:, self._kkl.z].reshape(*self._batch, self.artifact.filter.size).copy()
 
     def reset(self, y0: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
         """Forget the past and take in the first sample.
@@ -235,18 +202,15 @@ class KKLObserver(RecordEstimates):
         """
         y0, x0 = real_array("y", y0).copy(), None if x0 is None else real_array("x0", x0)  # callers reuse arrays
         check_output(self.artifact, y0, y0.shape[:-1], first=True)
-        z0, age = first_state(self.artifact, y0, x0)
-        if self._compile is None and not self._compiled and y0.ndim == 1 and self._samples >= SOON and available():
-            self._compiled = True
-            self._set_levels()
-            self._warm_up()
-        if self._tracker is not None:
-            self._tracker.reset(y0, x0)
-            self._tracker.supervise(z0, age)
-        self._z, self._y, self._age, self._x_hat = z0, y0, age, None
-        if self._monitor is not None:
-            self._monitor.reset(y0.shape[:-1])
+        self._state, self._batch = self._begin(y0, x0), y0.shape[:-1]
         return self.decode()
+
+    def _begin(self, y0: np.ndarray, x0: np.ndarray | None) -> np.ndarray:
+        """Rows at first samples (..., ny), or at known states (..., nx)."""
+        z0, age = first_state(self.artifact, y0, x0)
+        n = math.prod(y0.shape[:-1])
+        x0 = None if x0 is None else x0.reshape(n, self.artifact.nx)
+        return self._kkl.begin(y0.reshape(n, self.artifact.ny), z0.reshape(n, self.artifact.filter.size), age, x0)
 
     @property
     def score(self) -> np.ndarray:
@@ -261,9 +225,9 @@ class KKLObserver(RecordEstimates):
         RuntimeError
             Before :meth:`reset`, or without ``monitor=True``.
         """
-        if self._monitor is None or self._z is None:
+        if self._kkl.monitor is None or self._state is None:
             raise RuntimeError("score needs an observer made with monitor=True, and reset(y0)")
-        return self._monitor.score
+        return self._kkl.monitor.score(self._state[:, self._kkl.watched]).reshape(self._batch)
 
     @property
     def mismatch(self) -> np.ndarray:
@@ -299,18 +263,13 @@ class KKLObserver(RecordEstimates):
         ValueError, RuntimeError
             As :meth:`reset`, and before it.
         """
-        z = self.z
-        rows = bool_array("rows", rows, z.shape[:-1])
+        state = self._begun()
+        rows = bool_array("rows", rows, self._batch)
         y0, x0 = real_array("y", y0), None if x0 is None else real_array("x0", x0)
         check_output(self.artifact, y0, (int(rows.sum()),), first=True)
-        z[rows], age = first_state(self.artifact, y0, x0)
-        self._z, self._y, self._x_hat = z, self._y.copy(), None
-        self._y[rows], self._age = y0, np.where(rows, age, self._age)
-        if self._tracker is not None:
-            self._tracker.restart(rows, y0, x0)
-            self._tracker.supervise(z, self._age, rows)
-        if self._monitor is not None:
-            self._monitor.restart(rows)
+        begun = self._begin(y0, x0)
+        self._state = state.copy()
+        self._state[rows.ravel()] = begun
 
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
         """Take in the next sample.
@@ -353,43 +312,23 @@ class KKLObserver(RecordEstimates):
         rows : array_like of bool, shape (...,), optional
             The rows of the batch that take it in, by default all.
         """
-        if self._z is None:
+        state, batch = self._state, self._batch
+        if state is None:
             raise RuntimeError("call reset(y0) before step(y)")
-        batch = self._z.shape[:-1]
         if rows is not None:
-            rows = bool_array("rows", rows, batch)
-        u = held_input(self.artifact, u, batch)
-        gaps, missing = None, y is None
+            rows = bool_array("rows", rows, batch).ravel()
+        u = held_input(self.artifact, u, batch).reshape(len(state), self.artifact.nu)
         if y is None:
-            y, gaps = np.full(self._y.shape, np.nan), np.ones(self._y.shape, dtype=bool)
+            y = np.full((len(state), self.artifact.ny), np.nan)
         else:
-            y = real_array("y", y).copy()  # as in reset
-            gaps = check_output(self.artifact, y, batch)
-        if not batch:
-            if rows is not None and not rows:
-                return
-            rows = None
-            self._samples += 1
-        tracker, linear = self._tracker, self.artifact.filter
-        if tracker is not None:
-            h = tracker.advance(y, u, rows)
-            if gaps is not None:
-                y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
-        elif gaps is not None:
-            y = filled(self.artifact, self._states, y, gaps, u, z=self._z, before=self._y, age=self._age)
-        advance = linear.advance_single if self._compiled and not batch else linear.advance
-        z = advance(self._z, self._y, u, y)
-        if rows is not None:
-            z, y = np.where(rows[..., None], z, self._z), np.where(rows[..., None], y, self._y)
-        self._z, self._y, self._age, self._x_hat = z, y, self._age + (1 if rows is None else rows), None
-        if tracker is not None:
-            tracker.supervise(self._z, self._age, rows)
-        if self._monitor is not None and not missing:
-            self._x_hat = self.decode()
-            seen = None if rows is None else rows[..., None]
-            if gaps is not None:
-                seen = ~gaps if seen is None else ~gaps & seen
-            self._monitor.update(self.artifact.residual(self._y, self._x_hat), seen)
+            y = real_array("y", y)
+            check_output(self.artifact, y, batch)
+            y = y.reshape(len(state), self.artifact.ny)
+        if rows is None:
+            self._state = self._kkl.step(state, y, u)
+        elif rows.any():
+            self._state = state.copy()
+            self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows])
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Return the current estimate: T_inv(z), the network's half of :meth:`step`, or the tracker's.
@@ -409,11 +348,8 @@ class KKLObserver(RecordEstimates):
         ValueError, RuntimeError
             If ``rows`` does not fit the batch; before :meth:`reset`.
         """
-        z, age = self._moment(rows)
-        x_hat = self._x_hat if self._tracker is None else self._tracker.estimate
-        if x_hat is not None:
-            return x_hat.copy() if rows is None else x_hat[rows]
-        return self._states(z, age)
+        state, batch = self._some(rows)
+        return self._kkl.decode(state).reshape(*batch, self.artifact.nx)
 
     @property
     def parameters_hat(self) -> np.ndarray:
@@ -426,8 +362,9 @@ class KKLObserver(RecordEstimates):
         ValueError
             If the artifact estimates no parameters.
         """
-        z, age = self._moment(None)
-        return self._identifier()(z, age)
+        state = self._begun()
+        found = self._kkl.parameters_hat(state)
+        return found.reshape(*self._batch, found.shape[-1])
 
     @property
     def covariance(self) -> np.ndarray:
@@ -465,35 +402,19 @@ class KKLObserver(RecordEstimates):
         ndarray, shape (..., nx, nx) or (number of True in rows, nx, nx)
             As :attr:`covariance`, which also raises the same.
         """
-        z, age = self._moment(rows)
-        if self._tracker is not None:
-            covariance = self._tracker.covariance(self._age)
-            return covariance if rows is None else covariance[rows]
+        state, batch = self._some(rows)
         self.artifact.require_covariance()
-        return self._states.covariances(z, age)
+        return self._kkl.covariance(state).reshape(*batch, self.artifact.nx, self.artifact.nx)
 
-    def _twin(self, artifact: Artifact, *, monitor: bool = False) -> "KKLObserver":
-        """Another with the same levels of noise, tracking and compilation."""
-        options = self._levels | {"compiled": self._compiled or self._compile, "tracking": self._tracking}
-        return KKLObserver(artifact, monitor=monitor, **options)
-
-    def _moment(self, rows: np.ndarray | None) -> tuple[np.ndarray, Any]:
-        """The filter's state and its age in seconds, of some rows."""
-        if self._z is None:
+    def _begun(self) -> np.ndarray:
+        if self._state is None:
             raise RuntimeError("call reset(y0) before the observer is used")
-        z, age = self._z, self._age
-        if rows is not None:
-            rows = bool_array("rows", rows, z.shape[:-1])
-            z, age = z[rows], np.broadcast_to(age, rows.shape)[rows]
-        return z, age * self.artifact.filter.dt
+        return self._state
 
-    def _identifier(self) -> Decoders:
-        artifact = self.artifact
-        if not artifact.estimated_parameters:
-            raise ValueError(
-                f"this observer for {artifact.system!r} estimates no parameters: train one that does "
-                "with kkl-gym train --uncertain all=0.1 --estimate-parameters"
-            )
-        if self._parameters is None:
-            self._parameters = Decoders(artifact, slice(artifact.nx, None), **self._levels)
-        return self._parameters
+    def _some(self, rows: np.ndarray | None) -> tuple[np.ndarray, tuple[int, ...]]:
+        """Some rows of the state, and the shape of the batch that they are."""
+        state = self._begun()
+        if rows is None:
+            return state, self._batch
+        state = state[bool_array("rows", rows, self._batch).ravel()]
+        return state, (len(state),)

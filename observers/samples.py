@@ -86,24 +86,25 @@ def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tu
     return z0, math.inf  # which every map takes for its age_max
 
 
-def checked_record(
-    artifact: Artifact, y: np.ndarray, u: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Return a record (steps, ..., signals) as floats, and what is missing of it; of ``u`` the last may be absent."""
+def checked_record(artifact: Artifact, y: np.ndarray) -> np.ndarray:
+    """Return a record of outputs (steps, ..., ny) as floats."""
     y = real_array("y", y)
     if y.ndim < 2 or not len(y):
         raise ValueError(f"y must be a record of shape (steps, ..., {artifact.ny}), got {y.shape}")
-    gaps = check_output(artifact, y, y.shape[:-1])
-    if gaps is not None:
+    if check_output(artifact, y, y.shape[:-1]) is not None:
         check_output(artifact, y[:1], y[:1].shape[:-1], first=True)
-        y = y.copy()  # in which they are filled
+    return y
+
+
+def held_inputs(artifact: Artifact, u: np.ndarray | None, samples: tuple[int, ...]) -> np.ndarray:
+    """Return inputs (steps - 1, ..., nu) beside outputs of a shape (steps, ...); the last row may be one too many."""
+    steps, *batch = samples
     if u is not None:
         u = real_array("u", u)
-        if u.ndim < 1 or len(u) not in (len(y) - 1, len(y)):
-            raise ValueError(f"u must have {len(y) - 1} or {len(y)} rows for {len(y)} rows of y, got shape {u.shape}")
-        if artifact.nu:
-            _check_finite("u", u[: len(y) - 1])
-    return y, u, gaps
+        if u.ndim < 1 or len(u) not in (steps - 1, steps):
+            raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got shape {u.shape}")
+        u = u[: steps - 1]
+    return held_input(artifact, u, (steps - 1, *batch))
 
 
 def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:

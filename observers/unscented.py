@@ -55,28 +55,39 @@ def transformed(
     return mean, points.products(spread, spread, nx), points.products(at - x, spread, nx)
 
 
-def conditioned(
-    x: np.ndarray,
-    P: np.ndarray,
-    innovation: np.ndarray,
-    S: np.ndarray,
-    across: np.ndarray,
-    missing: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Condition a batch of Gaussians on what samples differ by from what was expected.
+def whitened(
+    innovation: np.ndarray, S: np.ndarray, across: np.ndarray, missing: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """V (n, nx, ny) and white innovations (n, ny), by which samples make x + V white and P - V V^T of x and P.
 
-    Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``innovation`` (n, ny), ``S``, ``across`` (n, ny, ny) and (n, nx, ny),
-    ``missing`` (n, ny); returns ``white`` (n, ny).
+    Shapes: ``innovation``, ``missing`` (n, ny), ``S`` (n, ny, ny), ``across`` (n, nx, ny).
     """
-    missing = np.isnan(innovation) if missing is None else missing
     if missing.any():
         innovation = np.where(missing, 0.0, innovation)
         across = np.where(missing[:, None, :], 0.0, across)
         S = np.where(missing[:, None, :] | missing[..., None], np.eye(S.shape[-1]), S)  # apart from those measured
-    told = np.concatenate([across.mT, innovation[..., None]], axis=-1)
-    white = told / np.sqrt(S) if S.shape[-1] == 1 else np.linalg.solve(factor(S), told)
-    change = white[..., :-1].mT @ white  # K S K^T, and K times the innovation
-    return x + change[..., -1], P - change[..., :-1], white[..., -1]
+    if S.shape[-1] == 1:
+        root = np.sqrt(S[:, 0])
+        return across / root[..., None], innovation / root
+    both = np.linalg.solve(factor(S), np.concatenate([across.mT, innovation[..., None]], axis=-1))
+    return both[..., :-1].mT, both[..., -1]
+
+
+def shift(x: np.ndarray, V: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """Return x + V white."""
+    return x + (V @ white[..., None])[..., 0]
+
+
+def add(P: np.ndarray, V: np.ndarray, W: np.ndarray, sign: float = 1.0) -> np.ndarray:
+    """Return P + sign V W^T."""
+    return P + sign * (V @ W.mT)
+
+
+def solved(P: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Solve P X = b, (n, nx, k), for covariances P; NaN where one is not positive definite."""
+    root = factor(P)
+    solution: np.ndarray = np.linalg.solve(root.mT, np.linalg.solve(root, b))
+    return solution
 
 
 def factor(P: np.ndarray) -> np.ndarray:
@@ -92,4 +103,4 @@ def factor(P: np.ndarray) -> np.ndarray:
     return found
 
 
-__all__ = ["Points", "conditioned", "factor", "transformed"]
+__all__ = ["Gaussian", "Points", "add", "factor", "shift", "solved", "transformed", "whitened"]

@@ -42,13 +42,11 @@ def test_following_the_page_adds_a_system(tmp_path):
     root = tmp_path
     for package in ("kkl_gym", "observers", "training"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copytree(ROOT / "examples" / "research", root / "examples" / "research")
     shutil.copy(ROOT / "pyproject.toml", root)
     (root / "bin").mkdir()
-    for name, called in (("kkl-gym", f'"{sys.executable}" -m training'), ("python", f'"{sys.executable}"')):
-        command = root / "bin" / name
-        command.write_text(f'#!/bin/sh\nexec {called} "$@"\n')
-        command.chmod(0o755)
+    command = root / "bin" / "kkl-gym"
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m training "$@"\n')
+    command.chmod(0o755)
     path = os.pathsep.join([str(command.parent), os.environ["PATH"]])
     environment = os.environ | {"PATH": path, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
 
@@ -76,10 +74,6 @@ def test_following_the_page_adds_a_system(tmp_path):
 
     look = root / "runs" / "first-look"
     assert {path.name for path in look.iterdir() if path.is_file()} >= {"fitzhugh_nagumo.safetensors", "report.png"}
-    certificates = {path.name for path in (look / "certificates").iterdir()}
-    assert certificates == {"table.md", "fitzhugh_nagumo.json", "fitzhugh_nagumo.png"}
-    assert len((look / "faults" / "faults.csv").read_text().splitlines()) == 1 + 8 * 4
-    assert "| fitzhugh_nagumo |" in (look / "faults" / "table.md").read_text()
     assert (look / "agent" / "agent.safetensors").exists()
     checks = """
 import numpy as np
@@ -87,7 +81,8 @@ import observers
 from kkl_gym import ENV_IDS, get_system
 from training.agents.agent import Agent
 from training.presets import preset
-from training.systems import PROFILES, controller
+from training.agents.tasks import TASKS
+from training.systems import controller
 
 assert list(ENV_IDS)[-1] == "fitzhugh_nagumo" and ENV_IDS["fitzhugh_nagumo"] == "KKLFitzHughNagumo-v0"
 system = get_system("fitzhugh_nagumo")
@@ -96,7 +91,7 @@ assert np.allclose(controller(system)(np.array([system.target])), 0.0)
 assert preset(system, "input-aware", "fast").eigenvalues[0] == -0.1
 assert observers.load("fitzhugh_nagumo", 0.5, monitor=True).artifact.system == "fitzhugh_nagumo"
 agent = Agent.read("runs/first-look/agent/agent.safetensors")
-assert agent.observer == "fitzhugh_nagumo" and agent.task == PROFILES["fitzhugh_nagumo"].task
+assert agent.observer == "fitzhugh_nagumo" and agent.task == TASKS["fitzhugh_nagumo"]
 """
     do(sys.executable, "-c", checks)
 
@@ -106,7 +101,7 @@ def test_a_first_look_is_the_command_in_full_made_small():
     for label, language, text in blocks():
         if language == "sh":
             commands[LOOK if label.startswith(LOOK) else FULL].append(text.strip())
-    assert len(commands[LOOK]) == len(commands[FULL]) >= 5
+    assert len(commands[LOOK]) == len(commands[FULL]) >= 3
     for small, full in zip(commands[LOOK], commands[FULL], strict=True):
         assert small.startswith(f"{full} --") or full.startswith("cp ")
 

@@ -23,7 +23,7 @@ def test_the_page_of_commands_is_new():
     page = runpy.run_path(str(DOCS / "site" / "commands.py"))["page"]()
     assert page == (DOCS / "reference" / "commands.md").read_text(), "make docs writes the page"
     width = "fast 20, paper 512; spinn: fast 128, paper 512; records: 96 |\n"
-    for shown in ("--preset", "`--ekf`, `--no-ekf`", width, "### `kkl-gym agent train`"):
+    for shown in ("--preset", "`--ekf`", width, "### `kkl-gym agent train`"):
         assert shown in page
 
 
@@ -38,15 +38,20 @@ def test_the_reference_has_every_public_name(package):
 def test_links_lead_to_the_same_place_in_the_site():
     text = "See [`it`]({}), `[x]({})`.\n\n```python\nx[0]({})\n```\n"
     for source, page, link, becomes in [
-        ("docs/guides/check.md", "guides/check.md", "data.md#records", "data.md#records"),
-        ("docs/guides/check.md", "guides/check.md", "../../Makefile", f"{REPOSITORY}/blob/main/Makefile"),
-        ("docs/guides/check.md", "guides/check.md", "../../training", f"{REPOSITORY}/tree/main/training"),
-        ("docs/guides/check.md", "guides/check.md", "../results/agents", f"{REPOSITORY}/tree/main/docs/results/agents"),
-        ("docs/guides/check.md", "guides/check.md", "../../CONTRIBUTING.md", "../development/contributing.md"),
+        ("docs/guides/diagnose.md", "guides/diagnose.md", "data.md#records", "data.md#records"),
+        ("docs/guides/diagnose.md", "guides/diagnose.md", "../../Makefile", f"{REPOSITORY}/blob/main/Makefile"),
+        ("docs/guides/diagnose.md", "guides/diagnose.md", "../../training", f"{REPOSITORY}/tree/main/training"),
+        (
+            "docs/guides/diagnose.md",
+            "guides/diagnose.md",
+            "../results/agents",
+            f"{REPOSITORY}/tree/main/docs/results/agents",
+        ),
+        ("docs/guides/diagnose.md", "guides/diagnose.md", "../../CONTRIBUTING.md", "../development/contributing.md"),
         ("docs/start/a.md", "start/a.md", "../../examples/notebooks/own_system.ipynb", "../notebooks/own_system.md"),
-        ("CONTRIBUTING.md", "development/contributing.md", "docs/guides/check.md#a", "../guides/check.md#a"),
-        ("docs/guides/check.md", "guides/check.md", "https://arxiv.org", "https://arxiv.org"),
-        ("docs/guides/check.md", "guides/check.md", "#here", "#here"),
+        ("CONTRIBUTING.md", "development/contributing.md", "docs/guides/diagnose.md#a", "../guides/diagnose.md#a"),
+        ("docs/guides/diagnose.md", "guides/diagnose.md", "https://arxiv.org", "https://arxiv.org"),
+        ("docs/guides/diagnose.md", "guides/diagnose.md", "#here", "#here"),
     ]:
         relinked = HOOKS["relinked"](text.format(link, link, link), source, page, repository=REPOSITORY)
         assert relinked == text.format(becomes, link, link)
@@ -63,6 +68,13 @@ def test_pictures_are_light_and_dark_where_both_are_there(tmp_path):
     )
     text = "One {}\n\n{}\n\n{}, [a link](../figures/a.png)\n\n```md\n![An a](../figures/a.png)\n```\n"
     assert HOOKS["themed"](text.format(a, b, code), tmp_path / "guides") == text.format(twice, b, code)
+
+
+def test_formulas_are_mathml():
+    page = '<span class="arithmatex">\\(a &lt; b\\)</span><div class="arithmatex">\\[\nx_1\n\\]</div>'
+    typeset = HOOKS["typeset"](page)
+    assert re.search(r'<span class="formula"><math [^>]+"inline"><mrow><mi>a</mi><mo>&#x0003C;</mo><mi>b</mi>', typeset)
+    assert re.search(r'<div class="formula"><math [^>]+"block"><mrow><msub><mi>x</mi><mn>1</mn></msub>', typeset)
 
 
 def test_notebooks_are_pages():

@@ -8,15 +8,17 @@ if TYPE_CHECKING:
     from training.diagnosis import Observability, observability
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
+    from training.export.torch_memory import TorchMemory
+    from training.export.torch_observer import TorchObserver
     from training.identification.learning import adapt, identify
     from training.lessons.calibrate import calibrate
     from training.lessons.flow import learn_flow
     from training.lessons.map import Maps, learn_map
     from training.lessons.run import Run
-    from training.presets import preset, recorded_preset
+    from training.presets import preset
     from training.rollouts import learn
     from training.rollouts.callback import KKLTrainingCallback
-    from training.sources.recorded import RecordedSource
+    from training.sources.recorded import RecordedSource, recorded_preset
     from training.sources.simulated import SimulatedSource
     from training.sources.source import Source
     from training.train_observer import Result, train
@@ -31,6 +33,8 @@ __all__ = [
     "Run",
     "SimulatedSource",
     "Source",
+    "TorchMemory",
+    "TorchObserver",
     "adapt",
     "calibrate",
     "errors",
@@ -57,6 +61,8 @@ _MODULES = {
     "Run": "lessons.run",
     "SimulatedSource": "sources.simulated",
     "Source": "sources.source",
+    "TorchMemory": "export.torch_memory",
+    "TorchObserver": "export.torch_observer",
     "adapt": "identification.learning",
     "calibrate": "lessons.calibrate",
     "errors": "evaluation.errors",
@@ -67,7 +73,7 @@ _MODULES = {
     "nrmse": "evaluation.metrics",
     "observability": "diagnosis",
     "preset": "presets",
-    "recorded_preset": "presets",
+    "recorded_preset": "sources.recorded",
     "smape": "evaluation.metrics",
     "train": "train_observer",
     "unseen_trajectories": "evaluation.errors",

@@ -1,4 +1,4 @@
-"""The command line, ``kkl-gym`` (or ``python -m training``): a table of commands, and what is said of errors.
+"""The command line, ``kkl-gym`` (or ``python -m training``): a table of commands, and messages of errors.
 
 Importing this module imports nothing that takes time or may be missing. The module of a command is imported when that
 command is called.
@@ -15,35 +15,35 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr
 from functools import cache
 from importlib import import_module
+from importlib.metadata import version
 from typing import Any, NoReturn
 
 Commands = Mapping[str, tuple[str, str]]
 """The module and the class in it that are behind each command."""
 
 COMMANDS: Commands = {
-    "check": ("training.commands.check", "Check"),
+    "demo": ("training.commands.demo", "Demo"),
+    "maps": ("training.commands.maps", "Maps"),
+    "diagnose": ("training.commands.diagnose", "Diagnose"),
     "record": ("training.commands.record", "RecordCommand"),
     "train": ("training.commands.train", "Train"),
     "identify": ("training.commands.identify", "Identify"),
-    "adapt": ("training.commands.identify", "Adapt"),
     "evaluate": ("training.commands.evaluate", "Evaluate"),
-    "agent": ("training.commands.agent", "AgentCommand"),
-    "faults": ("training.commands.faults", "Faults"),
-    "maps": ("training.commands.maps", "Maps"),
     "export": ("training.commands.export", "ExportCommand"),
-    "demo": ("training.commands.demo", "Demo"),
+    "agent": ("training.commands.agent", "AgentCommand"),
 }
 
+DESCRIPTION = """Learned KKL observers for Gymnasium environments.
 
-# What an interruption may be followed by, by the first words of the command.
-AFTER_INTERRUPTION = {
-    ("train",): "--resume goes on from the last checkpoint, if there is one",
-    ("identify",): "--resume goes on from the last checkpoint, if there is one",
-    ("adapt",): "--resume goes on from the last checkpoint, if there is one",
-    ("agent", "train"): "--resume goes on from the last checkpoint, if there is one",
-}
+A first look: kkl-gym demo. An observer for a system of yours: kkl-gym diagnose script.py, kkl-gym train script.py.
+One for any environment: kkl-gym record ENV_ID, kkl-gym train NAME --data. kkl-gym COMMAND --help has the options,
+kkl-gym --version the version."""
 
-WIDE = 140  # columns of what is printed into a file or a pipe, where tables of 80 would be cut
+RESUMES = "--resume goes on from the last checkpoint, if there is one"
+# Hints after an interruption, by the first words of the command.
+AFTER_INTERRUPTION = {("train",): RESUMES, ("identify",): RESUMES, ("agent", "train"): RESUMES}
+
+WIDE = 140  # columns of output into a file or a pipe, where tables of 80 would be cut
 PROG = "kkl-gym"
 MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
@@ -67,7 +67,7 @@ EXTRAS = {
     "envs": {"h5py", "minari"},
     "dask": {"distributed"},
     "ray": {"ray"},
-    "onnx": {"onnx", "onnxruntime"},
+    "onnx": {"onnx", "onnxruntime", "onnxscript"},
 }
 
 
@@ -80,6 +80,9 @@ def main(
 ) -> None:
     """Entry point of the ``kkl-gym`` command."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments[:1] == ["--version"]:
+        print(f"kkl-gym {version('kkl-gym')}")
+        return
     with _noticing_interruptions() as interrupted:
         try:
             from rich.console import Console
@@ -95,7 +98,7 @@ def main(
                 module = (error.name or "").partition(".")[0]
                 extras = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
                 sys.exit(": ".join([prog, str(error), *extras]))
-            if isinstance(error, BrokenPipeError):  # who reads what is printed has seen enough, as head does
+            if isinstance(error, BrokenPipeError):  # the reader of the pipe has enough, as head does
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 sys.exit(1)
             if isinstance(error, ValueError | OSError | FloatingPointError):
@@ -135,23 +138,27 @@ def read(arguments: list[str], *, prog: str = PROG, commands: Commands = COMMAND
     import tyro
 
     called = arguments[:1]
+    if called and called[0] not in commands and not called[0].startswith("-"):
+        from observers.names import suggestion  # with numpy, which help need not wait for
+
+        _end(prog, f"unknown command {called[0]!r}{suggestion(called[0], commands)}: {', '.join(commands)}", MISUSED)
     if called and called[0].startswith("--tyro"):  # completion of the shell wants to know all
         called = list(commands)
     classes = {name: (load if name in called else _described)(*behind) for name, behind in commands.items()}
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
-        with redirect_stderr(said):
+        with redirect_stderr(printed):
             return tyro.extras.subcommand_cli_from_dict(
                 classes,
                 prog=prog,
-                description="Learned KKL observers for Gymnasium environments.",
-                args=arguments,
-                config=(tyro.conf.DisallowNone,),
+                description=DESCRIPTION if commands is COMMANDS else None,
+                args=arguments or ["--help"],
+                config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
             )
     except SystemExit as end:
         if end.code != MISUSED:
             raise
-        _end(prog, _without_box(said.getvalue()), MISUSED)
+        _end(prog, _without_box(printed.getvalue()), MISUSED)
 
 
 def _end(prog: str, message: str, code: int) -> NoReturn:
@@ -160,7 +167,7 @@ def _end(prog: str, message: str, code: int) -> NoReturn:
 
 
 def _without_box(text: str) -> str:
-    """What tyro says of options that it cannot read, in one line: without frame, colours, title, help and reasons."""
+    """Tyro's message on options that it cannot read, in one line: without frame, colours, title, help and reasons."""
     parts: list[list[str]] = [[]]
     for line in text.splitlines()[1:]:  # the first bears the title
         content = re.sub(r"\x1b\[[0-9;]*m", "", line).strip(" │╰╯")
@@ -169,19 +176,21 @@ def _without_box(text: str) -> str:
         else:
             parts[-1].append(content)
     kept = [" ".join(" ".join(part).split()).partition(" Got errors:")[0] for part in parts]
+    similar = r"(?:Perhaps you meant|Arguments similar to \S+):.*?(--[\w-]+).*"  # and the whole help of the option
+    kept = [re.sub(similar, r"did you mean \1?", part) for part in kept]
     return "; ".join(part for part in kept if part and not part.startswith(("Argument helptext", "For full helptext")))
 
 
 def load(module: str, name: str) -> Callable[..., Any]:
-    """Import what is behind a command."""
+    """Import the class of a command."""
     found: Callable[..., Any] = getattr(import_module(module), name)
     return found
 
 
 @cache
 def _described(module: str, name: str) -> Callable[..., Any]:
-    """In the place of a command that is not called: the summary of its class, read without importing the module."""
-    import ast  # here, as is the next, so that an interruption soon finds somebody who notices it
+    """A stand-in for a command that is not called: the summary of its class, read without importing the module."""
+    import ast  # here, as is the next, so that the handler of interruptions is set before slow imports
     from importlib.util import find_spec
     from pathlib import Path
 

@@ -1,7 +1,8 @@
-"""What a training run is made of."""
+"""The settings of a training run."""
 
 import dataclasses
 import json
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
+
+from observers.names import suggestion
 
 Pipeline = Literal["input-aware", "spinn"]
 Optimiser = Literal["adam", "soap"]
@@ -33,8 +36,7 @@ STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attrib
 class Config:
     """A training run; together with the system it determines the artifact.
 
-    The defaults are those of the preset "fast" of input-aware maps. A source reads what concerns its motions: of
-    simulated ones their number and kinds, of recorded ones what is held out.
+    The defaults are those of the preset "fast" of input-aware maps. A source reads the settings of its motions.
 
     Raises
     ------
@@ -84,7 +86,7 @@ class Config:
     """Whether the output layer of a trained forward map is solved for by least squares in the end (spinn)."""
     transients: bool = True
     """Whether T_inv is fitted at every age since reset, where the filter holds T(x(t)) + e^{At} (z_0 - T(x_0)), and at
-    every level of measurement noise (spinn). Otherwise it is fitted to T(x) alone, and told neither."""
+    every level of measurement noise (spinn); otherwise to T(x) alone."""
     scaling: Scaling = "relative"
     """How states are scaled. relative: in units of their standard deviation, and errors of T_inv count relative to the
     state's size. range: in units of half their range, and all errors count alike. Input-aware maps are relative."""
@@ -93,39 +95,35 @@ class Config:
     inputs: bool = True
     """Whether the filter of an input-aware map takes in the system's inputs; else it is fitted to free motion only."""
     policy: str | None = None
-    """What acts on the system while motions are simulated for an input-aware map: "controller" for the system's own
-    (a linear-quadratic regulator at the target by default), or a function of yours, as script.py:function or
-    module:function, that turns states (n, nx) into actions (n, nu) in [-1, 1]. It acts on states with an error and
-    explores; one trajectory in twelve is its own. There are no free motions then, and no second inverse for
-    them. For plants that no random input would hold within their bounds."""
+    """A policy for plants that no random input holds within their bounds (input-aware): "controller" for the system's
+    own (by default a linear-quadratic regulator at the target), or script.py:function or module:function, from states
+    (n, nx) to actions (n, nu) in [-1, 1]. It acts on states with an error and explores, but for one trajectory in
+    twelve. There are no free motions then."""
     free_inverse: bool = True
     """Whether an input-aware map has a second inverse, of z_y alone, for as long as no input has acted. Never under a
     policy."""
     lead_in_input: NotNegative = 0.0
-    """Some free trajectories start where inputs have led from X. Positive: constant inputs up to this multiple of
-    their bounds, for 20 s. Zero: random inputs within their bounds, for 10 s."""
+    """Inputs lead the starts of some free trajectories out of X: for 20 s constant ones, up to this multiple of their
+    bounds, or for 10 s random ones within their bounds if it is 0."""
     process_noise_share: Share = 0.35
     """Share of an input-aware map's trajectories with process noise. Each has a level of its own, up to the system's.
-    The map is told the level unless the share is 0."""
+    The map is given the level unless the share is 0."""
     measurement_noise_max: Levels = 1.0
     """Largest standard deviation of the measurement noise that a map is trained for (spinn with transients too), of all
     outputs or of each."""
     noise_free_share: Share = 0.2
-    """Share of the samples without measurement noise, where a map is told its level."""
+    """Share of the samples without measurement noise, where a map is given its level."""
     high_noise_emphasis: Positive = 2.0
-    """How often samples have high levels of measurement noise, which are harder to learn. 1 draws the level evenly on
-    a logarithmic scale over the two decades below measurement_noise_max; higher values draw high levels more often."""
+    """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
+    measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
     windows: Count = 8000
     """Starts of the filter for each age (recorded motions)."""
     members: Count = 1
-    """Networks that are fitted from other random numbers and averaged: what one makes up beyond few records, the others
-    do not. They end as one network, as wide as all together."""
+    """Networks that are fitted from other random numbers and averaged into one, as wide as all together: they
+    extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()
-    """Measured signals whose zero is arbitrary, such as angles of encoders that were zeroed anywhere: the map depends
-    on how they change, not on where they are (recorded motions)."""
-    untold_noise: NotNegative = 0.0
-    """Standard deviation of further noise in every sample, over the largest level, of which the map is not informed: it
-    keeps networks from learning the noise of few records by heart."""
+    """Measured signals whose zero is arbitrary, such as angles of encoders: the map depends on their changes alone
+    (recorded motions)."""
     held_out: Annotated[float, Field(ge=0, lt=1)] = 0.2
     """Share of the records that is not trained on, on which covariances are calibrated and errors measured; whole
     records where there are five or more, else the end of each."""
@@ -141,15 +139,13 @@ class Config:
     truncation: Positive = 1e-6
     """Part epsilon of the filter's start that may be left where the forward map's data begins (paper, sec. 5.2)."""
     closed_loop_trajectories: Annotated[int, Field(ge=0)] = 0
-    """Trajectories of a controller, or the policy, that acts on the estimate, on which the inverse of an input-aware
-    map is fitted a second time beside the others; 0 for no second time."""
+    """Trajectories of a controller, or the policy, that acts on the estimate, on which an input-aware map is fitted a
+    second time beside the others; 0 for none."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
-    values, as a part of these. "all" stands for each that is not named. Some motions keep the values themselves
-    (:func:`training.trajectories.parameters.uncertain_plant`). The map still gives the state alone, whichever plant it
-    is."""
+    values, as a part of these; "all" stands for each that is not named. Some motions keep the values themselves."""
     estimate_parameters: bool = False
-    """Whether the map gives the uncertain parameters too, so that the observer identifies the plant while it runs."""
+    """Whether the map gives the uncertain parameters too."""
     cpu_seconds: Positive | None = None
     """CPU seconds after which the training of all networks together ends, steps done or not."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -196,22 +192,30 @@ def setting_types() -> dict[str, Any]:
 
 
 def read_changes(path: Path) -> dict[str, Any]:
-    """Settings from a JSON file, for :func:`override`."""
+    """Settings from a TOML or JSON file, for :func:`override`."""
+    language, loads = ("TOML", tomllib.loads) if path.suffix == ".toml" else ("JSON", json.loads)
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # that of JSON, or of a text in another encoding
-        raise ValueError(f"{path} is no JSON: {error}") from None
-    types = setting_types()
-    # A file of settings must not name code to run: a policy is given on the command line.
-    del types["pipeline"], types["closed_loop_trajectories"], types["policy"]
-    if not isinstance(found, dict) or not set(found) <= set(types):
-        unknown = sorted(set(found) - set(types)) if isinstance(found, dict) else type(found).__name__
-        raise ValueError(f"{path} must be an object of settings among {', '.join(sorted(types))}; it has {unknown}")
-    return _validated(found, str(path))
+        settings = loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # that of the language, or of a text in another encoding
+        raise ValueError(f"{path} is no {language}: {error}") from None
+    if not isinstance(settings, dict):
+        raise ValueError(f"{path} must hold settings by name, got a {type(settings).__name__}")
+    return checked_changes(settings, str(path))
+
+
+def checked_changes(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Settings by name, as JSON has their values, each of its type and within its limits."""
+    # A file of settings must not name code to run: --policy does.
+    names = sorted(set(setting_types()) - {"pipeline", "policy"})
+    for name in settings:
+        if name not in names:
+            close = suggestion(name, names)
+            raise ValueError(f"{where}: unknown setting {name!r}{close}; there are {', '.join(names)}")
+    return _validated(settings, where)
 
 
 def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
-    """The configuration behind what an artifact says of its training."""
+    """The configuration in an artifact's account of its training, with some settings changed."""
     known = setting_types()
     found = {name: value for name, value in training.items() if name in known and value is not None}
     if not {"pipeline", "eigenvalues"} <= set(found):

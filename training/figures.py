@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Theme = Literal["light", "dark"]
 RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"
-# All eight are told apart with each kind of colour blindness. The same places of matplotlib's own cycle, in which
+# All eight can be distinguished with each kind of colour blindness. The same places of matplotlib's own cycle, in which
 # environments render outside of this style, have like colours.
 CYCLES: dict[Theme, tuple[str, ...]] = {
     "light": ("#0072b2", "#e69f00", "#009e73", "#c2187a", "#56b4e9", "#7a4a1e", "#1a1a1a", "#9a9a9a"),

@@ -1,4 +1,4 @@
-"""Resumable jobs: a lock on each folder, and what identifies the results in it."""
+"""Folders of runs and jobs: a lock on each, and a file with what identifies the results in it."""
 
 import hashlib
 import json
@@ -44,10 +44,10 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 
 
 def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
-    """Refuse to work in a folder that holds something else."""
+    """Raise ValueError if a folder's identity file, where there is one, describes something else."""
     if not path.exists():
         return
-    here = _as_json(described)
+    here = json.loads(json.dumps(described))
     try:
         there = json.loads(path.read_text())
         changed = [name for name in sorted({*there, *here}) if there.get(name) != here.get(name)]
@@ -76,26 +76,22 @@ def locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterator[None]:
-    """Lock a job's folder and write what identifies the job in job.json."""
-    path = folder / "job.json"
+    """Lock a job's folder and write what identifies the job; ValueError if the folder holds another."""
     with locked(folder):
-        check_identity(path, described, what)
-        write(path, json.dumps(_as_json(described), indent=2) + "\n")
+        check_identity(folder / "job.json", described, what)
+        write(folder / "job.json", json.dumps(described, indent=2) + "\n")
         yield
 
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a training run's folder and write what identifies the run in config.json.
-
-    A folder without checkpoints is free for any run.
-    """
+    """Lock a training run's folder and write its configuration. A folder without checkpoints is free for any run."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)
         elif _has_checkpoints(folder):
             check_identity(folder / "config.json", described, "a run of another configuration")
-        write(folder / "config.json", json.dumps(_as_json(described), indent=2) + "\n")
+        write(folder / "config.json", json.dumps(described, indent=2) + "\n")
         yield
 
 
@@ -110,8 +106,3 @@ def refuse_checkpoints(folder: Path) -> None:
 
 def _has_checkpoints(folder: Path) -> bool:
     return any(folder.glob("[!.]*.checkpoint.*"))
-
-
-def _as_json(described: Mapping[str, Any]) -> dict[str, Any]:
-    """As it will be read from a file: lists in place of tuples."""
-    return dict(json.loads(json.dumps(described)))

@@ -1,7 +1,7 @@
 """Progress bars; where none can be drawn, a line a minute, which the log of a run gets as well.
 
-A line says what a bar would: ``simulating lorenz: 30 of 100, 0:00:30 passed, 0:01:10 left``. A thread writes it, so
-that a phase that does not report is not silent.
+A line has what a bar has: ``simulating lorenz: 30 of 100, 0:00:30 passed, 0:01:10 left``. A thread writes it, so that
+a phase that does not report is not silent.
 """
 
 import math
@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rich.console import Console
@@ -27,7 +26,7 @@ from rich.progress import (
 
 LOG = "log.txt"  # in the folder of a run
 
-FIRST_LINE, NEXT_LINE = 5.0, 60.0  # seconds before the first line of a phase, and between lines
+FIRST_LINE, NEXT_LINE = 60.0, 60.0  # seconds before the first line of a phase, and between lines
 BEAT = 1.0  # seconds between looks at the clock
 
 
@@ -38,7 +37,7 @@ class ProgressBars(Progress):
     """
 
     def __init__(self, console: Console | None, log: Path | None = None, **options: Any) -> None:
-        drawn = console is not None and (console.is_interactive or console.is_jupyter)
+        self._drawn = console is not None and (console.is_interactive or console.is_jupyter)
         super().__init__(
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -46,11 +45,10 @@ class ProgressBars(Progress):
             TimeElapsedColumn(),
             TimeRemainingColumn(),
             console=console or Console(quiet=True),
-            disable=not drawn,
+            disable=not self._drawn,
             speed_estimate_period=3600.0,
             **options,
         )
-        self._written = None if drawn else console
         self._log, self._logged = log, False
         self._due: dict[TaskID, float] = {}
         self._ended = threading.Event()
@@ -74,33 +72,27 @@ class ProgressBars(Progress):
     def say(self, text: str) -> None:
         """Print a line above the bars, and to the log."""
         self.tell()
-        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
-        self._append(text)
+        self._write(text, printed=True)
 
     def start(self) -> None:
         """Begin to draw, or to write."""
         super().start()
-        if self._written is not None or self._log is not None:
-            threading.Thread(target=self._beat, daemon=True).start()
+        threading.Thread(target=self._beat, daemon=True).start()
 
     def stop(self) -> None:
         """End it."""
         self._ended.set()
         self.tell()
-        if not self.disable:  # old versions of rich end even disabled bars with a line
+        if self._drawn:  # old versions of rich end even disabled bars with a line
             super().stop()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
         super().__exit__(kind, error, traceback)
-        if error is not None and self._logged:  # what was refused leaves nothing behind
-            self._append(f"ended by {type(error).__name__}{': ' if str(error) else ''}{error}")
+        if error is not None and self._logged:  # an invalid command leaves no log behind
+            self._write(f"ended by {type(error).__name__}{': ' if str(error) else ''}{error}", printed=False)
 
     def tell(self) -> None:
         """Write a line for each task that is due, or that ended."""
-        if self._written is None and self._log is None:
-            return
         with self._lock:
             for task in self.tasks:
                 passed = task.elapsed or 0.0
@@ -108,22 +100,20 @@ class ProgressBars(Progress):
                 if due == math.inf or passed < (FIRST_LINE if task.finished else due):
                     continue
                 self._due[task.id] = math.inf if task.finished else passed + NEXT_LINE
-                line = _line(task, passed)
-                if self._written is not None:
-                    self._written.print(line, markup=False, highlight=False, soft_wrap=True)
-                self._append(line)
+                self._write(_line(task, passed), printed=not self._drawn)
 
     def _beat(self) -> None:
         while not self._ended.wait(BEAT):
             self.tell()
 
-    def _append(self, text: str) -> None:
-        if self._log is None:
-            return
-        self._logged = True
-        self._log.parent.mkdir(parents=True, exist_ok=True)
-        with self._log.open("a", encoding="utf-8") as file:
-            file.write(f"{datetime.now().isoformat(' ', 'seconds')} {text}\n")
+    def _write(self, text: str, *, printed: bool) -> None:
+        if printed:
+            self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        if self._log is not None:
+            self._logged = True
+            self._log.parent.mkdir(parents=True, exist_ok=True)
+            with self._log.open("a", encoding="utf-8") as file:
+                file.write(f"{datetime.now().isoformat(' ', 'seconds')} {text}\n")
 
 
 @contextmanager
@@ -144,8 +134,8 @@ def _line(task: Task, passed: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as people say them: 40 s, 12 min, 3.5 h, 2.1 days."""
-    for unit, length, limit in (("s", 1, 90), ("min", 60, 5400), ("h", 3600, 48 * 3600)):
+    """Seconds in the largest fitting unit: 40 s, 12 min, 3.5 h."""
+    for unit, length, limit in (("s", 1, 90), ("min", 60, 5400)):
         if seconds < limit:
             return f"{seconds / length:.3g} {unit}"
-    return f"{seconds / 86400:.3g} days"
+    return f"{seconds / 3600:.3g} h"

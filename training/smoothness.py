@@ -1,8 +1,7 @@
 """Whether a spectrum makes T smooth, before any training: how much z differs between states that are close."""
 
 import functools
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import scipy
@@ -12,7 +11,7 @@ from kkl_gym.system import System
 from training.maps.coordinates import settling_time
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum, evenly_spaced
-from training.trajectories.record import recording_ages
+from training.trajectories.motions import recording_ages
 
 SMOOTH = 0.85  # least exponent of a smooth T: differences in z fall as distance^0.85 where neighbours come closer
 MOTIONS = 300  # that are followed
@@ -30,19 +29,6 @@ SPREAD = 4.0  # fast end of an interval over its slow end
 FASTEST_MODE = 0.5  # bound of |fast end| * dt
 
 
-@dataclass(frozen=True)
-class Smoothness:
-    """What the z of neighbouring states say of T. Shape: ``exponent`` (ny * modes,)."""
-
-    spectrum: Spectrum
-    exponent: np.ndarray
-
-    @property
-    def smooth(self) -> bool:
-        """Whether the exponents of all modes are at least SMOOTH."""
-        return bool((self.exponent >= SMOOTH).all())
-
-
 def check_continuous(system: System) -> None:
     """Raise ValueError if a system is in discrete time, to which the equation of T does not apply."""
     if system.discrete:
@@ -54,14 +40,14 @@ def check_continuous(system: System) -> None:
 
 def smoothness(
     system: System, spectra: Iterable[Spectrum], dt: float, *, box_factor: float = 1.5, seed: int = 0
-) -> Iterator[Smoothness]:
-    """Compare z between neighbouring states of different motions, for several spectra.
+) -> Iterator[np.ndarray]:
+    """For each spectrum, exponents (ny * modes,) of differences in z between neighbouring states of different motions.
 
     Motions without input are simulated once, half of them from X and half from a larger box, and the filters run beside
-    them. Those states count at which a filter has forgotten its start to one part in a million.
+    them. Those states count at which a filter has forgotten its start to one part in a million. NaN where too few do.
     """
     check_continuous(system)
-    spectra, rate = list(spectra), system.typical_rate
+    rate = system.typical_rate
     step = max(dt, FINEST / rate)
     filters = [spectrum.filter(system.ny, step) for spectrum in spectra]
     settled = [2.0 * settling_time(linear) for linear in filters]
@@ -78,18 +64,18 @@ def smoothness(
             f"motions of {system.name} leave bounds = {system.bounds} within {min(settled):.3g} s, before the filter "
             "of any spectrum has forgotten its start; widen the bounds or shrink X"
         )
-    for spectrum, linear, rows in zip(spectra, filters, known, strict=True):
-        yield _compared(system, spectrum, x=x, z=linear.run(y, no_input, ages), known=rows)
+    for linear, rows in zip(filters, known, strict=True):
+        yield _exponents(system, x=x, z=linear.run(y, no_input, ages), known=rows)
 
 
-def _compared(system: System, spectrum: Spectrum, *, x: np.ndarray, z: np.ndarray, known: np.ndarray) -> Smoothness:
+def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Compare the z (ages, motions, size) of the known among states x (ages, motions, nx)."""
     asking, others = known[:, :ASKING], known[:, ASKING:]  # neighbours are of different motions
     low, high = system.box()
     least = AT_REST * (high - low) / 2
     too_few = known.sum() < FEWEST_STATES or not asking.any() or others.sum() < FAR
     if too_few or (x[known].std(0) <= least).all():
-        return Smoothness(spectrum, np.full(z.shape[-1], np.nan))
+        return np.full(z.shape[-1], np.nan)
     x = x / np.maximum(x[known].std(0), least)
     z_scale = z[known].std(0)
     z = z / np.where(z_scale > 0, z_scale, 1.0)
@@ -100,8 +86,7 @@ def _compared(system: System, spectrum: Spectrum, *, x: np.ndarray, z: np.ndarra
     closer = np.sqrt(((distances[:, :1] / reach) ** 2).mean(0))
     first, last = np.sqrt(((differences / reach[..., None]) ** 2).mean(0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        exponent = np.where(last > 0, np.log(first / last) / np.log(closer), 1.0)  # of a constant output: 1
-    return Smoothness(spectrum, exponent)
+        return np.where(last > 0, np.log(first / last) / np.log(closer), 1.0)  # of a constant output: 1
 
 
 def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spectrum]:
@@ -116,16 +101,13 @@ def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spect
 
 @functools.cache
 def smooth_spectrum(system: System, dt: float, duration: float = np.inf) -> Spectrum:
-    """Choose the slowest of the :func:`intervals` for which T is smooth, as slow modes average noise best."""
-    found = []
-    for one in smoothness(system, intervals(system, dt, duration), dt):
-        if one.smooth:
-            return one.spectrum
-        found.append(one)
-    return found[smoothest(found)].spectrum
+    """Choose the slowest of the :func:`intervals` for which T is smooth, as slow modes average noise best.
 
-
-def smoothest(found: Sequence[Smoothness]) -> int:
-    """Find the spectrum that comes closest to a smooth T."""
-    least = [float(np.nan_to_num(one.exponent, nan=-np.inf).min()) for one in found]
-    return max(range(len(found)), key=lambda i: (least[i], i))
+    Where T is smooth for none, the one with the largest exponents is chosen, and of equal ones the fastest.
+    """
+    spectra, least = intervals(system, dt, duration), list[float]()
+    for spectrum, exponents in zip(spectra, smoothness(system, spectra, dt), strict=True):
+        least.append(float(np.nan_to_num(exponents, nan=-np.inf).min()))
+        if least[-1] >= SMOOTH:
+            return spectrum
+    return spectra[max(range(len(spectra)), key=lambda i: (least[i], i))]

@@ -1,7 +1,6 @@
 """Build the demo in the browser: ``python docs/demo/build.py OUT`` makes a folder that any file server can show.
 
-It holds this folder's page, the module ``kkl_observer.js``, and the constants of each system's default map as
-``kkl-gym export --format js`` writes them.
+It holds this folder's page, and a file for each system's default map that ``kkl_observer.js`` reads.
 """
 
 import json
@@ -10,13 +9,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from step_file import write_step
 
 import kkl_gym
 from training.export import Exported
-from training.export.step_file import javascript, write_step
 
 HERE = Path(__file__).parent
-PAGE = ("index.html", "style.css", "main.js", "world.js", "systems.js", "drawing.js")
+PAGE = ("index.html", "style.css", "main.js", "world.js", "systems.js", "drawing.js", "kkl_observer.js")
 
 
 def build(out: Path) -> None:
@@ -31,7 +30,6 @@ def build(out: Path) -> None:
     for name in PAGE:
         if (out / name).resolve() != (HERE / name).resolve():  # a site's builder may have copied the page already
             shutil.copyfile(HERE / name, out / name)
-    (out / "kkl_observer.js").write_text(javascript(), encoding="utf-8")
     described = []
     for name, cls in kkl_gym.SYSTEMS.items():
         exported, system = Exported.read(name), cls()

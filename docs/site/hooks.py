@@ -1,4 +1,4 @@
-"""What the site does beyond mkdocs: pages that lie elsewhere, links that lead out of ``docs/``, pictures on dark."""
+"""What the site adds to mkdocs: pages that lie elsewhere, links out of ``docs/``, pictures on dark, formulas."""
 
 import json
 import posixpath
@@ -6,9 +6,11 @@ import re
 import struct
 from base64 import b64decode
 from collections.abc import Mapping
+from html import unescape
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import get_plugin_logger
 from mkdocs.structure.files import File, Files
@@ -31,6 +33,9 @@ FETCHED = re.compile(r'<(?:script|link|img)[^>]+(?:src|href)="?(https?://[^" >]+
 LINK = re.compile(r"^```.*?^```|`[^`\n]*`|\]\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
 # The same code, then an image and where it lies.
 IMAGE = re.compile(r"^```.*?^```|`[^`\n]*`|(!\[[^\]]*\])\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
+
+# What pymdownx.arithmatex makes of $inline$ and $$displayed$$ formulas.
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 log = get_plugin_logger(__name__)
 
@@ -58,8 +63,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Show as code what docstrings refer to by Sphinx's roles, which Markdown does not know."""
-    return ROLE.sub("<code>", html)
+    """Show as code what docstrings refer to by Sphinx's roles, which Markdown does not know, and formulas as MathML."""
+    return typeset(ROLE.sub("<code>", html))
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
@@ -115,6 +120,17 @@ def relinked(markdown: str, source: str, page: str, *, repository: str) -> str:
         return f"]({repository}/{kind}/{BRANCH}/{target}{mark}{anchor})"
 
     return LINK.sub(rewrite, markdown)
+
+
+def typeset(html: str) -> str:
+    """A page whose formulas are MathML, which browsers draw without a script."""
+
+    def formula(found: re.Match[str]) -> str:
+        tag, latex = found.groups()
+        mathml = convert(unescape(latex.strip()), display="block" if tag == "div" else "inline")
+        return f'<{tag} class="formula">{mathml}</{tag}>'
+
+    return FORMULA.sub(formula, html)
 
 
 def themed(markdown: str, folder: Path) -> str:

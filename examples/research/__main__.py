@@ -7,6 +7,7 @@ COMMANDS = {
     "certify": ("examples.research.certificates.command", "Certify"),
     "agents": ("examples.research.agents.command", "Compare"),
     "speed": ("examples.research.speed.speed", "Speed"),
+    "torch": ("examples.research.speed.torch_steps", "TorchSpeed"),
     "sizes": ("examples.research.speed.sizes", "Sizes"),
 }
 GOES_ON: dict[tuple[str, ...], str] = {(name,): "the same command goes on" for name in ("benchmark", "agents", "sizes")}

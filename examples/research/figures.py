@@ -32,16 +32,17 @@ from observers.names import resolve
 from observers.storage import replacing, write
 from training.agents.agent import Agent, find
 from training.agents.play import Episodes, play
-from training.commands import demo, faults
+from training.agents.seeds import agent_evaluation_seed
+from training.agents.tasks import Task
+from training.commands import demo
 from training.commands.options import shown
 from training.commands.portraits import animate
 from training.evaluation.errors import estimates as estimates_of
-from training.evaluation.errors import kalman_estimates, unseen_trajectories
+from training.evaluation.errors import unseen_trajectories
+from training.evaluation.faults import FAULTS
 from training.evaluation.metrics import percentage_error
-from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
+from training.figures import ALARM, ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
 from training.lessons.calibrate import chi_square
-from training.seeds import agent_evaluation_seed
-from training.systems import Task
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,6 +56,7 @@ DT = 0.01  # s, of the systems that ship
 EKF = "EKF with the exact equations"
 RIVALS = {"ekf": "tuned EKF", "ukf": "tuned UKF", "gru": "GRU"}  # of the benchmark, in the figure of noise
 BAND = 0.9  # of the errors lie in a band
+THRESHOLDS = (0.5, 100.0)  # of the monitor's score, in the figure of faults
 LEVELS = (0.0, 0.5)  # of measurement noise, in the figure of errors over time
 SMALLEST = 0.01  # percent that is shown of errors under noise
 QUANTILES = (0.1, 0.5, 0.9)  # of the runs, in the same figure
@@ -190,7 +192,7 @@ def errors_of_runs(
         runs = unseen_trajectories(system, DT, n=trajectories, duration=duration or system.duration, seed=0)
         x_hats = (
             estimates_of(Artifact.read(resolve(name)), system, runs, **how),
-            kalman_estimates(system, runs, DT, **how),
+            estimates_of(None, system, runs, **how),
         )
         errors[name] = [percentage_error(runs.x, x_hat) for x_hat in x_hats]
     return errors
@@ -248,6 +250,24 @@ def coverage(path: Path, rows: pd.DataFrame) -> None:
         axes[-1].legend(loc="lower right")
 
 
+def draw_faults(path: Path, runs: pd.DataFrame) -> None:
+    """Draw how many runs exceed a threshold of the monitor's score in time, sound ones and faulty ones."""
+    observers = list(runs.observer.unique())
+    with drawing(path, max(5.0, 2.5 * len(observers)), 3.2) as figure:
+        axes: Any = figure.subplots(1, len(observers), sharey=True, squeeze=False)[0]
+        for ax, observer in zip(axes, observers, strict=True):
+            group = runs[runs.observer == observer]
+            for fault, color in zip(FAULTS, (MEASURED, RIVAL, ALARM, ESTIMATE), strict=True):
+                scores = np.sort(group[group.fault == fault].score)
+                share = 100 * np.arange(len(scores), 0, -1) / len(scores)
+                ax.step(scores, share, where="pre", color=color, label="sound" if fault == "none" else fault)
+            ax.axvline(1.0, color=TRUTH, lw=0.8, ls="--", label="where it warns")
+            title = f"{observer.replace('_', ' ')}, within {group.deadline.iloc[0]:g} s"
+            ax.set(title=title, xlabel="threshold of the score", xscale="log", xlim=THRESHOLDS, ylim=(-2, 102))
+        axes[0].set_ylabel("runs above it, %")
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=1 + len(FAULTS))
+
+
 FIGURES: Mapping[str, Callable[[], Draw]] = {
     "figures/estimates.png": estimates,
     "figures/portraits.gif": portraits,
@@ -265,7 +285,7 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "results/environments/curves.png": lambda: partial(
         draw_curves, learned=pd.read_csv(RESULTS / "environments" / "curves.csv")
     ),
-    "results/faults/scores.png": lambda: partial(faults.draw, found=pd.read_csv(RESULTS / "faults" / "faults.csv")),
+    "results/faults/scores.png": lambda: partial(draw_faults, runs=pd.read_csv(RESULTS / "faults" / "faults.csv")),
     "results/sizes/sizes.png": lambda: (
         lambda path: sizes.draw(path, *map(pd.read_csv, sorted((RESULTS / "sizes").glob("*.csv"))))
     ),

@@ -1,17 +1,1 @@
 """Wrappers: a learned observer in an environment, a memory around any, agents that act more slowly than it samples."""
-
-from kkl_gym.wrappers.estimator import Estimator
-from kkl_gym.wrappers.memory import KKLMemory, KKLVectorMemory
-from kkl_gym.wrappers.single import ActionRepeat, KKLObservation
-from kkl_gym.wrappers.vector import KKLVectorObservation, VectorActionRepeat, VectorEstimate
-
-__all__ = [
-    "ActionRepeat",
-    "Estimator",
-    "KKLMemory",
-    "KKLObservation",
-    "KKLVectorMemory",
-    "KKLVectorObservation",
-    "VectorActionRepeat",
-    "VectorEstimate",
-]

@@ -4,43 +4,41 @@ import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from kkl_gym.plant import Plant
-from kkl_gym.rows import clipped
 from observers import Artifact, KKLObserver, LinearFilter, shipped
-from observers.checks import choice, flag
+from observers.checks import choice, flag, shown
+from observers.estimator import Estimator, Running
 from observers.factors import standard_deviations
 from observers.names import resolve
 
 
-class Estimator(Protocol):
-    """A batch of observers, as :class:`VectorEstimate` drives them."""
+class Estimates:
+    """Any estimator of states, as :class:`VectorEstimate` drives and shows it; it is not told states at a start."""
 
-    space: gym.spaces.Box
+    def __init__(self, estimator: Estimator[Any], space: gym.spaces.Box) -> None:
+        self._running, self.space = Running(estimator), space
+        self.advance = self._running.advance
 
-    def reset(self, y0: np.ndarray, x0: np.ndarray) -> object:
+    def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past and take in the first samples. Shapes: ``y0`` (n, ny), ``x0`` (n, nx)."""
-        ...
+        self._running.reset(y0)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
-        ...
-
-    def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in samples (..., ny) and the inputs (..., nu) that led to them."""
-        ...
+        self._running.restart(y0, rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """What ``info`` gains. Shapes: ``rows`` (n,); returns (number of rows, ...)."""
-        ...
+        return {"x_hat": self._running.decode(rows)}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """What of a report is the observation. Shapes: returns (number of rows, width)."""
-        ...
+        return report["x_hat"]
 
 
 class KKLEstimator:
@@ -147,8 +145,9 @@ class KKLEstimator:
         self.observer.restart(y0, rows, x0 if self._known_start else None)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in samples (..., ny) and the inputs (..., nu) that led to them."""
-        self.observer.advance(y, None if u is None else self.known(u), rows)
+        """Take in samples (..., ny), NaN where missing, and the inputs (..., nu) that led to them."""
+        missing = y.shape == (1,) and y[0] != y[0]  # of a single observer, which takes None for a whole sample
+        self.observer.advance(None if missing else y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """What ``info`` gains. Shapes: ``rows`` (...,)."""
@@ -180,7 +179,25 @@ class KKLEstimator:
 
 def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
     """Values (..., width) as observations: float32, within the bounds of their space."""
-    return clipped(values, space.low, space.high)
+    with np.errstate(over="ignore"):  # what float32 cannot hold is infinite
+        out = values.astype(np.float32)
+    np.maximum(out, space.low, out=out)
+    return np.minimum(out, space.high, out=out)
+
+
+def check_untouched(obs: Any, emitted: bytes, env: Any, inside: Any) -> None:
+    """Raise ValueError unless observations are still those that were emitted inside the wrappers of ``env``."""
+    if isinstance(obs, np.ndarray) and obs.tobytes() == emitted:
+        return
+    between = []
+    while env is not inside and hasattr(env, "env"):
+        between.append(type(env).__name__)
+        env = env.env
+    raise ValueError(
+        f"of the wrappers between the environment and the observer ({', '.join(between) or shown(env)}) one changes "
+        "observations, but the observer reads info['y'], which it does not change: put it outside the observer, or "
+        "give the environment a sensor that does the same, as in gym.make(ID, sensor=kkl_gym.Sensor(bias=0.1))"
+    )
 
 
 def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

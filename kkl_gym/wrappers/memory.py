@@ -26,7 +26,6 @@ class _Remembering:
         env: Any,
         action_space: gym.Space[Any],
         observation_space: gym.Space[Any],
-        *,
         measured: Entries | None,
         angles: Angles,
         time_constants: Sequence[float],
@@ -105,13 +104,7 @@ class KKLMemory(gym.Wrapper[np.ndarray, Any, Any, Any], RecordConstructorArgs):
             other = "for vectors there is KKLVectorMemory, and make_vec_env of stable-baselines3 takes wrapper_class"
             raise ValueError(f"KKLMemory needs a gymnasium.Env ({other}), got {shown(env)}")
         found = _Remembering(
-            env,
-            env.action_space,
-            env.observation_space,
-            measured=measured,
-            angles=angles,
-            time_constants=time_constants,
-            input_time_constants=input_time_constants,
+            env, env.action_space, env.observation_space, measured, angles, time_constants, input_time_constants
         )
         # As the specification can write them down, once they are known to be what they should.
         RecordConstructorArgs.__init__(
@@ -128,49 +121,12 @@ class KKLMemory(gym.Wrapper[np.ndarray, Any, Any, Any], RecordConstructorArgs):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Reset the environment and the memory.
-
-        Parameters
-        ----------
-        seed : int, optional
-            As for the environment.
-        options : dict, optional
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            What is measured, with the memory of an output at rest.
-        info : dict
-            The environment's.
-        """
+        """Reset the environment and the memory: what is measured, with the memory of an output at rest."""
         obs, info = self.env.reset(seed=seed, options=options)
         return self._memory.reset(self._outputs(obs)), info
 
     def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
-        """Step the environment, and remember the action and what is measured then.
-
-        Parameters
-        ----------
-        action : object
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            What is measured, and the memory.
-        reward : float
-            The environment's.
-        terminated, truncated : bool
-            The environment's.
-        info : dict
-            The environment's.
-
-        Raises
-        ------
-        ValueError
-            As described above.
-        """
+        """Step the environment, and remember the action and what is measured then."""
         u = self._inputs(action)
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._memory.advance(self._outputs(obs), u), reward, terminated, truncated, info
@@ -234,10 +190,10 @@ class KKLVectorMemory(VectorWrapper):
             env,
             env.single_action_space,
             env.single_observation_space,
-            measured=measured,
-            angles=angles,
-            time_constants=time_constants,
-            input_time_constants=input_time_constants,
+            measured,
+            angles,
+            time_constants,
+            input_time_constants,
         )
         super().__init__(env)
         self.autoreset_mode = autoreset_mode_in(env)
@@ -249,22 +205,7 @@ class KKLVectorMemory(VectorWrapper):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Reset environments and memories, all or the rows of ``options["reset_mask"]``.
-
-        Parameters
-        ----------
-        seed : int or sequence of int or None, length num_envs, optional
-            As for the environment.
-        options : mapping, optional
-            As for the environment.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            What is measured and remembered, in all rows.
-        info : dict
-            The environment's.
-        """
+        """Reset environments and memories, all or the rows of ``options["reset_mask"]``."""
         options, mask = with_mask(options, self.num_envs)
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self._ended = self._ended & ~mask
@@ -275,29 +216,7 @@ class KKLVectorMemory(VectorWrapper):
         return self._memory.shown(), info
 
     def step(self, actions: Any) -> Step:
-        """Step the environments, and remember the actions and what is measured then.
-
-        Parameters
-        ----------
-        actions : object
-            As for the environment.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            What is measured, and the memory.
-        rewards : ndarray, shape (num_envs,)
-            The environment's.
-        terminated, truncated : ndarray of bool, shape (num_envs,)
-            The environment's.
-        info : dict
-            The environment's.
-
-        Raises
-        ------
-        ValueError
-            As described above.
-        """
+        """Step the environments, and remember the actions and what is measured then."""
         batch = (self.num_envs,)
         u = self._inputs(actions, batch)
         obs, reward, terminated, truncated, info = self.env.step(actions)

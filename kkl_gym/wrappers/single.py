@@ -12,10 +12,10 @@ from gymnasium.utils import RecordConstructorArgs
 from kkl_gym.envs import KKLEnv
 from kkl_gym.identity import how_to_make_one, source_of
 from kkl_gym.rendering import TRAIL
-from kkl_gym.wrappers.estimator import KKLEstimator, observation
-from kkl_gym.wrappers.named import NamedEstimator, Samples
+from kkl_gym.wrappers.estimator import KKLEstimator, check_untouched, observation
+from kkl_gym.wrappers.rollouts import NamedEstimator, Samples
 from observers import Artifact
-from observers.checks import integer, shown
+from observers.checks import choice, flag, integer, shown
 from observers.names import resolve
 
 _FEW = 8  # numbers that are compared one by one more quickly than NumPy clips them
@@ -25,15 +25,20 @@ _FLOAT32 = np.dtype(np.float32)
 class _SystemSamples:
     """What an observer sees of environments of systems: ``info`` says it, and numbers the samples."""
 
-    count = 0  # of the sample that the observer has seen last
+    def __init__(self, env: Any) -> None:
+        self.count = 0  # of the sample that the observer has seen last
+        self._env = self._inside = env
+        while not isinstance(self._inside, KKLEnv | KKLObservation):
+            self._inside = self._inside.env
 
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Output and state after a reset."""
+        """Output and state after a reset; ValueError if a wrapper inside changes observations."""
+        check_untouched(observation, self._inside.emitted, self._env, self._inside)
         self.count = int(info["sample"])
         return info["y"], info["x"]
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Output after a step, and the input that led to it; ValueError if a sample was skipped."""
+        """Output after a step, and the input that led to it; ValueError if a sample was skipped or changed."""
         sample = int(info["sample"])
         if sample != self.count + 1:
             raise ValueError(
@@ -41,16 +46,18 @@ class _SystemSamples:
                 "wrappers that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation, and "
                 "reset after an error"
             )
+        check_untouched(observation, self._inside.emitted, self._env, self._inside)
         return info["y"], info["u"]
 
 
 class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
     """Shows a learned observer's estimate in place of the state.
 
-    Around an environment of ours the observer sees only ``info["y"]`` and the input ``info["u"]`` that the environment
-    applied. ``info`` gains ``z``, the filter's state, and with ``estimate="x"`` ``x_hat``, shape (nx,), both float64
-    and not clipped. With ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit
-    the estimates (a faulty sensor, states that the map was not made for).
+    Around an environment of ours the observer sees only ``info["y"]``, which the environment's ``sensor`` makes, and
+    the input ``info["u"]`` that the environment applied. ``info`` gains ``z``, the filter's state, and with
+    ``estimate="x"`` ``x_hat``, shape (nx,), both float64 and not clipped. With ``monitor`` it gains ``score`` too, an
+    array of shape (), above 1 where the samples do not fit the estimates (a faulty sensor, states that the map was not
+    made for).
 
     With ``estimate="z"`` the network is not evaluated, and nothing tracks (the map of :attr:`observer` holds no
     motion), unless there is a monitor or the start is known. There is then no ``x_hat``, and :meth:`render` shows no
@@ -66,8 +73,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     Parameters
     ----------
     env : gymnasium.Env
-        A :class:`KKLEnv`, bare or under wrappers that leave ``info`` alone; or the environment that the observer's file
-        names, under wrappers that leave its measured signals, its actions and its steps alone.
+        A :class:`KKLEnv`, bare or under wrappers that leave observations and ``info`` alone; or the environment that
+        the observer's file names, under wrappers that leave its measured signals, its actions and its steps alone.
     observer : str or path, optional
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the environment's
         system.
@@ -89,9 +96,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         ``info`` gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). It needs a map with a covariance,
         as ``kkl-gym train`` makes them.
     compiled : bool, optional
-        Whether Numba runs the observer's steps, as :class:`observers.KKLObserver` has it. None compiles them at a reset
-        after a thousand samples; from there on estimates are rounded in another way. True or False make what is seen
-        the same in every episode of the same seed.
+        Whether Numba compiles the observer's step, as :class:`observers.KKLObserver` has it; None: where installed.
 
     Attributes
     ----------
@@ -106,6 +111,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         If the environment is not one of ours and the observer not from its rollouts, ``estimate`` is unknown, a flag is
         no bool, no map ships for the system, or the noise level is beyond the map's range. At a step, if the agent acts
         on a map that knows no inputs and ``ignore_input`` is false, or a wrapper inside hides samples from the
+        observer. At a reset and at a step, if a wrapper inside changes observations, which would not reach the
         observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
@@ -143,52 +149,33 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 f"KKLObservation needs a gymnasium.Env (for vectors: KKLVectorObservation), got {shown(env)}"
             )
         base, artifact = env.unwrapped, None if observer is None else Artifact.read(resolve(observer))
+        # As the specification can write it down, once it is known to be what it should.
+        how: dict[str, Any] = {
+            "estimate": choice("estimate", estimate, ("x", "z")),
+            "measurement_noise": measurement_noise,
+            "monitor": flag("monitor", monitor),
+            "known_start": flag("known_start", known_start),
+            "uncertainty": flag("uncertainty", uncertainty),
+            "compiled": None if compiled is None else flag("compiled", compiled),
+        }
+        ignore_input = flag("ignore_input", ignore_input)
         estimator: KKLEstimator
         samples: Samples | _SystemSamples
         if artifact is not None and artifact.environment is not None:
-            estimator = NamedEstimator(
-                env,
-                env.observation_space,
-                env.action_space,
-                artifact=artifact,
-                estimate=estimate,
-                measurement_noise=measurement_noise,
-                monitor=monitor,
-                known_start=known_start,
-                uncertainty=uncertainty,
-                compiled=compiled,
-            )
+            estimator = NamedEstimator(env, env.observation_space, env.action_space, artifact, **how)
             samples = estimator.samples
         elif isinstance(base, KKLEnv):
-            estimator = KKLEstimator.of_plant(
-                base.plant,
-                artifact,
-                estimate=estimate,
-                measurement_noise=measurement_noise,
-                ignore_input=ignore_input,
-                monitor=monitor,
-                known_start=known_start,
-                uncertainty=uncertainty,
-                compiled=compiled,
-            )
-            samples = _SystemSamples()
+            estimator = KKLEstimator.of_plant(base.plant, artifact, ignore_input=ignore_input, **how)
+            samples = _SystemSamples(env)
         else:
             raise ValueError(
                 f"KKLObservation needs a kkl_gym environment, or an observer from rollouts of {source_of(env)}: "
                 f"{how_to_make_one(source_of(env))}"
             )
-        # As the specification can write them down, once they are known to be what they should.
-        RecordConstructorArgs.__init__(
-            self,
-            observer=None if observer is None else os.fspath(observer),
-            estimate=estimate,
-            measurement_noise=None if measurement_noise is None else estimator.observer.measurement_noise,
-            ignore_input=bool(ignore_input),
-            monitor=bool(monitor),
-            known_start=bool(known_start),
-            uncertainty=bool(uncertainty),
-            compiled=None if compiled is None else bool(compiled),
-        )
+        if measurement_noise is not None:
+            how["measurement_noise"] = estimator.observer.measurement_noise
+        observer = None if observer is None else os.fspath(observer)
+        RecordConstructorArgs.__init__(self, observer=observer, ignore_input=ignore_input, **how)
         gym.Wrapper.__init__(self, env)
         self._estimator, self._samples = estimator, samples
         self.observer = self._estimator.observer
@@ -205,51 +192,14 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Reset the environment, and the observer to its first sample.
-
-        Parameters
-        ----------
-        seed : int, optional
-            As for the environment.
-        options : dict, optional
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            The first estimate.
-        info : dict
-            The environment's, with what the observer adds.
-        """
+        """Reset the environment, and the observer to its first sample; the first estimate."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._trail.clear()
         self._estimator.reset(*self._samples.first(obs, info))
         return self._show(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Step the environment, and the observer with the new sample and the input that led to it.
-
-        Parameters
-        ----------
-        action : array_like, shape (nu,)
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray of float32
-            The estimate after the new sample.
-        reward : float
-            The environment's.
-        terminated, truncated : bool
-            The environment's.
-        info : dict
-            The environment's, with what the observer adds.
-
-        Raises
-        ------
-        ValueError
-            As described above.
-        """
+        """Step the environment, and the observer with the new sample and the input that led to it."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._estimator.advance(*self._samples.next(obs, info, action))
         self._samples.count += 1
@@ -276,21 +226,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self._estimator.replace(observer)
 
     def render(self) -> np.ndarray | None:
-        """Draw the phase portrait with states and estimates so far; other environments draw what they draw.
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3), or None
-            An RGB image; None without ``render_mode``, and where it is shown in a window.
-        """
+        """Draw the phase portrait with states and estimates so far; other environments draw what they draw."""
         base = self.unwrapped
         return base.draw(self._trail) if isinstance(base, KKLEnv) else self.env.render()  # type: ignore[return-value]
-
-    def _animate(self) -> None:
-        """Draw the window of an environment of ours, unless another observer further out does."""
-        base = self.unwrapped
-        if isinstance(base, KKLEnv) and base.drawn_by == self._draws:
-            base.animate(self._trail)
 
     def _show(self, info: dict[str, Any]) -> np.ndarray:
         report = self._estimator.report()
@@ -298,15 +236,21 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         if self._rendering and "x_hat" in report:
             self._trail.append(report["x_hat"].tolist())
         if self._rendering and self.render_mode == "human":
-            self._animate()
+            base = self.unwrapped
+            if isinstance(base, KKLEnv) and base.drawn_by == self._draws:  # and no observer further out
+                base.animate(self._trail)
         if len(self._low) <= _FEW:
             values = self._estimator.listed(report)
             for value, low, high in zip(values, self._low, self._high):
                 if not low <= value <= high:
                     break
             else:
-                return np.array(values, _FLOAT32)
-        return observation(self._estimator.shown(report), self._estimator.space)
+                return self._emit(np.array(values, _FLOAT32))
+        return self._emit(observation(self._estimator.shown(report), self._estimator.space))
+
+    def _emit(self, obs: np.ndarray) -> np.ndarray:
+        self.emitted = obs.tobytes()  # as another observer around this one compares what reaches it
+        return obs
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -348,24 +292,7 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
         self.metadata = {**env.metadata, "render_fps": max(1, round(frames / repeat))}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold an action for ``repeat`` steps.
-
-        Parameters
-        ----------
-        action : array_like, shape (nu,)
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray
-            Of the last step.
-        reward : float
-            Sum over the steps.
-        terminated, truncated : bool
-            Of the last step.
-        info : dict
-            Of the last step.
-        """
+        """Hold an action for ``repeat`` steps; all but the sum of rewards is of the last of them."""
         total = 0.0
         for _ in range(self.repeat):
             obs, reward, terminated, truncated, info = self.env.step(action)

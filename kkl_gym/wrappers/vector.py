@@ -13,8 +13,8 @@ from kkl_gym.identity import how_to_make_one
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import Trails
 from kkl_gym.vector import Infos, KKLVectorEnv, autoreset_mode_of, last_of_episodes, with_mask
-from kkl_gym.wrappers.estimator import Estimator, KKLEstimator, observation
-from kkl_gym.wrappers.named import NamedEstimator, Samples
+from kkl_gym.wrappers.estimator import Estimates, KKLEstimator, check_untouched, observation
+from kkl_gym.wrappers.rollouts import NamedEstimator, Samples
 from observers import Artifact
 from observers.checks import integer, shown
 from observers.names import resolve
@@ -34,7 +34,7 @@ class VectorEstimate(VectorWrapper):
     ``info["final_obs"]`` holds the last estimates.
     """
 
-    def __init__(self, env: VectorEnv, estimator: Estimator) -> None:
+    def __init__(self, env: VectorEnv, estimator: Estimates | KKLEstimator) -> None:
         super().__init__(env)
         self.autoreset_mode = autoreset_mode_in(env)
         self._estimator = estimator
@@ -42,6 +42,11 @@ class VectorEstimate(VectorWrapper):
         self.observation_space: gym.spaces.Box = batch_space(estimator.space, env.num_envs)  # type: ignore[assignment]
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._sample = np.zeros(env.num_envs, dtype=np.int64)
+        self.emitted = b""  # the last observations, as of environments
+        # What emits the observations; None if that are environments in a Sync or Async vector.
+        self._inside: Any = None if isinstance(env, _Telling) else env
+        while self._inside is not None and not isinstance(self._inside, KKLVectorEnv | VectorEstimate):
+            self._inside = getattr(self._inside, "env", None)
         rendering = isinstance(env.unwrapped, KKLVectorEnv) and env.render_mode is not None
         self._trails = Trails(env.num_envs) if rendering else None  # of estimates
 
@@ -50,7 +55,8 @@ class VectorEstimate(VectorWrapper):
     ) -> tuple[np.ndarray, Infos]:
         """Reset environments and observers, all or the rows of ``options["reset_mask"]``."""
         options, mask = with_mask(options, self.num_envs)
-        _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        inner, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        self._check_untouched(inner, at_reset=True)
         if not isinstance(info, dict) or not isinstance(info["y"], np.ndarray):
             raise ValueError(
                 f"the observer reads info['y'] as an array, and {shown(self.env)} changes info: put wrappers such as "
@@ -68,7 +74,8 @@ class VectorEstimate(VectorWrapper):
 
     def step(self, actions: np.ndarray) -> Step:
         """Step the environments, and the observers with the new samples and the inputs that led to them."""
-        _, reward, terminated, truncated, info = self.env.step(actions)
+        inner, reward, terminated, truncated, info = self.env.step(actions)
+        self._check_untouched(inner)
         before, ended = self._ended, terminated | truncated
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended = ended
@@ -110,6 +117,7 @@ class VectorEstimate(VectorWrapper):
             final |= {key: info[key] * column(ended, info[key]), f"_{key}": ended.copy()}
             info[key][ended] = values
         shown[ended] = observation(self._estimator.shown(first), self.single_observation_space)
+        self.emitted = shown.tobytes()
         self._trace(info)
         return shown
 
@@ -137,12 +145,22 @@ class VectorEstimate(VectorWrapper):
                 "an error"
             )
 
+    def _check_untouched(self, obs: Any, *, at_reset: bool = False) -> None:
+        """Raise ValueError if a wrapper inside changes observations; Sync and Async vectors say at resets only."""
+        if self._inside is not None:
+            check_untouched(obs, self._inside.emitted, self.env, self._inside)
+        elif at_reset and not isinstance(self.env, _Telling):
+            base: Any = self.env.unwrapped
+            check_untouched(obs, b"".join(base.get_attr("emitted")), self.env, base)
+
     def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
         """Add the observers' report to ``info``, for ``rows``; returns the observations of all."""
         report = self._estimator.report()
         for key, values in report.items():
             info |= {key: values, f"_{key}": rows.copy()}
-        return observation(self._estimator.shown(report), self.single_observation_space)
+        obs = observation(self._estimator.shown(report), self.single_observation_space)
+        self.emitted = obs.tobytes()
+        return obs
 
 
 class _Telling(VectorWrapper):
@@ -230,8 +248,8 @@ class KKLVectorObservation(VectorEstimate):
     Parameters
     ----------
     env : gymnasium.vector.VectorEnv
-        A vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone, or over the
-        environment that the observer's file names.
+        A vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave observations and ``info``
+        alone, or over the environment that the observer's file names.
     observer : str or path, optional
         As for :class:`kkl_gym.KKLObservation`.
     estimate : {"x", "z"}
@@ -287,31 +305,19 @@ class KKLVectorObservation(VectorEstimate):
         uncertainty: bool = False,
     ) -> None:
         artifact = None if observer is None else Artifact.read(resolve(observer))
+        how: dict[str, Any] = {
+            "estimate": estimate,
+            "measurement_noise": measurement_noise,
+            "monitor": monitor,
+            "known_start": known_start,
+            "uncertainty": uncertainty,
+        }
         estimator: KKLEstimator
         if artifact is not None and artifact.environment is not None and isinstance(env, gym.vector.VectorEnv):
-            estimator = NamedEstimator(
-                env,
-                env.single_observation_space,
-                env.single_action_space,
-                artifact=artifact,
-                estimate=estimate,
-                measurement_noise=measurement_noise,
-                monitor=monitor,
-                known_start=known_start,
-                uncertainty=uncertainty,
-            )
+            estimator = NamedEstimator(env, env.single_observation_space, env.single_action_space, artifact, **how)
             env = _Telling(env, estimator.samples)
         else:
-            estimator = KKLEstimator.of_plant(
-                plant_of(env),
-                artifact,
-                estimate=estimate,
-                measurement_noise=measurement_noise,
-                ignore_input=ignore_input,
-                monitor=monitor,
-                known_start=known_start,
-                uncertainty=uncertainty,
-            )
+            estimator = KKLEstimator.of_plant(plant_of(env), artifact, ignore_input=ignore_input, **how)
             _check_process_noise(env, estimator.observer.artifact)
         super().__init__(env, estimator)
         self._estimator: KKLEstimator = estimator
@@ -319,20 +325,7 @@ class KKLVectorObservation(VectorEstimate):
         self.estimate = estimate
 
     def replace_observer(self, observer: str | os.PathLike[str] | Artifact) -> None:
-        """Take the maps of another observer with the same filter, in all rows at once: the filters' states stay.
-
-        Parameters
-        ----------
-        observer : str or path or Artifact
-            As for :meth:`kkl_gym.KKLObservation.replace_observer`.
-
-        Raises
-        ------
-        ValueError
-            As there.
-        observers.ArtifactError
-            As there.
-        """
+        """As :meth:`kkl_gym.KKLObservation.replace_observer`, in all rows at once: the filters' states stay."""
         asked = self._estimator.asked(observer)
         if self.observer.artifact.environment is None:  # the vector is of environments of ours
             _check_process_noise(self.env, asked)
@@ -399,46 +392,14 @@ class VectorActionRepeat(VectorWrapper):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Reset the environments, or the rows of ``options["reset_mask"]``.
-
-        Parameters
-        ----------
-        seed : int or sequence of int or None, length num_envs, optional
-            As for the environment.
-        options : mapping, optional
-            As for the environment.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            Of all rows.
-        info : dict
-            The environment's.
-        """
+        """Reset the environments, or the rows of ``options["reset_mask"]``."""
         options, mask = with_mask(options, self.num_envs)
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self._ended = self._ended & ~mask
         return obs, info
 
     def step(self, actions: np.ndarray) -> Step:
-        """Hold actions for ``repeat`` steps.
-
-        Parameters
-        ----------
-        actions : array_like, shape (num_envs, nu)
-            As for the environment.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            Of each row's last step.
-        rewards : ndarray, shape (num_envs,)
-            Sums over each row's steps.
-        terminated, truncated : ndarray of bool, shape (num_envs,)
-            Of each row's last step.
-        info : dict
-            Of each row's last step.
-        """
+        """Hold actions for ``repeat`` steps; rewards are sums over each row's steps, the rest is of its last one."""
         waiting = self._ended  # since an earlier step; they stay as they are in this one
         total, info = np.zeros(self.num_envs), Infos()
         for _ in range(self.repeat):

@@ -24,7 +24,7 @@ from observers.storage import UNFINISHED
 from training import checkpoints
 from training.agents.agent import Agent
 from training.agents.play import play
-from training.maps.optimise import LOG_EVERY
+from training.lessons.run import LOG_EVERY
 
 pytestmark = pytest.mark.long
 
@@ -71,8 +71,8 @@ class Train:
     interval = LOG_EVERY  # batches between two checkpoints
 
     def arguments(self, out):
-        sizes = "--trajectories 20 --duration 5 --samples 30 --width 16 --depth 1 --batch 128 --inverse-steps 1500"
-        return ["train", "van_der_pol", *sizes.split(), "--no-monitor", "--resume", "--out", str(out)]
+        sizes = "--set trajectories=20 duration=5 samples=30 width=16 depth=1 batch=128 inverse_steps=1500"
+        return ["train", "van_der_pol", *sizes.split(), "--resume", "--out", str(out)]
 
     def kept(self, out):
         """Units of work that need not be done again; raises ValueError if a file is damaged."""

@@ -208,7 +208,7 @@ def trainings():
         paths = [str(oscillator(Path(folder) / f"run{seed}.csv", seed)) for seed in range(6)]
         out = Path(folder) / "run"
         main(["train", "spring", "--data", *paths, "--measured", "position", "--inputs", "force", "--hidden", "speed",
-              "--inverse-steps", "1000", "--out", str(out)])  # fmt: skip
+              "--set", "inverse_steps=1000", "--out", str(out)])  # fmt: skip
         observer = observers.load(out / "spring.safetensors")
         table = np.loadtxt(oscillator(Path(folder) / "new.csv", 100), delimiter=",", skiprows=1)
     x_hat = observer.estimate(table[:, 1:2], table[:-1, 2:3])

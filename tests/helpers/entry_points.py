@@ -280,10 +280,10 @@ def limits(**changes):
 
 def watched(limits, level, dt):
     monitor, scores = Monitor(limits, level, dt), []
-    monitor.reset(())
+    rows = monitor.start(1)
     for residual in np.linspace(0.1, 0.3, 20):
-        monitor.update(np.array([residual]))
-        scores.append(monitor.score)
+        rows = monitor.update(rows, np.array([[residual]]), np.array([[True]]))
+        scores.append(monitor.score(rows))
     return scores
 
 

@@ -8,7 +8,7 @@ from scipy.linalg import solve_sylvester
 
 from kkl_gym import System
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
-from training.filter_noise import stationary_covariance
+from training.maps.coordinates import stationary_covariance
 
 F = np.array([[0.0, 1.0], [-1.0, 0.0]])
 C = np.array([[1.0, 0.0]])

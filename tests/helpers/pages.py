@@ -16,7 +16,7 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 BLOCK = re.compile(r"((?:^<!--(?:(?!-->).)*-->\n+)*)^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-COMMENT = re.compile(r"<!--\s*(slow|continues|small|first|printed)\b:?\s*(.*?)\s*-->", re.DOTALL)
+COMMENT = re.compile(r"<!--\s*(slow|small|first|printed)\b:?\s*(.*?)\s*-->", re.DOTALL)
 
 
 def name(page):
@@ -46,7 +46,7 @@ class Block:
     @property
     def needs_training(self):
         """Whether only the slow tests run it."""
-        return bool({"slow", "continues"} & set(self.said))
+        return "slow" in self.said
 
 
 @dataclass(frozen=True)

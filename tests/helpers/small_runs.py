@@ -9,12 +9,11 @@ from kkl_gym import VanDerPol
 from observers import Artifact, LinearFilter
 from training import preset
 from training.config import override
+from training.maps.inverse import ClosedLoopSampler, TrajectorySampler
 from training.maps.networks import Network
-from training.maps.samplers import ClosedLoopSampler, TrajectorySampler
 from training.spectrum import papers_spectrum
 from training.trajectories.closed_loop import record_closed_loop
-from training.trajectories.record import Motions, record, recording_ages
-from training.trajectories.signals import KINDS
+from training.trajectories.motions import KINDS, Motions, record, recording_ages
 
 CPU = torch.device("cpu")
 SIZES = {

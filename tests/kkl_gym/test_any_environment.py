@@ -272,3 +272,32 @@ def test_vectors_that_are_refused(saved):
     told = observer_of("Pendulum-v1", ["info[angle]"], ["obs[2]"], [], dt=0.05)
     with pytest.raises(ValueError, match=r"measures info\[angle\], which vectors do not say"):
         KKLVectorObservation(SyncVectorEnv([partial(gym.make, "Pendulum-v1")] * 2), saved(told))
+
+
+class Losing(gym.ObservationWrapper):
+    """Loses the second entry of every other observation, but not of the first."""
+
+    lost = True
+
+    def observation(self, observation):
+        self.lost = not self.lost
+        return np.where([False, self.lost, False], np.float32(np.nan), observation)
+
+
+@pytest.mark.parametrize("vectors", [False, True])
+def test_what_is_missing_of_an_observation_is_passed_over(saved, vectors):
+    artifact = PENDULUM()
+    if vectors:
+        env = KKLVectorObservation(SyncVectorEnv([lambda: Losing(gym.make("Pendulum-v1"))] * 2), saved(artifact))
+    else:
+        env = KKLObservation(Losing(gym.make("Pendulum-v1")), saved(artifact))
+    expected = KKLObserver(artifact)
+    obs, info = env.reset(seed=5)
+    expected.reset(info["y"])
+    for k in range(6):
+        before = obs
+        obs, *_, info = env.step(np.full(env.action_space.shape, 0.5, np.float32))
+        assert np.isnan(info["y"][..., 1]).all() == (k % 2 == 0)
+        np.testing.assert_allclose(info["x_hat"], expected.step(info["y"], info["u"]))
+        assert np.isfinite(obs).all()
+        assert k % 2 or np.array_equal(obs[..., 1], before[..., 1])  # held

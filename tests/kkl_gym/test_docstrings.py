@@ -5,6 +5,7 @@ import doctest
 import pytest
 
 import kkl_gym.envs
+import kkl_gym.sensor
 import kkl_gym.vector
 import kkl_gym.wrappers.memory
 import kkl_gym.wrappers.single
@@ -15,6 +16,7 @@ import kkl_gym.wrappers.vector
     ("module", "classes"),
     [
         (kkl_gym.envs, {"KKLEnv"}),
+        (kkl_gym.sensor, {"Sensor"}),
         (kkl_gym.vector, {"KKLVectorEnv"}),
         (kkl_gym.wrappers.memory, {"KKLMemory", "KKLVectorMemory"}),
         (kkl_gym.wrappers.single, {"ActionRepeat", "KKLObservation"}),

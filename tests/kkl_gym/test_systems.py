@@ -162,7 +162,7 @@ def test_get_system_from_a_script_or_a_module(script, monkeypatch):
 
 
 @pytest.mark.parametrize("nonsense", [
-    "nonsense", "", "Lorenz", "no_such_module:Class", "kkl_gym:NoClass", "no/such/file.py:Class",
+    "nonsense", "", "Lorentz", "no_such_module:Class", "kkl_gym:NoClass", "no/such/file.py:Class",
     ":Lorenz", "..:Lorenz", "kkl_gym:KKLEnv", "kkl_gym:__version__", "kkl_gym:System",
 ])  # fmt: skip
 def test_nonsense_names_raise_with_the_name(nonsense):

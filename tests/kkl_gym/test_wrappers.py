@@ -12,7 +12,9 @@ from gymnasium.vector import SyncVectorEnv
 
 import kkl_gym
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
+from kkl_gym.wrappers.estimator import observation
 from observers import Artifact, ArtifactError, KKLObserver, load
+from observers.kkl import KKL
 
 checking_wrapped = pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version:UserWarning")
 ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler
@@ -124,8 +126,8 @@ def test_the_environment_is_left_as_it_was(saved):
 def test_estimate_z_does_without_the_network(monkeypatch):
     """Unless there is a monitor, which needs it; info has no x_hat in any case."""
     asked = []
-    decode = KKLObserver.decode
-    monkeypatch.setattr(KKLObserver, "decode", lambda self, rows=None: asked.append(rows) or decode(self, rows))
+    decode = KKL.decode
+    monkeypatch.setattr(KKL, "decode", lambda self, state: asked.append(state) or decode(self, state))
     for estimate, watched, calls in (("x", False, 5), ("z", False, 0), ("z", True, 5)):
         environment = {"measurement_noise": 0.5} if watched else {}
         env = KKLObservation(KKLEnv("lorenz", **environment), estimate=estimate, monitor=watched)
@@ -378,3 +380,10 @@ def test_render_shows_the_estimate_and_the_input(saved):
     of_z = wrapped(saved, "van_der_pol", "z", env={"render_mode": "rgb_array"})
     of_z.reset(seed=0)
     assert (of_z.render() == of_z.unwrapped.render()).all()  # which has no estimate of the state
+
+
+def test_observations_are_clipped_and_what_float32_cannot_hold_is_infinite():
+    box = gym.spaces.Box(np.array([-1, -np.inf], np.float32), np.array([1, np.inf], np.float32))
+    shown = observation(np.array([[2.0, 1e39], [-1e300, -1e300], [0.5, 0.5]]), box)
+    assert shown.dtype == np.float32
+    assert shown.tolist() == [[1.0, np.inf], [-1.0, -np.inf], [0.5, 0.5]]

@@ -48,7 +48,7 @@ def test_who_estimates_no_parameters_says_so(make_artifact):
     with pytest.raises(RuntimeError, match="reset"):
         _ = observer.parameters_hat
     observer.reset(np.zeros(1))
-    with pytest.raises(ValueError, match="--estimate-parameters"):
+    with pytest.raises(ValueError, match="--set estimate_parameters=true"):
         _ = observer.parameters_hat
     with pytest.raises(ValueError, match="estimates no parameters"):
         observer.estimate_parameters(np.zeros((3, 1)))

@@ -189,11 +189,11 @@ def test_what_is_missing_is_not_judged():
     artifact, y = exact(limits=LIMITS), TwoOutputs().output(motions(1)[:, 0])
     watched, first = KKLObserver(artifact, 0.0, monitor=True), Monitor(LIMITS, 0.0, DT)
     watched.reset(y[0])
-    first.reset((2,))
+    rows = first.start(1)
     for k in range(1, 60):
         x_hat = watched.step([y[k, 0] + 0.2, math.nan])
-        first.update(np.array([[y[k, 0] + 0.2 - x_hat[0], 0.0]] * 2), np.array([[True, False]] * 2))
-        assert watched.score == pytest.approx(first.score[0])
+        rows = first.update(rows, np.array([[y[k, 0] + 0.2 - x_hat[0], 0.0]]), np.array([[True, False]]))
+        assert watched.score == pytest.approx(first.score(rows)[0])
     score = watched.score
     assert score > 0.3
     watched.step([math.nan, math.nan])

@@ -28,15 +28,15 @@ def limits(ny=1, **changes):
 
 def test_running_means_by_hand():
     monitor = Monitor(limits(), 1.0, 0.01)
-    monitor.reset(())
+    rows = monitor.start(1)
     a = 1 - np.exp(-0.1)
     rng = np.random.default_rng(0)
     mean, square = 0.0, 1.0
     for k, r in enumerate(rng.normal(0.3, 1.0, 40), 1):
-        monitor.update(np.array([r]))
+        rows = monitor.update(rows, np.array([[r]]), np.array([[True]]))
         mean, square = mean + a * (r - mean), square + a * (r**2 - square)
         expected = max(abs(mean) / 0.5, square / 2.1, 0.4 / square)
-        assert monitor.score == pytest.approx(expected if k > 5 else 0.0)
+        assert monitor.score(rows) == pytest.approx(expected if k > 5 else 0.0)
 
 
 def test_limits_between_levels_add_as_variances():

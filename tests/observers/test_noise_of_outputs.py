@@ -22,7 +22,9 @@ def test_each_output_has_an_input_of_the_network_and_its_part_in_the_shrinkage(m
     assert inverse.noise_features(0.3, 0.1) == inverse.noise_features((0.3, 0.3), 0.1)
     seen = []
     heard = dataclasses.replace(inverse, mlp=Spy(inverse.mlp, seen))
-    KKLObserver(dataclasses.replace(artifact, inverse=heard), levels, process_noise=0.1).reset(np.zeros(2))
+    KKLObserver(dataclasses.replace(artifact, inverse=heard), levels, process_noise=0.1, compiled=False).reset(
+        np.zeros(2)
+    )
     np.testing.assert_allclose(seen[0][-4:], [*told, 0.0], rtol=1e-6)
 
 
@@ -149,9 +151,8 @@ def test_limits_of_outputs_with_levels_of_their_own():
         with pytest.raises(ValueError, match=r"no limits beyond noise \[1\.0, 100\.0\]"):
             found.at(wrong)
     monitor = Monitor(dataclasses.replace(found, warm_up=0.0), (0.1, 10.0), 0.01)
-    monitor.reset(())
-    monitor.update(np.zeros(2))  # the mean squares begin at those of the noise
-    assert monitor.score == pytest.approx(0.005 / (0.01 * np.exp(-0.1)))
+    rows = monitor.update(monitor.start(1), np.zeros((1, 2)), np.ones((1, 2), bool))  # from squares of the noise
+    assert monitor.score(rows) == pytest.approx(0.005 / (0.01 * np.exp(-0.1)))
     old = limits(levels=np.array([0.0, 1.0, 100.0]))  # of all outputs
     np.testing.assert_allclose(old.at(1.0)[0], found.mean[1])
     np.testing.assert_allclose(old.at((1.0, 100.0))[0], found.mean[2])

@@ -210,7 +210,7 @@ def test_what_is_refused_changes_nothing(make_artifact):
         (np.array([["a"], ["b"]]), None, "y must hold real numbers"),
         (np.zeros((3, 1)), np.zeros((1, 1)), r"2 or 3 rows for 3 rows of y, got shape \(1, 1\)"),
         (np.zeros((3, 1)), 0.0, r"2 or 3 rows for 3 rows of y, got shape \(\)"),
-        (np.zeros((3, 1)), np.zeros((2, 2)), r"u must have shape \(1,\)"),
+        (np.zeros((3, 1)), np.zeros((2, 2)), r"u must have shape \(2, 1\)"),
         (np.zeros((3, 1)), np.full((2, 1), math.nan), "u holds NaN"),
     ],
 )

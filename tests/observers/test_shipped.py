@@ -91,5 +91,5 @@ def test_where_samples_are_missing_from_the_start_t_inv_is_no_surer_than_what_wa
             if k in (29, 80, 100, 300):
                 error = x[k] - x_hat
                 squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(observer.covariance), error)
-                assert np.mean(squared < 4.605) > 0.7
+                assert np.mean(squared < 4.605) > 0.6  # of 0.9: factors are those of runs without gaps
     assert np.sqrt(np.mean((error / system.scale) ** 2)) < 0.1

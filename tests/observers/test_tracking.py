@@ -326,7 +326,8 @@ def test_sigma_points_have_mean_and_covariance(nx):
     H, R = rng.normal(size=(2, nx)), np.diag([0.3, 0.7])
     y = rng.normal(size=(5, 2))
     expected, S, across = unscented.transformed(x, P, function=lambda x: x @ H.T, points=points)
-    found, left, white = unscented.conditioned(x, P, y - expected, S + R, across)
+    V, white = unscented.whitened(y - expected, S + R, across, np.isnan(y))
+    found, left = unscented.shift(x, V, white), unscented.add(P, V, V, -1.0)
     nis = (white**2).sum(-1) / 2
     S = H @ P @ H.T + R
     K = P @ H.T @ np.linalg.inv(S)

@@ -15,6 +15,7 @@ from examples.research.benchmark.protocol import Protocol, component_smape, meas
 from examples.research.methods import METHODS, Budget, Method, get_method
 from examples.research.resumable import run_job
 from kkl_gym import get_system
+from observers.estimator import Estimate
 from training.evaluation.errors import unseen_trajectories
 from training.evaluation.metrics import nrmse, smape
 from training.seeds import Stream
@@ -29,6 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from examples.research.methods import Method, WrongParameters
+from observers.estimator import Estimate
 
 
 class Constant(Method):
@@ -57,11 +59,14 @@ class Held:
     def __init__(self, mean):
         self.mean = mean
 
-    def reset(self, y0):
-        return np.tile(self.mean, (len(y0), 1))
+    def start(self, n):
+        return n
 
-    def step(self, y):
-        return np.tile(self.mean, (len(y), 1))
+    def advance(self, state, y, u=None, dt=None):
+        return state
+
+    def estimate(self, state):
+        return Estimate(np.tile(self.mean, (state, 1)))
 '''
 
 
@@ -197,17 +202,18 @@ class Oracle(Method):
         self.seen.append((noise, []))
         return self
 
-    def reset(self, y0):
-        self.k = -1
-        return self.step(y0)
+    def start(self, n):
+        return -1
 
-    def step(self, y):
+    def advance(self, state, y, u=None, dt=None):
         self.seen[-1][1].append(y)
-        self.k += 1
-        x = self.x[self.k].copy()
+        return state + 1
+
+    def estimate(self, state):
+        x = self.x[state].copy()
         for row, value in self.wrong:
             x[row] = value
-        return x
+        return Estimate(x)
 
 
 def test_measure_marks_the_lost_and_the_escaped_and_adds_noise():

@@ -19,12 +19,12 @@ from examples.research.certificates.generalisation import generalisation_term, p
 from examples.research.certificates.lipschitz import lipschitz_lower, lipschitz_upper, norm_product
 from examples.research.certificates.segments import segment_lipschitz
 from examples.research.certificates.settled import record_settled
+from examples.research.certificates.smooth import Smooth, decoder, encoder
 from kkl_gym import SYSTEMS, get_system
 from kkl_gym.simulate import simulate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from observers.names import resolve
-from training.filter_noise import stationary_covariance
-from training.maps.smooth import Smooth
+from training.maps.coordinates import stationary_covariance
 
 A, B = np.diag([-1.0, -2.5, -4.0]), np.ones((3, 1))
 M = sylvester(A, B)
@@ -273,3 +273,28 @@ def test_shipped_maps(name):
         assert found.noisy_error <= found.forward.noisy_bound
         assert found.forward.propagated_risk < 1.5 * found.forward.steep_risk  # the second of fewer states
     assert json.loads(json.dumps(found.as_json(), allow_nan=False))["inverse_term"] is None  # infinite
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_jacobians_by_differences(activation):
+    rng = np.random.default_rng(1)
+    network = Smooth(MLP([rng.normal(size=(7, 3)), rng.normal(size=(5, 7)), rng.normal(size=(2, 5))],
+                         [rng.normal(size=7), rng.normal(size=5), rng.normal(size=2)], activation))  # fmt: skip
+    x, eps = rng.normal(size=(4, 3)), 1e-6
+    for j in range(3):
+        step = eps * np.eye(3)[j]
+        assert np.allclose(network.jacobian(x)[..., j], (network(x + step) - network(x - step)) / (2 * eps), atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["van_der_pol-large", "rossler-spinn"])
+def test_the_smooth_maps_are_the_observers(name):
+    tracks = False if name.endswith("-large") else None
+    observer = observers.load(name, 0.3, process_noise=0.03, tracking=tracks)
+    y = np.random.default_rng(2).normal(size=(1, 1))
+    observer.reset(y)
+    for _ in range(6000):  # beyond the greatest age that the map tells apart
+        x_hat = observer.step(y)
+    assert np.allclose(decoder(observer.artifact, 0.3, 0.03)(observer.z), x_hat, atol=1e-4)
+    if observer.artifact.forward is not None:
+        x = np.random.default_rng(3).normal(size=(5, 3))
+        assert np.allclose(encoder(observer.artifact.forward)(x), observer.artifact.forward(x), atol=1e-5)

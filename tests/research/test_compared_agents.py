@@ -13,7 +13,7 @@ from PIL import Image
 
 from examples.research.agents import comparison, picture
 from examples.research.agents.comparison import KINDS, ComparedAgent, read_results
-from examples.research.agents.filtered import KalmanFilters, show_filtered
+from examples.research.agents.filtered import kalman_filters, show_filtered
 from examples.research.agents.statistics import interval, middle, normalised
 from examples.research.agents.tables import write_table
 from examples.research.agents.window import Stacks, WindowObservation, learn_window, read
@@ -23,9 +23,8 @@ from training.agents.agent import Agent, find
 from training.agents.environments import single
 from training.agents.observing import SETTINGS, wander
 from training.agents.play import play
-from training.agents.tasks import HIDDEN_VELOCITIES, TASKS
+from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, control_task
 from training.progress import progress_bars
-from training.systems import control_task
 
 PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
@@ -193,7 +192,7 @@ def test_kalman_filters_that_know_the_input_follow_a_driven_state():
         errors.append(np.abs(info["x_hat"] - info["x"]).max())
     assert max(errors[200:]) < 0.1 < errors[0]
     y, unknown = np.ones((3, 1)), np.full((3, 2), np.nan)  # states, at which they are not to look
-    filters, rows = KalmanFilters(env.unwrapped), np.array([True, False, False])
+    filters, rows = kalman_filters(env.unwrapped), np.array([True, False, False])
     filters.reset(y, unknown)
     first = filters.report()["x_hat"]
     filters.advance(-y, np.zeros((3, 1)))

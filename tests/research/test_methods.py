@@ -9,7 +9,7 @@ import torch
 from linear_system import F, Oscillator, TwoOutputs, sylvester
 from scipy.linalg import expm
 
-from examples.research.benchmark.protocol import run
+from examples.research.certificates.smooth import decoder
 from examples.research.methods import ABLATION, METHODS, Budget, Task, get_method
 from examples.research.methods.kalmannet import Gain, KalmanNetFilter
 from examples.research.methods.recurrent import rollout
@@ -18,7 +18,13 @@ from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from kkl_gym.systems import VanDerPol
 from observers import LinearFilter
-from training.maps.smooth import decoder
+from observers.estimator import Running
+
+
+def run(estimator, y):
+    """Estimates along outputs (steps, n, ny)."""
+    return Running(estimator).along(y)
+
 
 SMALL = Budget("small", 100, 25.0, samples=60, cpu_seconds=math.inf, width=32, depth=2, dt=0.05)
 TINY = replace(SMALL, trajectories=10, samples=20, width=8, depth=1, dt=0.02, steps=2)
@@ -106,7 +112,7 @@ def test_rollout_is_the_filter_sample_by_sample(ny):
 def test_kalman_filters_know_the_noise(name):
     method, system = get_method(name), get_system("van_der_pol")
     trained, y0 = {"diffusion": np.array([0.01])}, np.array([[3.0]])
-    first = [method.observer(trained, system, 0.01, noise).reset(y0)[0, 0] for noise in (0.0, 50.0)]
+    first = [run(method.observer(trained, system, 0.01, noise), y0[None])[0, 0, 0] for noise in (0.0, 50.0)]
     assert first[0] == pytest.approx(3.0, abs=0.01)  # from the centre of X, 0
     assert first[1] == pytest.approx(3.0 * (25 / 3) / (25 / 3 + 2500), rel=1e-6)
     assert get_method("ekf-wrong").believed(system).parameters == pytest.approx({"mu": 3.3})

@@ -10,6 +10,7 @@ import observers
 from examples.research.speed.observers import limit, table_rows
 from examples.research.speed.sizes import Sizes
 from examples.research.speed.speed import Speed
+from examples.research.speed.torch_steps import TorchSpeed
 
 TINY = {"steps": 5, "turns": 1, "num_envs": 4, "vector_steps": 3}
 
@@ -32,6 +33,17 @@ def test_speed_of_a_shipped_system(observer, wrapped, observers, capsys):
     assert rows == [2 + len(wrapped), 3 + len(wrapped), 6 * observers]
     with pytest.raises(ValueError, match="turns must be positive"):
         Speed(turns=0).run(Console())
+
+
+def test_the_table_of_torch_has_a_row_for_each_observer_and_the_memory(capsys):
+    lines = TorchSpeed(rows=(128,), turns=1).run(Console(width=200))
+    assert [(line[0], line[1], len(line)) for line in lines] == [
+        (name, "128", 5) for name in ("reverse_duffing", "van_der_pol", "rossler", "lorenz", "memory")
+    ]
+    assert min(float(each) for line in lines for each in line[2:]) > 0
+    assert capsys.readouterr().out.count("| lorenz | 128 |") == 1
+    with pytest.raises(ValueError, match="rows at least 128, got 3 and"):
+        TorchSpeed(rows=(4,)).run(Console())
 
 
 def test_the_table_has_the_share_of_the_products_speed_that_a_network_reaches():

@@ -12,6 +12,7 @@ from small_runs import toy
 import kkl_gym
 from kkl_gym.equations import EquationError
 from kkl_gym.simulate import simulate
+from observers.estimator import Running
 from training import errors, preset, train, unseen_trajectories
 from training.kalman import ExtendedKalmanFilter
 from training.smoothness import smooth_spectrum
@@ -41,7 +42,7 @@ def test_the_kalman_filter_follows_a_map_as_it_follows_its_integration():
     found = []
     for system in (Sampled(), Oscillator()):
         one = ExtendedKalmanFilter(system, DT, Q=np.diag([0.01, 0.02]), R=np.array([[0.3]]))
-        found.append([one.reset(y[0]), *(one.step(y[k], u[k]) for k in range(1, 60))])
+        found.append(Running(one).along(y, u[1:]))
     np.testing.assert_allclose(found[0], found[1], rtol=1e-7, atol=1e-9)
 
 

@@ -12,6 +12,7 @@ from small_runs import toy
 
 import kkl_gym
 from kkl_gym.simulate import simulate
+from observers.estimator import Running
 from training import train
 from training.cli import main
 from training.evaluation.errors import NoStartsError, starts
@@ -20,12 +21,7 @@ from training.kalman import ExtendedKalmanFilter, unknown_start
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CART_POLE = f"{EXAMPLES / 'cart_pole.py'}:CartPole"
 PENDULUM = f"{EXAMPLES / 'circle_pendulum.py'}:CirclePendulum"
-SMALL = "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch 64 --inverse-steps 9 --runs 100"
-
-
-def run(observer, y):
-    """Estimates along outputs (steps, n, ny)."""
-    return np.array([observer.reset(y[0]), *(observer.step(sample) for sample in y[1:])])
+SMALL = "--set trajectories=20 duration=5 samples=20 width=4 depth=1 batch=64 inverse_steps=9 runs=100"
 
 
 @pytest.fixture
@@ -107,7 +103,8 @@ def test_what_is_known_of_a_start_on_the_circle(pendulum):
     np.testing.assert_allclose(covariance, np.diag([0.5, 0.5, 64 / 3]), atol=0.5)
     x = simulate(pendulum, pendulum.draw_starts(np.random.default_rng(1), 5), 300, pendulum.dt)
     y = pendulum.output(x) + 0.05 * np.random.default_rng(2).normal(size=(301, 5, 2))
-    x_hat = run(ExtendedKalmanFilter(pendulum, pendulum.dt, Q=1e-6 * np.eye(3), R=0.05**2 * np.eye(2)), y)
+    kalman = ExtendedKalmanFilter(pendulum, pendulum.dt, Q=1e-6 * np.eye(3), R=0.05**2 * np.eye(2))
+    x_hat = Running(kalman).along(y)
     assert np.sqrt(np.square(x_hat - x)[150:].mean((0, 1))) == pytest.approx(0, abs=0.2)
 
 
@@ -117,12 +114,8 @@ def test_every_command_takes_a_system_on_the_circle(tmp_path, monkeypatch, capsy
     main(["train", PENDULUM, *SMALL.split()])
     assert "does not track" not in capsys.readouterr().out
     path = "runs/circle_pendulum/circle_pendulum.safetensors"
-    sizes = {
-        "evaluate": "--trajectories 4 --duration 6 --measurement-noise 0 --csv errors.csv",
-        "faults": "--trajectories 4 --duration 6 --measurement-noise 0.1",
-    }
-    for command, small in sizes.items():
-        main([command, path, "--system", PENDULUM, *small.split()])
+    for small in ("--measurement-noise 0 --csv errors.csv", "--measurement-noise 0.1 --faults"):
+        main(["evaluate", path, "--system", PENDULUM, "--trajectories", "4", "--duration", "6", *small.split()])
     assert set(pd.read_csv("errors.csv").starts) == {"X", "2X \\ X"}
 
 

@@ -4,7 +4,8 @@ from itertools import product
 
 import pytest
 
-from training.seeds import Stream, agent_evaluation_seed, agent_training_seed, generator
+from training.agents.seeds import agent_evaluation_seed, agent_training_seed
+from training.seeds import Stream, generator
 
 
 def test_no_two_streams_meet():

@@ -6,7 +6,7 @@ from linear_system import Oscillator, sylvester
 
 from kkl_gym import get_system
 from training.spectrum import Spectrum, evenly_spaced, papers_spectrum
-from training.trajectories.record import record
+from training.trajectories.motions import record
 
 
 def test_complex_modes_filter_a_linear_system_to_its_sylvester_solution():

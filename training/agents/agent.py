@@ -16,10 +16,10 @@ from kkl_gym.wrappers.vector import VectorEnv
 from observers import MLP, storage
 from observers.checks import choice, shown
 from observers.errors import ArtifactError
-from observers.names import resolve
+from observers.names import matching, resolve
 from training.agents.information import ESTIMATED, INFORMATION, Information, make
+from training.agents.tasks import Task
 from training.jobs import describe
-from training.systems import Task
 
 FORMAT = 2
 KEY = "kkl-gym-agent"
@@ -241,6 +241,6 @@ def find(name: str) -> Path:
         return Path(name)
     folder = files("training.agents").joinpath("shipped")
     names = sorted(entry.name.removesuffix(".safetensors") for entry in folder.iterdir())
-    if name not in names:
+    if (known := matching(name, names)) is None:
         raise AgentError(f"no agent {name!r} ships; there are {', '.join(names)}; a file ends in .safetensors")
-    return Path(str(folder.joinpath(f"{name}.safetensors")))
+    return Path(str(folder.joinpath(f"{known}.safetensors")))

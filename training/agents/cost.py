@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
-from training.systems import Task
+from training.agents.tasks import Task
 
 MAX_COST = 10.0  # three scales off in every state; beyond it, networks would learn little else
 

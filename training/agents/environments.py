@@ -13,8 +13,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from kkl_gym import KKLVectorEnv, VectorActionRepeat
 from kkl_gym.wrappers.vector import VectorEnv
 from observers.checks import shown
+from training.agents.tasks import Task
 from training.rollouts.playing import make
-from training.systems import Task
 
 CLEAN, CLEAN_Y = "clean", "clean_y"  # keys of info: the observation before noise was added, and its measured entries
 

@@ -16,9 +16,8 @@ from observers.factors import standard_deviations
 from observers.names import resolve
 from training.agents.environments import vector
 from training.agents.history import stacked, traces
-from training.agents.tasks import deviation
-from training.systems import Task, profile
-from training.trajectories.derivatives import linearised
+from training.agents.tasks import Task, deviation
+from training.trajectories.equations import linearised
 
 Information = Literal["state", "y", "stacked", "traces", "z", "x_hat", "x_hat_std", "recurrent"]
 INFORMATION: tuple[Information, ...] = get_args(Information)
@@ -142,11 +141,10 @@ def estimates(task: Task, information: Information, num_envs: int, observer: str
 
 
 def observer_of(system: System) -> str:
-    """Name of the map that agents get for a system: the one of its profile, or of its own name."""
-    name = profile(system).agent_observer or system.name
-    if name not in shipped():
+    """Name of the shipped map of a system."""
+    if system.name not in shipped():
         raise ValueError(f"no observer ships for {system.name!r}: name a .safetensors file (--observer FILE)")
-    return name
+    return system.name
 
 
 def output_deviation(system: System) -> Feature:

@@ -32,10 +32,10 @@ from training.agents.environments import CLEAN_Y, vector
 from training.agents.information import ESTIMATED, OBSERVED, Information, observer_of
 from training.agents.observing import KKL, OBSERVER, Estimation, Privileged, estimated_entries, wander
 from training.agents.policy import ALGORITHMS, CONTINUOUS, head_of, linear, lstm_in, perceptron
+from training.agents.seeds import agent_training_seed
+from training.agents.tasks import PREFERRED, Task
 from training.checkpoints import SUFFIX
 from training.progress import ProgressBars, progress_bars
-from training.seeds import agent_training_seed
-from training.systems import Task, profile
 
 RECURRENT = "ppo_lstm"
 # Share of the steps of a training, the first ones, in which there are no estimates yet.
@@ -52,7 +52,7 @@ def algorithm_for(task: Task, information: Information, actions: gym.Space[Any])
     if information == "recurrent":
         return RECURRENT
     if task.system is not None:
-        return profile(get_system(task.system)).algorithm
+        return PREFERRED.get(task.name, "ppo")
     return "sac" if isinstance(actions, spaces.Box) and task.env_id in settings_of("sac") else "ppo"
 
 

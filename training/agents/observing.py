@@ -12,16 +12,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from kkl_gym.wrappers.vector import VectorEnv
 from training.agents.environments import CLEAN, CLEAN_Y, single, vector
 from training.agents.information import FeatureObservation, Information, make
+from training.agents.tasks import Task
 from training.maps.coordinates import SETTLED
-from training.presets import RECORDED_NOISE, recorded_preset
 from training.progress import ProgressBars
 from training.records import Record
 from training.rollouts.callback import KKLTrainingCallback
-from training.rollouts.playing import Recorder, roll_out
-from training.rollouts.policies import WANDERING, policy_of
-from training.sources.recorded import RecordedSource, split
+from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
+from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset, split
 from training.spectrum import evenly_spaced
-from training.systems import Task
 from training.train_observer import train
 
 OBSERVER = "observer.safetensors"

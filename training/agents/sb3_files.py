@@ -21,7 +21,7 @@ from training.agents.agent import Agent, AgentError, fingerprint, rules
 from training.agents.bridge import SB3VecEnv
 from training.agents.information import OBSERVED, Information, make, observer_of
 from training.agents.policy import ACTIVATIONS, ALGORITHMS, CONTINUOUS, actor, head_of, lstm_in
-from training.systems import Task
+from training.agents.tasks import Task
 
 _LAYERS = {  # of the deterministic policy in a file of each algorithm; SAC's are TQC's, and PPO's A2C's
     "sac": re.compile(r"actor\.latent_pi\.\d+|actor\.mu"),

@@ -1,18 +1,148 @@
-"""Which tasks there are, and how well agents do those of systems."""
+"""Control tasks: an environment, how long each action is held, and what of it is measured; and scores of systems'."""
 
+import json
 import re
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym import ENV_IDS, SYSTEMS, get_system
-from kkl_gym.system import System
-from training.systems import PROFILES, Task, control_task, profile
+from kkl_gym import ENV_IDS, OWN_ID, SYSTEMS, get_system
+from kkl_gym.memory import output_time_constants
+from kkl_gym.system import Box, System
+from observers.checks import LARGEST, flag, integer, is_finite, shown
+from observers.names import matching
+from training.evaluation.levels import Level
 
-TASKS: dict[str, Task] = {name: known.task for name, known in PROFILES.items() if known.task}
+MAX_SAMPLES = 100_000  # of an episode: all of them are kept while it is played
+MAX_FRAMES = 1_000  # which may come from a stranger's file
 TOLERANCE = 0.2  # distance from the target over the scale, within which an agent holds it
+
+
+@dataclass(frozen=True)
+class Task:
+    """An environment and what agents may see of it.
+
+    Of a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` stay empty. ``env_id`` and
+    ``env_kwargs`` are those of ``gym.make``; ``repeat`` is in samples, ``time_constants`` and ``frames`` in actions.
+    """
+
+    env_id: str
+    measured: tuple[int, ...] = ()
+    hidden: tuple[int, ...] | None = None
+    measurement_noise: Level = 0.0
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    repeat: int = 1
+    time_constants: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
+    frames: int = 8
+    past_actions: bool = True
+    angles: tuple[tuple[int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.env_id, str):
+            raise ValueError(f"env_id must be a string, got {shown(self.env_id)}")
+        try:  # as a file holds them
+            object.__setattr__(self, "env_kwargs", json.loads(json.dumps(dict(self.env_kwargs))))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"env_kwargs must be JSON, got {shown(self.env_kwargs)}: {error}") from None
+        for name in ("measured", "hidden"):
+            if (given := getattr(self, name)) is not None:
+                entries = tuple(integer(f"an entry of {name}", entry, 0) for entry in given)
+                empty = name == "measured" and not entries and self.system is None
+                if len(set(entries)) < len(entries) or empty:
+                    raise ValueError(f"{name} must name entries of the observation, each once, got {shown(given)}")
+                object.__setattr__(self, name, entries)
+        object.__setattr__(self, "angles", _pairs(self.env_id, self.angles, self.measured))
+        if self.system is None:
+            if not is_finite(self.measurement_noise) or not 0 <= self.measurement_noise < LARGEST:  # type: ignore[operator]
+                raise ValueError(
+                    "measurement_noise must be one number from 0 on, for all that is measured, got "
+                    f"{shown(self.measurement_noise)}"
+                )
+            object.__setattr__(self, "measurement_noise", float(self.measurement_noise))  # type: ignore[arg-type]
+            if self.repeat != 1:
+                raise ValueError(f"only environments of systems repeat actions, and {self.env_id} is none")
+        else:
+            if isinstance(self.measurement_noise, list):
+                object.__setattr__(self, "measurement_noise", tuple(self.measurement_noise))
+            limit = integer("max_episode_steps", self.env_kwargs.get("max_episode_steps"), 1, MAX_SAMPLES)
+            object.__setattr__(self, "repeat", integer("repeat", self.repeat, 1, limit))
+        object.__setattr__(self, "time_constants", output_time_constants("time_constants", self.time_constants))
+        object.__setattr__(self, "past_actions", flag("past_actions", self.past_actions))
+        object.__setattr__(self, "frames", integer("frames", self.frames, 1, MAX_FRAMES))
+
+    @property
+    def system(self) -> str | None:
+        """Name of the system whose environment this is, None if it is another environment."""
+        if self.env_id == OWN_ID:
+            return str(self.env_kwargs.get("system"))
+        return next((name for name, env_id in ENV_IDS.items() if env_id == self.env_id), None)
+
+    @property
+    def name(self) -> str:
+        """Name of the system or the environment, for folders and tables."""
+        return self.env_id.replace("/", "-") if self.system is None else get_system(self.system).name
+
+    @property
+    def steps(self) -> int:
+        """Actions in an episode of a system."""
+        return int(self.env_kwargs["max_episode_steps"]) // self.repeat
+
+    @property
+    def without_noise(self) -> "Task":
+        """The same environment, measured exactly."""
+        return replace(self, measurement_noise=0.0)
+
+
+def _pairs(env_id: str, values: Any, measured: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
+    """Angles as pairs of entries, or ValueError."""
+    given = values.tolist() if isinstance(values, np.ndarray) else values
+    if not (
+        isinstance(given, list | tuple) and all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in given)
+    ):
+        raise ValueError(f"angles must be pairs of entries, cosine and sine, such as 0,1; got {shown(values)}")
+    pairs = tuple((integer("a cosine", cosine, 0), integer("a sine", sine, 0)) for cosine, sine in given)
+    named = [entry for pair in pairs for entry in pair]
+    if len(set(named)) < len(named) or not set(named) <= set(measured):
+        raise ValueError(
+            f"angles must name entries of {env_id} that are measured, {shown(measured)}, each once, got {shown(values)}"
+        )
+    return pairs
+
+
+def control_task(
+    system: str,
+    measurement_noise: Level = 0.5,
+    *,
+    period: float = 0.05,
+    duration: float = 20.0,
+    start_box: Box | None = None,
+    dt: float = 0.01,
+) -> Task:
+    """Return the task to bring a system to its target and hold it there; times are in seconds."""
+    for name, time, unit in (("period", period, dt), ("duration", duration, period)):
+        if not (is_finite(time) and is_finite(unit)) or not 0 < unit <= time:
+            raise ValueError(f"a task needs 0 < dt <= period <= duration, got {dt}, {period} and {duration}")
+        if abs(time / unit - round(time / unit)) > 1e-6:
+            raise ValueError(f"{name} = {time} s must be a whole multiple of {unit} s")
+    repeat = round(period / dt)
+    options = {"dt": dt, "start_box": start_box, "max_episode_steps": repeat * round(duration / period)}
+    own = {} if system in ENV_IDS else {"system": system}
+    env_id = ENV_IDS.get(system, OWN_ID)
+    return Task(env_id, measurement_noise=measurement_noise, env_kwargs=own | options, repeat=repeat)
+
+
+TASKS: dict[str, Task] = {
+    # Marginally stable: an agent that does not know the state cannot take energy out.
+    "reverse_duffing": control_task("reverse_duffing", period=0.1),
+    # The target is unstable. Starts keep to |x1| < 3: beyond it a slow manifold holds the motion under any input.
+    "van_der_pol": control_task("van_der_pol", start_box=((-3, 3), (-6, 6))),
+    "rossler": control_task("rossler", period=0.1, duration=30.0),
+    "lorenz": control_task("lorenz", duration=5.0),  # the input is weak
+}
+PREFERRED = {"reverse_duffing": "sac"}  # algorithm; ppo for all others
 
 # Positions are measured and velocities are not, as in rl-zoo3's tasks. ``hidden`` where an observer estimates less than
 # all the rest: of the double pendulum not the forces of its constraints.
@@ -32,9 +162,9 @@ HIDDEN_VELOCITIES: dict[str, Task] = {
 }
 
 
-def get_task(name: str, measurement_noise: float | tuple[float, ...] | None = None, **changes: Any) -> Task:
+def get_task(name: str, measurement_noise: Level | None = None, **changes: Any) -> Task:
     """Return the task of a system, of a script's class or of any environment id, with changes of its fields."""
-    name = next((system for system, env_id in ENV_IDS.items() if env_id == name), name)
+    name = matching(name, SYSTEMS) or name
     if name not in SYSTEMS and (name in gym.registry or re.search(r"-v\d+$", name)):
         known = HIDDEN_VELOCITIES.get(name)
         if known is None and not changes.get("measured"):
@@ -57,7 +187,7 @@ def task_of(system: System, name: str | None = None) -> Task:
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs for an agent to act on")
     dt = system.dt
-    return profile(system).task or control_task(
+    return TASKS.get(system.name) or control_task(
         name or system.name, system.measurement_noise, period=5 * dt, duration=2000 * dt, dt=dt
     )
 

@@ -15,13 +15,13 @@ from observers.storage import replacing
 from training.agents.agent import Agent, find
 from training.agents.information import Information
 from training.agents.play import Episodes, play
+from training.agents.seeds import agent_evaluation_seed
 from training.agents.tasks import TOLERANCE, scores, successes
 from training.commands.agent_task import Measured, TaskOptions
 from training.commands.options import NoiseLevel
 from training.evaluation.levels import show_level
 from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
-from training.seeds import agent_evaluation_seed
 
 TRANSIENT = 20  # steps of an episode whose estimates are not judged
 Name = Annotated[

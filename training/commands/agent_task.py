@@ -5,9 +5,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from training.agents.tasks import get_task
+from training.agents.tasks import Task, get_task
 from training.commands.record import EnvironmentArguments
-from training.systems import Task
 
 Measured = Annotated[
     str, tyro.conf.arg(metavar="INDICES", help_behavior_hint="(default: the positions, of environments known here)")

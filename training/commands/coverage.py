@@ -1,4 +1,4 @@
-"""What ``kkl-gym evaluate --calibration`` prints: whether error bars are true."""
+"""The table of ``kkl-gym evaluate --calibration``: coverage of error bars."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -7,18 +7,16 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from training.evaluation.coverage import REGIONS, Coverage, coverage, kalman_coverage
+from training.evaluation.coverage import REGIONS, Coverage, coverage
 from training.evaluation.errors import UnseenTrajectories
 from training.evaluation.levels import Level, as_cell, show_level
 
 if TYPE_CHECKING:
     import pandas as pd
 
-FIRST, SETTLED = (
-    2.0,
-    5.0,
-)  # seconds at the pace of the shipped systems: spans are the first ones, and all after the last
-SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # levels of noise, in multiples of the largest that the map is told
+# Seconds at the pace of the shipped systems: spans are the first ones, and all after the last.
+FIRST, SETTLED = 2.0, 5.0
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # levels of noise, in multiples of the map's largest
 
 
 def default_levels(artifact: Artifact) -> list[Level]:
@@ -40,7 +38,7 @@ def judged(
     how: dict[str, Any] = {"measurement_noise": level, "seed": seed, "spans": tuple(spans.values())}
     found = {"KKL": coverage(artifact, system, trajectories, **how)}
     if ekf:
-        found["EKF"] = kalman_coverage(system, trajectories, dt, **how)
+        found["EKF"] = coverage(None, system, trajectories, **how)
     return [
         {"observer": who, "span": span, "measurement_noise": as_cell(level), **_cells(one, system)}
         for who, each in found.items()

@@ -27,7 +27,7 @@ EVERY = 100  # steps between two reports
 
 @dataclass(frozen=True)
 class Demo:
-    """Run environments with their observers; print a table and draw true and estimated states.
+    """Run the environments with their observers: a table of errors, a figure of true and estimated states.
 
     The observer runs inside the environment. SPINN, the paper's, is given the same outputs afterwards, where it ships.
     """
@@ -44,29 +44,16 @@ class Demo:
     """Seed of the starts and the noise."""
     policy: OwnPolicy = None
     gif: bool = False
-    """Draw a moving picture as well: phase portraits of the first 12 s, of slow and fast systems at the pace of the
-    shipped ones; estimates.gif beside the figure."""
-    live: bool = False
-    """Open a window in which one system moves, by default Van der Pol's, with sliders for noise, input and faults of
-    the sensor. Keys are shown there."""
+    """Draw phase portraits of the first 12 s that move, at the pace of the shipped systems: estimates.gif."""
 
-    def run(self, console: Console) -> Path | None:
+    def run(self, console: Console) -> Path:
         """Run."""
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
-        if self.live and (self.duration is not None or self.gif):
-            raise ValueError("a window stays open until it is closed: leave out --duration and --gif beside --live")
-        if self.live and self.policy is not None:
-            raise ValueError("in a window the input is yours, by a slider and keys: leave out --policy beside --live")
-        environments = shown(self.system or ("van_der_pol" if self.live else None), self.observer)
+        environments = shown(self.system, self.observer)
         for one in environments:
             if not one.observed:
                 raise ValueError(f"no observer ships for {one.system.name!r}: name a file, --observer FILE")
-        if self.live:
-            from training.commands.live import show  # which takes a second that others need not wait for
-
-            show(environments[0], self.measurement_noise, seed=self.seed)
-            return None
         require_writable(self.out)
         with progress_bars(console) as progress:
             episodes = []
@@ -118,7 +105,7 @@ class Episode:
 
     @property
     def measurement_noise(self) -> str:
-        """Its level, for people."""
+        """The level as a text."""
         return show_level(self.env.unwrapped.measurement_noise)  # type: ignore[attr-defined]
 
 

@@ -1,7 +1,8 @@
-"""What several commands ask for: observers, the system of one's own that they are for, levels of noise, durations."""
+"""Options that several commands share: observers, their systems, levels of noise, parameters, how a run goes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -9,135 +10,29 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from kkl_gym import ENV_IDS, OWN_ID, SYSTEMS, get_system
 from kkl_gym.system import System
-from kkl_gym.systems import system_of
 from observers import Artifact, shipped
 from observers.names import resolve
 from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
-from training.trajectories.controllers import Controller
 from training.trajectories.parameters import EVERY
+from training.trajectories.policies import Controller
 
-SystemName = Annotated[
-    tyro.conf.Positional[str],
-    tyro.conf.arg(metavar="SYSTEM", help="A shipped system, or a class of yours as script.py:Class or module:Class."),
-]
-OneSystem = Annotated[
-    tyro.conf.Positional[str | None],
-    tyro.conf.arg(
-        metavar="[SYSTEM]",
-        help="One system alone: a shipped one, or a class of yours as script.py:Class or module:Class.",
-        help_behavior_hint="(default: all four that ship)",
-    ),
-]
-OneObserver = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="MAP",
-        help="An observer for that system: a shipped map or a .safetensors file.",
-        help_behavior_hint="(default: the newest that ships for it)",
-    ),
-]
-Parameters = Annotated[
-    dict[str, float],
-    tyro.conf.arg(
-        help="Physical parameters that differ from the system's defaults, as in: --parameters rho 30.",
-        help_behavior_hint="(default: none)",
-    ),
-]
-OneParameter = Annotated[
-    tuple[str, float],
-    PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="NAME=VALUE",
-        instance_from_str=lambda words: read_parameter(words[0]),
-        is_instance=lambda value: True,
-        str_from_instance=lambda parameter: ["{}={:g}".format(*parameter)],
-    ),
-]
-# Each by an option of its own, which is given several times: words after one might as well be observers.
-RepeatedParameters = Annotated[tuple[OneParameter, ...], tyro.conf.UseAppendAction]
-# Several words after one option, and the option several times.
-Unknowns = Annotated[
-    tuple[
-        Annotated[
-            tuple[tuple[str, tuple[float, ...]], ...],
-            PrimitiveConstructorSpec(
-                nargs="*",
-                metavar="NAME=VALUE[:LOW:HIGH]",
-                instance_from_str=lambda words: tuple(map(read_unknown, words)),
-                is_instance=lambda value: True,
-                str_from_instance=lambda found: [f"{name}={':'.join(map(str, of))}" for name, of in found],
-            ),
-        ],
-        ...,
-    ],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(help_behavior_hint=""),
-]
-HalfWidths = Annotated[
-    tuple[
-        Annotated[
-            tuple[str, float],
-            PrimitiveConstructorSpec(
-                nargs=1,
-                metavar="NAME=SHARE",
-                instance_from_str=lambda words: read_half_width(words[0]),
-                is_instance=lambda value: True,
-                str_from_instance=lambda found: ["{}={:g}".format(*found)],
-            ),
-        ],
-        ...,
-    ],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(help_behavior_hint="(default: none)"),
-]
-Observers = Annotated[
-    tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
-]
-OwnSystem = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="CLASS",
-        help="The system of observers that were made for one of your own, as script.py:Class or module:Class.",
-        help_behavior_hint="",
-    ),
-]
-# A level is written as a number for all outputs, or as one for each with commas between them. Defaults are in words.
-NoiseLevel = Annotated[
-    Level | None,
-    PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="LEVEL",
-        instance_from_str=lambda words: read_level(words[0]),
-        is_instance=lambda value: True,
-        str_from_instance=lambda level: [str(level)],
-    ),
-    tyro.conf.arg(help_behavior_hint="(default: the system's own)"),
-]
-NoiseLevels = Annotated[
-    tuple[Level, ...] | None,
-    PrimitiveConstructorSpec(
+Pairs = tuple[tuple[str, Any], ...]  # of the words NAME=VALUE behind an option
+Repeated = tuple[Pairs, ...]  # of an option that may be given several times; merged makes one mapping of them
+
+
+def words(read: Callable[[str], Any], metavar: str) -> PrimitiveConstructorSpec[Any]:
+    """An option that takes several words, of which a function reads each."""
+    return PrimitiveConstructorSpec(
         nargs="*",
-        metavar="LEVEL [LEVEL ...]",
-        instance_from_str=lambda words: tuple(map(read_level, words)),
+        metavar=metavar,
+        instance_from_str=lambda texts: tuple(map(read, texts)),
         is_instance=lambda value: True,
-        str_from_instance=lambda levels: [str(levels)],
-    ),
-    tyro.conf.arg(help_behavior_hint="(default: 0 and the system's own)"),
-]
-Seconds = Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the system's own)")]
-OwnPolicy = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="FUNCTION",
-        help="The policy of observers that were trained under one of your own, as script.py:function or "
-        "module:function. Those that were trained under the system's own controller need no option.",
-        help_behavior_hint="",
-    ),
-]
+        str_from_instance=lambda values: list(map(str, values or ())),
+    )
 
 
-def read_parameter(text: str) -> tuple[str, float]:
+def read_number(text: str) -> tuple[str, float]:
     """Read a parameter, written as ``mu=3.3``."""
     name, _, value = text.partition("=")
     try:
@@ -161,14 +56,119 @@ def read_unknown(text: str) -> tuple[str, tuple[float, ...]]:
 
 
 def read_half_width(text: str) -> tuple[str, float]:
-    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is of all parameters."""
+    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is for all parameters."""
     name, _, share = text.rpartition("=")
     try:
         return name.strip() or EVERY, float(share)
     except ValueError:
         raise ValueError(
-            f"{text!r} does not say how uncertain a parameter is: write NAME=SHARE, as in mu=0.1, or a number for all"
+            f"{text!r} is no uncertainty of a parameter: write NAME=SHARE, as in mu=0.1, or a number for all"
         ) from None
+
+
+def merged(option: str, repeated: Iterable[Pairs]) -> dict[str, Any]:
+    """The values of an option by name; ValueError if one has two."""
+    names = [name for pairs in repeated for name, _ in pairs]
+    if len({*names}) < len(names):
+        raise ValueError(f"{option} names a parameter twice: {', '.join(names)}")
+    return {name: value for pairs in repeated for name, value in pairs}
+
+
+SYSTEM = "A shipped system (lorenz, Lorenz or KKLLorenz-v0), or yours: script.py, script.py:Class or module:Class."
+SystemName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SYSTEM", help=SYSTEM)]
+OneSystem = Annotated[
+    tyro.conf.Positional[str | None],
+    tyro.conf.arg(metavar="[SYSTEM]", help=SYSTEM, help_behavior_hint="(default: all four that ship)"),
+]
+OwnSystem = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="CLASS",
+        help="The system of observers that were made for one of your own, as script.py:Class or module:Class.",
+        help_behavior_hint="",
+    ),
+]
+OneObserver = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="MAP",
+        help="An observer for that system: a shipped map or a .safetensors file.",
+        help_behavior_hint="(default: the newest that ships for it)",
+    ),
+]
+Observers = Annotated[
+    tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
+]
+Parameters = Annotated[
+    tuple[Annotated[Pairs, words(read_number, "NAME=VALUE")], ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(
+        help="Physical parameters that differ from the system's defaults, as in rho=30.",
+        help_behavior_hint="(default: none)",
+    ),
+]
+Plant = Annotated[
+    tuple[Annotated[Pairs, words(read_number, "NAME=VALUE")], ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(help_behavior_hint="(default: the observer's own)"),
+]
+Unknowns = Annotated[
+    tuple[Annotated[Pairs, words(read_unknown, "NAME=VALUE[:LOW:HIGH]")], ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(help_behavior_hint=""),
+]
+HalfWidths = Annotated[
+    tuple[Annotated[Pairs, words(read_half_width, "NAME=SHARE")], ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(help_behavior_hint="(default: none)"),
+]
+# A level is written as a number for all outputs, or as one for each with commas between them. Defaults are in words.
+NoiseLevel = Annotated[
+    Level | None,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="LEVEL",
+        instance_from_str=lambda texts: read_level(texts[0]),
+        is_instance=lambda value: True,
+        str_from_instance=lambda level: [str(level)],
+    ),
+    tyro.conf.arg(help_behavior_hint="(default: the system's own)"),
+]
+NoiseLevels = Annotated[
+    tuple[Level, ...] | None,
+    words(read_level, "LEVEL [LEVEL ...]"),
+    tyro.conf.arg(help_behavior_hint="(default: 0 and the system's own)"),
+]
+Seconds = Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the system's own)")]
+OwnPolicy = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="FUNCTION",
+        help="The policy of observers that were trained under one of your own, as script.py:function or "
+        "module:function. Those that were trained under the system's own controller need no option.",
+        help_behavior_hint="",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The folder of a training, and how it runs."""
+
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: runs/NAME)")] = None
+    """Where all files are written."""
+    resume: bool = False
+    """Go on from the checkpoints in the folder, if there are any."""
+    threads: int = 1
+    """CPU threads. More than one hardly help networks of the fast preset's size."""
+
+    def start(self) -> None:
+        """Set torch's threads."""
+        import torch  # which takes longer to import than all the rest
+
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
+        torch.set_num_threads(self.threads)
 
 
 def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[str, Artifact, System]]:
@@ -224,3 +224,15 @@ def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> C
     if not artifact.nu:
         raise ValueError(f"the policy {name!r} needs an observer that takes in inputs; this one takes none")
     return named_policy(system, name)
+
+
+def system_of(artifact: Artifact, given: str | None) -> System:
+    """The system that an artifact was made for, checked against it."""
+    artifact.require_system()
+    if given is None and artifact.system not in SYSTEMS:
+        raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")
+    base = get_system(given or artifact.system)
+    if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
+        base = base.replace(artifact.parameters)
+    artifact.check(base.name, base.parameters, dt=artifact.filter.dt, ny=base.ny, nu=base.nu)
+    return base

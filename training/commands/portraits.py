@@ -13,7 +13,7 @@ from training.figures import ESTIMATE, MEASURED, TRUTH, save_moving, style
 
 SECONDS = 12.0  # of motion at the pace of the systems that ship, where it plays as fast as the motion
 FRAMES = 144  # at most
-TRAIL = 0.35  # of what is shown: older points would hide the new ones
+TRAIL = 0.35  # of the samples drawn: older points would hide the new ones
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium as gym
@@ -10,10 +10,11 @@ import tyro
 from rich.console import Console
 from tyro.constructors import PrimitiveConstructorSpec
 
+from training.commands.data import names_in
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
-    from training.rollouts.policies import Policy
+    from training.rollouts.playing import Policy
 
 Argument = Annotated[
     tuple[str, Any],
@@ -32,6 +33,18 @@ _NAMES = tyro.conf.arg(metavar="SIGNALS", help_behavior_hint="")
 
 
 @dataclass(frozen=True)
+class PlayOptions:
+    """How an environment is made and for how long it is played."""
+
+    episodes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: no limit)")] = None
+    """Episodes to play."""
+    steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 100,000 if no episodes are given)")] = None
+    """Steps to play, at most; to diagnose, 10,000 by default."""
+    env_kwargs: EnvironmentArguments = ()
+    """An argument of the environment, once for each; values are JSON, or text."""
+
+
+@dataclass(frozen=True)
 class RecordCommand:
     """Play episodes of any environment, and write them as a Minari data set for `kkl-gym train --data minari:ID`."""
 
@@ -47,37 +60,33 @@ class RecordCommand:
     policy: str = "random"
     """Who acts: random; wandering (random actions, each held for a while); a function from observation to action as
     script.py:function or module:function; an agent.safetensors of `kkl-gym agent train ENV_ID --information state`; or
-    an agent of stable-baselines3 as ppo:FILE.zip, of which loading may run what is in the file."""
-    episodes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: no limit)")] = None
-    """Episodes to play."""
-    steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 100,000 if no episodes are given)")] = None
-    """Steps to play, at most."""
-    env_kwargs: EnvironmentArguments = ()
-    """An argument of the environment, once for each; values are JSON, or text."""
+    an agent of stable-baselines3 as ppo:FILE.zip, whose code loading may run."""
     seed: int = 0
     """Of the environment and of random actions."""
     dataset: Annotated[
         str, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from environment and policy)")
     ] = ""
     """Name of the data set, as in pendulum/random-v0."""
+    play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
 
     def run(self, console: Console) -> str:
         """Record."""
-        from training.records.minari import dataset_folder, write_dataset
+        from training.records.episodes import dataset_folder, write_dataset
         from training.rollouts import make, policy_of, roll_out
 
-        steps = 100_000 if self.episodes is None and self.steps is None else self.steps
+        episodes = self.play.episodes
+        steps = 100_000 if episodes is None and self.play.steps is None else self.play.steps
         name = self.dataset or f"{_word(self.env_id)}/{_word(self.policy)}-v0"
         dataset_folder(name)  # an error now, not at the end
-        with progress_bars(console) as progress, make(self.env_id, dict(self.env_kwargs)) as env:
+        with progress_bars(console) as progress, make(self.env_id, dict(self.play.env_kwargs)) as env:
             policy = _player(self.policy, env) if self.policy.endswith(".safetensors") else policy_of(self.policy, env)
-            with progress.phase(f"playing {self.env_id}", steps or self.episodes or 1) as report:
+            with progress.phase(f"playing {self.env_id}", steps or episodes or 1) as report:
                 rollouts = roll_out(
                     env,
                     policy,
                     measured=names_in(self.measured),
                     hidden=names_in(self.hidden),
-                    episodes=self.episodes,
+                    episodes=episodes,
                     steps=steps,
                     seed=self.seed,
                     name=name,
@@ -110,11 +119,6 @@ def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
     policy = agent.policy(env.action_space)
     flatten: Any = gym.spaces.flatten
     return lambda observation: policy(flatten(env.observation_space, observation)[None])[0]
-
-
-def names_in(text: str) -> list[str]:
-    """The names between commas."""
-    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def read_argument(text: str) -> tuple[str, Any]:

@@ -15,11 +15,12 @@ from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, get_system
 from training.commands.data import DataOptions
 from training.commands.maps import tracks_by
-from training.commands.options import HalfWidths, Parameters
-from training.commands.settings import Settings
-from training.config import Pipeline, read_changes
-from training.presets import CLOSED_LOOP, Preset, Size, preset, recorded_preset
+from training.commands.options import SYSTEM, HalfWidths, Parameters, RunOptions, merged
+from training.commands.settings import SettingsOptions
+from training.config import Pipeline
+from training.presets import Preset, Size, preset
 from training.progress import LOG, ProgressBars, duration, progress_bars
+from training.sources.recorded import recorded_preset
 from training.spectrum import Spectrum
 from training.trajectories.parameters import nominal_share, relative_ranges
 
@@ -30,9 +31,9 @@ if TYPE_CHECKING:
 
 RECORDED = "recorded"  # name of an observer from records, where the user gives none
 NAME = r"[\w][\w.-]*"  # of an observer, and so of a file
-OF_SYSTEMS = ("pipeline", "preset", "size", "closed_loop", "uncertain", "parameters")  # options
+OF_SYSTEMS = ("pipeline", "preset", "size", "uncertain", "policy", "parameters")  # options
 SIMULATED = (  # settings that say how motions are simulated
-    *("trajectories", "duration", "policy", "process_noise_share", "free_inverse", "lead_in_input", "runs"),
+    *("trajectories", "duration", "process_noise_share", "free_inverse", "lead_in_input", "runs"),
     *("closed_loop_trajectories", "estimate_parameters", "false_alarms"),
 )
 MOTIONS = {"equations": "the system's equations", "flow": "a learned flow"}
@@ -41,19 +42,19 @@ OF_RECORDS = ("windows", "arbitrary_zero", "held_out")
 
 @dataclass(frozen=True)
 class Train:
-    """Learn an observer and write it to one file: T_inv, the motion that it tracks by, covariances, a monitor's limits.
+    """Learn an observer from equations or from records, and write it to one file.
 
-    Motions are simulated by a system's equations, or recorded (--data). The run's folder, runs/NAME, receives
-    NAME.safetensors, report.png, checkpoints, log.txt with what is printed and, where TensorBoard is installed, its
-    scalars.
+    kkl-gym train lorenz: a shipped system. kkl-gym train script.py: the one that the script defines. kkl-gym train
+    NAME --data run*.csv: from recorded states. The folder runs/NAME receives NAME.safetensors (T_inv, the motion that
+    it tracks by, covariances, a monitor's limits), report.png, checkpoints, log.txt with all lines printed and, where
+    TensorBoard is installed, its scalars.
     """
 
     system: Annotated[
         tyro.conf.Positional[str],
         tyro.conf.arg(
             metavar="SYSTEM",
-            help="A shipped system, or a class of yours as script.py:Class or module:Class. With --data, a name of "
-            "your choice for what was recorded.",
+            help=f"{SYSTEM} With --data, a name of your choice for what was recorded.",
             help_behavior_hint="",
         ),
     ] = ""
@@ -65,55 +66,47 @@ class Train:
     size: Size = "default"
     """large: a T_inv that is accurate without tracking, for certificates and for use without a model; about ten minutes
     (input-aware). Writes NAME-large."""
-    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
-    """The run's folder."""
-    config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None
-    """JSON file of settings that differ from the preset's; options given here come before them."""
-    closed_loop: bool = False
-    """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on T_inv's estimate
-    (input-aware). Writes NAME-closed-loop."""
+    parameters: Parameters = ()
     uncertain: HalfWidths = ()
-    """How far a parameter may be from its value, as a part of that: mu=0.1, once for each, or 0.1 for all.
-    Some motions in training then have their own (input-aware), and the observer serves every such plant. It does not
-    track."""
-    no_inputs: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Let the filter take in no inputs; an input-aware map is then fitted to free motion only."""
-    resume: bool = False
-    """Go on from the checkpoints in the run's folder, if there are any."""
-    parameters: Parameters = field(default_factory=dict)
-    threads: int = 1
-    """CPU threads. More than one hardly help networks of the fast preset's size."""
+    """How far a parameter may be from its value, as a part of that: mu=0.1, or 0.1 for all. Some motions in training
+    then have their own (input-aware), and the observer serves every such plant. It does not track."""
+    policy: Annotated[str | None, tyro.conf.arg(metavar="FUNCTION", help_behavior_hint="(default: random inputs)")] = (
+        None
+    )
+    """What acts while motions are simulated: "controller" for the system's own, or script.py:function, from states
+    (n, nx) to actions (n, nu) in [-1, 1]. For plants that no random input would hold within their bounds."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks are trained; auto takes a GPU if there is one."""
     data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
     """Recorded motions, where the equations are unknown."""
-    settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=dict)
-    """What of the preset's configuration is to differ."""
+    settings: tyro.conf.OmitArgPrefixes[SettingsOptions] = field(default_factory=SettingsOptions)
+    """What is to differ from the preset. docs/reference/commands.md lists the settings and their defaults."""
+    folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
     def run(self, console: Console) -> Path:
         """Train."""
         began = time.monotonic()
-        import torch  # which takes longer to import than all the rest
+        self.folder.start()
+        import torch
 
         from training.evaluation.report import write_report
         from training.train_observer import train
 
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
         if self.device == "cuda" and not torch.cuda.is_available():
             raise ValueError("device cuda: torch sees no GPU; leave --device out to train on the CPU")
-        torch.set_num_threads(self.threads)
         changes = self._changes()
-        system = None if self._has_records(changes) else get_system(self.system, self.parameters)
+        system = None
+        if not self._has_records(changes):
+            system = get_system(self.system, merged("--parameters", self.parameters))
         name = self._name(system, changes)
-        folder = self.out or Path("runs") / name
+        folder = self.folder.out or Path("runs") / name
         path = folder / f"{name}.safetensors"
         with progress_bars(console, folder / LOG) as progress:
             source = (
                 self._records(name, changes, progress) if system is None else self._motions(system, changes, progress)
             )
             device = None if self.device == "auto" else torch.device(self.device)
-            result = train(source, folder=folder, resume=self.resume, device=device, console=progress)
+            result = train(source, folder=folder, resume=self.folder.resume, device=device, console=progress)
             result.artifact.save(path)  # before anything else may fail
             with progress.phase("drawing the report"):
                 write_report(folder / "report.png", result, source)
@@ -128,31 +121,24 @@ class Train:
     def _has_records(self, changes: Mapping[str, Any]) -> bool:
         """Whether motions are recorded; ValueError if options are for the other kind."""
         if not self.data.data:
-            given = [option for option in ("time", "measured", "inputs", "hidden") if getattr(self.data, option)]
+            given = [f"--{option}" for option in ("time", "measured", "inputs", "hidden") if getattr(self.data, option)]
             if given := [*given, *(name for name in changes if name in OF_RECORDS)]:
-                raise ValueError(f"{_options(given[:1])} needs recorded data (--data)")
+                raise ValueError(f"{given[0]} needs recorded data (--data)")
             if not self.system:
                 raise ValueError("name a system, or recorded data (--data)")
             return False
         plain = Train()
-        given = [option for option in OF_SYSTEMS if getattr(self, option) != getattr(plain, option)]
+        given = [f"--{option}" for option in OF_SYSTEMS if getattr(self, option) != getattr(plain, option)]
         if given := given or [name for name in changes if name in SIMULATED]:
-            raise ValueError(f"{_options(given)}: of no use with --data, where nothing is simulated")
+            raise ValueError(f"{', '.join(given)}: of no use with --data, where nothing is simulated")
         return True
 
     def _changes(self) -> dict[str, Any]:
-        """The settings that are to differ from the preset's: those of the file, and those of options before them."""
-        changes = (read_changes(self.config) if self.config else {}) | self.settings
+        """The settings that are to differ from the preset's."""
+        changes = self.settings.read()
         if self.uncertain:
-            named = [name for name, _ in self.uncertain]
-            if len({*named}) < len(named):
-                raise ValueError(f"--uncertain names a parameter twice: {', '.join(named)}")
-            changes["uncertain"] = dict(self.uncertain)
-        if self.no_inputs:
-            changes["inputs"] = False
-        if self.closed_loop:
-            changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
-        return changes
+            changes["uncertain"] = merged("--uncertain", self.uncertain)
+        return changes if self.policy is None else changes | {"policy": self.policy}
 
     def _name(self, system: System | None, changes: Mapping[str, Any]) -> str:
         """The observer's name, and its file's."""
@@ -170,11 +156,11 @@ class Train:
         return name if self.size == "default" else f"{name}-{self.size}"
 
     def _records(self, name: str, changes: Mapping[str, Any], progress: ProgressBars) -> "RecordedSource":
-        from training.sources.recorded import RecordedSource, described
+        from training.sources.recorded import RecordedSource
 
         records = self.data.read(progress)
         source = RecordedSource(records, recorded_preset(records, changes), name, warn=progress.say)
-        for line in described(source):
+        for line in source.described():
             progress.say(line)
         return source
 
@@ -207,8 +193,7 @@ class Train:
         words = ["kkl-gym", "evaluate", str(path)]
         if type(system) not in SYSTEMS.values():
             words += ["--system", self.system]
-        policy = self.settings.get("policy")
-        return shlex.join([*words, *(["--policy", policy] if policy not in (None, "controller") else [])])
+        return shlex.join([*words, *(["--policy", self.policy] if self.policy not in (None, "controller") else [])])
 
 
 def summary(result: "Result") -> list[str]:
@@ -228,7 +213,3 @@ def summary(result: "Result") -> list[str]:
             f"rms error over standard deviation on held-out records: {each} (after {after:.2g} s of transient)"
         )
     return lines
-
-
-def _options(names: list[str]) -> str:
-    return ", ".join(f"--{name.replace('_', '-')}" for name in names)

@@ -3,39 +3,35 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from numpy.linalg import LinAlgError
+import numpy as np
 
 from kkl_gym.simulate import SubstepsError, check_duration, check_interval
 from kkl_gym.system import System
-from observers.checks import check_dt
-from training.diagnosis import equations, levels, motion, outputs
+from observers.checks import check_dt, noise_levels
+from training.diagnosis import outputs, system
 from training.diagnosis.finding import Finding, Verdict
-from training.diagnosis.records import observability, of_records
-from training.diagnosis.signals import Judgement, Observability
-from training.diagnosis.subject import Subject
+from training.diagnosis.records import Judgement, Observability, observability, of_records
+from training.diagnosis.system import Subject
 from training.evaluation.levels import Level
-from training.trajectories.controllers import Controller
+from training.trajectories.policies import Controller
 
 FIRST: dict[str, Callable[[System], Iterator[Finding]]] = {
-    "system": equations.declaration,
-    "starts": equations.starts,
-    "equations": equations.kinds_of_numbers,
+    "system": system.declaration,
+    "equations": system.equations,
 }
 THEN: dict[str, Callable[[Subject], Iterator[Finding]]] = {
-    "compiled": equations.machine_code,
-    "finite": equations.finite,
-    "inputs": equations.inputs,
-    "bounds": motion.bounds,
-    "rate": motion.rate,
-    "sampling": motion.sampling,
-    "output": levels.outputs,
-    "process noise": levels.process_noise,
+    "compiled": system.machine_code,
+    "inputs": system.inputs,
+    "bounds": system.bounds,
+    "sampling": system.sampling,
+    "output": system.outputs,
+    "spectrum": outputs.spectrum,
     "observability": outputs.observability,
 }
 
 
 def check(
-    system: System,
+    of: System,
     *,
     dt: float | None = None,
     duration: float | None = None,
@@ -44,15 +40,17 @@ def check(
 ) -> Iterator[Finding]:
     """Look for what would go wrong with a system in environments, training and evaluation."""
     for name, look in FIRST.items():
-        findings = list(_guarded(name, look, system))
+        findings = list(_guarded(name, look, of))
         yield from findings
         if any(finding.verdict == "problem" for finding in findings):
             yield Finding(name, "note", "all other checks are left out", "mend this first")
             return
-    interval, noise = system.dt if dt is None else check_dt(dt), outputs.noise_of(system, measurement_noise)
-    subject = Subject(system, interval, system.duration if duration is None else duration, policy, noise)
+    given = [of.measurement_noise] if measurement_noise is None else measurement_noise
+    noise = tuple(level for one in given if np.any(level := noise_levels("measurement_noise", one, of.ny)))
+    interval = of.dt if dt is None else check_dt(dt)
+    subject = Subject(of, interval, of.duration if duration is None else duration, policy, noise)
     try:
-        check_interval(system, interval)
+        check_interval(of, interval)
         check_duration(subject.duration, interval)
         for name, look_at in THEN.items():
             yield from _guarded(name, look_at, subject)
@@ -61,12 +59,12 @@ def check(
 
 
 def _guarded(name: str, look: Callable[[Any], Iterator[Finding]], at: System | Subject) -> Iterator[Finding]:
-    """What a check says, and what it raises as a problem."""
+    """The findings of a check, and its exception as a problem."""
     try:
         yield from look(at)
     except SubstepsError:
         raise
-    except (ValueError, ArithmeticError, LinAlgError) as error:
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         yield _problem(name, error)
 
 

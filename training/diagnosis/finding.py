@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from training.neighbours import RESOLUTION
+RESOLUTION = 1e-3  # to which a network reads z, in standard deviations: what is left where there is no noise
 
 Verdict = Literal["ok", "note", "problem"]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a check: what was looked at, and what to change."""
+    """One line of a check: what was found, and what to change."""
 
     check: str
     verdict: Verdict
@@ -32,3 +32,8 @@ def percent(share: float) -> str:
 def error(share: float) -> str:
     """An error in percent, as far as a network resolves it."""
     return percent(share) if share >= RESOLUTION else f"< {percent(RESOLUTION)}"
+
+
+def point(x: object) -> str:
+    """A state."""
+    return f"({', '.join(f'{value:.3g}' for value in x)})"  # type: ignore[attr-defined]

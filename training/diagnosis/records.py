@@ -10,18 +10,15 @@ from scipy.spatial import cKDTree
 
 from observers import LinearFilter
 from observers.checks import integer, noise_levels, shown
-from training.diagnosis.signals import DETERMINED, Observability
-from training.evaluation.levels import Level
-from training.filter_noise import noise_covariance, root
-from training.maps.coordinates import coordinates, settling_time, spread
-from training.neighbours import told
-from training.presets import recorded_preset
+from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
+from training.evaluation.levels import Level, show_level
+from training.maps.coordinates import coordinates, noise_covariance, root, settling_time, spread
 from training.progress import ProgressBars, progress_bars
 from training.records import Record, check_signals, pieces, resampled
 from training.rollouts import Policy, make, policy_of, roll_out
-from training.rollouts.policies import RANDOM
+from training.rollouts.playing import RANDOM
 from training.seeds import Stream, generator
-from training.sources.recorded import FEW, split
+from training.sources.recorded import FEW, recorded_preset, split
 from training.sources.windows import along, restarted, samples_as_old, taken
 from training.spectrum import Spectrum
 
@@ -32,6 +29,117 @@ FEWEST_ASKING = 50  # samples, for a judgement
 FEWEST_OTHERS = 5  # times the coordinates of z
 NOISE_SHARES = 0.01, 0.1  # of an output's standard deviation, where no level is named
 FALLS = 1.25  # error with half of the samples over that with all, beyond which more would tell more
+NEIGHBOURS = 32  # at least, or twice as many as z has coordinates, so that planes rest on enough of them
+ROUNDING = 1e-9  # of z, in a linear regression
+DETERMINED, UNDETERMINED = 0.05, 0.8  # of a signal's standard deviation: largest and least errors of these verdicts
+AS_GOOD = 1.1  # times the least error, up to which a window is as good as any
+SEEN = 0.1  # largest error of a signal's change, in the signal's own error, for it to be known up to a constant
+
+# By the first word of a signal's verdict.
+VERDICTS: dict[str, tuple[Verdict, str]] = {
+    "determined": ("ok", ""),
+    "up": ("note", "an observer follows it from a known start; measure a signal that depends on its value, too"),
+    "partly": ("note", "measure one more signal that depends on it, or live with what is left"),
+    "not": ("problem", "measure a signal that depends on it, or leave it out"),
+    "never": ("note", "leave it out"),
+}
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict on one hidden signal."""
+
+    signal: str
+    verdict: str
+    window: int | None
+    errors: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What outputs and inputs determine of hidden signals.
+
+    Errors are root mean squares in standard deviations of the signals.
+
+    Parameters
+    ----------
+    measured, inputs, hidden : tuple of str
+        Names of the signals.
+    dt : float
+        Seconds in a step.
+    windows : tuple of int, length m
+        Steps back that outputs and inputs are known; 0 is the output alone.
+    noise : tuple of (float or tuple of float), length k
+        Levels of measurement noise; the first is 0.
+    errors : ndarray, shape (k, m, nx)
+        That the best estimate leaves after so many steps.
+    changes : ndarray, shape (m, nx)
+        That it leaves of how much a signal has changed over the window, in standard deviations of that change, without
+        noise; NaN where nothing has, and over windows of which the filter forgets where they began.
+    warnings : tuple of str
+        What the data are too few for.
+    """
+
+    measured: tuple[str, ...]
+    inputs: tuple[str, ...]
+    hidden: tuple[str, ...]
+    dt: float
+    windows: tuple[int, ...]
+    noise: tuple[Level, ...]
+    errors: np.ndarray
+    changes: np.ndarray
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def judgements(self) -> tuple[Judgement, ...]:
+        """The verdict on each hidden signal."""
+        return tuple(map(self._judged, range(len(self.hidden))))
+
+    def findings(self) -> Iterator[Finding]:
+        """The same as lines of a check."""
+        known = " and ".join(", ".join(names) for names in (self.measured, self.inputs) if names)
+        yield Finding("signals", "ok", f"{', '.join(self.hidden)} from {known}, in steps of {self.dt:.3g} s")
+        for one in self.judgements:
+            verdict, advice = VERDICTS[one.verdict.split()[0]]
+            text = f"{one.signal}: {one.verdict}{self._since(one.window)}"
+            if not np.isnan(one.errors[0]):
+                left = [f"{error(each)} at noise {show_level(level)}" for level, each in zip(self.noise, one.errors)]
+                text += f"; error {', '.join(left)}"
+            yield Finding("observability", verdict, text, advice)
+        for warning in self.warnings:
+            found, _, advice = warning.partition("; ")
+            yield Finding("data", "note", found, advice)
+
+    def csv(self) -> str:
+        """Errors by signal, level of noise and window, as the text of a file."""
+        lines = ["signal,measurement_noise,steps,seconds,error"]
+        for (k, m, i), left in np.ndenumerate(self.errors):
+            level, window = show_level(self.noise[k]).replace(", ", " "), self.windows[m]
+            lines.append(f"{self.hidden[i]},{level},{window},{window * self.dt:.6g},{left:.6g}")
+        return "\n".join(lines) + "\n"
+
+    def _judged(self, i: int) -> Judgement:
+        errors, exact = tuple(self.errors[:, :, i].min(1).tolist()), self.errors[0, :, i]
+        changes = self.changes[~np.isnan(self.changes[:, i]), i]
+        least, good = errors[0], exact <= max(DETERMINED, AS_GOOD * exact.min())
+        if np.isnan(least):
+            verdict = "never moves"
+        elif least <= DETERMINED:
+            verdict = "determined"
+        elif len(changes) and changes[-1] <= min(DETERMINED, SEEN * least):
+            verdict, good = "up to a constant", self.changes[:, i] <= DETERMINED
+        elif least < UNDETERMINED:
+            verdict = f"partly ({100 * least:.2g} % left)"
+        else:
+            verdict = "not determined"
+        window = None if verdict[:2] in ("ne", "no") else self.windows[int(good.argmax())]
+        return Judgement(self.hidden[i], verdict, window, errors)
+
+    def _since(self, window: int | None) -> str:
+        if window is None:
+            return ""
+        steps = f"{window} step{'s' * (window > 1)} ({window * self.dt:.3g} s)"
+        return f" from {steps} of y" if window else " from y alone"
 
 
 def observability(
@@ -72,7 +180,7 @@ def observability(
     Returns
     -------
     Observability
-        What was found; ``judgements`` says it in words.
+        What was found; ``judgements`` has it in words.
 
     Raises
     ------
@@ -107,8 +215,8 @@ def of_records(
     """Find what recorded outputs and inputs tell of recorded states.
 
     The filter that a training on the records would take is switched on at any sample. So many steps later its state z
-    is compared with that of like samples in other records (:mod:`training.neighbours`). Noise is added to z with the
-    covariance that it has there, and coordinates of z count as far as they are signal.
+    is compared with that of like samples in other records. Noise is added to z with the covariance that it has there,
+    and coordinates of z count as far as they are signal.
     """
     integer("seed", seed, 0)
     check_signals(records)
@@ -159,6 +267,28 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
         raise ValueError(f"measurement_noise must be a list of levels, as in [0.1, 0.3], got {shown(given)}")
     levels = [noise_levels("measurement_noise", level, y.shape[1]) for level in given]
     return tuple(dict.fromkeys([0.0, *levels]))
+
+
+def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows: Sequence[int]) -> Iterator[str]:
+    """Warnings of too few data; ``halves`` (windows, nx) are the errors with half of the samples."""
+    if records < FEW:
+        yield (
+            f"there are fewer than {FEW} records: samples are compared with others of the same, and what is constant "
+            "in a record looks as if it were determined; record more"
+        )
+    if len(found.windows) < len(windows):
+        yield (
+            f"windows of {windows[len(found.windows)]} steps and more are left out, as too few samples have so many "
+            "before them; record longer episodes, or more"
+        )
+    for i, name in enumerate(found.hidden):
+        exact = found.errors[0, :, i]
+        best = int(exact.argmin())
+        if exact[best] > DETERMINED and halves[best, i] > FALLS * exact[best]:
+            yield (
+                f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * halves[best, i]:.2g} % with "
+                "half of them; record more, with which it will be less"
+            )
 
 
 class Filtered:
@@ -222,33 +352,41 @@ def compare(
         R = root(own).T
         z, others_z = (share * scaled(each.z + rng.standard_normal(each.z.shape) @ R) for each in (asking, others))
         if np.any(level):
-            levels.append(told(z, asking.x, others_z=others_z, others_x=others.x).left)
+            levels.append(left_by(z, asking.x, others_z, others.x))
             continue
         of_both, of_others = (np.hstack([each.x, each.change]) for each in (asking, others))
-        both = told(z, of_both, others_z=others_z, others_x=of_others).left
-        left, change = np.split(both, 2)
+        left, change = np.split(left_by(z, of_both, others_z, of_others), 2)
         levels.append(left)
-        half = told(z, asking.x, others_z=others_z[::2], others_x=others.x[::2]).left
+        half = left_by(z, asking.x, others_z[::2], others.x[::2])
     return Compared(levels, change, half)
 
 
-def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows: Sequence[int]) -> Iterator[str]:
-    """What is to be said of the data; ``halves`` (windows, nx) are the errors to who has half of them."""
-    if records < FEW:
-        yield (
-            f"there are fewer than {FEW} records: samples are compared with others of the same, and what is constant "
-            "in a record looks as if it were told; record more"
-        )
-    if len(found.windows) < len(windows):
-        yield (
-            f"windows of {windows[len(found.windows)]} steps and more are left out, as too few samples have so many "
-            "before them; record longer episodes, or more"
-        )
-    for i, name in enumerate(found.hidden):
-        exact = found.errors[0, :, i]
-        best = int(exact.argmin())
-        if exact[best] > DETERMINED and halves[best, i] > FALLS * exact[best]:
-            yield (
-                f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * halves[best, i]:.2g} % with "
-                "half of them; record more, with which it will be less"
-            )
+def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.ndarray) -> np.ndarray:
+    """Errors (nx,) that z leaves of x, in standard deviations, from samples of both and of others.
+
+    The nearest others of each sample are weighed so that their z, weighted, is its own: a plane through them. Their x,
+    weighted, is then off by what z does not determine, of the sample itself and of the others, and by how far x bends
+    between them, which falls with the square of their distance. The first part is divided by 1 + the sum of squared
+    weights, as which it counts the variance; it is left where neighbours come as close as one likes. With one neighbour
+    of weight 1 that is the Delta test.
+
+    Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
+    """
+    deviation = np.where(np.ptp(x, 0) > 0, x.std(0), np.nan)
+    design = np.column_stack([np.ones(len(others_z)), others_z])
+    gram = design.T @ design + ROUNDING * len(design) * np.eye(len(design.T))
+    coefficients = np.linalg.solve(gram, design.T @ others_x)
+    others_x = others_x - design @ coefficients  # only what is bent need be found from neighbours
+    x = x - np.column_stack([np.ones(len(z)), z]) @ coefficients
+    linear: np.ndarray = np.sqrt((x**2).mean(0)) / deviation
+    n, modes = z.shape
+    if not modes:
+        return linear
+    k = min(len(others_z), max(NEIGHBOURS, 2 * (modes + 1)))
+    near = cKDTree(others_z).query(z, k=k)[1]
+    apart = others_z[near] - z[:, None]
+    # The smallest weights with the sum 1 for which neighbours cancel to RESOLUTION.
+    weights = np.linalg.solve(apart @ apart.mT + RESOLUTION**2 * modes * np.eye(k), np.ones((n, k, 1)))[..., 0]
+    weights /= weights.sum(1, keepdims=True)
+    squared = (np.einsum("nk,nkj->nj", weights, others_x[near]) - x) ** 2 / (1 + (weights**2).sum(1))[:, None]
+    return np.minimum(np.sqrt(squared.mean(0)) / deviation, linear)

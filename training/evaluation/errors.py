@@ -1,6 +1,6 @@
 """Estimation errors of an observer on trajectories that its training never saw."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -13,10 +13,8 @@ from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.seeds import Stream, generator
-from training.trajectories.controllers import Controller
-from training.trajectories.noise import draw_process_noise, noisy_output
-from training.trajectories.policy import under_policy
-from training.trajectories.signals import random_inputs
+from training.trajectories.motions import draw_process_noise, noisy_output, random_inputs, under_policy
+from training.trajectories.policies import Controller
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
 
@@ -46,6 +44,7 @@ class UnseenTrajectories:
     x: np.ndarray
     u: np.ndarray
     inside: np.ndarray
+    dt: float
     process_noise: float = 0.0
     plant: System | None = None
 
@@ -53,14 +52,6 @@ class UnseenTrajectories:
     def escaped(self) -> int:
         """Number of trajectories that left the bounds."""
         return int((~self.inside).sum())
-
-    def first(self, n: int) -> "UnseenTrajectories":
-        """Take the first of those drawn.
-
-        Drawn alone they might differ: rounding depends on the batch, and chaos on rounding.
-        """
-        inside = self.inside[:n]
-        return replace(self, x=self.x[:, : inside.sum()], u=self.u[:, : inside.sum()], inside=inside)
 
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -121,7 +112,7 @@ def unseen_trajectories(
     process_noise : float
         Level of the process noise, in multiples of the system's scale per second.
     policy : callable, optional
-        Acts on the system, see :func:`training.trajectories.policy.under_policy`; by default nothing does.
+        Acts on the system, see :func:`training.trajectories.motions.under_policy`; by default nothing does.
     plant : System, optional
         What moves in the place of the system, such as the same with other parameters
         (:meth:`kkl_gym.System.replace`, :func:`training.evaluation.plants.off_by`).
@@ -163,11 +154,11 @@ def unseen_trajectories(
     else:
         x = simulate(moving, x0, steps, dt, u=u if driven else None, w=w)
     inside = np.isfinite(x[-1]).all(-1)
-    return UnseenTrajectories(x[:, inside], u[:, inside], inside, process_noise, plant)
+    return UnseenTrajectories(x[:, inside], u[:, inside], inside, dt, process_noise, plant)
 
 
 def errors(
-    artifact: Artifact,
+    artifact: Artifact | None,
     system: System,
     trajectories: UnseenTrajectories,
     *,
@@ -175,12 +166,13 @@ def errors(
     seed: int,
     skip: float | None = None,
 ) -> Errors:
-    """Errors of an observer on test trajectories. It is told the levels of noise, and nothing of another plant.
+    """Errors of an observer on test trajectories. It is given the levels of noise, and nothing of another plant.
 
     Parameters
     ----------
-    artifact : Artifact
-        The observer.
+    artifact : Artifact or None
+        The observer; None for an extended Kalman filter that knows the system's equations, the inputs, both levels of
+        noise, and that starts are uniform in X.
     system : System
         What it was made for.
     trajectories : UnseenTrajectories
@@ -200,66 +192,50 @@ def errors(
     Raises
     ------
     ValueError
-        If the level of noise is none, or beyond the map's range.
+        If the level of noise is invalid, or beyond the map's range.
     """
     x_hat = estimates(artifact, system, trajectories, measurement_noise=measurement_noise, seed=seed)
-    return _errors(trajectories, x_hat, artifact.filter.dt, skip)
+    x = trajectories.x
+    first = round(TRANSIENT * len(x)) if skip is None else round(skip / trajectories.dt)
+    return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first), trajectories.escaped)
 
 
 def estimates(
-    artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
+    artifact: Artifact | None, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """What an observer makes of test trajectories, (steps + 1, n, nx): its errors are what :func:`errors` measures."""
+    """Estimates along test trajectories, (steps + 1, n, nx), whose errors :func:`errors` measures."""
+    observer = observer_of(artifact, system, trajectories, measurement_noise)
+    return follow(observer, measured(system, trajectories, measurement_noise, seed), trajectories.u)[0]
+
+
+def observer_of(
+    artifact: Artifact | None, system: System, trajectories: UnseenTrajectories, measurement_noise: Level
+) -> KKLObserver | ExtendedKalmanFilter:
+    """An observer that is given both levels of noise; without an artifact a Kalman filter, as in :func:`errors`."""
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
-    observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
-    y = measured(system, trajectories, level, seed)
-    return observer.estimate(y, trajectories.u if artifact.nu else None)
+    if artifact is not None:
+        return KKLObserver(artifact, level, process_noise=trajectories.process_noise)
+    Q = process_intensity(system, trajectories.process_noise, trajectories.dt)
+    return ExtendedKalmanFilter(system, trajectories.dt, Q=Q, R=measurement_covariance(system, level))
 
 
-def kalman_errors(
-    system: System,
-    trajectories: UnseenTrajectories,
-    dt: float,
-    *,
-    measurement_noise: Level,
-    seed: int,
-    skip: float | None = None,
-) -> Errors:
-    """Errors of an extended Kalman filter on the trajectories and the noise that :func:`errors` takes.
-
-    It knows the system's equations, the inputs and both levels of noise, and that starts are uniform in X.
-    """
-    x_hat = kalman_estimates(system, trajectories, dt, measurement_noise=measurement_noise, seed=seed)
-    return _errors(trajectories, x_hat, dt, skip)
+def follow(
+    observer: KKLObserver | ExtendedKalmanFilter, y: np.ndarray, u: np.ndarray, *, covariances: bool = False
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Estimates along records (steps + 1, n, nx), and their covariances if these are asked for."""
+    if isinstance(observer, KKLObserver):
+        inputs = u if observer.artifact.nu else None
+        return observer.estimate(y, inputs), observer.estimate_covariance(y, inputs) if covariances else None
+    state, found = observer.start(y.shape[1]), []
+    for k in range(len(y)):
+        state = observer.advance(state, y[k], u[k - 1])  # which ignores the input before the first sample
+        found.append((state.x, state.P) if covariances else (state.x,))
+    x_hat, *beside = map(np.array, zip(*found, strict=True))
+    return x_hat, beside[0] if covariances else None
 
 
-def kalman_estimates(
-    system: System, trajectories: UnseenTrajectories, dt: float, *, measurement_noise: Level, seed: int
-) -> np.ndarray:
-    """What the filter of :func:`kalman_errors` makes of test trajectories, (steps + 1, n, nx)."""
+def measured(system: System, trajectories: UnseenTrajectories, measurement_noise: Level, seed: int) -> np.ndarray:
+    """Outputs of trajectories with noise, (steps + 1, n, ny)."""
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
-    y = measured(system, trajectories, level, seed)
-    kalman = kalman_filter(system, dt, trajectories.process_noise, level)
-    x_hat = np.empty_like(trajectories.x)
-    x_hat[0] = kalman.reset(y[0])
-    for k in range(1, len(y)):
-        x_hat[k] = kalman.step(y[k], trajectories.u[k - 1])
-    return x_hat
-
-
-def kalman_filter(system: System, dt: float, process_noise: float, measurement_noise: Level) -> ExtendedKalmanFilter:
-    """An extended Kalman filter that knows both levels of noise, and assumes a little process noise at least."""
-    Q = process_intensity(system, process_noise, dt)
-    return ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, measurement_noise))
-
-
-def measured(system: System, trajectories: UnseenTrajectories, level: Level, seed: int) -> np.ndarray:
-    """Measure trajectories. Shapes: returns (steps + 1, n, ny)."""
     rng = generator(Stream.EVALUATION, seed, 1)
     return noisy_output(trajectories.plant or system, trajectories.x, measurement_noise=level, rng=rng)
-
-
-def _errors(trajectories: UnseenTrajectories, x_hat: np.ndarray, dt: float, skip: float | None) -> Errors:
-    x = trajectories.x
-    first = round(TRANSIENT * len(x)) if skip is None else round(skip / dt)
-    return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first), trajectories.escaped)

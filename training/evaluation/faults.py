@@ -12,7 +12,7 @@ from training.evaluation.levels import Level
 from training.seeds import Stream, generator
 from training.sources.simulated import sound_motions
 from training.systems import profile
-from training.trajectories.controllers import Controller
+from training.trajectories.policies import Controller
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)

@@ -45,7 +45,7 @@ def multiple(system: System, factor: float) -> Level:
 def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
     """Return the level of measurement noise that is asked for; by default the system's own, as far as a map knows it.
 
-    A map that is told one level for all outputs gets the largest of those that are the system's own.
+    A map that takes one level for all outputs gets the largest of those that are the system's own.
     """
     if given is not None:
         return noise_levels("measurement_noise", given, system.ny)
@@ -57,7 +57,7 @@ def level_for(artifact: Artifact, system: System, given: Level | None = None) ->
 
 
 def beyond(artifact: Artifact, level: Level) -> str:
-    """Say why a map cannot be told a level of measurement noise."""
+    """Why a level of measurement noise is invalid for a map; empty if it is not."""
     try:
         if artifact.inverse.within(level) == level:
             return ""

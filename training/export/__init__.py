@@ -1,8 +1,7 @@
-"""An observer's step for programs without Python: as an ONNX graph, as C99, and for JavaScript.
+"""An observer's step outside NumPy: as a module of Torch, which exports to ONNX, and as C99.
 
-All are of :class:`Exported`, and hold what :meth:`observers.KKLObserver.reset` and :meth:`observers.KKLObserver.step`
-do with samples that are all there. What fills gaps is in JavaScript and, of observers that track, everywhere. The
-monitor and calibrated covariances are in JavaScript alone.
+Both hold what :meth:`observers.KKLObserver.reset` and :meth:`observers.KKLObserver.step` do, but for known starts and
+the monitor. Gaps are filled in C only by observers that track.
 """
 
 from training.export.exported import PRECISIONS, Exported

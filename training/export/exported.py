@@ -18,8 +18,7 @@ from observers.inverse import InverseMap
 from observers.motion import Motion
 from observers.names import resolve
 from observers.storage import checksum
-from observers.supervision import INFLATION, Supervision
-from observers.tracker_kernel import RELINEARISATIONS
+from observers.supervision import INFLATION, RELINEARISATIONS, Supervision
 from observers.unscented import Points
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
@@ -54,7 +53,7 @@ class Exported:
         text, path = os.fspath(name_or_path), resolve(name_or_path)
         artifact = Artifact.read(path)
         observer = KKLObserver(artifact, measurement_noise, process_noise=process_noise)
-        exported = cls(
+        return cls(
             artifact,
             name=identifier(path.stem if text.endswith(path.suffix) else text),
             source=path.name,
@@ -63,20 +62,6 @@ class Exported:
             measurement_noise=observer.measurement_noise,
             process_noise=observer.process_noise,
         )
-        if precision == "float":
-            exported._check_range()
-        return exported
-
-    def _check_range(self) -> None:
-        motion, scales = self.artifact.motion, [(each.x_offset, each.x_scale) for each in self.maps.values()]
-        if motion is not None:
-            scales.append((motion.x_offset, motion.x_scale))
-        largest = float(np.abs(np.concatenate(scales, axis=None)).max())
-        if largest > float(np.finfo(np.float32).max):
-            raise ArtifactError(
-                f"the scale of the estimates of {self.source}, {largest:g}, is beyond the range of floats: export it "
-                "with --precision double"
-            )
 
     @property
     def maps(self) -> dict[str, InverseMap]:
@@ -109,25 +94,22 @@ class Exported:
     @property
     def estimates(self) -> list[str]:
         """Names of what is estimated: states, then parameters."""
-        artifact = self.artifact
-        if artifact.signals is not None:
-            states = list(artifact.signals["hidden"])
-        else:
-            system = SYSTEMS.get(artifact.system)
-            states = list(system.state_names) if system else _numbered("x", artifact.nx)
-        return [*states, *artifact.estimated_parameters]
+        artifact, system = self.artifact, SYSTEMS.get(self.artifact.system)
+        states = list(system.state_names) if system else _numbered("x", artifact.nx)
+        return [*self._signals("hidden", states), *artifact.estimated_parameters]
 
     @property
     def outputs(self) -> list[str]:
         """Names of the measured outputs."""
-        signals = self.artifact.signals
-        return _numbered("y", self.artifact.ny) if signals is None else list(signals["measured"])
+        return self._signals("measured", _numbered("y", self.artifact.ny))
 
     @property
     def inputs(self) -> list[str]:
         """Names of the known inputs."""
-        signals = self.artifact.signals
-        return _numbered("u", self.artifact.nu) if signals is None else list(signals["inputs"])
+        return self._signals("inputs", _numbered("u", self.artifact.nu))
+
+    def _signals(self, role: str, others: list[str]) -> list[str]:
+        return others if self.artifact.signals is None else list(self.artifact.signals[role])
 
     @property
     def described(self) -> dict[str, Any]:
@@ -176,19 +158,6 @@ def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}
     return scaling | {"low": low, "high": high, "start_mean": mean, "start_covariance": covariance}
-
-
-def table(inverse: InverseMap, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T_inv's covariance in units of ``scale`` (nx,), by level (k,) and age (m,), two of each at least."""
-    error = inverse.error_covariance
-    assert error is not None
-    covariance = error.covariance / np.outer(scale, scale)
-    levels, ages = error.levels, error.ages
-    if len(levels) == 1:
-        levels, covariance = np.array([0.0, 1.0]), np.repeat(covariance, 2, 0)
-    if len(ages) == 1:
-        ages, covariance = np.array([0.0, 1.0]), np.repeat(covariance, 2, 1)
-    return levels, ages, covariance
 
 
 def identifier(name: str) -> str:

@@ -1,7 +1,7 @@
 """The lesson of calibration: covariances and limits of a monitor, from one pass of motions nothing was trained on."""
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,9 +9,10 @@ from scipy.special import gammaincinv
 
 from kkl_gym.system import System
 from observers import Artifact, ErrorCovariance, Factors, InverseMap, Limits, Motion
+from observers.decoder import Decoders
 from observers.factors import COVERAGE
+from observers.tracker import Tracker
 from training.config import settings_of
-from training.lessons.together import Together, decoders
 from training.progress import ProgressBars, progress_bars
 from training.sources.simulated import SimulatedSource
 from training.sources.source import Runs, Source, TooFewRunsError
@@ -78,110 +79,89 @@ def calibrate(
     with progress_bars(console) as progress:
         with progress.phase("motions for calibration") as report:
             runs = source.runs(report=report)
-        return _Calibration(artifact, motion or artifact.motion, source, runs, false_alarms, progress).calibrated()
+        return _Calibration(artifact, motion or artifact.motion, source, runs, false_alarms).calibrated(progress)
 
 
-@dataclass
 class _Calibration:
-    artifact: Artifact
-    motion: Motion | None
-    source: Source
-    runs: Runs
-    false_alarms: float
-    progress: ProgressBars
+    """All levels of noise at once: rows are runs at the first level, the same runs at the second, and so on."""
 
-    def __post_init__(self) -> None:
-        artifact, steps = self.artifact, len(self.runs.u)
-        dt = artifact.filter.dt
-        knots = {round(age * self.source.pace / dt) for age in AGES}
-        last = max(1, min(4 * steps // 5, round(AGES[-1] * self.source.pace / dt)))
-        self.knots = np.array(sorted({k for k in knots if k < last} | {last}))
-        between = np.sqrt(self.knots[1:] * np.maximum(self.knots[:-1], 0.5))
-        edges = [0.0, *between.tolist(), float(steps)]
-        counts = [PER_AGE] * len(between) + [4 * PER_AGE]
-        spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts, strict=False))
-        self.spans = [np.unique(span.round()).astype(int) for span in spans]
+    def __init__(
+        self, artifact: Artifact, motion: Motion | None, source: Source, runs: Runs, false_alarms: float
+    ) -> None:
+        self.artifact, self.motion, self.source, self.runs = artifact, motion, source, runs
+        self.false_alarms, self.dt = false_alarms, artifact.filter.dt
+        self.knots, self.spans = _knots(len(runs.u), source.pace / self.dt)
         self.ages = np.unique(np.concatenate(self.spans))
         self.informed = "measurement_noise" in artifact.inverse.features
-        largest = (artifact.inverse if self.informed else self.source.config).measurement_noise_max
+        largest = (artifact.inverse if self.informed else source.config).measurement_noise_max
         self.levels = np.multiply.outer(LEVELS, largest)
-        self.noisy = self.runs.process_noise > 0
-        rng = np.random.default_rng(0)
-        shape = (len(LEVELS), *self.runs.y.shape)
-        self.y = self.runs.y + self.levels.reshape(len(LEVELS), 1, 1, -1) * rng.standard_normal(shape)
+        count, noise = len(LEVELS), np.random.default_rng(0).standard_normal((len(LEVELS), *runs.y.shape))
+        y = runs.y + self.levels.reshape(count, 1, 1, -1) * noise
+        self.x, self.u = (np.tile(values, (1, count, 1)) for values in (runs.x, runs.u))
+        self.y = np.moveaxis(y, 0, 1).reshape(len(y[0]), -1, y.shape[-1])
+        process, kind = np.unique(runs.process_noise, return_inverse=True)
+        self.groups = [(_as_level(level), float(each)) for level in self.levels for each in process]
+        self.owner = np.add.outer(len(process) * np.arange(count), kind.ravel()).ravel()
+        self.noisy = runs.process_noise > 0
 
-    def calibrated(self) -> Artifact:
-        artifact = dataclasses.replace(self.artifact, motion=None, limits=None)
+    def calibrated(self, progress: ProgressBars) -> Artifact:
+        """The artifact with all tables."""
+        replace = dataclasses.replace
+        artifact = replace(self.artifact, motion=None, limits=None)
         monitored = artifact.knows_output and self.runs.sound
         if self.informed:
             artifact = self.with_covariances(artifact)
             if self.motion is not None:  # factors are of P as the filter has it
-                artifact = dataclasses.replace(
-                    artifact, motion=dataclasses.replace(self.motion, factors=Factors.ones())
-                )
+                artifact = replace(artifact, motion=replace(self.motion, factors=Factors.ones()))
         if artifact.motion is None and not monitored:
             return artifact
-        with self.progress.phase("calibrating", len(self.runs.y)) as report:
+        with progress.phase("calibrating", len(self.y)) as report:
             distances, extremes = self.followed(artifact, report)
         if artifact.motion is not None:
             groups = (~self.noisy, self.noisy) if self.noisy.any() else (~self.noisy,)
             usual = self.runs.usual
             factors = [[self.by_knot(each, usual & group, self.factor) for each in distances] for group in groups]
-            table = Factors(np.array(LEVELS), self.knots * artifact.filter.dt, np.array(factors))
-            artifact = dataclasses.replace(artifact, motion=dataclasses.replace(artifact.motion, factors=table))
-        return dataclasses.replace(artifact, limits=self.limits(extremes)) if monitored else artifact
+            table = Factors(np.array(LEVELS), self.knots * self.dt, np.array(factors))
+            artifact = replace(artifact, motion=replace(artifact.motion, factors=table))
+        return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
 
-    def groups(self) -> list[tuple[int, np.ndarray, Any, float]]:
-        """For each level, and for runs with and without process noise: its index, their rows, and both levels."""
-        parts = [np.flatnonzero(group) for group in (~self.noisy, self.noisy) if group.any()]
-        return [
-            (i, rows, _as_level(level), float(self.runs.process_noise[rows[0]]))
-            for i, level in enumerate(self.levels)
-            for rows in parts
-        ]
+    def by_level(self, values: np.ndarray) -> np.ndarray:
+        """Values (m, rows, ...) as (levels, m, n, ...)."""
+        return np.moveaxis(values.reshape(len(values), len(LEVELS), -1, *values.shape[2:]), 1, 0)
 
     def with_covariances(self, artifact: Artifact) -> Artifact:
         """The covariance of T_inv's errors by level and age, of each map."""
-        linear, free, seconds = artifact.filter, artifact.free_inverse is not None, self.ages * artifact.filter.dt
-        x = self.runs.x[self.ages]
-        known = np.isfinite(x).all(-1)
-        least = np.diag(LEAST_VARIANCE * np.ptp(x[known], axis=0) ** 2 + np.finfo(float).tiny)
-        error = np.full((len(LEVELS), *x.shape), np.nan)
-        for i, rows, level, process_noise in self.groups():
-            z = linear.run(self.y[i][:, rows], self.runs.u[:, rows], self.ages)
-            error[i][:, rows] = x[:, rows] - decoders(artifact, level, process_noise)(z, seconds[:, None])
+        linear, seconds, x = artifact.filter, self.ages * self.dt, self.x[self.ages]
+        x_hat = Rows(artifact, self.groups, self.owner).decode(linear.run(self.y, self.u, self.ages), seconds[:, None])
+        errors, known = self.by_level(x - x_hat), np.isfinite(self.runs.x[self.ages]).all(-1)
+        least = np.diag(LEAST_VARIANCE * np.ptp(self.runs.x[self.ages][known], axis=0) ** 2 + np.finfo(float).tiny)
         moved = np.zeros(known.shape, dtype=bool)
         acted = np.maximum.accumulate((self.runs.u != 0).any(-1), axis=0)
         moved[self.ages > 0] = acted[self.ages[self.ages > 0] - 1]
-        driven = known & moved if free else known
 
         def with_table(inverse: InverseMap, group: np.ndarray) -> InverseMap:
-            table = [self.by_knot(each, group, lambda e: _covariance(e, least)) for each in error]
-            covariance = ErrorCovariance(np.array(LEVELS), self.knots * linear.dt, np.array(table))
+            table = [self.by_knot(each, group, lambda e: _covariance(e, least)) for each in errors]
+            covariance = ErrorCovariance(np.array(LEVELS), self.knots * self.dt, np.array(table))
             return dataclasses.replace(inverse, error_covariance=covariance)
 
+        if artifact.free_inverse is None:
+            return dataclasses.replace(artifact, inverse=with_table(artifact.inverse, known))
         return dataclasses.replace(
             artifact,
-            inverse=with_table(artifact.inverse, driven),
-            free_inverse=with_table(artifact.free_inverse, known & ~moved) if artifact.free_inverse else None,
+            inverse=with_table(artifact.inverse, known & moved),
+            free_inverse=with_table(artifact.free_inverse, known & ~moved),
         )
 
     def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, list[np.ndarray]]:
         """Squared distances (levels, ages, n) of a tracker's errors; extremes (levels, n, ny) of residuals' means."""
-        dt, groups = artifact.filter.dt, self.groups()
-        observers = Together(artifact, [(level, noise, len(rows)) for _, rows, level, noise in groups])
-        rows = [(i, rows) for i, rows, *_ in groups]
-        y = np.concatenate([self.y[i][:, each] for i, each in rows], axis=1)
-        u = np.concatenate([self.runs.u[:, each] for _, each in rows], axis=1)
-        x = np.concatenate([self.runs.x[:, each] for _, each in rows], axis=1)
-        share = -np.expm1(-dt / (WINDOW * self.source.pace))
-        first = round(WARM_UP * self.source.pace / dt)
+        observers, y, pace = Rows(artifact, self.groups, self.owner), self.y, self.source.pace
+        share, first = -np.expm1(-self.dt / (WINDOW * pace)), round(WARM_UP * pace / self.dt)
         mean, square = np.zeros_like(y[0]), np.zeros_like(y[0])
         largest, high, low = np.zeros_like(mean), np.zeros_like(mean), np.full_like(mean, np.inf)
-        found = np.full((len(self.ages), y.shape[1]), np.nan)
+        distances = np.full((len(self.ages), y.shape[1]), np.nan)
         slots = {int(age): i for i, age in enumerate(self.ages)}
         for k in range(len(y)):
-            x_hat = observers.reset(y[0]) if k == 0 else observers.step(y[k], u[k - 1])
+            x_hat = observers.reset(y[0]) if k == 0 else observers.step(y[k], self.u[k - 1])
             if artifact.knows_output:
                 residual = artifact.residual(y[k], x_hat)
                 mean += share * (residual - mean)
@@ -190,23 +170,13 @@ class _Calibration:
                     largest, high = np.maximum(largest, np.abs(mean)), np.maximum(high, square)
                     low = np.minimum(low, square)
             if artifact.motion is not None and k in slots:
-                found[slots[k]] = squared_distance(x[k] - x_hat, observers.covariance)
+                distances[slots[k]] = squared_distance(self.x[k] - x_hat, observers.covariance)
             if k % REPORTED == 0:
                 report(k)
-
-        def by_level(values: np.ndarray) -> np.ndarray:
-            """Of rows (..., rows of all levels) those of each level, (levels, ..., n)."""
-            out = np.full((len(LEVELS), *values.shape[:-1], self.runs.y.shape[1]), np.nan)
-            at = 0
-            for i, each in rows:
-                out[i][..., each] = values[..., at : at + len(each)]
-                at += len(each)
-            return out
-
-        return by_level(found), [np.moveaxis(by_level(each.T), 1, -1) for each in (largest, low, high)]
+        return self.by_level(distances), [self.by_level(each[None])[:, 0] for each in (largest, low, high)]
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
-        """What is found of the values (ages, n, ...) about each knot; where too few are there, of the next knot."""
+        """A function of the values (ages, n, ...) about each knot; where these are too few, that of the next knot."""
         known = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
         cells = [np.isin(self.ages, span)[:, None] & known for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
@@ -227,13 +197,100 @@ class _Calibration:
         mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))
         below = np.array([1 / (MARGIN * rare(1 / np.maximum(each, 1e-300), share)) for each in low])
         below[~self.levels.reshape(len(LEVELS), -1).any(-1)] = 0.0
-        pace, dt = self.source.pace, self.artifact.filter.dt
-        seconds = len(self.runs.u) * dt
+        pace, seconds = self.source.pace, len(self.u) * self.dt
         return Limits(self.levels, mean, below, above, WINDOW * pace, WARM_UP * pace, self.false_alarms, seconds)
 
 
+class Rows:
+    """An observer whose rows belong to groups, each with a level of measurement and of process noise of its own."""
+
+    def __init__(self, artifact: Artifact, groups: Sequence[tuple[Any, float]], owner: np.ndarray) -> None:
+        self._linear, self._nx, self._age, self._owner = artifact.filter, artifact.nx, 0, owner
+        self._decoders = [
+            Decoders(artifact, slice(artifact.nx), measurement_noise=level, process_noise=noise)
+            for level, noise in groups
+        ]
+        self._tracker = None if artifact.motion is None else _Stacked(artifact, groups, self._decoders, owner)
+
+    def reset(self, y: np.ndarray) -> np.ndarray:
+        """Begin. Shapes: ``y`` (n, ny); returns (n, nx)."""
+        self._z, self._y, self._age = self._linear.start(y), y, 0
+        if self._tracker is not None:
+            self._rows = self._tracker.begin(y)
+        return self._estimate()
+
+    def step(self, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Take in the next samples, all of them present. Shapes: ``u`` (n, nu); returns (n, nx)."""
+        if self._tracker is not None:
+            self._rows, _ = self._tracker.advance(self._rows, y, u)
+        self._z, self._y, self._age = self._linear.advance(self._z, self._y, u, y), y, self._age + 1
+        return self._estimate()
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """That of the tracker, (n, nx, nx)."""
+        assert self._tracker is not None
+        return self._tracker.covariance(self._rows, np.full(len(self._z), float(self._age)))
+
+    def decode(self, z: np.ndarray, age: Any) -> np.ndarray:
+        """T_inv of filter states (..., n, size) at ages in seconds, (..., n, nx)."""
+        x_hat = np.empty((*z.shape[:-1], self._nx))
+        for i, each in enumerate(self._decoders):
+            mine = self._owner == i
+            x_hat[..., mine, :] = each(z[..., mine, :], age)
+        return x_hat
+
+    def _estimate(self) -> np.ndarray:
+        if self._tracker is None:
+            return self.decode(self._z, self._age * self._linear.dt)
+        self._rows = self._tracker.supervise(self._rows, self._z, np.full(len(self._z), float(self._age)))
+        return self._rows[:, self._tracker.x]
+
+
+class _Stacked(Tracker):
+    """A tracker whose rows have levels of their own."""
+
+    def __init__(
+        self,
+        artifact: Artifact,
+        groups: Sequence[tuple[Any, float]],
+        decoders: Sequence[Decoders],
+        owner: np.ndarray,
+    ) -> None:
+        (level, noise), self._each, self._owner = groups[0], decoders, owner
+        super().__init__(artifact, decoders[0], measurement_noise=level, process_noise=noise)
+        q, r = zip(*(self.motion.variances(*group) for group in groups), strict=True)
+        q = [each * self.motion.x_scale**2 for each in q]
+        self._Q, self._R = (np.array([np.diag(one) for one in each])[owner] for each in (q, r))
+
+    def _map_estimates(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
+        return self._by_group(z, age, where, Decoders.__call__)
+
+    def _map_covariances(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
+        return self._by_group(z, age, where, Decoders.covariances)
+
+    def _by_group(self, z: np.ndarray, age: np.ndarray, where: np.ndarray, of: Any) -> np.ndarray:
+        owner = self._owner[where]
+        parts = {i: of(self._each[i], z[owner == i], age[owner == i]) for i in np.unique(owner)}
+        values = np.empty((len(z), *next(iter(parts.values())).shape[1:]))
+        for i, part in parts.items():
+            values[owner == i] = part
+        return values
+
+
+def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Ages in samples at which tables have entries, and for each of these those that are looked at about it."""
+    last = max(1, min(4 * steps // 5, round(AGES[-1] * pace)))
+    knots = np.array(sorted({k for k in (round(age * pace) for age in AGES) if k < last} | {last}))
+    between = np.sqrt(knots[1:] * np.maximum(knots[:-1], 0.5))
+    edges = [0.0, *between.tolist(), float(steps)]
+    counts = [PER_AGE] * len(between) + [4 * PER_AGE]
+    spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts, strict=False))
+    return knots, [np.unique(span.round()).astype(int) for span in spans]
+
+
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
-    """What a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
+    """Value that a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
 
     Median and 90 % quantile decide, not a few motions that are lost. It is at most ten times the largest extreme, for
     outputs that stand still in most motions. Shapes: ``extremes`` (n, ny); returns (ny,).

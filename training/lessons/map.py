@@ -10,20 +10,18 @@ import torch
 
 from kkl_gym.system import System
 from observers import Artifact, ForwardMap, InverseMap, LinearFilter
-from training.filter_noise import stationary_covariance
 from training.lessons.run import Run
+from training.maps.coordinates import StateScale
 from training.maps.forward import ForwardProblem, transients, truncation_step
-from training.maps.inverse import InverseProblem
+from training.maps.inverse import ClosedLoopSampler, ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
 from training.maps.networks import Network, averaged, on_torch
-from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
-from training.maps.scaling import StateScale
 from training.seeds import Stream, generator
 from training.sources.simulated import SimulatedSource
 from training.sources.source import Pairs, Source
 from training.spectrum import Spectrum
 from training.systems import named_policy
 from training.trajectories.closed_loop import record_closed_loop
-from training.trajectories.record import recording_ages
+from training.trajectories.motions import recording_ages
 
 CLOSED_LOOP_SECONDS = 20.0  # of each motion, at the pace of the shipped systems
 
@@ -120,9 +118,6 @@ class _MapLesson:
     def _along(self, pairs: Pairs, linear: LinearFilter, error: np.ndarray | None = None) -> TrajectorySampler:
         """Batches along motions; z may have an error of some covariance beside."""
         config = self.config
-        if config.untold_noise:
-            levels = config.untold_noise * np.broadcast_to(np.asarray(config.measurement_noise_max), linear.B.shape[1])
-            error = np.einsum("j,jab->ab", levels**2, stationary_covariance(linear))
         with self.run.progress.phase("preparing batches"):
             return TrajectorySampler(
                 pairs,

@@ -1,24 +1,35 @@
-"""What the lessons of a training share: its folder, progress, checkpoints, and how errors fell."""
+"""A training under way: its folder, progress and checkpoints, and one optimisation loop for every network."""
 
 import hashlib
 import json
 import math
+import operator
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+from rich.progress import Progress
 from torch import nn
 
-from training.config import Config
-from training.maps.optimise import Log, Stage, log_to, optimise
-from training.maps.step import Loss
+from observers.storage import naming
+from training import checkpoints
+from training.config import Config, Optimiser
 from training.progress import LOG, ProgressBars, progress_bars
+
+LOG_EVERY = 100
+WARM_UP = 0.01  # part of a stage in which the learning rate rises
+
+# A batch is drawn with the generator it is given and nothing else, so that a resumed run goes on as it would have.
+Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
+
+Log = Callable[[str, float, int], object]
+"""Takes the name of a scalar, its value and the number of the batch."""
 
 
 @dataclass
@@ -92,4 +103,215 @@ class Run:
         self.seconds[name] += time.process_time() - began
 
 
-__all__ = ["Run"]
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One optimisation within a run."""
+
+    name: str
+    steps: int
+    learning_rate: float
+    folder: Path
+    fingerprint: str
+    seed: int
+    cpu_seconds: float = math.inf
+    optimiser: Optimiser = "adam"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The file that keeps how far it has come."""
+        return self.folder / f"{self.name}{checkpoints.SUFFIX}"
+
+
+class _Course:
+    """How far a stage has come: batches done, CPU seconds spent, and the error by batch."""
+
+    def __init__(
+        self, stage: Stage, step: int = 0, seconds: float = 0.0, history: list[tuple[int, float]] | None = None
+    ) -> None:
+        self.stage, self.step, self.history = stage, step, history or []
+        self._spent, self._began = seconds, time.process_time()
+
+    @property
+    def seconds(self) -> float:
+        return self._spent + time.process_time() - self._began
+
+    @property
+    def part(self) -> float:
+        return max(self.step / self.stage.steps, min(1.0, self.seconds / self.stage.cpu_seconds))
+
+    @property
+    def learning_rate(self) -> float:
+        done = self.part
+        warm = min(1.0, (done + 1 / self.stage.steps) / WARM_UP)
+        return self.stage.learning_rate * (warm * 0.5 * (1.0 + math.cos(math.pi * done)))
+
+    @property
+    def over(self) -> bool:
+        return self.step >= self.stage.steps or self.seconds >= self.stage.cpu_seconds
+
+
+def optimise(
+    stage: Stage, module: nn.Module, loss: Loss, progress: Progress, *, log: Log | None = None, resume: bool
+) -> list[tuple[int, float]]:
+    """Minimise a loss over the parameters of a module, with checkpoints.
+
+    Every tensor in ``module.state_dict()`` is part of the checkpoint, buffers included.
+
+    On a GPU the batches of a ``capturable`` module replay one CUDA graph, with TF32 matrix products unless
+    NVIDIA_TF32_OVERRIDE=0. Data and initial weights of a seed are those on a CPU; batches are not, as the generators
+    differ, so that errors agree but for chance.
+    """
+    device = next(module.parameters()).device
+    generator = torch.Generator(device).manual_seed(stage.seed)
+    optimiser = _optimiser(stage, module)
+    parts = {"module": module, "optimiser": optimiser}
+    course = _restore(stage, parts, generator) if resume and stage.checkpoint.exists() else _Course(stage)
+    task = progress.add_task(stage.name, total=stage.steps, completed=course.step)
+    batch = Step(module, loss, optimiser, generator)
+    captured = device.type == "cuda" and getattr(module, "capturable", False)
+    run, saved_at, over = Captured(batch, generator) if captured else batch, time.monotonic(), course.over
+    while not over:
+        batch.set_learning_rate(course.learning_rate)
+        run()
+        if not batch.optimises:
+            optimiser.step()
+        course.step += 1
+        over = course.over
+        if course.step % LOG_EVERY and not over:
+            continue
+        mean = float(batch.total) / ((course.step - 1) % LOG_EVERY + 1)
+        if mean != mean:
+            raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {course.step}")
+        batch.total.zero_()
+        course.history.append((course.step, mean))
+        if log is not None:
+            for name, value in batch.terms.items():
+                log(f"{stage.name}/{name}", float(value), course.step)
+        total = round(course.step / course.part)  # that there will be by the time the clock ends it
+        progress.update(task, completed=course.step, total=total, description=f"{stage.name} (error {mean:.3g})")
+        if over or time.monotonic() - saved_at > checkpoints.SECONDS:
+            _save(course, parts, generator)
+            saved_at = time.monotonic()
+    return course.history
+
+
+def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
+    if stage.optimiser == "adam":
+        capturable = next(module.parameters()).is_cuda
+        return torch.optim.Adam(module.parameters(), lr=stage.learning_rate, capturable=capturable)
+    from pytorch_optimizer import SOAP
+
+    return SOAP(module.parameters(), lr=stage.learning_rate, weight_decay=0.0)
+
+
+@contextmanager
+def log_to(folder: Path) -> Iterator[Log | None]:
+    """TensorBoard scalars in a folder, where TensorBoard is installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        yield None
+        return
+    with naming(folder), SummaryWriter(folder) as writer:
+        yield writer.add_scalar
+
+
+def _save(course: _Course, parts: dict[str, Any], generator: torch.Generator) -> None:
+    state = {name: part.state_dict() for name, part in parts.items()} | {"generator": generator.get_state()}
+    state |= {"step": course.step, "seconds": course.seconds, "history": course.history}
+    checkpoints.save(course.stage.checkpoint, state, fingerprint=course.stage.fingerprint)
+
+
+def _restore(stage: Stage, parts: dict[str, Any], generator: torch.Generator) -> _Course:
+    found = checkpoints.load(stage.checkpoint, fingerprint=stage.fingerprint)
+    with checkpoints.restoring(stage.checkpoint):
+        for name, part in parts.items():
+            part.load_state_dict(found[name])
+        generator.set_state(found["generator"])
+        history = [(int(step), float(error)) for step, error in found["history"]]
+        return _Course(stage, operator.index(found["step"]), float(found["seconds"]), history)
+
+
+class Step:
+    """One batch: draw, loss, gradients, clipping, Adam's step and the sum of errors, in tensors that stay in place.
+
+    SOAP steps after it, because its eigenvectors cannot be part of a CUDA graph.
+    """
+
+    def __init__(
+        self, module: nn.Module, loss: Loss, optimiser: torch.optim.Optimizer, generator: torch.Generator
+    ) -> None:
+        self.module, self.loss, self.optimiser, self.generator = module, loss, optimiser, generator
+        self.optimises = isinstance(optimiser, torch.optim.Adam)
+        device = next(module.parameters()).device
+        self.total, self.terms = torch.zeros((), device=device), dict[str, torch.Tensor]()
+        if self.optimises and device.type == "cuda":  # a graph would keep a number as it was when captured
+            for group in optimiser.param_groups:
+                group["lr"] = torch.as_tensor(group["lr"], dtype=torch.float32, device=device)
+
+    def set_learning_rate(self, rate: float) -> None:
+        """For the batches that follow."""
+        for group in self.optimiser.param_groups:
+            if isinstance(group["lr"], torch.Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+
+    def __call__(self) -> None:
+        """Run it."""
+        terms = self.loss(self.generator)
+        self.optimiser.zero_grad(set_to_none=True)
+        terms["loss"].backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
+        if self.optimises:
+            self.optimiser.step()
+        self.total += terms.get("error", terms["loss"]).detach()
+        self.terms = {name: value.detach() for name, value in terms.items()}
+
+
+class Captured:
+    """A function of tensors that stay in place: its first calls run as they are, the others replay a CUDA graph."""
+
+    WARM_UP = 3  # calls in which the optimiser and torch's libraries allocate what they keep
+
+    def __init__(self, function: Callable[[], None], generator: torch.Generator) -> None:
+        self._function, self._generator, self._calls = function, generator, 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        """Run the function, or replay it."""
+        if self._calls < self.WARM_UP:
+            stream, current = torch.cuda.Stream(), torch.cuda.current_stream()  # type: ignore[no-untyped-call]
+            stream.wait_stream(current)
+            with _on_gpu(), torch.cuda.stream(stream):
+                self._function()
+            current.wait_stream(stream)
+        else:
+            self._graph = self._graph or self._captured()
+            self._graph.replay()
+        self._calls += 1
+
+    def _captured(self) -> torch.cuda.CUDAGraph:
+        graph = torch.cuda.CUDAGraph()
+        graph.register_generator_state(self._generator)
+        try:
+            with _on_gpu(), torch.cuda.graph(graph):
+                self._function()
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"a batch cannot be captured as a CUDA graph, as if f or h copied tensors to the host: {error}; train "
+                "with --device cpu"
+            ) from error
+        return graph
+
+
+@contextmanager
+def _on_gpu() -> Iterator[None]:
+    """TF32 matrix products, and functions uncompiled that the compiler fails on."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        with torch._dynamo.config.patch(suppress_errors=True):
+            yield
+    finally:
+        torch.set_float32_matmul_precision(before)

@@ -1,15 +1,20 @@
-"""Coordinates of the filter's state that a network can read."""
+"""What networks read and give: coordinates of z with the noise in them, and scaled states."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
+import scipy
 
 from observers import LinearFilter
+from training.config import Scaling
 
 # A mode of z whose variation is smaller than this part of the largest is left out: it holds rounding errors.
 SMALLEST_MODE = 1e-7
 STILL = 1e-12  # of a component's size: a standard deviation below it is rounding
 SETTLED = np.log(1e3)  # time constants after which a filter has forgotten its start to one part in a thousand
+LEAST = 0.1  # of the mean square of a scaled state, added to it: errors of smaller states are not taken relative
 
 
 @dataclass(frozen=True)
@@ -54,3 +59,77 @@ def spread(z: np.ndarray) -> np.ndarray:
 def settling_time(linear: LinearFilter) -> float:
     """Time in seconds after which the filter has forgotten its start to one part in a thousand."""
     return float(SETTLED / linear.slowest)
+
+
+def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
+    """Covariances (ages, ny, size, size) of z's error due to unit white noise on each output, by age in samples."""
+    phi = linear.transition
+    out = np.empty((len(ages), linear.B.shape[1], linear.size, linear.size))
+    for j, (early, late, equilibrium) in enumerate(_columns(linear)):
+        drive = phi @ late + early
+        after_first = phi @ equilibrium + early  # s_1 = after_first v_0
+        own = late @ late.T
+        covariance, at = after_first @ after_first.T, 1
+        for i, age in enumerate(ages):
+            if age == 0:
+                out[i, j] = equilibrium @ equilibrium.T
+                continue
+            for _ in range(int(age) - at):
+                covariance = phi @ covariance @ phi.T + drive @ drive.T
+            at = int(age)
+            out[i, j] = covariance + own
+    return out
+
+
+def stationary_covariance(linear: LinearFilter) -> np.ndarray:
+    """Limit of :func:`noise_covariance` at great ages, (ny, size, size)."""
+    phi = linear.transition
+    out = []
+    for early, late, _ in _columns(linear):
+        drive = phi @ late + early
+        out.append(scipy.linalg.solve_discrete_lyapunov(phi, drive @ drive.T) + late @ late.T)
+    return np.array(out)
+
+
+def _columns(linear: LinearFilter) -> Iterator[tuple[np.ndarray, ...]]:
+    """Each output's columns of early_y, late_y and equilibrium, each (size, 1)."""
+    for j in range(linear.B.shape[1]):
+        yield tuple(matrix[:, j : j + 1] for matrix in (linear.early_y, linear.late_y, linear.equilibrium))
+
+
+def root(covariance: np.ndarray) -> np.ndarray:
+    """Matrices R with R R^T = covariance, (..., size, size), also where rounding made small eigenvalues negative."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+@dataclass(frozen=True)
+class StateScale:
+    """Scaled states are (x - offset) / scale. Shapes: ``offset`` (nx,), ``scale`` (nx,)."""
+
+    offset: np.ndarray
+    scale: np.ndarray
+    relative: bool
+    nx: int | None = None
+
+    @classmethod
+    def of(cls, x: np.ndarray, scaling: Scaling, *, nx: int | None = None) -> Self:
+        """Find the scale of some states. Shapes: ``x`` (..., nx)."""
+        axes = tuple(range(x.ndim - 1))
+        if scaling == "relative":
+            offset, scale = x.mean(axes), x.std(axes)
+        else:
+            low, high = x.min(axes), x.max(axes)
+            offset, scale = (low + high) / 2, (high - low) / 2
+        moves = scale > STILL * np.abs(x).max(axes)
+        return cls(offset, np.where(moves, scale, 1.0), scaling == "relative", nx)
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Scale states (..., nx)."""
+        return np.asarray((x - self.offset) / self.scale)
+
+    def weight(self, x: np.ndarray) -> np.ndarray:
+        """Weights (...,) of the errors at states (..., nx)."""
+        if not self.relative:
+            return np.ones(x.shape[:-1])
+        return np.asarray(1.0 / (((x / self.scale)[..., : self.nx] ** 2).mean(-1) + LEAST))

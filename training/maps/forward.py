@@ -1,31 +1,47 @@
-"""The forward map T as a physics-informed network (paper, sec. 5)."""
+"""The forward map T as a physics-informed network (paper, sec. 5): its equation, its risk, its output layer."""
 
 import math
 from collections.abc import Callable
 
 import numpy as np
 import torch
+from scipy.linalg import qr, solve_triangular
 from torch import nn
 
-from kkl_gym.system import System
-from observers import ForwardMap, LinearFilter
-from training.maps.coordinates import spread
-from training.maps.least_squares import output_layer
-from training.maps.networks import Network, compiled, tensor
-from training.maps.pde import along, on_tensors, residual
-from training.maps.scaling import StateScale
+from kkl_gym.equations import components
+from kkl_gym.system import Components, System
+from observers import Artifact, ForwardMap, LinearFilter
+from training.maps.coordinates import StateScale, spread
+from training.maps.networks import Network, compiled, from_mlp, tensor
 
 SOLVED = 20_000  # pairs, and points, from which the output layer is solved for in the end
+RIDGE = 1e-5  # of the least squares for it, over the mean column of their matrix
+
+TensorMap = Callable[[torch.Tensor], torch.Tensor]
 
 
-def truncation_time(linear: LinearFilter, z0_norm: float, epsilon: float) -> float:
-    """Time t* after which at most epsilon is left of a start z0.
+def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
+    """A system's f or h, which take and give components, on states (n, nx), as (n, components)."""
+    values = components(equations, x.unbind(-1))
+    # A number becomes a tensor by a sum: a copy from the host would not be allowed in a CUDA graph.
+    return torch.stack([(x.new_zeros(len(x)) + value).to(x.dtype) for value in values], -1)
 
-    t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, where the logarithm's argument is
-    printed upside down).
-    """
-    poles, V = np.linalg.eig(linear.A)
-    return float(max(0.0, np.log(np.linalg.cond(V) * z0_norm / epsilon)) / np.abs(poles.real).min())
+
+def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Values of a network at x and their derivatives along f; by hand, as torch.compile has no forward mode."""
+    for layer in network:
+        if isinstance(layer, nn.Linear):
+            x, f = layer(x), f @ layer.weight.T
+        elif isinstance(layer, nn.Tanh):
+            x = torch.tanh(x)
+            f = (1 - x * x) * f
+        elif isinstance(layer, nn.SiLU):
+            gate = torch.sigmoid(x)
+            f = gate * (1 + x * (1 - gate)) * f
+            x = gate * x
+        else:
+            raise TypeError(f"no derivative of {type(layer).__name__} is implemented; use Linear, Tanh and SiLU layers")
+    return x, f
 
 
 class ForwardProblem(nn.Module):
@@ -89,7 +105,7 @@ class ForwardProblem(nn.Module):
         f, h = on_tensors(self.system.f, x) / self._xs, on_tensors(self.system.h, x)
         value, derivative = along(self.network, (x - self._xo) / self._xs, f)
         T, derivative = self._zo + self._zs * value, self._zs * derivative
-        return residual(T, derivative, h=h, A=self._A, B=self._B), f.norm(dim=-1)
+        return derivative - T @ self._A.T - h @ self._B.T, f.norm(dim=-1)
 
     @torch.no_grad()
     def solve_output_layer(self, rng: np.random.Generator, report: Callable[[int], object] = lambda done: None) -> None:
@@ -105,7 +121,7 @@ class ForwardProblem(nn.Module):
         device, x = self._x.device, self._points.cpu()[at].double()
         q, f = (x - self._xo.cpu()) / self._xs.cpu(), on_tensors(self.system.f, x) / self._xs.cpu()
         value, derivative = along(features, q, f)
-        weights = output_layer(
+        weights = _output_layer(
             self.linear,
             equation=(value.numpy(), derivative.numpy(), on_tensors(self.system.h, x).numpy()),
             speed=f.norm(dim=-1).numpy(),
@@ -127,11 +143,67 @@ class ForwardProblem(nn.Module):
         return ForwardMap(self.network.export(), self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
 
 
+def _output_layer(
+    linear: LinearFilter,
+    *,
+    equation: tuple[np.ndarray, np.ndarray, np.ndarray],
+    speed: np.ndarray,
+    pairs: tuple[np.ndarray, np.ndarray],
+    physics_weight: float,
+    report: Callable[[int], object],
+) -> np.ndarray:
+    """Solve for the weights with which fixed features phi make T(x) = W [phi(x), 1].
+
+    In the coordinates of A's eigenvectors, dT/dx f = A T + B h is one linear equation for each component of T: with
+    T_i = w . phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point. Pairs add T_i = z_i.
+    Both are solved in the mean square by a QR factorisation with a small ridge. As in :class:`ForwardProblem`, the
+    equation's rows are divided by the local speed plus the rate of the mode.
+
+    Shapes: ``equation`` (m, features), (m, features) and (m, ny), ``speed`` (m,), ``pairs`` (n, features) and (n, nz);
+    returns (nz, features + 1).
+    """
+    value, derivative, h = equation
+    phi, phi_along = np.column_stack([value, np.ones(len(value))]), np.column_stack([derivative, np.zeros(len(value))])
+    poles, V = np.linalg.eig(linear.A)
+    driven = np.linalg.solve(V, linear.B @ h.T).T
+    known = np.column_stack([pairs[0], np.ones(len(pairs[0]))]) / np.sqrt(len(pairs[0]))
+    target = np.linalg.solve(V, pairs[1].T).T / np.sqrt(len(pairs[0]))
+    solved = np.empty((len(poles), phi.shape[1]), dtype=V.dtype)
+    for i, pole in enumerate(poles):
+        report(i)
+        row = np.sqrt(physics_weight / len(phi)) / (speed + abs(pole))
+        matrix = np.vstack([(phi_along - pole * phi) * row[:, None], known])
+        ridge = RIDGE * np.linalg.norm(matrix) / np.sqrt(phi.shape[1]) * np.eye(phi.shape[1])
+        right = np.concatenate([driven[:, i] * row, target[:, i]])
+        Q, R = qr(np.vstack([matrix, ridge]), mode="economic", overwrite_a=True, check_finite=False)
+        solved[i] = solve_triangular(R, Q[: len(right)].conj().T @ right)
+    return np.real(V @ solved)
+
+
+def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
+    """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x): (n, nz)."""
+    T = artifact.forward
+    if T is None:
+        raise ValueError("this observer holds no forward map T")
+    at, scale, z_scale, A, B = map(torch.tensor, (x, T.x_scale, T.z_scale, artifact.filter.A, artifact.filter.B))
+    f, h = on_tensors(system.f, at), on_tensors(system.h, at)
+    network = from_mlp(T.mlp, dtype=torch.float64)
+    value, derivative = along(network, (at - torch.tensor(T.x_offset)) / scale, f / scale)
+    value, derivative = torch.tensor(T.z_offset) + z_scale * value, z_scale * derivative
+    P: np.ndarray = (derivative - value @ A.T - h @ B.T).numpy()
+    return P
+
+
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:
-    """First sample k* by which the filter has forgotten its start along every trajectory."""
+    """First sample k* by which at most epsilon is left of the filter's start along every trajectory.
+
+    t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, where the logarithm's argument is
+    printed upside down).
+    """
     x0 = system.draw_starts(np.random.default_rng(0), 10_000, box_factor)
     z0 = float(np.linalg.norm(linear.start(system.output(x0)), axis=-1).max())
-    t = truncation_time(linear, z0, epsilon)
+    poles, V = np.linalg.eig(linear.A)
+    t = max(0.0, np.log(np.linalg.cond(V) * z0 / epsilon)) / np.abs(poles.real).min()
     if t >= steps * linear.dt:
         raise ValueError(
             f"trajectories of {steps * linear.dt:g} s end before the filter has forgotten its start, t* = {t:.3g} s; "
@@ -141,7 +213,7 @@ def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon
 
 
 def transients(T: np.ndarray, z0: np.ndarray, *, linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
-    """What the filter holds along trajectories by T alone: z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)).
+    """Filter states along trajectories by T alone: z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)).
 
     For an exact T this is the filter's own state at every age, so that none needs to be simulated (paper, sec. 3).
 

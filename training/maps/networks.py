@@ -28,17 +28,6 @@ class Network(nn.Sequential):
             nn.init.xavier_normal_(layer.weight)
             nn.init.zeros_(layer.bias)
 
-    @classmethod
-    def of(cls, mlp: MLP) -> "Network":
-        """One that says what an exported one does, whose hidden layers are of one width."""
-        inputs, width, depth = mlp.inputs, len(mlp.biases[0]), len(mlp.weights) - 1
-        network = cls(inputs, mlp.outputs, width=width, depth=depth, activation=mlp.activation)
-        with torch.no_grad():
-            for layer, weight, bias in zip(network.linear_layers(), mlp.weights, mlp.biases, strict=True):
-                layer.weight.copy_(torch.tensor(weight))
-                layer.bias.copy_(torch.tensor(bias))
-        return network
-
     def linear_layers(self) -> list[nn.Linear]:
         """The layers that hold weights, in order."""
         return [layer for layer in self if isinstance(layer, nn.Linear)]

@@ -1,13 +1,21 @@
-"""Recorded data: files of samples, the columns that are asked of them, what is checked, and uniform grids."""
+"""Recorded data: files of samples and episodes, checks of them, and uniform grids."""
 
 from training.records.checks import check_dt, check_memory, check_signals
 from training.records.episodes import Episode, Rollouts
-from training.records.reading import read_records
-from training.records.record import Record
-from training.records.resampling import jitter, median_step, pieces, resampled, sampling_interval
-from training.records.signals import Signals
+from training.records.files import read_records
+from training.records.record import (
+    ROLES,
+    Record,
+    Signals,
+    jitter,
+    median_step,
+    pieces,
+    resampled,
+    sampling_interval,
+)
 
 __all__ = [
+    "ROLES",
     "Episode",
     "Record",
     "Rollouts",

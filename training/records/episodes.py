@@ -1,20 +1,37 @@
-"""Episodes of an environment as records: which entries of observations, actions and ``info`` are what."""
+"""Episodes of an environment as records, and the Minari data sets in which they are exchanged. Nothing in one runs."""
 
-from collections.abc import Mapping, Sequence
+import copy
+import errno
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 
+from kkl_gym.identity import APPEARANCE, sampling_interval
 from kkl_gym.named import InputReader, Reader, acting, resolved
-from training.records.record import Record
-from training.records.signals import Signals
+from observers.checks import check_dt
+from observers.storage import UNFINISHED, clear_unfinished
+from training.records.record import Record, Signals
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+    from minari import MinariDataset
+
+PREFIX = "minari:"  # of the name of a data set among names of files
+KEY = "kkl_gym"  # in the metadata, of what Minari has no place for
+DATA, METADATA = "data", "metadata.json"  # where a data set keeps both
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What happened from a reset to the end. Shapes: ``rewards`` (n,), ``infos`` (n + 1, ...)."""
+    """The steps from a reset to the end. Shapes: ``rewards`` (n,), ``infos`` (n + 1, ...)."""
 
     observations: Any
     actions: Any
@@ -25,7 +42,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Episodes of one environment, and what it is."""
+    """Episodes of one environment."""
 
     name: str
     environment: Mapping[str, Any] | None
@@ -36,7 +53,7 @@ class Rollouts:
     signals: Signals = Signals()  # noqa: RUF009 - it is frozen
 
     def records(self, wanted: Signals | None = None) -> list[Record]:
-        """Read the episodes."""
+        """Read the wanted signals of each episode, by default those of the rollouts."""
         source = self.name if self.environment is None else self.environment["id"]
         wanted = wanted or Signals()
         if wanted.time:
@@ -52,31 +69,182 @@ class Rollouts:
         signals = Signals("t", measured, wanted.inputs or acting(self.action_space), hidden)
         readers = [Reader(self.observation_space, names, source=source) for names in (measured, hidden) if names]
         read_u = InputReader(self.action_space, signals.inputs, source=source)
-        found = []
+        records = []
         for i, episode in enumerate(self.episodes):
-            n = len(episode.rewards)
+            n, name = len(episode.rewards), f"{self.name}, episode {i}"
             if not n:
                 continue
             try:
                 y, *x = (read(episode.observations, episode.infos, (n + 1,)) for read in readers)
                 u = read_u(episode.actions, (n,))
             except ValueError as error:
-                raise ValueError(f"{self.name}, episode {i}: {error}") from error
+                raise ValueError(f"{name}: {error}") from error
             if np.isnan(y[0]).any():
                 raise ValueError(
-                    f"{self.name}, episode {i}: {measured[int(np.isnan(y[0]).argmax())]} is not there after the reset, "
-                    "where an observer takes its first sample; measure something else"
+                    f"{name}: {measured[int(np.isnan(y[0]).argmax())]} is not there after the reset, where an observer "
+                    "takes its first sample; measure something else"
                 )
-            found.append(
-                Record(
-                    f"{self.name}, episode {i}",
-                    self.dt * np.arange(n + 1),
-                    y,
-                    np.concatenate([u, u[-1:]]) if signals.inputs else None,
-                    x[0] if hidden else None,
-                    signals,
-                    source=self.name,
-                    environment=self.environment,
-                )
+            record = Record(
+                name,
+                self.dt * np.arange(n + 1),
+                y,
+                np.concatenate([u, u[-1:]]) if signals.inputs else None,
+                x[0] if x else None,
+                signals,
+                source=self.name,
+                environment=self.environment,
             )
-        return found
+            records.append(record)
+        return records
+
+
+def is_dataset(name: str | Path) -> bool:
+    """Whether a name is that of a Minari data set: ``minari:ID``, or a folder that holds one."""
+    return str(name).startswith(PREFIX) or any((Path(name) / part / METADATA).is_file() for part in (DATA, "."))
+
+
+def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
+    """Read a Minari data set."""
+    _require()
+    try:
+        dataset = _opened(str(name))
+        metadata = dataset.storage.metadata
+        own = metadata.get(KEY, {})
+        signals = Signals(measured=own.get("measured", ()), hidden=own.get("hidden", ()))
+        dt = check_dt(own["dt"]) if "dt" in own else None
+        episodes = [
+            Episode(one.observations, one.actions, one.rewards, bool(one.terminations[-1:].any()), one.infos or {})
+            for one in dataset.iterate_episodes()
+        ]
+    except (AssertionError, AttributeError, KeyError, OSError, TypeError, ValueError, NotImplementedError) as error:
+        raise ValueError(f"{name} cannot be read as a Minari data set: {error}") from error
+    if not episodes:
+        raise ValueError(f"{name} holds no episode")
+    spec = dataset.env_spec
+    kwargs = {} if spec is None else {key: value for key, value in spec.kwargs.items() if key not in APPEARANCE}
+    return Rollouts(
+        str(name).removeprefix(PREFIX),
+        None if spec is None else {"id": spec.id, "kwargs": kwargs},
+        dt or _interval(str(name), spec, kwargs, warn),
+        metadata["observation_space"],
+        metadata["action_space"],
+        episodes,
+        signals,
+    )
+
+
+def _opened(name: str) -> "MinariDataset":
+    import minari
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    folder = Path(get_dataset_path(name.removeprefix(PREFIX)) if name.startswith(PREFIX) else name)
+    data = next((part for part in (folder / DATA, folder) if (part / METADATA).is_file()), None)
+    if data is None:
+        raise ValueError(f"there is none in {folder}; `minari list local` says which there are")
+    keys = json.loads((data / METADATA).read_text(encoding="utf-8")).keys()
+    if not {"observation_space", "action_space"} <= keys:  # Minari would make the environment, whatever it runs
+        raise ValueError("it does not say its spaces")
+    return minari.MinariDataset(data)
+
+
+def _interval(name: str, spec: Any, kwargs: Mapping[str, Any], warn: Callable[[str], object]) -> float:
+    """Seconds between samples, of an environment of Gymnasium's own; to make others may run what a file names."""
+    registered, reason = None if spec is None else gym.registry.get(spec.id), ""
+    if registered is not None and str(registered.entry_point).startswith("gymnasium."):
+        try:
+            with gym.make(spec.id, **kwargs) as env:
+                return sampling_interval(env)
+        except Exception as error:  # whatever is missing
+            reason = f", and {spec.id} cannot be made ({error})"
+    warn(f"{name} says no sampling interval{reason}: a step counts as 1 s")
+    return 1.0
+
+
+def write_dataset(rollouts: Rollouts, spec: "EnvSpec | None", *, policy: str) -> Path:
+    """Write a Minari data set, whole or not at all; what killed processes left beside it is removed."""
+    folder = dataset_folder(rollouts.name)
+    from minari import __version__
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.dataset.minari_storage import MinariStorage
+    from minari.namespace import create_namespace, list_local_namespaces
+
+    namespace = parse_dataset_id(rollouts.name)[0]
+    if namespace is not None and namespace not in list_local_namespaces():
+        create_namespace(namespace)
+    clear_unfinished(folder.parent)
+    temporary = folder.with_name(f"{UNFINISHED}{secrets.token_hex(4)}")
+    temporary.mkdir(parents=True)
+    try:
+        storage = MinariStorage.new(
+            temporary / DATA,
+            observation_space=rollouts.observation_space,
+            action_space=rollouts.action_space,
+            env_spec=None if spec is None else _in_json(spec),
+            jpeg_encoding=False,
+        )
+        for episode in rollouts.episodes:
+            going_on = [False] * (len(episode.rewards) - 1)
+            buffer = EpisodeBuffer(
+                observations=episode.observations,
+                actions=episode.actions,
+                rewards=list(episode.rewards),
+                terminations=[*going_on, episode.terminated],
+                truncations=[*going_on, not episode.terminated],
+                infos=dict(episode.infos),
+            )
+            storage.update_episodes([buffer])
+        own = {"dt": rollouts.dt} | {role: list(getattr(rollouts.signals, role)) for role in ("measured", "hidden")}
+        storage.update_metadata(
+            {"dataset_id": rollouts.name, "minari_version": __version__, "algorithm_name": policy, KEY: own}
+        )
+        os.rename(temporary, folder)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError):
+            _refuse_existing(folder, rollouts.name)  # another process was quicker
+        raise
+    return folder
+
+
+def dataset_folder(name: str) -> Path:
+    """The folder of a data set that is to be written; an error if none can be written there."""
+    _require()
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    try:
+        parse_dataset_id(name)
+    except (TypeError, ValueError):
+        raise ValueError(f"a Minari data set is called as in pendulum/random-v0, got {name!r}") from None
+    folder = Path(get_dataset_path(name))
+    _refuse_existing(folder, name)
+    parent = next(parent for parent in folder.parents if parent.exists())
+    if not os.access(parent, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(parent))
+    return folder
+
+
+def _refuse_existing(folder: Path, name: str) -> None:
+    if folder.exists():
+        raise ValueError(f"there is a data set {name} already; name another (--dataset), or `minari delete {name}`")
+
+
+def _in_json(spec: "EnvSpec") -> "EnvSpec":
+    """A specification as JSON can hold it: classes and functions by where they are written."""
+    written = copy.copy(spec)
+    for name in ("entry_point", "vector_entry_point"):
+        if callable(made_by := getattr(spec, name)):
+            where = getattr(made_by, "__qualname__", type(made_by).__qualname__)
+            setattr(written, name, f"{made_by.__module__}:{where}")
+    return written
+
+
+def _require() -> None:
+    try:
+        import h5py  # noqa: F401
+        import minari  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f'{error}: Minari data sets need pip install "kkl-gym[envs]"', name=error.name
+        ) from None

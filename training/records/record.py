@@ -1,17 +1,47 @@
 """A record: samples of a plant's outputs, and of its inputs and states where they were recorded."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NoReturn
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from observers.checks import real_array
-from training.records.signals import Signals
 
 ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # of the arrays' columns, as Signals calls them
-LARGEST = 1e100  # of a sample; sums of squares are finite up to there
+MAX_SAMPLE = 1e100  # sums of squares are finite up to there
+LONGEST_GAP = 3.0  # steps between samples across which is interpolated
+ROUNDING = 1e-6  # of a step, by which times may be off
+
+
+@dataclass(frozen=True)
+class Signals:
+    """The columns of records by their roles; files are searched for the usual names of empty ones.
+
+    A measured, an input or a hidden signal is the name of a column, or ``cos(column)`` or ``sin(column)`` of an angle
+    in rad.
+    """
+
+    time: str = ""
+    measured: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    hidden: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for role in ROLES.values():
+            names = getattr(self, role)
+            if isinstance(names, str) or not all(isinstance(name, str) and name for name in names):
+                raise ValueError(f"{role} must be names of columns, got {names!r}")
+            if twice := sorted({name for name in names if names.count(name) > 1}):
+                raise ValueError(f"{role} names {', '.join(twice)} twice")
+            object.__setattr__(self, role, tuple(names))
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """The measured, input and hidden signals, in this order."""
+        return self.measured + self.inputs + self.hidden
 
 
 @dataclass(frozen=True)
@@ -34,38 +64,37 @@ class Record:
                 object.__setattr__(self, letter, real_array(f"{self.name}: {letter}", values))
         if np.ndim(self.t) != 1 or len(self.t) < 2:
             raise ValueError(f"{self.name}: t must be two samples at least, got shape {np.shape(self.t)}")
-        if not self.signals.time:
-            object.__setattr__(self, "signals", replace(self.signals, time="t"))
+        names: dict[str, Any] = {"time": self.signals.time or "t"}
+        for letter, role in ROLES.items():
+            if (values := getattr(self, letter)) is not None:
+                names[role] = self._names(letter, role, values)
+        object.__setattr__(self, "signals", replace(self.signals, **names))
         self._check("t", self.signals.time, self.t)
-        back = np.flatnonzero(np.diff(self.t) <= 0)
-        if len(back):
+        if len(back := np.flatnonzero(np.diff(self.t) <= 0)):
             row = int(back[0]) + 1
             self._fail(
                 self.signals.time, row, f"time must increase, but {self.t[row]:g} comes after {self.t[row - 1]:g}"
             )
         for letter, role in ROLES.items():
-            values = getattr(self, letter)
-            if values is not None:
-                for name, column in zip(self._names(letter, role, values), values.T, strict=True):
+            if (values := getattr(self, letter)) is not None:
+                for name, column in zip(names[role], values.T, strict=True):
                     self._check(letter, name, column)
 
     def _names(self, letter: str, role: str, values: np.ndarray) -> tuple[str, ...]:
-        """The names of an array's columns, which are numbered where nobody has named them; see that they fit it."""
+        """Names of an array's columns, numbered where none are given; ValueError if the array's shape is invalid."""
         if values.ndim != 2 or len(values) != len(self.t) or not values.shape[1]:
             raise ValueError(
                 f"{self.name}: {letter} must have shape ({len(self.t)}, n) as there are {len(self.t)} times, "
                 f"got {values.shape}"
             )
-        if not getattr(self.signals, role):
-            numbered: Any = {role: tuple(f"{letter}{i + 1}" for i in range(values.shape[1]))}
-            object.__setattr__(self, "signals", replace(self.signals, **numbered))
         names: tuple[str, ...] = getattr(self.signals, role)
+        names = names or tuple(f"{letter}{i + 1}" for i in range(values.shape[1]))
         if len(names) != values.shape[1]:
             raise ValueError(f"{self.name}: {letter} has {values.shape[1]} columns, but {role} = {names}")
         return names
 
     def _check(self, letter: str, name: str, column: np.ndarray) -> None:
-        """See that no sample of a column is infinite, and that no more are missing than may be."""
+        """Raise ValueError if a sample is infinite, or missing where none may be."""
         refuse_infinite(self.name, name, column)
         missing = np.isnan(column)
         if missing.all():
@@ -85,11 +114,11 @@ class Record:
 
     @property
     def fingerprint(self) -> str:
-        """What identifies the samples and the names of their signals."""
-        found = hashlib.sha256(repr(self.signals).encode())
+        """Hash of the samples and of the names of their signals."""
+        digest = hashlib.sha256(repr(self.signals).encode())
         for values in (self.t, self.y, self.u, self.x):
-            found.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
-        return found.hexdigest()[:16]
+            digest.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+        return digest.hexdigest()[:16]
 
     @property
     def duration(self) -> float:
@@ -98,7 +127,80 @@ class Record:
 
 
 def refuse_infinite(name: str, column: str, values: np.ndarray) -> None:
-    """Raise an error that names file, column and row if a value is infinite, or so large that its square is."""
-    infinite = np.flatnonzero(abs(values) > LARGEST)
-    if len(infinite):
+    """Raise ValueError if a value is infinite, or so large that its square is."""
+    if len(infinite := np.flatnonzero(abs(values) > MAX_SAMPLE)):
         raise ValueError(f"{name}: column {column}, row {infinite[0] + 1}: {values[infinite[0]]:g} is no sample")
+
+
+def median_step(*records: Record) -> float:
+    """Median of the steps of time in seconds, of one record or several."""
+    return float(np.median(np.concatenate([np.diff(record.t) for record in records])))
+
+
+def sampling_interval(*records: Record) -> float:
+    """The median step in seconds, of no more digits than the times agree on, two at least."""
+    uneven = max(map(jitter, records))
+    digits = 12 if uneven < 1e-12 else int(np.clip(-np.log10(uneven), 2, 12))
+    return float(f"{median_step(*records):.{digits}g}")
+
+
+def jitter(record: Record) -> float:
+    """Largest deviation of a step from the median step over it, gaps of samples aside."""
+    steps = np.diff(record.t) / median_step(record)
+    return float(np.max(abs(steps - np.maximum(steps.round(), 1.0))))
+
+
+def resampled(record: Record, dt: float | None = None) -> Record:
+    """Put a record on a uniform grid that begins with its first sample.
+
+    Outputs are linear between samples, as the filter takes them for: the value at a time of the grid is there one
+    sample later at most. States, which no observer sees, follow a monotone cubic (PCHIP). Both are NaN between samples
+    of their own column that are more than 3 dt apart. An input is the mean over each interval of the grid of what was
+    held. On a record that has this grid nothing but rounding changes.
+    """
+    dt = median_step(record) if dt is None else dt
+    if not 0 < dt <= record.duration * (1 + ROUNDING):
+        raise ValueError(f"{record.name}: dt = {dt:g} s must be positive, and no more than its {record.duration:g} s")
+    steps = int(np.floor(record.duration / dt + ROUNDING))
+    t = np.minimum(record.t[0] + dt * np.arange(steps + 1), record.t[-1])
+    signals, columns = record.signals, [] if record.x is None else list(record.x.T)
+    y = [_interpolated(record, name, values, t, smooth=False) for name, values in zip(signals.measured, record.y.T)]
+    x = [_interpolated(record, name, values, t, smooth=True) for name, values in zip(signals.hidden, columns)]
+    return replace(record, t=t, y=np.stack(y, -1), u=_held(record, t, dt), x=np.stack(x, -1) if x else None)
+
+
+def _interpolated(record: Record, name: str, values: np.ndarray, t: np.ndarray, *, smooth: bool) -> np.ndarray:
+    """A column at the times t of a grid; NaN in gaps."""
+    there = ~np.isnan(values)
+    at, values, dt = record.t[there], values[there], t[1] - t[0]
+    close = np.zeros(len(t), dtype=bool)
+    if len(at) > 1:
+        after = np.clip(np.searchsorted(at, t - ROUNDING * dt), 1, len(at) - 1)
+        inside = (t >= at[0]) & (t <= at[-1]) & (at[after] - at[after - 1] <= LONGEST_GAP * dt * (1 + ROUNDING))
+        close = inside | (np.minimum(abs(t - at[after - 1]), abs(t - at[after])) <= ROUNDING * dt)
+    if close.sum() < 2 or not (smooth or (close[1:] & close[:-1]).any()):  # a filter takes one sample after the other
+        raise ValueError(
+            f"{record.name}: column {name}: no samples are less than {LONGEST_GAP:g} dt = {LONGEST_GAP * dt:.3g} s "
+            "apart; take a larger dt"
+        )
+    return np.where(close, PchipInterpolator(at, values)(t) if smooth else np.interp(t, at, values), np.nan)
+
+
+def _held(record: Record, t: np.ndarray, dt: float) -> np.ndarray | None:
+    """Means of held inputs over the intervals that begin at t; the last input holds on."""
+    if record.u is None:
+        return None
+    ends = np.append(record.t, max(record.t[-1], t[-1]) + 2 * dt)
+    total = np.concatenate([np.zeros((1, record.u.shape[1])), np.cumsum(np.diff(ends)[:, None] * record.u, 0)])
+    means = [(np.interp(t + dt, ends, column) - np.interp(t, ends, column)) / dt for column in total.T]
+    return np.stack(means, -1)
+
+
+def pieces(records: Iterable[Record]) -> list[Record]:
+    """Split records where a row lacks an output: no filter runs across a gap."""
+    parts = []
+    for record in records:
+        whole = ~np.isnan(record.y).any(-1)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(int)))
+        parts += [record.part(slice(int(a), int(b))) for a, b in zip(edges[::2], edges[1::2]) if b - a > 1]
+    return parts

@@ -1,7 +1,6 @@
-"""Rollouts of environments: who acts, what is recorded, and observers that are learned from it."""
+"""Rollouts of environments, and observers that are learned from them."""
 
 from training.rollouts.learning import learn
-from training.rollouts.playing import make, roll_out
-from training.rollouts.policies import Policy, policy_of
+from training.rollouts.playing import Policy, make, policy_of, roll_out
 
 __all__ = ["Policy", "learn", "make", "policy_of", "roll_out"]

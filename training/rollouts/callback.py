@@ -4,10 +4,9 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from kkl_gym import KKLObservation, KKLVectorObservation
 from observers import Artifact, KKLObserver
@@ -23,19 +22,17 @@ from observers.checks import integer, shown
 from observers.replacement import check_replacement
 from training.config import Config, settings_of
 from training.maps.coordinates import settling_time
-from training.presets import OF_THE_FILTER, OF_THE_MAPS
-from training.records import Record
-from training.rollouts.gathering import Gathering
-from training.sources.errors import RecordedErrors, recorded_errors
-from training.sources.recorded import RecordedSource
+from training.records import ROLES, Record, Signals, check_dt, resampled
+from training.sources.recorded import OF_THE_FILTER, RecordedSource, check_plant, recorded_errors
 from training.train_observer import train
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again
+LONGEST = 250  # steps of a piece: episodes without an end are cut, so that some of each can be held out
 
 
 @dataclass(frozen=True)
 class Refit:
-    """What came of a refit."""
+    """A refit: the observer in use after it, whether that is a new one, and errors on held-out episodes."""
 
     artifact: Artifact
     taken: bool
@@ -45,22 +42,20 @@ class Refit:
     seconds: float
 
     def __str__(self) -> str:
-        """For people, on one line."""
-        found = f"error {self.error:.3g} after {self.before:.3g}" if self.taken else f"error still {self.error:.3g}"
-        return f"refitted the observer at step {self.steps}: {found} ({self.seconds:.2g} s)"
+        """The errors, on one line."""
+        errors = f"error {self.error:.3g} after {self.before:.3g}" if self.taken else f"error still {self.error:.3g}"
+        return f"refitted the observer at step {self.steps}: {errors} ({self.seconds:.2g} s)"
 
 
 class KKLTrainingCallback(BaseCallback):
     """Refits the observer in :class:`kkl_gym.KKLObservation` on the episodes of the agent that is being trained.
 
-    Estimates are good where the rollouts have been that the observer was learned from. An agent in training goes
-    elsewhere, and in a simulator its hidden signals are seen: every step serves the agent and the observer. The
-    environments keep their filters and what these hold; T_inv is replaced, and with it the covariances and the flow.
-
-    A refit fits T_inv anew to all episodes that are kept, but for a share that is held out for good. An observer that
-    is worse on that share than the one in use is not taken. Refits take place where an algorithm begins to collect:
-    an on-policy one never learns from a batch of two observers, and without ``rehearsal`` there is none after the last
-    batch. One is left out while no episode is as long as the filter remembers.
+    Estimates are accurate where the rollouts have been that the observer was learned from; an agent in training goes
+    elsewhere. A refit fits T_inv, and with it the covariances and the flow, to all episodes that are kept, but for a
+    share that is held out for good. An observer with a larger error on that share than the one in use is not taken. The
+    environments keep their filters and the states of these. Refits take place where an algorithm begins to collect, so
+    that an on-policy one never learns from a batch of two observers, and not while no episode is as long as the filter
+    remembers.
 
     Logged are ``kkl/error``, the error on held-out episodes of the observer in use (root mean square over standard
     deviation), ``kkl/error_before``, that of the one before, and ``kkl/refit_seconds``.
@@ -69,24 +64,21 @@ class KKLTrainingCallback(BaseCallback):
     ----------
     every : int, default 5000
         Environment steps, of all environments together, from refit to refit.
-    first : int, optional
-        Steps before the first one; by default ``every``.
     keep : int, default 100_000
         Steps that are kept; older ones are forgotten.
     records : sequence of training.records.Record, optional
-        Episodes from before, the oldest first, such as those that the observer was learned from, as
-        :func:`training.records.read_records` reads them. They are kept beside the agent's own, and none of them is held
-        out. A refit is then left out while no episode that is held out is as long as the filter remembers.
+        Episodes from before, the oldest first, such as those that the observer was learned from. They are kept beside
+        the agent's own, and none of them is held out.
     rehearsal : int, default 0
-        Further steps at the end of each call of ``learn``, in which the agent acts without exploration, as it will when
-        it is used, and which end in a last refit. An agent that explores goes elsewhere.
+        Further steps at the end of each call of ``learn``, in which the agent acts without exploration, and which end
+        in a last refit.
     outputs : str, default "y"
-        What of ``info`` is recorded as outputs: by default what the observer saw, with whatever noise there was. Where
-        an environment tells them without noise, the key under which it does.
+        The key of ``info`` under which outputs are recorded: by default those that the observer saw, noise included, to
+        which the map's noise level 0 then refers.
     path : str or path, optional
         A ``.safetensors`` file that receives the observer in use at each refit, whole or not at all.
     on_refit : callable, optional
-        Told of each :class:`Refit`.
+        Called with each :class:`Refit`.
     verbose : int, default 0
         Whether refits are printed, as for other callbacks.
     **settings : object
@@ -105,11 +97,6 @@ class KKLTrainingCallback(BaseCallback):
         observer that was not learned from rollouts, or another one than the others, or if a record is of another plant.
         At a step, if ``info`` lacks the hidden signals, or a wrapper skips samples.
 
-    Notes
-    -----
-    Records hold what the observer saw. Noise that an environment adds is therefore that of the records, to which the
-    map's level 0 refers, as for :func:`training.learn`; with ``outputs`` level 0 is no noise.
-
     Examples
     --------
     >>> import gymnasium as gym
@@ -122,15 +109,12 @@ class KKLTrainingCallback(BaseCallback):
     """
 
     artifact: Artifact
-    _config: Config
-    _level: float | tuple[float, ...]
-    _gathering: Gathering
+    _gathering: "Gathering"
 
     def __init__(
         self,
         every: int = 5000,
         *,
-        first: int | None = None,
         keep: int = 100_000,
         records: Sequence[Record] = (),
         rehearsal: int = 0,
@@ -141,26 +125,21 @@ class KKLTrainingCallback(BaseCallback):
         **settings: Any,
     ) -> None:
         super().__init__(verbose)
-        self._every = integer("every", every, 1)
-        self._next = self._every if first is None else integer("first", first, 1)
-        self._keep, self._outputs = integer("keep", keep, 1), outputs
         if not isinstance(records, Sequence) or not all(isinstance(record, Record) for record in records):
             raise ValueError(f"records must be a list of training.records.Record, got {shown(records)}")
-        self._before = tuple(records)
-        self._rehearsal = integer("rehearsal", rehearsal, 0)
         if path is not None and not (isinstance(path, str | os.PathLike) and os.fspath(path).endswith(".safetensors")):
             raise ValueError(f"path must end in .safetensors, got {shown(path)}")
-        self._path = None if path is None else Path(path)
         if on_refit is not None and not callable(on_refit):
             raise ValueError(f"on_refit must be a function of a Refit, got {shown(on_refit)}")
-        self._on_refit = on_refit
         if fixed := [name for name in OF_THE_FILTER if name in settings]:
             raise ValueError(
                 f"{', '.join(fixed)} cannot change: the filter in use stays; learn another observer instead"
             )
-        if unknown := [name for name in settings if name not in OF_THE_MAPS]:
-            raise ValueError(f"there is no setting {', '.join(unknown)}; there are {', '.join(OF_THE_MAPS)}")
-        self._settings = settings
+        Config("input-aware", eigenvalues=(-1.0,), **settings)  # an error now, not at the first refit
+        self._every, self._keep = integer("every", every, 1), integer("keep", keep, 1)
+        self._before, self._rehearsal, self._outputs = tuple(records), integer("rehearsal", rehearsal, 0), outputs
+        self._path, self._on_refit, self._settings = path, on_refit, settings
+        self._next = self._every
 
     def _init_callback(self) -> None:
         used = _observers(self.training_env)
@@ -183,124 +162,109 @@ class KKLTrainingCallback(BaseCallback):
                     f"measurement_noise_max = {config.measurement_noise_max} is less than the noise {level} that the "
                     "observer in use assumes"
                 )
-        if not hasattr(self, "_gathering"):
+        if hasattr(self, "_gathering"):
+            check_replacement(self.artifact, artifact)
+        else:
             self._gathering = Gathering(
                 artifact, keep=self._keep, held_out=config.held_out, outputs=self._outputs, before=self._before
             )
-        else:
-            check_replacement(self.artifact, artifact)
         self.artifact, self._config = artifact, config
         # An observer that tracks is judged under the noise that it sees, where outputs are recorded without.
-        seen = self._outputs != "y" and artifact.motion is not None
-        self._level = used[0].measurement_noise if seen else 0.0
+        noisy = self._outputs != "y" and artifact.motion is not None
+        self._level = used[0].measurement_noise if noisy else 0.0
 
     def _on_training_start(self) -> None:
         for row in range(self.training_env.num_envs):
             self._begin(row, goes_on=True)
 
     def _on_step(self) -> bool:
-        self._took(self.locals["infos"], self.locals["dones"])
+        self._add(self.locals["infos"], self.locals["dones"])
         return True
-
-    def _took(self, infos: Sequence[dict[str, Any]], dones: Iterable[bool]) -> None:
-        """Take in a step of all environments."""
-        for row, (info, done) in enumerate(zip(infos, dones, strict=True)):
-            self._gathering.add(row, info)
-            if done:
-                self._begin(row)
 
     def _on_rollout_start(self) -> None:
         if self._gathering.steps >= self._next:
             self._refit_where_possible()
 
     def _on_training_end(self) -> None:
-        if self._rehearsal:
-            for infos, dones in rehearsed(self.model, self._rehearsal):
-                if infos:
-                    self._took(infos, dones)
-                else:
-                    for row in range(self.training_env.num_envs):
-                        self._begin(row)
-            self._refit_where_possible()
-
-    def _refit_where_possible(self) -> None:
-        self._next = self._gathering.steps + self._every
-        train, held_out = self._gathering.records()
-        memory = settling_time(self.artifact.filter)
-        # Records from before are long enough to learn from, but not from where the agent is now.
-        needed = (train, held_out) if self._before and self._config.held_out else (train,)
-        if all(any(record.duration >= memory for record in records) for records in needed):
-            self._refit(train, held_out)
+        if not self._rehearsal:
+            return
+        for infos, dones in rehearsed(self.model, self._rehearsal):
+            self._add(infos, dones)
+        self._refit_where_possible()
 
     def _begin(self, row: int, *, goes_on: bool = False) -> None:
-        """Begin an episode with what its reset said, or with its first step where that is not known."""
-        inside = self.training_env.unwrapped  # what lies around does not pass the infos of resets on
+        """Begin an episode with the info of its reset, or with its first step where that is not known."""
+        inside = self.training_env.unwrapped  # wrappers do not pass the infos of resets on
         known = _vector_wrapper(self.training_env) is None
         self._gathering.begin(row, inside.reset_infos[row] if known else {}, goes_on=goes_on)
 
-    def _refit(self, train_on: list[Record], held_out: list[Record]) -> None:
+    def _add(self, infos: Sequence[dict[str, Any]], dones: Sequence[bool] | np.ndarray) -> None:
+        """Add a step of all environments; after a reset of all there are no ``infos``."""
+        for row, done in enumerate(dones):
+            if infos:
+                self._gathering.add(row, infos[row])
+            if done:
+                self._begin(row)
+
+    def _refit_where_possible(self) -> None:
+        self._next = self._gathering.steps + self._every
+        kept, held_out = self._gathering.records()
+        memory = settling_time(self.artifact.filter)
+        # Records from before are long enough to learn from, but not from where the agent is now.
+        needed = (kept, held_out) if self._before and self._config.held_out else (kept,)
+        if all(any(record.duration >= memory for record in records) for records in needed):
+            self._refit(kept, held_out)
+
+    def _refit(self, kept: list[Record], held_out: list[Record]) -> None:
         began, old = time.monotonic(), self.artifact
         with torch.random.fork_rng():  # the agent's random numbers stay its own
-            source = RecordedSource(train_on, self._config, old.system, held_out=held_out, C=old.C)
-            new = train(source).artifact
-        lost = (old.motion is not None and new.motion is None) or (
+            new = train(RecordedSource(kept, self._config, old.system, held_out=held_out, C=old.C)).artifact
+        if (old.motion is not None and new.motion is None) or (
             old.inverse.error_covariance is not None and new.inverse.error_covariance is None
-        )
-        if lost:
+        ):
             warnings.warn("the observer in use stays: too little is held out so far to calibrate another", stacklevel=2)
             return
         before, after = (
-            _together(recorded_errors(each, held_out, measurement_noise=self._level)) for each in (old, new)
+            _rms(recorded_errors(each, held_out, measurement_noise=self._level).values()) for each in (old, new)
         )
         taken = not after > before
         if taken:
             self.artifact = new
-            self._replace()
+            vector = _vector_wrapper(self.training_env)
+            if vector is None:
+                self.training_env.env_method("replace_observer", new)
+            else:
+                vector.replace_observer(new)
         if self._path is not None:
             self.artifact.save(self._path)
-        found = Refit(
-            self.artifact, taken, before, after if taken else before, self._gathering.steps, time.monotonic() - began
-        )
-        scalars = {"error": found.error, "error_before": before, "refit_seconds": found.seconds}
-        for name, value in scalars.items():
+        seconds, error = time.monotonic() - began, after if taken else before
+        refit = Refit(self.artifact, taken, before, error, self._gathering.steps, seconds)
+        for name, value in {"error": error, "error_before": before, "refit_seconds": seconds}.items():
             self.logger.record(f"kkl/{name}", value)
         if self.verbose:
-            print(found)
+            print(refit)
         if self._on_refit is not None:
-            self._on_refit(found)
-
-    def _replace(self) -> None:
-        vector = _vector_wrapper(self.training_env)
-        if vector is None:
-            self.training_env.env_method("replace_observer", self.artifact)
-        else:
-            vector.replace_observer(self.artifact)
+            self._on_refit(refit)
 
 
 def rehearsed(model: BaseAlgorithm, steps: int) -> Iterator[tuple[Sequence[dict[str, Any]], np.ndarray]]:
-    """Play an agent as it will act, without exploration, in the environments in which it has learned."""
-    env: Any = model.get_env()
-    with _as_it_is(model.get_vec_normalize_env()):
+    """Play an agent without exploration in the environments in which it has learned, whose scales stay as they are."""
+    env, scaling = model.get_env(), model.get_vec_normalize_env()
+    assert env is not None
+    learns = scaling is not None and scaling.training
+    if scaling is not None:
+        scaling.training = False
+    try:
         observations, state, dones = env.reset(), None, np.ones(env.num_envs, dtype=bool)
         yield (), dones
         for _ in range(math.ceil(steps / env.num_envs)):
-            actions, state = model.predict(observations, state, dones, deterministic=True)
+            actions, state = model.predict(observations, state, dones, deterministic=True)  # type: ignore[arg-type]
             observations, _, dones, infos = env.step(actions)
             yield infos, dones
-    model.set_env(env)  # which makes a training that goes on reset it
-
-
-@contextmanager
-def _as_it_is(scaling: VecNormalize | None) -> Iterator[None]:
-    """What scales observations learns nothing inside."""
-    if scaling is None:
-        yield
-        return
-    before, scaling.training = scaling.training, False
-    try:
-        yield
     finally:
-        scaling.training = before
+        if scaling is not None:
+            scaling.training = learns
+    model.set_env(env)  # which makes a training that goes on reset it
 
 
 def _observers(env: VecEnv) -> list[KKLObserver]:
@@ -326,10 +290,115 @@ def _vector_wrapper(env: VecEnv) -> KKLVectorObservation | None:
     return None
 
 
-def _together(errors: RecordedErrors) -> float:
+def _rms(errors: Iterable[float]) -> float:
     """Root mean square of the errors of all hidden signals that move; NaN if none does."""
-    known = [error for error in errors.relative.values() if not math.isnan(error)]
+    known = [error for error in errors if not math.isnan(error)]
     return float(np.sqrt(np.mean(np.square(known)))) if known else math.nan
+
+
+@dataclass
+class _Piece:
+    """Samples of one environment since its reset, or since it was cut."""
+
+    y: list[np.ndarray] = field(default_factory=list)
+    x: list[np.ndarray] = field(default_factory=list)
+    u: list[np.ndarray] = field(default_factory=list)
+    sample: int = 0  # the number of the last one
+    goes_on: bool = False  # whether the episode may be further than its first sample
+
+
+class Gathering:
+    """Episodes of several environments as records, from what observers and environments put into ``info``."""
+
+    def __init__(
+        self, artifact: Artifact, *, keep: int, held_out: float, outputs: str = "y", before: Sequence[Record] = ()
+    ) -> None:
+        names, self._environment = artifact.signals or {}, artifact.environment or {}
+        self._signals = Signals("t", *(tuple(names[role]) for role in ROLES.values()))
+        self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
+        self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
+        self._open = defaultdict[int, _Piece](_Piece)  # by environment
+        self._kept = deque[tuple[bool, Record]]()
+        self._total = self._made = self.steps = 0
+        check_dt(before, self._dt)
+        for record in before:
+            check_plant(artifact, record)
+            uniform = resampled(record, self._dt)
+            uniform = replace(uniform, u=uniform.u if self._signals.inputs else None, signals=self._signals)
+            for begin in range(0, len(uniform.t) - 1, LONGEST):
+                part = uniform.part(slice(begin, begin + LONGEST + 1))
+                if part.x is not None:
+                    self._take(part, held_out=False)
+
+    def begin(self, row: int, info: Mapping[str, Any], *, goes_on: bool = False) -> None:
+        """Take in the first sample of an episode."""
+        self._close(row)
+        piece = self._open[row] = _Piece(goes_on=goes_on)
+        if self._outputs in info:
+            piece.y, piece.x = [np.array(info[self._outputs])], [info.get("x", np.full(self._nx, np.nan))]
+
+    def add(self, row: int, info: Mapping[str, Any]) -> None:
+        """Take in the sample after a step."""
+        if missing := [key for key in (self._outputs, "u", "x", "sample") if key not in info]:
+            raise ValueError(
+                f"info of environment {row} has no {', '.join(map(repr, missing))}: KKLObservation tells the true "
+                f"{', '.join(self._signals.hidden)} as 'x' where the environment inside shows them at each step; an "
+                "observer is refitted there alone; training.agents.SB3VecEnv passes on what its info_keys name, "
+                "('y', 'u', 'x', 'sample')"
+            )
+        piece, sample = self._open[row], int(info["sample"])
+        if piece.y and sample != piece.sample + 1:
+            if not piece.goes_on:
+                raise ValueError(
+                    f"environment {row} showed sample {sample} after {piece.sample}: put wrappers that skip steps, "
+                    "such as ActionRepeat, inside KKLObservation while observers are refitted"
+                )
+            piece = self._open[row] = _Piece()
+        if piece.y:
+            piece.u.append(info["u"])
+        piece.y.append(np.array(info[self._outputs]))
+        piece.x.append(info["x"])
+        piece.sample, piece.goes_on = sample, False
+        self.steps += 1
+        if len(piece.u) == LONGEST:
+            self._cut(row)
+
+    def records(self) -> tuple[list[Record], list[Record]]:
+        """Records to fit and records that are held out, with the episodes under way as far as they have come."""
+        for row, piece in self._open.items():
+            if piece.u:
+                self._cut(row)
+        return [record for held, record in self._kept if not held], [record for held, record in self._kept if held]
+
+    def _cut(self, row: int) -> None:
+        """End a piece; the next one begins with its last sample."""
+        piece = self._open[row]
+        self._close(row)
+        self._open[row] = _Piece(piece.y[-1:], piece.x[-1:], sample=piece.sample)
+
+    def _close(self, row: int) -> None:
+        piece = self._open[row]
+        if not piece.u or np.isnan(piece.x).all():
+            return
+        env_id = self._environment["id"]
+        record = Record(
+            f"{env_id}, piece {self._made}",
+            self._dt * np.arange(len(piece.y)),
+            np.stack(piece.y),
+            np.stack([*piece.u, piece.u[-1]]) if self._signals.inputs else None,
+            np.stack(piece.x),
+            self._signals,
+            source=env_id,
+            environment=self._environment,
+        )
+        self._take(record, held_out=bool(self._every) and self._made % self._every == 1)
+        self._made += 1
+
+    def _take(self, record: Record, *, held_out: bool) -> None:
+        self._kept.append((held_out, record))
+        self._total += len(record.t) - 1
+        while self._total > self._keep and len(self._kept) > 1:
+            self._total -= len(self._kept.popleft()[1].t) - 1
 
 
 __all__ = ["KKLTrainingCallback", "Refit", "rehearsed"]

@@ -10,11 +10,9 @@ from rich.console import Console
 from observers import Artifact
 from training.config import Config
 from training.jobs import refuse_checkpoints
-from training.presets import recorded_preset
 from training.progress import ProgressBars, progress_bars
-from training.rollouts.playing import make, roll_out
-from training.rollouts.policies import RANDOM, Policy, policy_of
-from training.sources.recorded import RecordedSource
+from training.rollouts.playing import RANDOM, Policy, make, policy_of, roll_out
+from training.sources.recorded import RecordedSource, recorded_preset
 
 
 def learn(
@@ -72,7 +70,12 @@ def learn(
         steps = 100_000
     settings = {"seed": seed} | settings
     folder = None if out is None else Path(out)
-    _check(hidden, settings, folder)
+    # Errors before anything is played. Settings that follow from rollouts are not known yet.
+    if not np.size(hidden):
+        raise ValueError("say which signals are hidden, which the observer is to estimate, as in hidden=[2]")
+    Config("input-aware", **{"eigenvalues": (-1.0,)} | {name: v for name, v in settings.items() if v is not None})
+    if folder is not None:
+        refuse_checkpoints(folder)
     with progress_bars(console) as progress:
         playing = progress.phase(f"playing {env_id}", steps or episodes or 1)
         with make(env_id, env_kwargs) as env, playing as report:
@@ -93,16 +96,3 @@ def learn(
         if folder is not None:
             artifact.save(folder / f"{name}.safetensors")
     return artifact
-
-
-def _check(hidden: Sequence[str | int], settings: Mapping[str, Any], out: Path | None) -> None:
-    """Raise before anything is played what would be an error after; settings that rollouts decide are not right yet."""
-    if not np.size(hidden):
-        raise ValueError("say which signals are hidden, which the observer is to estimate, as in hidden=[2]")
-    chosen_later: dict[str, Any] = {"eigenvalues": (-1.0,), "dt": 1.0, "measurement_noise_max": 1.0}
-    Config("input-aware", **chosen_later | {name: value for name, value in settings.items() if value is not None})
-    if out is not None:
-        refuse_checkpoints(out)
-
-
-__all__ = ["learn"]

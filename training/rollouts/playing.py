@@ -1,9 +1,10 @@
-"""Playing episodes, and keeping what happened."""
+"""Rollouts of environments: policies, played episodes, and a wrapper that records them."""
 
 import copy
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,13 +12,19 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
 from kkl_gym.identity import identity, sampling_interval
+from kkl_gym.loading import load_function
 from kkl_gym.named import InputReader, Reader, acting, resolved
-from observers.checks import integer
+from observers.checks import integer, shown
 from training.records import Episode, Rollouts, Signals
-from training.rollouts.policies import Policy
+
+Env = gym.Env[Any, Any]
+Policy = Callable[[Any], Any]  # from an observation to an action
+RANDOM = "random"
+WANDERING = "wandering"
+LONGEST_HOLD = 30  # steps: the longest mean time for which a wandering policy holds an action
 
 
-def make(env_id: str, kwargs: Mapping[str, Any] | None = None) -> gym.Env[Any, Any]:
+def make(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Env:
     """Make an environment."""
     try:
         return gym.make(env_id, **(kwargs or {}))
@@ -25,8 +32,64 @@ def make(env_id: str, kwargs: Mapping[str, Any] | None = None) -> gym.Env[Any, A
         raise ValueError(f"cannot make {env_id!r}: {error}") from error
 
 
+def policy_of(policy: str | Policy, env: Env) -> Policy:
+    """Random actions, a function by its place, or an agent of stable-baselines3 (``ppo:FILE.zip``)."""
+    if callable(policy):
+        return policy
+    if policy == RANDOM:
+        return lambda observation: env.action_space.sample()
+    if policy == WANDERING:
+        return _wandering(env.action_space)
+    if not isinstance(policy, str) or ":" not in policy:
+        raise ValueError(
+            "a policy is random, wandering, script.py:function, module:function or an agent as in ppo:FILE.zip, "
+            f"got {shown(policy)}"
+        )
+    algorithm, _, file = policy.partition(":")
+    if not file.endswith(".zip") and Path(f"{file}.zip").is_file():  # stable-baselines3 adds the ending as well
+        file += ".zip"
+    return _agent(algorithm, Path(file), env) if file.endswith(".zip") else load_function(policy)
+
+
+def _wandering(space: gym.Space[Any]) -> Policy:
+    """Random actions, each held for a random number of steps, whose mean is drawn every hundred steps."""
+    calls, left, mean, action = 0, 0, 1.0, None
+
+    def act(observation: Any) -> Any:
+        nonlocal calls, left, mean, action
+        if calls % 100 == 0:
+            mean = LONGEST_HOLD ** space.np_random.random()
+        if left == 0:
+            action, left = space.sample(), int(space.np_random.geometric(1 / mean))
+        calls, left = calls + 1, left - 1
+        return action
+
+    return act
+
+
+def _agent(name: str, path: Path, env: Env) -> Policy:
+    import sb3_contrib
+    import stable_baselines3
+
+    algorithms = {
+        each.lower(): getattr(library, each) for library in (sb3_contrib, stable_baselines3) for each in library.__all__
+    }
+    if name.lower() not in algorithms:
+        raise ValueError(f"{name!r} is no algorithm of stable-baselines3 or sb3-contrib; name it as in ppo:FILE.zip")
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}")
+    agent = algorithms[name.lower()].load(path, device="cpu")
+    for what in ("observation_space", "action_space"):
+        here, there = getattr(env, what), getattr(agent, what)
+        if here != there:
+            raise ValueError(
+                f"{path} was trained on the {what.replace('_', ' ')} {there}, but the environment has {here}"
+            )
+    return lambda observation: agent.predict(observation, deterministic=True)[0]
+
+
 def roll_out(
-    env: gym.Env[Any, Any],
+    env: Env,
     policy: Policy,
     *,
     measured: Sequence[str | int],
@@ -35,39 +98,39 @@ def roll_out(
     steps: int | None = None,
     seed: int = 0,
     name: str = "",
-    report: Callable[[float], object] | None = None,
+    report: Callable[[float], object] = lambda done: None,
 ) -> Rollouts:
-    """Play episodes and keep observations, actions and what is asked of ``info``."""
+    """Play episodes and keep observations, actions and the entries of ``info`` that are signals."""
     if episodes is None and steps is None:
         raise ValueError("say how much to record: episodes or steps")
-    for what, count in (("episodes", episodes), ("steps", steps)):
-        if count is not None:
-            integer(what, count, 1)
+    most_episodes, most_steps = (
+        math.inf if count is None else integer(what, count, 1)
+        for what, count in (("episodes", episodes), ("steps", steps))
+    )
     recorder = Recorder(env, measured=measured, hidden=hidden, name=name)
     env.action_space.seed(integer("seed", seed, 0))
     played = total = 0
-    while (episodes is None or played < episodes) and (steps is None or total < steps):
+    while played < most_episodes and total < most_steps:
         observation, _ = recorder.reset(seed=None if played else seed)
-        over, length = False, 0
-        while not over and (steps is None or total + length < steps):
+        over = False
+        while not over and total < most_steps:
             observation, _, terminated, truncated, _ = recorder.step(policy(observation))
-            over, length = terminated or truncated, length + 1
-        played, total = played + 1, total + length
+            over, total = terminated or truncated, total + 1
+        played += 1
         if played == 1:
             recorder.rollouts().records()  # an error now, not after hours
-        if report is not None:
-            report(played if steps is None else total)
-    found = recorder.rollouts()
-    found.records()  # an error now where a signal cannot be read
-    return found
+        report(played if steps is None else total)
+    rollouts = recorder.rollouts()
+    rollouts.records()  # an error now where a signal cannot be read
+    return rollouts
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Keeps the episodes that are played in an environment: observations, actions and what is asked of ``info``."""
+    """Keeps the last ``keep`` steps at least that are played in an environment, by whole episodes."""
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         *,
         measured: Sequence[str | int],
         hidden: Sequence[str | int],
@@ -109,17 +172,16 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         return observation, float(reward), self._terminated, truncated, info
 
     def rollouts(self, *, going_on: bool = False) -> Rollouts:
-        """Hand out what was played; the episode that is going on counts as far as it got, and is not gone on with."""
+        """The episodes played; the one under way counts as far as it got, and ends there unless ``going_on``."""
         if not going_on:
             self._end()
-        under_way = [self._episode()] if self._rewards else []
         return Rollouts(
             self._name,
             self._identity,
             sampling_interval(self.env),
             self.env.observation_space,
             self.env.action_space,
-            [*self._played, *under_way],
+            [*self._played, *([self._episode()] if self._rewards else [])],
             self._signals,
         )
 
@@ -141,18 +203,18 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         self._begin()
 
     def _episode(self) -> Episode:
-        """The one that is going on, as far as it got."""
+        """The episode under way, as far as it got."""
         return Episode(
             _stacked(self.env.observation_space, self._observations),
             _stacked(self.env.action_space, self._actions),
             np.array(self._rewards),
             bool(self._terminated),
-            {key: _values(list(values), key) for key, values in zip(self._keys, zip(*self._infos))},
+            {key: _numbers(list(values), key) for key, values in zip(self._keys, zip(*self._infos))},
         )
 
 
-def _values(values: list[Any], key: str) -> np.ndarray:
-    """What ``info`` held under a key at each step; NaN at the first where a reset says nothing."""
+def _numbers(values: list[Any], key: str) -> np.ndarray:
+    """The entries of ``info`` under a key; NaN at a reset that lacks it."""
     if all(value is None for value in values):
         raise ValueError(f"info has no {key!r}, at the reset or at a step")
     if values[0] is None and len(values) > 1 and values[1] is not None:
@@ -164,6 +226,6 @@ def _values(values: list[Any], key: str) -> np.ndarray:
 
 
 def _stacked(space: gym.Space[Any], values: list[Any]) -> Any:
-    """Values of a space, one upon the other: arrays, of a Dict or Tuple in its structure."""
+    """Values of a space as arrays, those of a Dict or Tuple in its structure."""
     empty: Any = create_empty_array(space, len(values), fn=np.zeros)
     return concatenate(space, values, empty)

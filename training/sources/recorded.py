@@ -3,17 +3,19 @@
 import functools
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from observers import Artifact, Equations, LinearFilter
+from observers import Artifact, Equations, KKLObserver, LinearFilter
 from observers.checks import shown
 from training.config import Config
 from training.maps.coordinates import settling_time
 from training.records import (
+    ROLES,
     Record,
     Signals,
     check_dt,
@@ -23,22 +25,40 @@ from training.records import (
     median_step,
     pieces,
     resampled,
+    sampling_interval,
 )
 from training.seeds import Stream, generator
-from training.sources.errors import recorded_errors
-from training.sources.output import linear_output
-from training.sources.source import Increments, Pairs, Report, Runs, TooFewRunsError
+from training.sources.source import OF_MEDIAN, Increments, Pairs, Report, Runs, TooFewRunsError
 from training.sources.windows import samples_as_old, windows
-from training.spectrum import Spectrum
-from training.trajectories.record import recording_ages
+from training.spectrum import Spectrum, evenly_spaced
+from training.trajectories.motions import recording_ages
 
 FEW = 5  # records, below which none is held out as a whole
 STRETCHES, SAMPLES = 600, 2_000_000  # at most, of stretches to calibrate on and of their samples together
-MEMORIES = 2.0  # of the filter's memory, that stretches are long at most
+STRETCH_MEMORIES = 2.0  # of the filter's memory, that stretches are long at most
 FEWEST = 50  # samples that a stretch may begin at
 BEYOND = 0.5  # of the states' range, by which estimates may leave it
 INCREMENTS = 400_000  # at most
 WINDOW = 10  # samples at least over which innovations are averaged
+# What C x leaves of an output is noise, unless it is nearly all, or squares of states explain a part of it.
+UNEXPLAINED, SQUARES = 0.7, 0.8  # of the output's standard deviation, and of what is left
+LITTLE = 0.1  # of that standard deviation: less is taken for noise in any case
+ROUNDING = 1e-6  # of an output's size: below it an entry of C, or what is left, is rounding
+OUTLIER = 6.0  # standard deviations of what is left, by its median
+LEAST_NOISE = 1e-4  # assumed at least, in standard deviations of the outputs: with R = 0 the gain would not fall
+MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # of records: eigenvalues for each output, in multiples of the signals' rate
+RECORD_MEMORIES = 3.0  # of the filter in a record at least, unless its slowest mode were faster than the signals
+# Of rollouts, whose hidden signals an agent wants within steps: how many modes, the slowest and the fastest per step.
+# Few modes that are far apart forget the start soon, and tell single steps from each other.
+EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
+EPISODE_MEMORIES = 1.5  # of the filter in an episode at least
+RECORDED_NOISE = 0.1  # of an output's standard deviation: the largest noise beside that of the records
+RECORDED: dict[str, Any] = {
+    "samples": 60, "width": 96, "depth": 2, "learning_rate": 3e-3, "inverse_steps": 3000, "members": 3,
+    "noise_free_share": 0.5, "scaling": "range",  # errors count by their own size, not the state's
+}  # fmt: skip
+FASTEST_PER_STEP = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
+OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")  # settings
 
 
 class RecordedSource:
@@ -90,47 +110,44 @@ class RecordedSource:
         self.dt, self.process_noise = config.dt, 0.0
         self.linear = Spectrum(config.eigenvalues, config.pairs).filter(self.ny, config.dt, self.nu)
         check_memory(records, settling_time(self.linear), lambda text: warn(f"warning: {text}"))
-        kept = [resampled(record, config.dt) for record in records]
+        uniform = [resampled(record, config.dt) for record in records]
         if held_out is None:
-            kept, apart = split(kept, config.held_out, config.seed)
+            self.kept, self.held_out = split(uniform, config.held_out, config.seed)
         else:
-            apart = [resampled(record, config.dt) for record in held_out]
-        self.kept, self.held_out = kept, apart
-        self.rate = signal_rate(kept)
-        self.pace = 1 / self.rate
+            self.kept, self.held_out = uniform, [resampled(record, config.dt) for record in held_out]
+        self.pace = 1 / signal_rate(self.kept)
 
     def identity(self) -> dict[str, Any]:
-        """What identifies the source."""
+        """Name and fingerprints of the records."""
         return {"name": self.name, "records": [record.fingerprint for record in self.records]}
 
     def facts(self) -> dict[str, Any]:
         """Arguments of :class:`observers.Artifact`."""
-        signals = self.signals
-        inputs = signals.inputs if self.nu else ()
-        found = {
+        signals = {role: getattr(self.signals, role) for role in ROLES.values()}
+        facts = {
             "system": self.name,
             "parameters": {},
             "measurement_noise": 0.0,
-            "signals": {"measured": signals.measured, "inputs": inputs, "hidden": signals.hidden},
+            "signals": signals | ({} if self.nu else {"inputs": ()}),
             "environment": self.records[0].environment,
         }
         try:
-            return found | {"C": self._output()[0]}
+            return facts | {"C": linear_output(self.kept, self.C)[0]}
         except ValueError:  # tracking() says why
-            return found
+            return facts
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """Arguments of :class:`training.maps.samplers.TrajectorySampler`."""
+        """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""
         zero = [self.signals.measured.index(name) for name in self.config.arbitrary_zero]
         return {"measurement_noise": 0.0, "silent": linear.equilibrium[:, zero]}
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
-        """Recorded states with what the filter holds if it was switched on some samples before."""
+        """Recorded states, and the states of a filter that was switched on some samples before."""
         ages = recording_ages(math.ceil(settling_time(linear) / self.dt), self.config.samples)
         return windows(pieces(self.kept), linear, ages=ages, n=self.config.windows)
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
-        """Stretches of what was held out, side by side, from samples all over it."""
+        """Stretches of the records held out, side by side, from samples all over them."""
         whole = [piece for piece in pieces(self.held_out) if piece.x is not None and len(piece.t) > 2]
         owner = first = np.zeros(0, int)
         if whole:
@@ -138,32 +155,35 @@ class RecordedSource:
         if len(owner) < FEWEST:
             raise TooFewRunsError(
                 f"what was held out has {len(owner)} samples with states to begin at, too few to calibrate on "
-                f"({FEWEST}): record more, or hold more out (held_out, --held-out)"
+                f"({FEWEST}): record more, or hold more out (--set held_out=0.3)"
             )
-        memory = settling_time(self.linear) / self.dt
-        steps = max(2, min(round(MEMORIES * memory), max(len(piece.t) for piece in whole) - 1))
+        longest = max(len(piece.t) for piece in whole) - 1
+        steps = max(2, min(round(STRETCH_MEMORIES * settling_time(self.linear) / self.dt), longest))
         most = min(STRETCHES, max(2 * FEWEST, SAMPLES // steps))
         if len(owner) > most:
             chosen = np.linspace(0, len(owner) - 1, most).round().astype(int)
             owner, first = owner[chosen], first[chosen]
         rows = first + np.arange(steps + 1)[:, None]
-        lengths = np.array([len(piece.t) for piece in whole])
-        begins = np.concatenate([[0], np.cumsum(lengths)])[owner]
-        where = begins + np.minimum(rows, lengths[owner] - 1)
-        x = np.concatenate([np.asarray(piece.x) for piece in whole])[where]
-        x[rows >= lengths[owner]] = np.nan
-        u = np.zeros((steps, len(first), 0))
-        if self.nu:
-            u = np.concatenate([np.asarray(piece.u) for piece in whole])[where[:-1]]
-        y = np.concatenate([piece.y for piece in whole])[where]
-        return Runs(x, y, u, process_noise=np.zeros(len(first)), usual=np.ones(len(first), dtype=bool))
+        ends = np.array([len(piece.t) for piece in whole])[owner] - 1
+
+        def side_by_side(letter: str) -> np.ndarray:
+            """A signal (steps + 1, n, size), of which the last sample stands beyond a piece's end."""
+            values = [getattr(piece, letter) for piece in whole]
+            inside = np.minimum(rows, ends)
+            return np.stack([values[i][inside[:, j]] for j, i in enumerate(owner)], axis=1)
+
+        x = side_by_side("x")
+        x[rows > ends] = np.nan
+        u = side_by_side("u")[:-1] if self.nu else np.zeros((steps, len(first), 0))
+        n = len(first)
+        return Runs(x, side_by_side("y"), u, process_noise=np.zeros(n), usual=np.ones(n, dtype=bool))
 
     def equations(self) -> Equations:
-        """There are none."""
+        """Records have none."""
         raise ValueError("records have no equations")
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
-        """How states change from each recorded sample to the next, on what is trained on and what is held out."""
+        """Changes of the state from each sample to the next, of the records to train on and of those held out."""
         return self._both_increments
 
     @functools.cached_property
@@ -171,12 +191,12 @@ class RecordedSource:
         return self._increments(self.kept), self._increments(self.held_out)
 
     def _increments(self, records: Sequence[Record]) -> Increments:
-        found = list[tuple[np.ndarray, ...]]()
-        for record in pieces(records):
-            if record.x is not None:
-                u = record.u[:-1] if self.nu and record.u is not None else np.zeros((len(record.t) - 1, 0))
-                found.append((record.x[:-1], u, np.diff(record.x, axis=0)))
-        x, u, change = (np.concatenate(each) for each in zip(*found)) if found else (np.zeros((0, 1)),) * 3
+        parts = list[tuple[np.ndarray, ...]]()
+        for piece in pieces(records):
+            if piece.x is not None:
+                u = piece.u[:-1] if self.nu and piece.u is not None else np.zeros((len(piece.t) - 1, 0))
+                parts.append((piece.x[:-1], u, np.diff(piece.x, axis=0)))
+        x, u, change = (np.concatenate(each) for each in zip(*parts)) if parts else (np.zeros((0, 1)),) * 3
         known = np.flatnonzero(np.isfinite(x + change).all(-1))
         if not len(known):
             raise ValueError(
@@ -187,10 +207,13 @@ class RecordedSource:
         return Increments(x[known], u[known], change[known])
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
-        """Errors on what was held out, relative to the signals' standard deviations."""
-        found = recorded_errors(artifact, self.held_out)
-        known = {signal: error for signal, error in found.relative.items() if math.isfinite(error)}
-        return {"records": fingerprints(self.records), "held_out_errors": known, "held_out_after": found.after}
+        """Errors on the records held out, relative to the signals' standard deviations."""
+        errors = recorded_errors(artifact, self.held_out)
+        return {
+            "records": fingerprints(self.records),
+            "held_out_errors": {name: error for name, error in errors.items() if math.isfinite(error)},
+            "held_out_after": settling_time(artifact.filter),
+        }
 
     def tracking(self) -> dict[str, Any]:
         """Arguments of :class:`observers.Motion` beside the flow; ValueError where nothing can track."""
@@ -201,7 +224,7 @@ class RecordedSource:
             )
         if not self.held_out:
             raise ValueError("covariances are calibrated on what is held out: held_out must be positive, got 0")
-        _, least = self._output()
+        _, least = linear_output(self.kept, self.C)
         _ = self._both_increments  # or the reason why there are none
         x = np.concatenate([record.x for record in self.kept if record.x is not None])
         x = x[np.isfinite(x).all(-1)]
@@ -215,11 +238,78 @@ class RecordedSource:
             "process_noise": np.zeros(self.nx),  # the flow's error stands for all noise
             "least_process_noise": 1.0,
             "least_measurement_noise": least,
-            "window": max(WINDOW * self.dt, 0.5 / self.rate),
+            "window": max(WINDOW * self.dt, 0.5 * self.pace),
         }
 
-    def _output(self) -> tuple[np.ndarray, np.ndarray]:
-        return linear_output(self.kept, self.C)
+    def described(self) -> list[str]:
+        """The signals, the records and the filter, for people."""
+        signals, records = self.signals, self.records
+        given = " and ".join(", ".join(names) for names in (signals.measured, signals.inputs) if names)
+        seconds, step, uneven = sum(each.duration for each in records), median_step(*records), max(map(jitter, records))
+        lacking = sum(int(np.isnan(record.y).any(-1).sum()) for record in records)
+        rates = Spectrum(self.config.eigenvalues, self.config.pairs).poles.real
+        return [
+            f"training an observer for {self.name} from recorded states: {', '.join(signals.hidden)} from {given}",
+            f"{len(records)} records of {seconds:.4g} s together, {lacking} rows without an output",
+            f"steps of {step:.4g} s (median), uneven by up to {uneven:.1%}; resampled to {self.dt:g} s",
+            f"{len(rates)} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
+        ]
+
+
+def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> Config:
+    """Return a configuration for records, which decide dt, the eigenvalues of A, and the largest noise.
+
+    dt is the median step. The eigenvalues follow from the rate of the signals and the length of the records; those of
+    rollouts from dt and the length of episodes. The largest noise is a tenth of each output's standard deviation.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Records of the same signals.
+    changes : mapping of str to object, optional
+        Settings that are to differ.
+
+    Returns
+    -------
+    Config
+        For :func:`training.train` with a :class:`training.RecordedSource`.
+
+    Raises
+    ------
+    ValueError
+        If dt does not suit the records, or an output never changes.
+    """
+    given = {name: value for name, value in (changes or {}).items() if value is not None}
+    chosen: dict[str, Any] = {"dt": sampling_interval(*records), **RECORDED} | given
+    check_dt(records, chosen["dt"])
+    if records[0].environment is not None and not np.isclose(chosen["dt"], median_step(*records), rtol=1e-6):
+        raise ValueError(
+            f"dt = {chosen['dt']:g} s: an observer for {records[0].environment['id']} takes a sample at each step, "
+            f"every {median_step(*records):g} s; leave dt out"
+        )
+    chosen.setdefault("duration", max(50.0, chosen["dt"]))
+    if "eigenvalues" not in given:
+        chosen["eigenvalues"] = _recorded_eigenvalues(records, chosen["dt"])
+    if "measurement_noise_max" not in given:
+        y = np.concatenate([record.y for record in records])
+        levels = tuple(float(f"{RECORDED_NOISE * size:.3g}") for size in np.nanstd(y, 0))
+        if still := [name for name, level in zip(records[0].signals.measured, levels) if not level]:
+            raise ValueError(f"{', '.join(still)} never changes: leave it out of what is measured")
+        chosen["measurement_noise_max"] = levels[0] if len(levels) == 1 else levels
+    return Config("input-aware", **chosen)
+
+
+def _recorded_eigenvalues(records: Sequence[Record], dt: float) -> tuple[float, ...]:
+    if records[0].source:
+        steps = float(np.median([len(record.t) for record in records]))
+        slowest = min(max(EPISODE_SLOWEST, EPISODE_MEMORIES * np.log(1e3) / steps), EPISODE_FASTEST / 4)
+        spaced = evenly_spaced(EPISODE_MODES, -slowest / dt, -EPISODE_FASTEST / dt)
+    else:
+        rate = signal_rate(records)
+        length = np.median([record.duration for record in records])
+        slowest = min(max(SLOWEST * rate, RECORD_MEMORIES * np.log(1e3) / length), rate)
+        spaced = evenly_spaced(MODES, -slowest, -min(FASTEST * rate, FASTEST_PER_STEP / dt))
+    return tuple(float(f"{value:.6g}") for value in spaced)
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:
@@ -252,29 +342,14 @@ def check_plant(artifact: Artifact, record: Record) -> None:
 
 
 def fingerprints(records: Sequence[Record]) -> dict[str, str]:
-    """What identifies each file, or all episodes of a data set together, by its name."""
-    found = dict[str, list[str]]()
+    """A fingerprint for each file, or for all episodes of a data set together, by its name."""
+    each = dict[str, list[str]]()
     for record in records:
-        found.setdefault(record.source or Path(record.name).name, []).append(record.fingerprint)
+        each.setdefault(record.source or Path(record.name).name, []).append(record.fingerprint)
     return {
-        name: each[0] if len(each) == 1 else hashlib.sha256("".join(each).encode()).hexdigest()[:16]
-        for name, each in found.items()
+        name: one[0] if len(one) == 1 else hashlib.sha256("".join(one).encode()).hexdigest()[:16]
+        for name, one in each.items()
     }
-
-
-def described(source: RecordedSource) -> list[str]:
-    """What is going to be done."""
-    signals, records, config = source.signals, source.records, source.config
-    given = " and ".join(", ".join(names) for names in (signals.measured, signals.inputs) if names)
-    uneven, seconds = max(map(jitter, records)), sum(record.duration for record in records)
-    lacking = sum(int(np.isnan(record.y).any(-1).sum()) for record in records)
-    rates = Spectrum(config.eigenvalues, config.pairs).poles.real
-    return [
-        f"training an observer for {source.name} from recorded states: {', '.join(signals.hidden)} from {given}",
-        f"{len(records)} records of {seconds:.4g} s together, {lacking} rows without an output",
-        f"steps of {median_step(*records):.4g} s (median), uneven by up to {uneven:.1%}; resampled to {config.dt:g} s",
-        f"{len(rates)} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
-    ]
 
 
 def signal_rate(records: Sequence[Record]) -> float:
@@ -294,4 +369,79 @@ def signal_rate(records: Sequence[Record]) -> float:
     return float(np.median(moving))
 
 
-__all__ = ["RecordedSource", "check_plant", "described", "fingerprints", "signal_rate", "split"]
+def recorded_errors(
+    artifact: Artifact,
+    records: Sequence[Record],
+    after: float | None = None,
+    *,
+    measurement_noise: float | tuple[float, ...] = 0.0,
+) -> dict[str, float]:
+    """Root mean square errors of hidden signals along records, over standard deviations; NaN where none is known.
+
+    Those of the first ``after`` seconds are left out, by default until the filter has settled.
+    """
+    first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
+    errors, states = [np.zeros((0, artifact.nx))], [np.zeros((0, artifact.nx))]
+    rng = np.random.default_rng(0)
+    for record in pieces(records):
+        if record.x is not None:
+            y = record.y + np.asarray(measurement_noise) * rng.standard_normal(record.y.shape)
+            errors.append((estimates(artifact, replace(record, y=y), measurement_noise) - record.x)[first:])
+            states.append(record.x[first:])
+    error, x = np.concatenate(errors), np.concatenate(states)
+    known = ~np.isnan(error).any(-1)
+    error, x = error[known], x[known]
+    names = (artifact.signals or {})["hidden"]
+    if not len(error):
+        return dict.fromkeys(names, math.nan)
+    moves = np.ptp(x, 0) > 0  # rounding may leave a standard deviation of what stands still
+    return dict(zip(names, (np.sqrt(np.mean(error**2, 0)) / np.where(moves, x.std(0), np.nan)).tolist()))
+
+
+def estimates(artifact: Artifact, record: Record, measurement_noise: float | tuple[float, ...] = 0.0) -> np.ndarray:
+    """An observer's estimates (n, nx) along a record without gaps on its grid."""
+    return KKLObserver(artifact, measurement_noise).estimate(record.y, record.u if artifact.nu else None)
+
+
+def linear_output(records: Sequence[Record], known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Fit C of y = C x, unless it is known: (ny, nx), and standard deviations of the rest, (ny,)."""
+    y, x = (np.concatenate([getattr(record, name) for record in records if record.x is not None]) for name in "yx")
+    both = np.isfinite(np.column_stack([x, y])).all(-1)
+    if not both.any():
+        raise ValueError("no sample has all measured and all hidden signals; record them together")
+    x, y = x[both], y[both]
+    size, moves = np.sqrt(np.mean(y**2, 0)), y.std(0)
+    C, left = _fitted(x, y, size) if known is None else (known, _usual(y - x @ known.T))
+    least = np.maximum(left, LEAST_NOISE * np.where(moves > ROUNDING * size, moves, np.where(size > 0, size, 1.0)))
+    if known is not None:
+        return C, least
+    i, j = np.triu_indices(x.shape[1])
+    _, unexplained = _fitted(np.column_stack([x, x[:, i] * x[:, j], np.ones(len(x))]), y, size)
+    much = left > np.maximum(LITTLE * moves, ROUNDING * size)
+    wrong = much & ((left > UNEXPLAINED * moves) | (unexplained < SQUARES * left))
+    signals = records[0].signals
+    if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
+        raise ValueError(
+            f"{', '.join(other)} is no sum of {', '.join(signals.hidden)} without an offset, with which a tracker "
+            "compares its samples: train with what is measured, in the same units, among the hidden signals"
+        )
+    return C, least
+
+
+def _fitted(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """C of a fit that leaves outliers out, and standard deviations of the rest, (ny,)."""
+    size = np.sqrt(np.mean(x**2, 0))
+    size, scale = np.where(size > 0, size, 1.0), np.where(scale > 0, scale, 1.0)
+    kept = np.ones(len(x), dtype=bool)
+    for _ in range(4):
+        C = np.linalg.lstsq(x[kept] / size, y[kept] / scale, rcond=1e-9)[0].T
+        C = np.where(np.abs(C) > ROUNDING, C, 0.0) * scale[:, None] / size
+        apart = y - x @ C.T
+        usual = _usual(apart)
+        kept = (np.abs(apart) <= np.maximum(OUTLIER * usual, ROUNDING * scale)).all(-1)
+    return C, usual
+
+
+def _usual(apart: np.ndarray) -> np.ndarray:
+    """Standard deviations of noise (n, ny), from medians: outliers do not count."""
+    return np.asarray(OF_MEDIAN * np.median(np.abs(apart), axis=0))

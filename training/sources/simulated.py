@@ -1,7 +1,7 @@
 """Motions of a system that is simulated."""
 
-import dataclasses
 import functools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,22 @@ from training.maps.coordinates import spread
 from training.seeds import Stream, generator
 from training.sources.source import Increments, Pairs, Report, Runs
 from training.systems import named_policy
-from training.trajectories.controllers import Controller
-from training.trajectories.derivatives import output_matrix
-from training.trajectories.expression import field_expression, output_expression, output_facts
-from training.trajectories.noise import draw_process_noise
+from training.trajectories.equations import field_expression, output_expression, output_facts, output_matrix
+from training.trajectories.motions import (
+    DRIVEN,
+    FIRST,
+    KINDS,
+    Motions,
+    check_share,
+    draw_process_noise,
+    random_inputs,
+    record,
+    recording_ages,
+    trajectories,
+    under_policy,
+)
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, uncertain_plant, with_parameters
-from training.trajectories.policy import policy_fingerprint, under_policy
-from training.trajectories.record import FIRST, Motions, check_share, record, recording_ages, trajectories
-from training.trajectories.signals import DRIVEN, KINDS, random_inputs
+from training.trajectories.policies import Controller, policy_fingerprint
 
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned
@@ -68,18 +76,17 @@ class SimulatedSource:
         self.ages = recording_ages(self.steps, config.samples)
 
     def identity(self) -> dict[str, Any]:
-        """What identifies the source."""
+        """The system, its equations included, and what else motions depend on."""
         system = self.system
-        found = {
-            **describe(system),
+        identity = describe(system) | {
             "process_noise": float(system.process_noise),
-            "scale": [float(one) for one in system.scale],
+            "scale": list(map(float, system.scale)),
         }
         if self.ranges:
-            found["nominal_share"] = nominal_share(self.ranges)
+            identity["nominal_share"] = nominal_share(self.ranges)
         if self.policy:
-            found["policy_actions"] = policy_fingerprint(self.policy, system)
-        return found
+            identity["policy_actions"] = policy_fingerprint(self.policy, system)
+        return identity
 
     def facts(self) -> dict[str, Any]:
         """Arguments of :class:`observers.Artifact`."""
@@ -94,7 +101,7 @@ class SimulatedSource:
         }
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """Arguments of :class:`training.maps.samplers.TrajectorySampler`."""
+        """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""
         return {
             "measurement_noise": self.system.measurement_noise,
             "process_noise_max": self.process_noise,
@@ -109,10 +116,8 @@ class SimulatedSource:
         else:
             both = self.nu and config.free_inverse and not policy  # then free motions have a map of their own
             motions = Motions(kinds=DRIVEN if both else KINDS, policy=policy and blind(policy, self.nx))
-        motions = dataclasses.replace(
-            motions, process_noise_share=self.process_noise_share, box_factor=config.box_factor
-        )
-        found = record(
+        motions = replace(motions, process_noise_share=self.process_noise_share, box_factor=config.box_factor)
+        pairs = record(
             self.plant,
             linear,
             n=config.trajectories,
@@ -122,7 +127,7 @@ class SimulatedSource:
             motions=motions,
             report=report,
         )
-        return self.known(found)
+        return self.known(pairs)
 
     def known(self, pairs: Any) -> Any:
         """Pairs without the parameters that are not to be estimated, and whether these are the system's own."""
@@ -130,16 +135,16 @@ class SimulatedSource:
         if self.ranges:
             own = [self.system.parameters[name] for name in self.ranges]
             nominal = (pairs.x[0, :, self.nx :] == own).all(-1)
-        return dataclasses.replace(pairs, x=pairs.x[..., : self.nx + len(self.estimated)], nominal=nominal)
+        return replace(pairs, x=pairs.x[..., : self.nx + len(self.estimated)], nominal=nominal)
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
         """Motions with the system's process noise, and as many without; of each a third from 2X, the others from X."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed), max(1, round(RUN * self.pace / self.dt))
-        plant, found = with_parameters(self.system, self.ranges), list[tuple[np.ndarray, ...]]()
-        levels = sorted({0.0, self.process_noise})
+        plant, levels = with_parameters(self.system, self.ranges), sorted({0.0, self.process_noise})
+        parts = list[tuple[np.ndarray, ...]]()
 
         def part(done: float) -> None:
-            report((len(found) + done) / len(levels))
+            report((len(parts) + done) / len(levels))
 
         for level in levels:
             x, u, usual = sound_motions(
@@ -154,10 +159,9 @@ class SimulatedSource:
                 report=part,
                 box_factor=BEYOND,
             )
-            found.append((x, u, np.full(x.shape[1], level), usual))
-        xs, us, noise, usual = zip(*found, strict=True)
-        x = np.concatenate(xs, 1)
-        u = np.concatenate(us, 1)[..., : self.nu]
+            parts.append((x, u, np.full(x.shape[1], level), usual))
+        xs, us, noise, usual = zip(*parts, strict=True)
+        x, u = np.concatenate(xs, 1), np.concatenate(us, 1)[..., : self.nu]
         return Runs(x[..., : self.nx], plant.output(x), u, np.concatenate(noise), np.concatenate(usual), sound=True)
 
     def equations(self) -> Equations:
@@ -167,18 +171,19 @@ class SimulatedSource:
             return Equations(field, 0)
         x, u = self._states(4)
         later = simulate(self.system, x, 1, self.dt, u=u[None] if self.system.nu else None)[-1]
-        inside, substeps = np.isfinite(later).all(-1), 1
-        while substeps <= SUBSTEPS:
+        inside = np.isfinite(later).all(-1)
+        for substeps in (2**i for i in range(SUBSTEPS.bit_length())):
             equations = Equations(field, substeps)
             with np.errstate(all="ignore"):  # too long a step may go anywhere
                 apart = np.abs(equations(x, u, self.dt) - later)[inside] / self._scale[1]
             off = np.quantile(apart.max(-1), 0.99)
             if off <= INTEGRATION_ERROR:
-                return equations
-            substeps *= 2
-        if off <= TOO_FAR_OFF:
-            return equations
-        raise ValueError(f"{SUBSTEPS} Runge-Kutta steps in each {self.dt:g} s are off by {off:.2g} standard deviations")
+                break
+        if off > TOO_FAR_OFF:
+            raise ValueError(
+                f"{SUBSTEPS} Runge-Kutta steps in each {self.dt:g} s are off by {off:.2g} standard deviations"
+            )
+        return equations
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
         """States about motions, and where they are a sample later."""
@@ -192,9 +197,9 @@ class SimulatedSource:
         u = np.where(rng.random((INCREMENTS, 1)) < 0.5, 0.0, u[rows]) if self.nu else np.zeros((INCREMENTS, 0))
         later = simulate(self.system, x, 1, self.dt, u=u[None] if self.nu else None)[-1]
         inside = np.isfinite(later).all(-1)
-        found = Increments(x[inside], u[inside], (later - x)[inside])
-        held = round(JUDGED * len(found.x))
-        return found.part(slice(held, None)), found.part(slice(held))
+        both = Increments(x[inside], u[inside], (later - x)[inside])
+        held = round(JUDGED * len(both.x))
+        return both.part(slice(held, None)), both.part(slice(held))
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
         """Nothing: ``kkl-gym evaluate`` measures errors."""
@@ -236,13 +241,11 @@ class SimulatedSource:
         """States (n, nx) along short motions from X and 2X, and inputs (n, nu)."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed, 6), max(1, round(seconds * self.pace / self.dt))
         motions = Motions(kinds=KINDS if self.nu else (), box_factor=BEYOND, policy=self.policy)
-        found = trajectories(self.system, n=100, steps=steps, dt=self.dt, rng=rng, motions=motions)
+        chunks = trajectories(self.system, n=100, steps=steps, dt=self.dt, rng=rng, motions=motions)
         every = max(1, steps // 500)
-        x, u = zip(*((x[:-1:every], u[::every]) for x, u, _ in found), strict=True)
-        x, u = np.concatenate(x, 1).reshape(-1, self.nx), np.concatenate(u, 1)
-        if not self.nu:
-            return x, np.zeros((len(x), self.system.nu))
-        return x, u.reshape(-1, self.system.nu)
+        xs, us = zip(*((x[:-1:every], u[::every]) for x, u, _ in chunks), strict=True)
+        x, u = np.concatenate(xs, 1).reshape(-1, self.nx), np.concatenate(us, 1)
+        return x, u.reshape(-1, self.system.nu) if self.nu else np.zeros((len(x), self.system.nu))
 
 
 def sound_motions(
@@ -264,8 +267,7 @@ def sound_motions(
     explores. Shapes: returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu), and which start in X, (n,).
     """
     level = system.process_noise if process_noise is None else process_noise
-    kept: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    tried = stayed = 0
+    parts, tried, stayed = list[tuple[np.ndarray, np.ndarray, np.ndarray]](), 0, 0
     while stayed < n:
         count = max(n - stayed, n // 4)
         x0 = system.draw_starts(rng, count)
@@ -281,11 +283,11 @@ def sound_motions(
                 u[:, ::2] = random_inputs(system, len(range(0, count, 2)), steps, dt=dt, rng=rng, kinds=DRIVEN)
             x = simulate(system, x0, steps, dt, u=u, w=w, report=lambda k: report(k / steps))
         inside = np.isfinite(x[-1]).all(-1)
-        kept.append((x[:, inside], u[:, inside], ~far[inside]))
+        parts.append((x[:, inside], u[:, inside], ~far[inside]))
         tried, stayed = tried + count, stayed + int(inside.sum())
         if tried >= FIRST:
             check_share(system, stayed, tried, steps * dt)
-    xs, us, usual = zip(*kept, strict=True)
+    xs, us, usual = zip(*parts, strict=True)
     return np.concatenate(xs, 1)[:, :n], np.concatenate(us, 1)[:, :n], np.concatenate(usual)[:n]
 
 
@@ -296,6 +298,3 @@ def unknown_start(system: System) -> tuple[np.ndarray, np.ndarray]:
         return (low + high) / 2, np.diag((high - low) ** 2 / 12)
     x = system.draw_starts(np.random.default_rng(0), 10_000)
     return x.mean(0), np.cov(x.T).reshape(system.nx, -1) + np.diag(1e-6 * (high - low) ** 2)
-
-
-__all__ = ["SimulatedSource", "sound_motions", "unknown_start"]

@@ -8,9 +8,10 @@ import numpy as np
 
 from observers import Artifact, Equations, LinearFilter
 from training.config import Config
-from training.trajectories.record import Pairs
+from training.trajectories.motions import Pairs
 
 Report = Callable[[float], object]
+OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ class Increments:
 class Source(Protocol):
     """Simulated motions of a system, recorded ones, or rollouts of an environment.
 
-    Lessons ask a source for motions and never where these come from. Motions to calibrate on are other ones than those
-    to train on.
+    Lessons take motions from a source and never ask where these come from. Motions to calibrate on are not those to
+    train on.
 
     Attributes
     ----------
@@ -72,35 +73,23 @@ class Source(Protocol):
 
     name: str
     config: Config
-
-    @property
-    def nx(self) -> int: ...  # noqa: D102
-
-    @property
-    def ny(self) -> int: ...  # noqa: D102
-
-    @property
-    def nu(self) -> int: ...  # noqa: D102
-
-    @property
-    def dt(self) -> float: ...  # noqa: D102
-
-    @property
-    def pace(self) -> float: ...  # noqa: D102
-
-    @property
-    def process_noise(self) -> float: ...  # noqa: D102
+    nx: int
+    ny: int
+    nu: int
+    dt: float
+    pace: float
+    process_noise: float
 
     def identity(self) -> dict[str, Any]:
         """What identifies the source, for fingerprints and the files of a run."""
         ...
 
     def facts(self) -> dict[str, Any]:
-        """What an artifact says of its source: arguments of :class:`observers.Artifact`."""
+        """Arguments of :class:`observers.Artifact` that describe the source."""
         ...
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """How batches are drawn: arguments of :class:`training.maps.samplers.TrajectorySampler`."""
+        """How batches are drawn: arguments of :class:`training.maps.inverse.TrajectorySampler`."""
         ...
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report) -> Pairs:
@@ -128,4 +117,4 @@ class Source(Protocol):
         ...
 
 
-__all__ = ["Increments", "Pairs", "Report", "Runs", "Source", "TooFewRunsError"]
+__all__ = ["OF_MEDIAN", "Increments", "Pairs", "Report", "Runs", "Source", "TooFewRunsError"]

@@ -1,1 +1,1 @@
-"""Simulated data: inputs, noise, recorded trajectories, closed loops, controllers and derivatives of the equations."""
+"""Simulated motions: inputs, noise, policies, closed loops, and what follows from a system's equations."""

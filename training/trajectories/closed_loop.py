@@ -5,13 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kkl_gym.simulate import advance_batch, followed_rows
+from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from training.trajectories.controllers import Controller
-from training.trajectories.noise import ALIKE, draw_process_noise, noisy_output
-from training.trajectories.policy import EXPLORATION
-from training.trajectories.record import Pairs
+from training.trajectories.motions import ALIKE, EXPLORATION, Pairs, draw_process_noise, noisy_output
+from training.trajectories.policies import Controller
 
 HOLDS = (1, 5, 10, 20)  # samples for which actions are held
 GROUPS = 50  # of closed-loop trajectories with a noise level and a time for which actions are held in common
@@ -40,73 +38,73 @@ def record_closed_loop(
 ) -> ClosedLoop:
     """Simulate trajectories from starts in X, in which the controller acts on x_hat, with exploration.
 
-    The controller never acts on the true state: such inputs would tell the observer, which filters them, what it is to
-    find out by itself. For the same reason noise is not added afterwards, but is what the observer and through it the
-    controller saw. Groups of trajectories differ in noise level, in how long an action is held, and in the level of
-    process noise if the observer is told it. Pairs of a group differ in how much is added to an action.
+    The inputs of a controller that acts on the true state would show it to the observer, which filters them. For the
+    same reason noise is not added afterwards: the controller acts on it too. Groups of trajectories differ in noise
+    level, in how long an action is held, and in the level of process noise if the observer is given it. Pairs of a
+    group differ in how much is added to an action.
     """
-    dt = artifact.filter.dt
-    low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
-    u_max = np.array(system.u_max)
-    largest_levels = np.broadcast_to(artifact.inverse.measurement_noise_max, system.ny).tolist()
-    xs, zs, levels, disturbances = [], [], [], []
+    largest = np.broadcast_to(artifact.inverse.measurement_noise_max, system.ny)
     groups = np.array_split(np.arange(n), min(n, GROUPS))
+    parts = list[tuple[np.ndarray, ...]]()
     for i, group in enumerate(groups):
-        count = len(group)
-        positions = [(i + rng.random()) / len(groups)] * system.ny
+        positions = np.full(system.ny, (i + rng.random()) / len(groups))
         if system.ny > 1 and rng.random() >= ALIKE:
-            positions[1:] = rng.random(system.ny - 1).tolist()
-        level = tuple(
-            largest * _part_of_largest(position - noise_free_share, noise_free_share, high_noise_emphasis)
-            for position, largest in zip(positions, largest_levels, strict=True)
-        )
-        hold = int(rng.choice(HOLDS))
-        amplitude = EXPLORATION * rng.random((count, 1))
+            positions[1:] = rng.random(system.ny - 1)
+        level, loud = np.zeros(system.ny), positions >= noise_free_share
+        along = (positions[loud] - noise_free_share) / (1 - noise_free_share)  # two decades, as in TrajectorySampler
+        level[loud] = largest[loud] * 100 ** (along ** (1 / high_noise_emphasis) - 1)
         disturbance = 0.0
         if artifact.process_noise_max is not None and rng.random() < process_noise_share:
             disturbance = system.process_noise * float(np.sqrt(rng.random()))
-        observer = KKLObserver(artifact, level, process_noise=disturbance)
-        x = system.draw_starts(rng, count).T.copy()
-        inside = np.ones(count, dtype=bool)
-        x_rows, z_rows = np.empty((len(ages), count, system.nx)), np.empty((len(ages), count, artifact.filter.size))
-        slot = {int(age): i for i, age in enumerate(ages)}
-        w = np.zeros_like(x)
-        u = np.zeros((count, system.nu))
-        for k in range(steps + 1):
-            y = noisy_output(system, x.T, measurement_noise=level, rng=rng)
-            if k == 0:
-                observer.reset(y)
-            else:
-                observer.advance(y, u)
-            if k in slot:
-                x_rows[slot[k]], z_rows[slot[k]] = x.T, observer.z
-            if k % hold == 0:
-                action = controller(observer.decode()) + amplitude * rng.uniform(-1, 1, (count, system.nu))
-                u = np.clip(action, -1.0, 1.0) * u_max
-            if disturbance:
-                w = np.ascontiguousarray(draw_process_noise(system, disturbance, n=count, steps=1, rng=rng)[0].T)
-            after = advance_batch(system, x, np.ascontiguousarray(u.T), w, dt)
-            beyond = np.flatnonzero(~((after >= low) & (after <= high)).all(0))
-            after = followed_rows(system, x, np.ascontiguousarray(u.T), w, dt=dt, end=after, rows=beyond)
-            inside &= ((after >= low) & (after <= high)).all(0)
-            x = np.where(inside, after, x)
-        xs.append(x_rows[:, inside])
-        zs.append(z_rows[:, inside])
-        levels.append(np.tile(level, (int(inside.sum()), 1)))
-        disturbances.append(np.full(int(inside.sum()), disturbance))
+        observer = KKLObserver(artifact, tuple(level.tolist()), process_noise=disturbance)
+        x, z = _group(system, observer, controller, len(group), steps=steps, ages=ages, rng=rng)
+        inside = np.isfinite(x[-1]).all(-1)
+        kept = int(inside.sum())
+        parts.append((x[:, inside], z[:, inside], np.full(kept, disturbance), np.tile(level, (kept, 1))))
         report(int(group[-1]) + 1)
+    xs, zs, disturbances, levels = zip(*parts, strict=True)
     kept = sum(map(len, levels))
     if 2 * kept < n:
         raise ValueError(
             f"of {n} trajectories under the controller only {kept} stayed within bounds = {system.bounds}; widen them, "
             "or shrink X"
         )
-    parts = np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(disturbances), np.concatenate(levels)
-    return ClosedLoop(ages, *parts)
+    return ClosedLoop(
+        ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(disturbances), np.concatenate(levels)
+    )
 
 
-def _part_of_largest(position: float, noise_free_share: float, high_noise_emphasis: float) -> float:
-    """A level over two decades, as in :class:`training.maps.samplers.TrajectorySampler`; none at negative positions."""
-    if position < 0:
-        return 0.0
-    return float(100 ** ((position / (1 - noise_free_share)) ** (1 / high_noise_emphasis) - 1))
+def _group(
+    system: System,
+    observer: KKLObserver,
+    controller: Controller,
+    n: int,
+    *,
+    steps: int,
+    ages: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """States and filter states at the ages of n trajectories; states are NaN beyond the bounds."""
+    level, u_max = observer.measurement_noise, np.array(system.u_max)
+    hold, amplitude = int(rng.choice(HOLDS)), EXPLORATION * rng.random((n, 1))
+    x0, u = system.draw_starts(rng, n), np.zeros((n, system.nu))
+    w = draw_process_noise(system, observer.process_noise, n=n, steps=steps, rng=rng)
+    zs, recorded = list[np.ndarray](), set(ages.tolist())
+
+    def act(k: int, x: np.ndarray) -> np.ndarray:
+        nonlocal u
+        y = noisy_output(system, np.where(np.isfinite(x), x, system.X_centre), measurement_noise=level, rng=rng)
+        if k == 0:
+            observer.reset(y)
+        else:
+            observer.advance(y, u)
+        if k in recorded:
+            zs.append(observer.z.copy())
+        if k % hold == 0:
+            action = controller(observer.decode()) + amplitude * rng.uniform(-1, 1, (n, system.nu))
+            u = np.clip(action, -1.0, 1.0) * u_max
+        return u
+
+    x = simulate(system, x0, steps, observer.artifact.filter.dt, u=act, w=w)
+    act(steps, x[-1])
+    return x[ages], np.stack(zs)

@@ -8,26 +8,21 @@ import numpy as np
 from kkl_gym.equations import input_matrix
 from kkl_gym.system import Box, Components, System
 from observers.checks import shown
-from training.trajectories.controllers import Controller
+from training.trajectories.policies import Controller
 
 # Of motions in training with one uncertain parameter, the share that has its own value; with more, the power of their
 # number, for it is the less likely that all are as said. Chosen on the four systems that ship: at 0.6 and a width of
-# 256 Lorenz's map no longer told its own plant from the others.
+# 256 Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
 EVERY = "all"  # in the place of a parameter's name
 ROOM = 1e6  # half-widths of its range that a parameter may lie from the middle
 
-
-def with_values(system: System, values: Mapping[str, Any]) -> System:
-    """A system with parameters that need not be numbers."""
-    changed = object.__new__(type(system))  # past the class's own check, which asks for floats
-    changed.__dict__.update(system.__dict__, **values)
-    return changed
+Ranges = Mapping[str, tuple[float, float]]
 
 
 def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Ranges about the values that a system's parameters have."""
+    """Ranges about the values that a system's parameters have; half-widths are parts of these values."""
     known = system.parameters
     for name in half_widths:
         if name not in known and name != EVERY:
@@ -40,62 +35,63 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
     ranges = {}
     for name, width in widths.items():
         value = known[name]
-        if not width:
-            continue
-        if not value:
+        if width and not value:
             raise ValueError(
                 f"the parameter {name} of {system.name} is 0, which has no relative range: leave it out, {name}=0"
             )
-        ranges[name] = (value - width * abs(value), value + width * abs(value))
+        if width:
+            ranges[name] = (value - width * abs(value), value + width * abs(value))
     return ranges
 
 
-def uncertain_plant(system: System, ranges: Mapping[str, tuple[float, float]]) -> System:
+def uncertain_plant(system: System, ranges: Ranges) -> System:
     """A system whose parameters differ from motion to motion, as a training for all of them wants it.
 
     Some motions have the system's own parameters, which are the likeliest: two in three where one parameter is
     uncertain. In the others parameters lie more often near the ends of their ranges, where plants are hardest to serve.
     """
-    return with_parameters(system, ranges, nominal_share(ranges), at_ends=True)
+    return with_parameters(system, ranges, in_training=True)
 
 
-def nominal_share(ranges: Mapping[str, tuple[float, float]]) -> float:
+def nominal_share(ranges: Ranges) -> float:
     """Share of the motions of :func:`uncertain_plant` that have the system's own parameters."""
     return NOMINAL_SHARE ** len(ranges)
 
 
-def with_parameters(
-    system: System, ranges: Mapping[str, tuple[float, float]], nominal_share: float = 0.0, *, at_ends: bool = False
-) -> System:
+def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False) -> System:
     """A system whose states are x and then some of its parameters, with derivative zero.
 
     An observer of such a system estimates parameters, a motion of it has parameters of its own, and derivatives by its
     states are derivatives by parameters as well.
     """
-    for name, (low, high) in ranges.items():
+    for name, limits in ranges.items():
         if name not in system.parameters:
             raise ValueError(
                 f"{system.name} has no parameter {shown(name)}; it has {', '.join(system.parameters) or 'none'}"
             )
-        if not low < high:
-            raise ValueError(f"the range of {name} must go from low to high, got {shown((low, high))}")
+        if not limits[0] < limits[1]:
+            raise ValueError(f"the range of {name} must go from low to high, got {shown(limits)}")
     if not ranges:
         return system
-    nx, names = system.nx, tuple(ranges)
+    nx, names, own = system.nx, tuple(ranges), [getattr(system, name) for name in ranges]
+    limits_of = [(float(low), float(high)) for low, high in ranges.values()]
+    middles = [(low + high) / 2 for low, high in limits_of]
     still = ((0.0,) * system.nu,) * len(names)
     constant = bool(system.nu) and type(system).g is System.g and not system.discrete
 
     def model(x: Components) -> System:
-        return with_values(system, dict(zip(names, x[nx:], strict=True)))
+        changed = object.__new__(type(system))  # past the class's own check, which asks for floats
+        changed.__dict__.update(system.__dict__, **dict(zip(names, x[nx:], strict=True)))
+        return changed
 
     class WithParameters(System):
         name = system.name
         state_names: ClassVar[tuple[str, ...]] = (*system.state_names, *names)
-        X: ClassVar[Box] = (*system.X, *((float(low), float(high)) for low, high in ranges.values()))
-        X_centre: ClassVar[tuple[float, ...]] = (*system.X_centre, *((a + b) / 2 for a, b in ranges.values()))
+        X: ClassVar[Box] = (*system.X, *limits_of)
+        X_centre: ClassVar[tuple[float, ...]] = (*system.X_centre, *middles)
         bounds: ClassVar[Box] = (
             *system.bounds,
-            *(((a + b) / 2 - ROOM * (b - a), (a + b) / 2 + ROOM * (b - a)) for a, b in ranges.values()),
+            *((mid - ROOM * (b - a), mid + ROOM * (b - a)) for mid, (a, b) in zip(middles, limits_of)),
         )
         u_max: ClassVar[tuple[float, ...]] = system.u_max
         G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *still) if constant else ()
@@ -107,17 +103,16 @@ def with_parameters(
         def draw_starts(self, rng: Any, n: int, factor: float = 1.0) -> Any:
             x = super().draw_starts(rng, n)  # parameters keep to their ranges, and states to what the system draws
             x[:, :nx] = system.draw_starts(rng, n, factor)
-            if at_ends:
-                low, high = np.transpose(list(ranges.values()))
+            if in_training:
+                low, high = np.transpose(limits_of)
                 along = (2 * x[:, nx:] - low - high) / (high - low)  # -1 to 1
                 x[:, nx:] = (low + high + np.sin(along * np.pi / 2) * (high - low)) / 2
-            if nominal_share:
-                x[rng.random(n) < nominal_share, nx:] = [getattr(system, name) for name in names]
+                x[rng.random(n) < nominal_share(ranges), nx:] = own
             return x
 
         @property
         def target(self) -> tuple[float, ...]:
-            return (*system.target, *(getattr(system, name) for name in names))
+            return (*system.target, *own)
 
         def h(self, x: Components) -> Components:
             return model(x).h(x[:nx])

@@ -17,12 +17,11 @@ from observers.names import resolve
 from observers.storage import write
 from training.agents.agent import fingerprint
 from training.agents.information import OBSERVED, observer_of
-from training.agents.tasks import TASKS
+from training.agents.tasks import TASKS, Task
 from training.commands.agent_task import TaskOptions
 from training.commands.options import NoiseLevels
 from training.evaluation.levels import Level
 from training.progress import ProgressBars
-from training.systems import PROFILES, Task
 
 
 @dataclass(frozen=True)
@@ -122,9 +121,8 @@ class Compare:
         """A task at each level of noise."""
         own = self.options.task(name)
         levels: list[Level] = list(self.measurement_noise or (own.measurement_noise,))
-        profile = PROFILES.get(own.name)
-        if self.measurement_noise is None and own.system is not None and profile is not None and profile.second_noise:
-            levels.append(profile.second_noise)
+        if self.measurement_noise is None and own.name in comparison.SECOND_NOISE:
+            levels.append(comparison.SECOND_NOISE[own.name])
         return [self.options.task(name, level) for level in levels]
 
     def _observers(self, tasks: list[Task]) -> dict[str, str]:

@@ -19,10 +19,9 @@ from training.agents.agent import fingerprint, rules
 from training.agents.environments import vector
 from training.agents.information import OBSERVED, Information, make, observer_of
 from training.agents.play import play
-from training.agents.tasks import scores, successes
+from training.agents.seeds import AGENT_EVALUATION_SEED
+from training.agents.tasks import Task, scores, successes
 from training.evaluation.levels import as_cell, as_name
-from training.seeds import AGENT_EVALUATION_SEED
-from training.systems import PROFILES, Task
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,6 +56,7 @@ CONCERNED = {  # by settings of a task that matter to some agents alone
     "past_actions": ("z", "traces", "stacked"),
     "angles": ("z",),
 }
+SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # further levels at which agents are trained
 SEEDS = 5
 RECURRENT_SEEDS, SECOND_NOISE_RECURRENT_SEEDS = 3, 1  # on systems, at most; their trainings take longest
 COLUMNS = {
@@ -207,8 +207,7 @@ def planned(
 
 def _most(task: Task) -> int:
     """Recurrent agents of a system's task, at most."""
-    known = PROFILES.get(task.name)
-    second = known is not None and known.second_noise == task.measurement_noise
+    second = SECOND_NOISE.get(task.name) == task.measurement_noise
     return SECOND_NOISE_RECURRENT_SEEDS if second else RECURRENT_SEEDS
 
 

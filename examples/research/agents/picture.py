@@ -10,9 +10,9 @@ from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
 from kkl_gym.system import System
 from training.agents.play import Episodes
+from training.agents.tasks import Task
 from training.evaluation.levels import show_level
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, drawing, save_moving, style
-from training.systems import Task
 
 FRAMES = 150  # of an animation, at most
 SECONDS = 10.0  # that it lasts

@@ -29,17 +29,16 @@ from training.agents.observing import (
     oldest_first,
     signals,
 )
+from training.agents.tasks import Task
 from training.config import Config
-from training.maps.inverse import InverseProblem
+from training.lessons.run import Stage, optimise
+from training.maps.inverse import Batch, InverseProblem
 from training.maps.networks import Network
-from training.maps.optimise import Stage, optimise
-from training.maps.samplers import Batch
-from training.presets import RECORDED
 from training.progress import ProgressBars
 from training.records import Record
 from training.rollouts.callback import rehearsed
 from training.rollouts.playing import Recorder
-from training.systems import Task
+from training.sources.recorded import RECORDED
 
 KEY = "kkl-gym-window"
 DEFAULT = Config("input-aware", eigenvalues=(-1.0,), dt=1.0, **RECORDED)  # for the size of its network

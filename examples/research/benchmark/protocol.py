@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from examples.research.methods import CausalObserver, Method
+from examples.research.methods import Method
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
+from observers.estimator import Running
 from training.evaluation.errors import TRANSIENT, Domain, UnseenTrajectories, starts, unseen_trajectories
 from training.evaluation.levels import Level, as_cell, multiple
 from training.evaluation.metrics import by_state, nrmse, smape
@@ -29,19 +30,6 @@ class Protocol:
     trajectories: int = 100
     duration: float = 50.0
     seed: int = 0
-
-
-def run(observer: CausalObserver, y: np.ndarray) -> np.ndarray:
-    """Give an observer one sample of y after the other.
-
-    Shapes: ``y`` (steps + 1, n, ny); returns (steps + 1, n, nx).
-    """
-    first = observer.reset(y[0])
-    out = np.empty((len(y), *first.shape))
-    out[0] = first
-    for k in range(1, len(y)):
-        out[k] = observer.step(y[k])
-    return out
 
 
 def with_shared_noise(
@@ -85,7 +73,7 @@ def measure(method: Method[Any], trained: Any, system: System, *, dt: float, pro
         skip = round(TRANSIENT * len(runs.x))
         for noise in protocol.measurement_noise:
             y = with_shared_noise(system, runs, measurement_noise=noise, n=n, seed=seed)
-            x_hat = run(method.observer(trained, system, dt, noise), y)
+            x_hat = Running(method.observer(trained, system, dt, noise)).along(y)
             late = smape(runs.x, x_hat, skip)
             errors = pd.DataFrame(
                 {
@@ -129,7 +117,7 @@ def validate(method: Method[Any], trained: Any, system: System, *, dt: float, pr
     medians = []
     for noise in tuned_for(method, system) or protocol.measurement_noise:
         y = with_shared_noise(system, runs, measurement_noise=noise, n=n, seed=seed)
-        x_hat = run(method.observer(trained, system, dt, noise), y)
+        x_hat = Running(method.observer(trained, system, dt, noise)).along(y)
         medians.append(np.median(smape(runs.x, x_hat)))
     return float(np.exp(np.mean(np.log(np.maximum(medians, 1e-6)))))
 
@@ -138,7 +126,7 @@ def step_time(
     method: Method[Any], trained: Any, *, system: System, dt: float, batch: int, seconds: float = 0.3
 ) -> float:
     """Time one step of a whole batch along motions from X, once an observer has followed them for a while."""
-    observer = method.observer(trained, system, dt, system.measurement_noise)
+    observer = Running(method.observer(trained, system, dt, system.measurement_noise))
     x = simulate(system, starts(system, "X", batch, np.random.default_rng(0)), UNTIMED + TIMED, dt)
     y = np.nan_to_num(system.output(x))
     best = np.inf

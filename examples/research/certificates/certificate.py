@@ -15,14 +15,14 @@ from examples.research.certificates.generalisation import (
 )
 from examples.research.certificates.lipschitz import lipschitz_lower, lipschitz_upper, norm_product, output_lipschitz
 from examples.research.certificates.settled import TRUNCATED, SettledTrajectories, record_settled
+from examples.research.certificates.smooth import decoder
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.checks import noise_levels
 from training.evaluation.levels import Level, level_for
 from training.evaluation.metrics import nrmse
-from training.maps.smooth import decoder
 from training.seeds import Stream, generator
-from training.trajectories.controllers import Controller
+from training.trajectories.policies import Controller
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,10 @@ from examples.research.certificates.generalisation import (
 )
 from examples.research.certificates.segments import segment_lipschitz
 from examples.research.certificates.settled import SettledTrajectories
+from examples.research.certificates.smooth import Smooth, encoder
 from kkl_gym.system import System
 from observers import Artifact
-from training.maps.smooth import Smooth, encoder, residual
+from training.maps.forward import residual
 
 QUANTILES = (0.5, 0.9, 0.99, 1.0)
 AGES = (0.0, 1.0, 2.0, 5.0, 10.0)  # s at the pace of the shipped systems, at which the envelope is reported

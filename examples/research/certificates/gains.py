@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from examples.research.certificates.smooth import decoder
 from observers import Artifact, LinearFilter
-from training.filter_noise import stationary_covariance
-from training.maps.smooth import decoder
+from training.maps.coordinates import stationary_covariance
 
 
 def theorem_gain(linear: LinearFilter) -> float:

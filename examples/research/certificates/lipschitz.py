@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
+from examples.research.certificates.smooth import Smooth
 from kkl_gym.system import System
-from training.maps.smooth import Smooth
-from training.trajectories.derivatives import evaluate, jacobian
+from training.trajectories.equations import evaluate, jacobian
 
 # Least and greatest slope of each activation, rounded outwards; those of x sigmoid(x) are where its second derivative
 # vanishes, at |x| = 2.39936.

@@ -3,8 +3,8 @@
 import numpy as np
 
 from examples.research.certificates.lipschitz import SLOPES
+from examples.research.certificates.smooth import Smooth
 from observers.network import ACTIVATIONS
-from training.maps.smooth import Smooth
 
 CHUNK = 256  # pieces whose enclosures are computed at once
 SLACK = 0.5  # part by which a constant may be too large before its segment is cut further

@@ -5,7 +5,7 @@ from typing import Any
 
 from examples.research.methods.ablation import INVERSE_METHODS, SPINN_METHODS
 from examples.research.methods.autoencoder import AE
-from examples.research.methods.base import Budget, CausalObserver, Configuration, Data, Method, Task, WrongParameters
+from examples.research.methods.base import Budget, Configuration, Data, Method, Task, WrongParameters
 from examples.research.methods.dmf import DMF, DMFNoise
 from examples.research.methods.gru import GRU
 from examples.research.methods.kalman import EKF, UKF, UntunedEKF, WrongEKF
@@ -71,7 +71,6 @@ __all__ = [
     "METHODS",
     "SHIPPED",
     "Budget",
-    "CausalObserver",
     "Configuration",
     "Data",
     "Method",

@@ -14,10 +14,10 @@ from examples.research.methods.kkl import KKLMethod
 from kkl_gym.system import System, typical_rate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from training.maps.coordinates import spread
+from training.maps.forward import on_tensors
 from training.maps.networks import Network, tensor
-from training.maps.pde import on_tensors
 from training.spectrum import Spectrum
-from training.trajectories.derivatives import output_matrix
+from training.trajectories.equations import output_matrix
 
 BATCH = 512
 LEARNING_RATE = 1e-3  # the authors'; at several times that the PDE residual jumps

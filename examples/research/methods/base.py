@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -14,14 +14,14 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import storage
+from observers.estimator import Estimator
 from training.evaluation.levels import Level
 from training.evaluation.plants import off_by
 from training.jobs import describe
-from training.maps.optimise import Stage, optimise
-from training.maps.step import Loss
+from training.lessons.run import Loss, Stage, optimise
 from training.progress import progress_bars
 from training.seeds import Stream, generator
-from training.trajectories.record import recording_ages, trajectories
+from training.trajectories.motions import recording_ages, trajectories
 
 _KEY = "kkl-gym-method"
 
@@ -30,24 +30,6 @@ WRONG = 0.1  # share by which every parameter of a wrong model is too large
 Trained = TypeVar("Trained")
 Configuration = Mapping[str, Any]
 Arrays = dict[str, np.ndarray]
-
-
-class CausalObserver(Protocol):
-    """x_hat_0 = reset(y_0), x_hat_k+1 = step(y_k+1); outputs (n, ny) in, estimates (n, nx) out."""
-
-    def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Forget the past and take in the first sample.
-
-        Shapes: ``y0`` (n, ny); returns (n, nx).
-        """
-        ...
-
-    def step(self, y: np.ndarray) -> np.ndarray:
-        """Take in the next sample.
-
-        Shapes: ``y`` (n, ny); returns (n, nx).
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -160,7 +142,7 @@ class Method(ABC, Generic[Trained]):
         """Train."""
 
     @abstractmethod
-    def observer(self, trained: Trained, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
+    def observer(self, trained: Trained, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
         """Make an observer. The arguments are given by position, so that a class may name them as it likes.
 
         Shapes: ``measurement_noise`` of length ny.

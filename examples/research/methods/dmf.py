@@ -1,16 +1,17 @@
 """Discrete-time observer with a learned, Schur stable A (Peralez and Nadri, 2024)."""
 
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
-from examples.research.methods.base import Arrays, CausalObserver, Configuration, Method, Task
+from examples.research.methods.base import Arrays, Configuration, Method, Task
 from examples.research.methods.kkl import SPECTRA, spectrum
 from examples.research.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, distance, rollout
 from kkl_gym.system import System
 from observers import MLP, LinearFilter
+from observers.estimator import Estimate, Estimator
 from observers.network import ACTIVATIONS
 from observers.storage import get_mlp, put_mlp
 from training.evaluation.levels import Level, multiple
@@ -86,7 +87,7 @@ class DMF(Method[Arrays]):
             arrays |= {f"{name}.{key}": value for key, value in found.export().items()}
         return arrays
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
         """The switching observer."""
         return Switching(trained, system)
 
@@ -150,6 +151,14 @@ def _unpack(arrays: Arrays, name: str) -> MLP:
     return get_mlp(arrays, f"{name}.", next(kind for kind in ACTIVATIONS if f"{name}.{kind}" in arrays))
 
 
+class Both(NamedTuple):
+    """Both filters' states (2, n, nz), last outputs (n, ny), which are NaN at first, filtered innovations (n, 2)."""
+
+    z: np.ndarray
+    y: np.ndarray
+    innovation: np.ndarray
+
+
 class Switching:
     """Both observers side by side; the estimate is that of the smaller filtered innovation."""
 
@@ -162,28 +171,31 @@ class Switching:
             own = {key.removeprefix(f"{name}."): value for key, value in arrays.items() if key.startswith(f"{name}.")}
             self._stages.append((own, _unpack(own, "network")))
 
-    def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Both from the learned start, the transient observer first in charge."""
+    def start(self, n: int) -> Both:
+        """Rows before their first sample."""
+        (first, _), ny = self._stages[0], len(self._y_offset)
+        return Both(np.zeros((2, n, len(first["A"]))), np.full((n, ny), np.nan), np.zeros((n, 2)))
+
+    def advance(self, state: Both, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Both:
+        """Advance both, compare their filtered innovations; first both from the learned start."""
+        new = np.isnan(state.y).any(-1, keepdims=True)
         first, _ = self._stages[0]
-        start = self._start((y0 - self._y_offset) / self._y_scale)
+        start = self._start((y - self._y_offset) / self._y_scale)
         z0 = first["z_offset"] + start @ np.linalg.inv(first["whiten"]).T
-        self._z = [z0, z0]
-        self._y = y0
-        self._innovation = np.zeros((len(y0), 2))
-        return self._decode(0)
+        z = [z @ own["A"].T + state.y @ own["B"].T for z, (own, _) in zip(state.z, self._stages, strict=True)]
+        state = Both(np.where(new, z0, z), y, state.innovation)
+        apart = np.linalg.norm(y[:, None] - self._system.output(self._both(state)), axis=-1)
+        return state._replace(innovation=np.where(new, 0.0, FORGET * state.innovation + (1 - FORGET) * apart))
 
-    def step(self, y: np.ndarray) -> np.ndarray:
-        """Advance both, compare their filtered innovations."""
-        for i, (own, _) in enumerate(self._stages):
-            self._z[i] = self._z[i] @ own["A"].T + self._y @ own["B"].T
-        self._y = y
-        x_hat = np.stack([self._decode(0), self._decode(1)], axis=1)
-        innovation = np.linalg.norm(y[:, None] - self._system.output(x_hat), axis=-1)
-        self._innovation = FORGET * self._innovation + (1 - FORGET) * innovation
-        chosen = self._innovation.argmin(1)
-        return np.asarray(x_hat[np.arange(len(y)), chosen])
+    def estimate(self, state: Both) -> Estimate:
+        """That of the smaller filtered innovation, first the transient observer's."""
+        chosen = state.innovation.argmin(1)
+        return Estimate(np.asarray(self._both(state)[np.arange(len(chosen)), chosen]))
 
-    def _decode(self, i: int) -> np.ndarray:
+    def _both(self, state: Both) -> np.ndarray:
+        return np.stack([self._decode(0, state.z[0]), self._decode(1, state.z[1])], axis=1)
+
+    def _decode(self, i: int, z: np.ndarray) -> np.ndarray:
         own, network = self._stages[i]
-        x_hat = network((self._z[i] - own["z_offset"]) @ own["whiten"].T)
+        x_hat = network((z - own["z_offset"]) @ own["whiten"].T)
         return np.asarray(own["x_offset"] + own["x_scale"] * x_hat)

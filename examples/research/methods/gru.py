@@ -1,13 +1,14 @@
 """A recurrent network on the output history: what a machine-learning user would try first."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import nn
 
-from examples.research.methods.base import Arrays, CausalObserver, Configuration, Method, Task
+from examples.research.methods.base import Arrays, Configuration, Method, Task
 from kkl_gym.system import System
+from observers.estimator import Estimate, Estimator
 from training.evaluation.levels import Level
 from training.maps.networks import tensor
 
@@ -36,7 +37,7 @@ class GRU(Method[Arrays]):
         arrays = {key: value.cpu().numpy() for key, value in problem.network.state_dict().items()}
         return {**arrays, **problem.scaling}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
         """The network, one sample at a time."""
         return Recurrent(trained)
 
@@ -109,14 +110,20 @@ class Recurrent:
         self._network.load_state_dict(weights)
         self._y_offset, self._y_scale, self._x_offset, self._x_scale = (arrays[key] for key in scaling)
 
-    def reset(self, y0: np.ndarray) -> np.ndarray:
-        """From a hidden state of zero."""
-        self._hidden = torch.zeros(1, len(y0), self._network.gru.hidden_size)
-        return self.step(y0)
+    def start(self, n: int) -> torch.Tensor:
+        """A hidden state of zero."""
+        return torch.zeros(1, n, self._network.gru.hidden_size)
 
     @torch.no_grad()
-    def step(self, y: np.ndarray) -> np.ndarray:
+    def advance(
+        self, state: torch.Tensor, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None
+    ) -> torch.Tensor:
         """One sample."""
         scaled = torch.as_tensor((y - self._y_offset) / self._y_scale, dtype=torch.float32)
-        features, self._hidden = self._network.gru(scaled[None], self._hidden)
-        return np.asarray(self._x_offset + self._x_scale * self._network.readout(features[0]).numpy())
+        hidden: torch.Tensor = self._network.gru(scaled[None], state)[1]
+        return hidden
+
+    @torch.no_grad()
+    def estimate(self, state: torch.Tensor) -> Estimate:
+        """The readout."""
+        return Estimate(np.asarray(self._x_offset + self._x_scale * self._network.readout(state[0]).numpy()))

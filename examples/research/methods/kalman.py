@@ -1,14 +1,15 @@
 """Kalman filters with the exact model, or a wrong one, as methods of the benchmark."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from examples.research.methods.base import Arrays, CausalObserver, Configuration, Method, Task, WrongParameters
+from examples.research.methods.base import Arrays, Configuration, Method, Task, WrongParameters
 from examples.research.methods.unscented import UnscentedKalmanFilter
 from kkl_gym.system import System
+from observers.estimator import Estimator
 from training.evaluation.levels import Level
-from training.kalman import ExtendedKalmanFilter, KalmanFilter, measurement_covariance
+from training.kalman import ExtendedKalmanFilter, measurement_covariance
 from training.sources.simulated import unknown_start
 
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
@@ -31,7 +32,7 @@ class EKF(Method[Arrays]):
 
     name: ClassVar[str] = "ekf"
     label: ClassVar[str] = "EKF"
-    filter: ClassVar[type[KalmanFilter]] = ExtendedKalmanFilter
+    filter: ClassVar[type[ExtendedKalmanFilter]] = ExtendedKalmanFilter
     diffusion: ClassVar[tuple[float, ...]] = DIFFUSION
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
@@ -42,7 +43,7 @@ class EKF(Method[Arrays]):
         """Nothing to learn."""
         return {"diffusion": np.array([configuration["diffusion"]])}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
         """The filter for a noise level."""
         Q = diffusion_intensity(trained, system)
         R = measurement_covariance(system, noise)
@@ -54,7 +55,7 @@ class UKF(EKF):
 
     name: ClassVar[str] = "ukf"
     label: ClassVar[str] = "UKF"
-    filter: ClassVar[type[KalmanFilter]] = UnscentedKalmanFilter
+    filter: ClassVar[type[ExtendedKalmanFilter]] = UnscentedKalmanFilter
 
 
 class WrongEKF(WrongParameters, EKF):
@@ -75,7 +76,7 @@ class UntunedEKF(Method[Arrays]):
         """Nothing to learn."""
         return {}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
         """The filter, whatever the noise."""
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)

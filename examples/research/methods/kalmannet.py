@@ -6,12 +6,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from examples.research.methods.base import Arrays, CausalObserver, Configuration, Data, Method, Task
+from examples.research.methods.base import Arrays, Configuration, Data, Method, Task
 from examples.research.methods.chunks import Chunks, error, noise_feature, varying
 from kkl_gym.simulate import SubstepsError, advance_batch
 from kkl_gym.system import System
+from observers.estimator import Estimate, Estimator
 from training.evaluation.levels import Level
-from training.maps.pde import on_tensors
+from training.maps.forward import on_tensors
 from training.sources.simulated import unknown_start
 
 ROWS = 64
@@ -73,7 +74,7 @@ class KalmanNet(Method[Arrays]):
             raise FloatingPointError(str(found)) from found
         return {key: value.detach().numpy() for key, value in problem.filter.state_dict().items()}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
         """The filter for a noise level."""
         return KalmanNetFilter(trained, system, dt, noise)
 
@@ -239,23 +240,22 @@ class KalmanNetFilter:
 
     def __init__(self, arrays: Arrays, system: System, dt: float, noise: Level) -> None:
         self._noise = noise_feature(noise, system)
-        self._filter = Gain(system, dt, hidden=len(arrays["hidden"]))
+        self._filter, self._ny = Gain(system, dt, hidden=len(arrays["hidden"])), system.ny
         self._filter.load_state_dict({key: torch.as_tensor(value) for key, value in arrays.items()})
 
-    @torch.no_grad()
-    def reset(self, y0: np.ndarray) -> np.ndarray:
-        """From the centre of X, corrected by the first sample."""
-        y = torch.as_tensor(y0, dtype=torch.float64)
-        fresh = self._filter.fresh(y)
-        return self._taken(self._filter.corrected(fresh, fresh.x, y, self._noise.expand(len(y), -1)))
+    def start(self, n: int) -> State:
+        """Rows that begin with the next sample, as those that are no longer finite."""
+        state = self._filter.fresh(torch.zeros(n, self._ny, dtype=torch.float64))
+        return state._replace(x=torch.full_like(state.x, torch.nan))
 
     @torch.no_grad()
-    def step(self, y: np.ndarray) -> np.ndarray:
+    def advance(self, state: State, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> State:
         """One sample."""
         sample = torch.as_tensor(y, dtype=torch.float64)
-        state, prior = self._filter.begun(self._state, sample, self._state.lost())
-        return self._taken(self._filter.corrected(state, prior, sample, self._noise.expand(len(y), -1)))
+        state, prior = self._filter.begun(state, sample, state.lost())
+        return self._filter.corrected(state, prior, sample, self._noise.expand(len(y), -1))
 
-    def _taken(self, state: State) -> np.ndarray:
-        self._state = state
-        return torch.where(state.lost(), self._filter.fresh(state.y).x, state.x).numpy()
+    @torch.no_grad()
+    def estimate(self, state: State) -> Estimate:
+        """The corrected state, or the centre of X where that is not finite."""
+        return Estimate(torch.where(state.lost(), self._filter.fresh(state.y).x, state.x).numpy())

@@ -3,11 +3,12 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from examples.research.methods.base import Budget, CausalObserver, Configuration, Method, Task, WrongParameters
+from examples.research.methods.base import Budget, Configuration, Method, Task, WrongParameters
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
+from observers.estimator import Estimator
 from observers.names import resolve
 from training.config import Config
 from training.evaluation.levels import Level
@@ -29,9 +30,9 @@ def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...
 class KKLMethod(Method[Artifact]):
     """A method that trains an artifact."""
 
-    def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
+    def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
         """The package's observer for a noise level, cut at the highest of its training, without process noise."""
-        return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0)
+        return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0).estimator
 
     def save(self, trained: Artifact, path: Path) -> None:
         """As an artifact that ``observers.load`` reads."""
@@ -113,7 +114,7 @@ class ShippedLarge(Shipped):
     label: ClassVar[str] = "T_inv alone, as shipped"
     suffix: ClassVar[str] = "-large"
 
-    def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
+    def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
         """T_inv of the large map, without a model."""
         return super().observer(replace(trained, motion=None), system, dt, measurement_noise)
 

@@ -14,7 +14,7 @@ from observers import Artifact, InverseMap
 from training.evaluation.levels import multiple
 from training.maps.networks import Network
 from training.spectrum import Spectrum
-from training.trajectories.derivatives import output_matrix
+from training.trajectories.equations import output_matrix
 
 
 class NODE(KKLMethod):

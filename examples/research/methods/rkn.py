@@ -1,15 +1,16 @@
 """A Kalman filter in a learned latent space (Becker et al., 2019)."""
 
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 from torch.nn.functional import elu, pad
 
-from examples.research.methods.base import Arrays, CausalObserver, Configuration, Method, Task
+from examples.research.methods.base import Arrays, Configuration, Method, Task
 from examples.research.methods.chunks import Chunks, error, noise_feature
 from kkl_gym.system import System
+from observers.estimator import Estimate, Estimator
 from training.evaluation.levels import Level
 from training.maps.networks import Network
 
@@ -102,7 +103,7 @@ class RKN(Method[Arrays]):
         arrays = {key: value.detach().cpu().numpy() for key, value in problem.cell.state_dict().items()}
         return {**arrays, "x_offset": chunks.x_offset, "x_scale": chunks.x_scale}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
         """The networks, one sample at a time."""
         return RKNObserver(trained, noise_feature(noise, system))
 
@@ -209,17 +210,18 @@ class RKNObserver:
         self._cell.load_state_dict(weights)
 
     @torch.no_grad()
-    def reset(self, y0: np.ndarray) -> np.ndarray:
-        """From the learned start, corrected by the first sample."""
-        return self._taken(self._cell.start(len(y0)), y0)
+    def start(self, n: int) -> Belief:
+        """Rows that begin with the next sample, as those that are no longer finite."""
+        return Belief(*(torch.full_like(each, torch.nan) for each in self._cell.start(n)))
 
     @torch.no_grad()
-    def step(self, y: np.ndarray) -> np.ndarray:
+    def advance(self, state: Belief, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Belief:
         """One sample."""
-        prior = self._cell.predicted(self._belief)
-        return self._taken(_begun(self._cell, prior, torch.zeros(len(y), dtype=torch.bool)), y)
+        prior = _begun(self._cell, self._cell.predicted(state), torch.zeros(len(y), dtype=torch.bool))
+        return update(prior, *self._cell.observe(torch.as_tensor(y, dtype=torch.float32), self._noise))
 
-    def _taken(self, prior: Belief, y: np.ndarray) -> np.ndarray:
-        self._belief = update(prior, *self._cell.observe(torch.as_tensor(y, dtype=torch.float32), self._noise))
-        mean = torch.where(self._belief.mean.isfinite(), self._belief.mean, 0.0)
-        return np.asarray(self._x_offset + self._x_scale * self._cell.decode(mean).numpy())
+    @torch.no_grad()
+    def estimate(self, state: Belief) -> Estimate:
+        """The mean, decoded."""
+        mean = torch.where(state.mean.isfinite(), state.mean, 0.0)
+        return Estimate(np.asarray(self._x_offset + self._x_scale * self._cell.decode(mean).numpy()))

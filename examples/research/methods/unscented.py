@@ -3,46 +3,44 @@
 import numpy as np
 
 from kkl_gym.simulate import advance_batch
-from observers.unscented import Gaussian, Points, conditioned, transformed
-from training.kalman import Corrected, KalmanFilter
+from observers.unscented import Gaussian, Points, add, shift, transformed, whitened
+from training.kalman import ExtendedKalmanFilter
 
 
-class UnscentedKalmanFilter(KalmanFilter):
+class UnscentedKalmanFilter(ExtendedKalmanFilter):
     """A batch of unscented Kalman filters (Wan and van der Merwe, 2000).
 
     Their sigma points are those with alpha = 1, beta = 2 and kappa = 3 - nx, which are usual. Where h is undefined at
-    one, it is taken at their mean. A filter starts anew if its corrected mean leaves the system's declared bounds, or
-    if its covariance is no longer positive definite. Parameters are those of :class:`KalmanFilter`.
+    one, it is taken at their mean. A filter starts again if its corrected mean leaves the system's declared bounds, or
+    if its covariance is no longer positive definite. The rest is as in the base class.
     """
 
     @np.errstate(over="ignore", invalid="ignore")
-    def _predicted(self, u: np.ndarray) -> Gaussian:
-
+    def _predicted(self, x: np.ndarray, P: np.ndarray, u: np.ndarray, dt: float) -> Gaussian:
         def move(points: np.ndarray) -> np.ndarray:
             flat = np.ascontiguousarray(points.reshape(-1, points.shape[-1]).T)
-            moved = advance_batch(self._system, flat, np.tile(u, len(points)), np.zeros_like(flat), self._dt)
+            moved = advance_batch(self._system, flat, np.tile(u, len(points)), np.zeros_like(flat), dt)
             return moved.T.reshape(points.shape)
 
-        mean, covariance, _ = transformed(self.x, self.P, function=move, points=self._points)
-        return mean, covariance + self._Q * self._dt
+        mean, covariance, _ = transformed(x, P, function=move, points=self._points)
+        return mean, covariance + self._Q * dt
 
     @np.errstate(over="ignore", invalid="ignore")
-    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
-        x, P, nis = self._updated(x, P, y)
+    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
+        x, P = self._updated(x, P, y)
         lost = ~self._inside(x, P)
         if lost.any():
             start = self._starts(int(lost.sum()))
             anew = self._updated(*start, y[lost])
-            sound = self._inside(*anew[:2])  # or else the start stands as it is
+            sound = self._inside(*anew)  # or else the start stands as it is
             x[lost] = np.where(sound[:, None], anew[0], start[0])
             P[lost] = np.where(sound[:, None, None], anew[1], start[1])
-            nis[lost] = np.inf
-        return x, P, nis
+        return x, P
 
-    def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
+    def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
         expected, S, across = transformed(x, P, function=self._output, points=self._points)
-        x, P, white = conditioned(x, P, y - expected, S + self._R, across, np.isnan(y))
-        return x, P, (white**2).sum(-1) / np.maximum((~np.isnan(y)).sum(-1), 1)
+        V, white = whitened(y - expected, S + self._R, across, np.isnan(y))
+        return shift(x, V, white), add(P, V, V, -1.0)
 
     def _output(self, points: np.ndarray) -> np.ndarray:
         y = self._system.output(points)

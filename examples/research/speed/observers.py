@@ -10,9 +10,10 @@ from kkl_gym.simulate import advance, simulate
 from kkl_gym.system import System
 from observers import Artifact, InverseMap, KKLObserver
 from observers.compiled import available
+from observers.estimator import Running
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
-from training.trajectories.derivatives import jacobian
+from training.trajectories.equations import jacobian
 
 BATCHES = 10  # of one step each, by filters that take one sample at a time
 FEWER = 10  # times as few samples, where Python takes a single one
@@ -62,7 +63,7 @@ def observer_tasks(
             tasks[f"KKL, error bars{way}"] = _stepping(observer, *taken, error_bars=True)
     R = measurement_covariance(system, artifact.measurement_noise)
     Q = process_intensity(system, system.process_noise, artifact.filter.dt)
-    ekf = ExtendedKalmanFilter(system, artifact.filter.dt, Q=Q, R=R)
+    ekf = Running(ExtendedKalmanFilter(system, artifact.filter.dt, Q=Q, R=R))
     tasks["EKF"] = _stepping(ekf, y[: (BATCHES if rows else few) + 1], u)
     try:
         from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF

@@ -15,8 +15,7 @@ from observers.names import resolve
 from training.agents.agent import KEY, LSTM, Agent, AgentError, find, fingerprint, rules
 from training.agents.information import observer_of
 from training.agents.play import play
-from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, get_task, scores
-from training.systems import Task
+from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, Task, get_task, scores
 
 PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
 OWN = f"{linear_system.__file__}:Oscillator"

@@ -13,8 +13,7 @@ from observers import load
 from training.agents.cost import MAX_COST, paid
 from training.agents.environments import single
 from training.agents.information import INFORMATION, make, observer_of, output_deviation
-from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, get_task
-from training.systems import Task, control_task
+from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, Task, control_task, get_task
 
 N = 3
 PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
@@ -150,7 +149,7 @@ def test_pay_is_minus_the_cost_and_escaping_never_pays():
 
 
 def test_a_system_is_named_in_three_ways():
-    assert get_task("lorenz") == get_task("KKLLorenz-v0") == TASKS["lorenz"]
+    assert get_task("Lorenz") == get_task("KKLLorenz-v0") == TASKS["lorenz"]
     own = get_task(f"{linear_system.__file__}:TwoOutputs", frames=2, env_kwargs={"process_noise": 0.0})
     assert (own.name, own.measurement_noise, own.frames) == ("two-outputs", (0.1, 0.3), 2)
     assert own.env_kwargs["process_noise"] == 0.0

@@ -15,10 +15,9 @@ from training.agents.learning import hyperparameters, learn, settings_of
 from training.agents.observing import KKL, Privileged, learn_observer
 from training.agents.play import play
 from training.agents.policy import ALGORITHMS
-from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, get_task, scores
+from training.agents.seeds import AGENT_EVALUATION_SEED
+from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, Task, control_task, get_task, scores
 from training.progress import ProgressBars
-from training.seeds import AGENT_EVALUATION_SEED
-from training.systems import Task, control_task
 
 PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
 NOISY_CART = replace(CART, measurement_noise=0.1)

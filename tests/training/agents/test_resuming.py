@@ -15,9 +15,8 @@ import torch
 from training import checkpoints
 from training.agents.agent import Agent
 from training.agents.learning import learn
-from training.agents.tasks import HIDDEN_VELOCITIES
+from training.agents.tasks import HIDDEN_VELOCITIES, control_task
 from training.cli import main
-from training.systems import control_task
 
 PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
 SHORT = control_task("van_der_pol", 0.2, duration=0.5)

@@ -13,13 +13,13 @@ from kkl_gym.compiled import SamplingStep
 from kkl_gym.simulate import advance_batch
 from training.agents.agent import Agent
 from training.agents.learning import learn
+from training.agents.seeds import AGENT_EVALUATION_SEED, agent_evaluation_seed
 from training.agents.tasks import HIDDEN_VELOCITIES
 from training.cli import main
 from training.commands.agent import Evaluate
 from training.commands.agent_task import TaskOptions
-from training.commands.record import RecordCommand
+from training.commands.record import PlayOptions, RecordCommand
 from training.records import read_records
-from training.seeds import AGENT_EVALUATION_SEED, agent_evaluation_seed
 
 OWN = f"{linear_system.__file__}:Oscillator"
 CART = HIDDEN_VELOCITIES["CartPole-v1"]
@@ -108,7 +108,7 @@ def test_an_agent_on_the_state_is_recorded_as_a_policy(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
     learn(CART, "state", tmp_path)
     path = tmp_path / "agent.safetensors"
-    options = {"measured": "0,2", "hidden": "1,3", "policy": str(path), "steps": 30}
+    options = {"measured": "0,2", "hidden": "1,3", "policy": str(path), "play": PlayOptions(steps=30)}
     name = RecordCommand("CartPole-v1", **options).run(Console())
     assert name == "cartpole-v1/agent-v0"
     (record, *_) = read_records((f"minari:{name}",))

@@ -14,7 +14,7 @@ from rich.console import Console
 from tracking import tracking_observer
 
 from training.cli import main
-from training.commands.evaluate import Evaluate
+from training.commands.evaluate import Evaluate, Motions
 
 
 class Cornered(linear_system.Oscillator):
@@ -32,10 +32,16 @@ class Unstable(linear_system.Oscillator):
 COLUMNS = "observer,starts,driven,process_noise,measurement_noise,trajectory,smape,smape_late"
 
 
+def evaluate(*observers, **options):
+    """The command, with the options of all groups."""
+    motions = {one.name: options.pop(one.name) for one in dataclasses.fields(Motions) if one.name in options}
+    return Evaluate(observers, motions=Motions(**motions), **options)
+
+
 def printed(*observers, **options):
     """The tables of the command, each a header and rows of cells, and all lines that are not of tables."""
     console = Console(width=200, record=True, file=io.StringIO())
-    Evaluate(observers, **options).run(console)
+    evaluate(*observers, **options).run(console)
     headers, rows, below = [], [], []
     for line in console.export_text().splitlines():
         if line.startswith("┏"):
@@ -87,7 +93,7 @@ def test_another_plant_moves_and_nothing_knows():
     options = {"trajectories": 4, "duration": 30.0, "measurement_noise": (0.0,)}
     options["system"] = f"{discrete_systems.__file__}:Turning"
     (right, _), _ = printed(path, **options)
-    (off, _), _ = printed(path, **options, plant=(("omega", 2.0),), ekf=True, csv=Path("errors.csv"))
+    (off, _), _ = printed(path, **options, plant=((("omega", 2.0),),), ekf=True, csv=Path("errors.csv"))
     assert [row[0] for row in off[1:]] == ["map", "EKF, same model"] * 2
     found = pd.read_csv("errors.csv")
     assert found.columns[:2].tolist() == ["observer", "plant"]
@@ -135,7 +141,7 @@ def test_why_there_are_no_runs():
     assert {row[0] for row in smape[1:]} == {"X"}
     assert int(smape[1][-1]) > 0
     assert any("left out: starts in 2X \\ X: no state of oscillator in 2X lies beyond X" in line for line in below)
-    unstable = Evaluate(("map.safetensors",), f"{__file__}:Unstable", trajectories=5, duration=20.0)
+    unstable = evaluate("map.safetensors", system=f"{__file__}:Unstable", trajectories=5, duration=20.0)
     with pytest.raises(ValueError, match=r"nothing is left to evaluate of map.safetensors"):
         unstable.run(console := Console(record=True))
     text = " ".join(console.export_text().split())
@@ -159,12 +165,12 @@ def test_t_inv_alone_of_an_observer_that_tracks(saved):
     artifact.save("map.safetensors")
     options = {"system": f"{linear_system.__file__}:Oscillator", "trajectories": 2, "duration": 5.0}
     tracked, alone = (
-        Evaluate(("map.safetensors",), no_tracking=without, **options).run(Console()) for without in (False, True)
+        evaluate("map.safetensors", no_tracking=without, **options).run(Console()) for without in (False, True)
     )
     assert set(alone.observer) == {"map.safetensors, T_inv alone"}
     assert not np.allclose(alone.smape, tracked.smape)
     dataclasses.replace(artifact, motion=None).save("map.safetensors")
-    same = Evaluate(("map.safetensors",), no_tracking=True, **options).run(Console())
+    same = evaluate("map.safetensors", no_tracking=True, **options).run(Console())
     assert set(same.observer) == {"map.safetensors"}
     np.testing.assert_array_equal(same.smape, alone.smape)
 
@@ -173,11 +179,11 @@ def test_calibration_is_judged(make_artifact, saved):
     system = f"{linear_system.__file__}:Oscillator"
     with_error_bars(make_artifact(system, dt=0.1)).save("map.safetensors")
     options = {"trajectories": 2, "duration": 5.5, "calibration": True, "ekf": True, "csv": Path("coverage.csv")}
-    found = Evaluate(("map.safetensors",), system, **options).run(console := Console(width=200, record=True))
+    found = evaluate("map.safetensors", system=system, **options).run(console := Console(width=200, record=True))
     assert len(found) == 3 * 6 * 2 * 2  # cases, levels, spans, and both who estimate
     assert found["90"].between(0, 100).all()
     assert set(found.observer) == {"KKL", "EKF"}
     assert Path("coverage.csv").exists()
     assert "NEES" in console.export_text()
     with pytest.raises(ValueError, match="no covariance"):
-        Evaluate((saved(),), calibration=True).run(console)
+        evaluate(saved(), calibration=True).run(console)

@@ -1,4 +1,4 @@
-"""``kkl-gym identify`` and ``kkl-gym adapt``; their refusals are among the others."""
+"""``kkl-gym identify``; its refusals are among the others."""
 
 import json
 
@@ -10,9 +10,7 @@ from kkl_gym.systems import VanDerPol
 from observers import Artifact
 from training.cli import main
 
-SIZES = "--trajectories 20 --duration 5 --samples 20 --inverse-steps 20 --width 8 --depth 1 --batch 64".replace(
-    "--", "--training."
-)
+SIZES = "--set trajectories=20 duration=5 samples=20 inverse_steps=20 width=8 depth=1 batch=64"
 
 
 def test_from_files_to_an_observer_and_to_another(tmp_path, capsys):
@@ -32,5 +30,6 @@ def test_from_files_to_an_observer_and_to_another(tmp_path, capsys):
     assert {"identification.png", "report.png", "log.txt"} <= {path.name for path in folder.iterdir()}
     with pytest.raises(SystemExit, match="van_der_pol-identified holds a run of another configuration: records = "):
         main(["identify", "van_der_pol", "--data", *data[:-1], *options, "--resume"])
-    main(["adapt", "van_der_pol", "--data", *data, "--out", "new.safetensors", *SIZES.split()])
-    assert Artifact.read("new.safetensors").parameters["mu"] == pytest.approx(found["value"], rel=1e-3)
+    main(["identify", "VanDerPol", "--observer", "van_der_pol", "--data", *data, *SIZES.split()])
+    adapted = Artifact.read("runs/van_der_pol-adapted/van_der_pol.safetensors")
+    assert adapted.parameters["mu"] == pytest.approx(found["value"], rel=1e-3)

@@ -29,14 +29,12 @@ def test_maps_has_a_row_for_each_file_and_cuts_no_name():
 @pytest.mark.parametrize(
     ("command", "work"),
     [
-        ("adapt NAME --data y.csv", "training.identification.adapt"),
+        ("identify lorenz --observer NAME --data y.csv", "training.identification.adapt"),
         ("evaluate NAME --trajectories 2 --duration 1 --no-tracking", None),
         ("evaluate NAME --calibration --trajectories 2 --duration 1 --measurement-noise 0.5", None),
-        ("faults NAME --trajectories 2 --duration 4", None),
+        ("evaluate NAME --faults --trajectories 2 --duration 4", None),
         ("export NAME --format c", None),
-        ("export NAME --format js", None),
         ("demo lorenz --observer NAME --duration 1", None),
-        ("demo lorenz --observer NAME --live", "training.commands.live.show"),
         ("agent train lorenz --observer NAME --timesteps 1", "training.agents.learning.learn"),
     ],
 )

@@ -16,8 +16,8 @@ from observers import Artifact, load
 from training.cli import main
 
 OSCILLATOR, FALLING = f"{linear_system.__file__}:Oscillator", f"{unstable_system.__file__}:Falling"
-TINY = {"trajectories": 20, "duration": 5, "samples": 20, "width": 8, "depth": 1, "batch": 64, "inverse-steps": 9}
-SIZES = [f"--{name}={value}" for name, value in {**TINY, "dt": 0.1, "runs": 100}.items()]
+TINY = {"trajectories": 20, "duration": 5, "samples": 20, "width": 8, "depth": 1, "batch": 64, "inverse_steps": 9}
+SIZES = ["--set", *(f"{name}={value}" for name, value in {**TINY, "dt": 0.1, "runs": 100}.items())]
 
 
 class OnFloats(linear_system.Autonomous):
@@ -66,8 +66,8 @@ def test_from_a_system_to_an_observer_that_tracks(capsys):
 @pytest.mark.parametrize(
     ("options", "name"),
     [
-        (["--size", "large", "--no-inputs"], "oscillator-large"),
-        (["--pipeline", "spinn", "--forward-steps", "9", "--eigenvalues", "-5", "-6", "-7"], "oscillator-spinn"),
+        (["inputs=false", "--size", "large"], "oscillator-large"),
+        (["forward_steps=9", "eigenvalues=-5,-6,-7", "--pipeline", "spinn"], "oscillator-spinn"),
     ],
 )
 def test_other_kinds_have_names_of_their_own(options, name, capsys):
@@ -93,7 +93,7 @@ def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(caps
     path, short = "runs/falling/falling.safetensors", ["--trajectories", "4", "--duration", "6"]
     for command in (
         ["evaluate", path, "--system", FALLING, *short, "--measurement-noise", "0", "--csv", "errors.csv"],
-        ["faults", path, "--system", FALLING, *short, "--measurement-noise", "0.01"],
+        ["evaluate", path, "--system", FALLING, *short, "--measurement-noise", "0.01", "--faults"],
     ):
         with pytest.raises(SystemExit, match="--policy"):
             main(command)
@@ -106,9 +106,12 @@ def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(caps
 def test_from_records_to_an_observer_that_tracks(capsys):
     files = [as_csv(f"run{seed}.csv", swing(seed, n=200, jitter=0.1)) for seed in range(5)]
     quick = {**SMALL, "inverse_steps": 30, "flow_steps": 30}
-    options = [f"--{name.replace('_', '-')}={value}" for name, value in quick.items()]
+    Path("quick.toml").write_text("\n".join(f"{name} = {value}" for name, value in quick.items()))
     columns = ["--measured", "position", "--inputs", "force"]
-    command, path = ["train", "spring", "--data", *files, *columns, *options], "runs/spring/spring.safetensors"
+    command, path = (
+        ["train", "spring", "--data", *files, *columns, "--config", "quick.toml"],
+        "runs/spring/spring.safetensors",
+    )
     main([*command, "--hidden", "position,speed"])
     printed = lines(capsys)
     assert printed[0] == "training an observer for spring from recorded states: position, speed from position and force"
@@ -123,6 +126,6 @@ def test_from_records_to_an_observer_that_tracks(capsys):
         kkl_gym.KKLObservation(gym.make("KKLVanDerPol-v0"), path)
     with pytest.raises(SystemExit, match="'spring' was learned from recorded states"):
         main(["evaluate", path])
-    main([*command, "--hidden", "speed", "--held-out", "0", "--out", "whole"])
+    main([*command, "--hidden", "speed", "--set", "held_out=0", "--out", "whole"])
     assert "it does not track: its estimates are T_inv's, without covariances" in lines(capsys)
     assert Path("whole/report.png").exists()

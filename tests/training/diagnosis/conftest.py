@@ -2,7 +2,7 @@ import functools
 
 import pytest
 
-import training.diagnosis.subject
+import training.diagnosis.system
 from kkl_gym.compiled import SamplingStep
 from kkl_gym.simulate import advance_batch
 
@@ -12,5 +12,5 @@ def _nothing_is_compiled():
     """Small systems take less time in NumPy than to be compiled."""
     in_numpy = functools.partial(functools.partial, advance_batch)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training.diagnosis.subject, "batch_step", lambda system: SamplingStep(in_numpy(system)))
+        patch.setattr(training.diagnosis.system, "batch_step", lambda system: SamplingStep(in_numpy(system)))
         yield

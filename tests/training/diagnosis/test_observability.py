@@ -12,6 +12,7 @@ from recorded_runs import as_csv, swing
 import training
 from training.cli import main
 from training.diagnosis import Observability, of_records
+from training.diagnosis.records import left_by
 from training.records import Record, Signals
 
 
@@ -144,7 +145,7 @@ def test_verdicts(errors, changes, verdict, window):
 
 def shown(arguments, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "250")
-    main(["check", *arguments])
+    main(["diagnose", *arguments])
     return capsys.readouterr().out
 
 
@@ -169,3 +170,32 @@ def test_the_command_on_records(capsys, tmp_path, monkeypatch):
     assert "speed from position and force" in text
     found = json.loads((tmp_path / "found.json").read_text())
     assert found[1]["found"].startswith("speed: determined from")
+
+
+def samples(n, modes, seed):
+    return np.random.default_rng(seed).uniform(-1, 1, (n, modes))
+
+
+def test_what_is_left_is_the_part_of_x_that_does_not_follow_from_z():
+    z, others = samples(500, 3, 0), samples(6000, 3, 1)
+    noise, others_noise = (np.sqrt(3) * samples(n, 1, 2)[:, 0] for n in (500, 6000))  # of variance 1
+
+    def x(z, noise):
+        bent = np.sin(2 * z[:, 0]) * z[:, 1]
+        return np.stack([bent, bent + 0.3 * noise, 2 * z[:, 2] + noise, noise, 0 * noise], -1)
+
+    left = left_by(z, x(z, noise), others, x(others, others_noise))
+    size = x(z, noise).std(0)
+    assert left[0] < 0.05
+    np.testing.assert_allclose(left[1:4] * size[1:4], [0.3, 1.0, 1.0], rtol=0.1)
+    assert np.isnan(left[4])
+
+
+def test_directions_below_the_resolution_tell_nothing():
+    z, others = samples(300, 2, 0) * [1, 1e-6], samples(4000, 2, 1) * [1, 1e-6]
+    assert left_by(z, (1e6 * z[:, 1:]) ** 2, others, (1e6 * others[:, 1:]) ** 2)[0] > 0.8
+
+
+def test_without_any_z_all_is_left():
+    x, others = samples(100, 1, 0), samples(1000, 1, 1)
+    assert left_by(np.zeros((100, 0)), x, np.zeros((1000, 0)), others)[0] == pytest.approx(1.0, abs=0.02)

@@ -13,7 +13,7 @@ from tracking import DT, of_t_inv, tracking_observer
 import training.evaluation.report
 from training import RecordedSource, SimulatedSource, preset
 from training.evaluation.report import Followed, held_out, write_report
-from training.presets import recorded_preset
+from training.sources.recorded import recorded_preset
 from training.train_observer import Result
 
 
@@ -49,10 +49,9 @@ def test_motions_of_the_report_are_others_of_the_same_kinds():
 
 def test_coverage_is_that_of_the_observer_with_its_covariance():
     artifact, runs = tracking_observer(), held_out(source())
-    followed = Followed(of_t_inv(replace(artifact, motion=None), 100.0), runs)
+    followed = Followed(of_t_inv(replace(artifact, motion=None), 100.0), runs, 0.3)
     assert (followed.distances < 0.1).all()  # far too large a covariance
-    np.testing.assert_allclose(followed.x[:, : len(runs.usual)], runs.x)
-    assert Followed(artifact, runs).distances.shape == followed.distances.shape
+    assert Followed(artifact, runs, 0.3).distances.shape == followed.distances.shape
 
 
 @pytest.mark.parametrize("tracks", [True, False])

@@ -14,7 +14,7 @@ from training.identification.identify import nearest
 from training.identification.windows import noise_level
 from training.progress import progress_bars
 from training.records import Record
-from training.trajectories.signals import random_inputs
+from training.trajectories.motions import random_inputs
 
 
 class HiddenSigns(Lorenz):

@@ -11,10 +11,10 @@ from tracking import plain_observer
 from observers import MLP, ArtifactError, KKLObserver, Motion
 from training import SimulatedSource, calibrate
 from training.config import settings_of
-from training.evaluation.coverage import REGIONS, coverage, kalman_coverage
+from training.evaluation.coverage import REGIONS, coverage
 from training.evaluation.errors import unseen_trajectories
-from training.filter_noise import noise_covariance
 from training.lessons.calibrate import chi_square, rare, squared_distance
+from training.maps.coordinates import noise_covariance
 
 DT, DISTURBED = 0.05, 0.5
 
@@ -205,7 +205,7 @@ def test_a_kalman_filter_is_consistent_on_a_linear_system():
     system = Oscillator()
     trajectories = unseen_trajectories(system, 0.05, n=600, duration=15.0, seed=2, process_noise=0.2)
     how = {"measurement_noise": 0.5, "seed": 2, "spans": (slice(-1, None),)}
-    (found,) = kalman_coverage(system, trajectories, 0.05, **how)
+    (found,) = coverage(None, system, trajectories, **how)
     limits = 3.5 * np.sqrt(np.array(REGIONS) * (1 - np.array(REGIONS)) / 600)
     assert (abs(found.joint - REGIONS) < limits).all()
     assert (abs(found.states - np.array(REGIONS)[:, None]) < limits[:, None]).all()
@@ -213,7 +213,7 @@ def test_a_kalman_filter_is_consistent_on_a_linear_system():
     assert found.limits[0] < 2.0 < found.limits[1]
     # One that takes the noise for half of what it is believes too much.
     half = dataclasses.replace(trajectories, process_noise=0.01)
-    (wrong,) = kalman_coverage(system, half, 0.05, **how)
+    (wrong,) = coverage(None, system, half, **how)
     assert wrong.nees > found.limits[1]
     assert wrong.joint[1] < 0.8
 

@@ -78,7 +78,7 @@ def test_an_observer_tracks_by_its_equations(whole, tmp_path):
     assert artifact.motion.factors.factors.shape == (2, 6, len(ages))  # without process noise and with it
     for inverse in (artifact.inverse, artifact.free_inverse):
         assert inverse.error_covariance.covariance.shape == (6, len(ages), 2, 2)
-    assert artifact.limits.duration == 12.0
+    assert artifact.limits.duration == 20.0
     runs = unseen_trajectories(Slow(), 0.05, n=100, duration=20.0, seed=0, driven=True)
     tracked, alone = (
         np.median(errors(each, Slow(), runs, measurement_noise=0.1, seed=0).late)

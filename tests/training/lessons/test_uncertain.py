@@ -15,7 +15,7 @@ from kkl_gym import VanDerPol
 from kkl_gym.system import System
 from training import SimulatedSource, errors, train, unseen_trajectories
 from training.config import Config
-from training.evaluation.parameters import parameter_errors
+from training.evaluation.plants import parameter_errors
 from training.spectrum import Spectrum
 
 

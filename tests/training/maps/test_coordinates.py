@@ -1,8 +1,17 @@
-"""The coordinates in which networks see z."""
+"""What networks read and give, and what the filter passes on of the noise on y."""
 
 import numpy as np
 
-from training.maps.coordinates import coordinates, spread
+from observers import LinearFilter
+from training.maps.coordinates import (
+    LEAST,
+    StateScale,
+    coordinates,
+    noise_covariance,
+    root,
+    spread,
+    stationary_covariance,
+)
 
 
 def test_coordinates_make_the_signal_white_and_the_noise_diagonal():
@@ -21,3 +30,47 @@ def test_spread_is_in_any_units_and_takes_rounding_for_rest():
     z = np.random.default_rng(0).normal(size=(1000, 3)) * [1e-20, 1.0, 1e-15] + [0.0, 1e6, 1.0]
     np.testing.assert_allclose(spread(z), [1e-20, 1.0, 1.0], rtol=0.1)
     assert (spread(np.zeros((10, 2))) == 1.0).all()
+
+
+def test_noise_covariance_against_simulation_at_every_age():
+    B = np.array([[1.0, 0.0], [1.0, 2.0], [0.0, 1.0]])
+    linear = LinearFilter(np.diag([-0.5, -4.0, -20.0]), B, 0.05)
+    ages = np.array([0, 1, 2, 5, 50])
+    n, levels = 50_000, np.array([1.0, 0.3])
+    y = np.random.default_rng(0).normal(size=(51, n, 2)) * levels
+    e = linear.run(y, np.zeros((50, n, 0)), ages)
+    together = np.einsum("j,ajkl->akl", levels**2, noise_covariance(linear, ages))
+    for predicted, sample in zip(together, e, strict=True):
+        measured = sample.T @ sample / n
+        size = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
+        assert np.abs(measured - predicted).max() / size.max() < 0.03
+
+
+def test_noise_covariance_tends_to_the_lyapunov_solution():
+    linear = LinearFilter(np.diag([-0.5, -4.0]), np.ones((2, 1)), 0.01, 1)
+    late = noise_covariance(linear, np.array([5000]))[0, 0]
+    np.testing.assert_allclose(late, stationary_covariance(linear)[0], rtol=1e-9, atol=1e-15)
+    assert not late[2:].any()  # the input is known exactly
+    np.testing.assert_allclose(root(late) @ root(late).T, late, atol=1e-15)
+
+
+def test_relative_scale_is_by_standard_deviation_and_weighs_small_states_more():
+    x = np.random.default_rng(0).normal((5.0, -3.0), (2.0, 0.1), (20, 5000, 2))
+    scale = StateScale.of(x, "relative")
+    np.testing.assert_allclose(scale(x).std((0, 1)), 1.0)
+    np.testing.assert_allclose(scale(x).mean((0, 1)), 0.0, atol=1e-12)
+    np.testing.assert_allclose(scale.weight(np.zeros(2)), 1 / LEAST)
+    np.testing.assert_allclose(scale.weight(scale.scale * [3.0, 1.0]), 1 / (5.0 + LEAST))
+
+
+def test_range_scale_reaches_from_minus_one_to_one_and_weighs_all_alike():
+    x = np.random.default_rng(0).uniform((1.0, -3.0), (2.0, 7.0), (1000, 2))
+    scale = StateScale.of(x, "range")
+    np.testing.assert_allclose(scale(x).min(0), -1.0)
+    np.testing.assert_allclose(scale(x).max(0), 1.0)
+    assert (scale.weight(x) == 1).all()
+
+
+def test_states_that_never_change_are_not_divided_by_zero():
+    for scaling in ("relative", "range"):
+        assert np.isfinite(StateScale.of(np.ones((10, 2)), scaling)(np.ones(2))).all()

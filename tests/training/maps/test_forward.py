@@ -1,30 +1,40 @@
 """The forward map T and its equation, against finite differences and quadrature."""
 
+import dataclasses
+import re
+
 import numpy as np
 import pytest
 import torch
-from linear_system import Autonomous, sylvester
+from kinked_systems import SYSTEMS as KINKED
+from linear_system import Autonomous, C, F, Oscillator, exact_observer, sylvester
 from quadrature import backward_quadrature
+from random_artifacts import random_artifact
 from small_runs import CPU
+from wrong_systems import Branching, Late
 
-from kkl_gym import ReverseDuffing
+from kkl_gym import EquationError, ReverseDuffing, get_system
 from kkl_gym.simulate import simulate
-from observers import Artifact, LinearFilter
+from kkl_gym.system import on_states
+from observers import MLP, Artifact, ForwardMap, LinearFilter
 from observers.names import resolve
-from training.maps.forward import ForwardProblem, transients, truncation_time
-from training.maps.networks import Network
-from training.maps.scaling import StateScale
+from training.maps.coordinates import StateScale
+from training.maps.forward import ForwardProblem, along, on_tensors, residual, transients, truncation_step
+from training.maps.networks import Network, from_mlp
 from training.spectrum import Spectrum
+from training.trajectories.equations import evaluate, jacobian
 
 
-def test_truncation_time_leaves_epsilon():
-    A = np.array([[-1.0, 5.0], [0.0, -2.0]])
-    linear = LinearFilter(A, np.ones((2, 1)), 0.01)
-    t = truncation_time(linear, 10.0, 1e-6)
-    poles, V = np.linalg.eig(A)
-    left = np.linalg.norm((V * np.exp(poles * t)) @ np.linalg.inv(V), 2) * 10.0
-    assert left <= 1e-6
-    assert t == pytest.approx(np.log(np.linalg.cond(V) * 10.0 / 1e-6))
+def test_truncation_leaves_epsilon_of_any_start():
+    system = Autonomous()
+    linear = LinearFilter(np.array([[-1.0, 5.0], [0.0, -2.0]]), np.ones((2, 1)), 0.01)
+    k = truncation_step(system, linear, steps=5000, epsilon=1e-6, box_factor=2.0)
+    z0 = linear.start(np.array([[-2.0], [2.0]]))
+    left = np.linalg.norm(np.linalg.matrix_power(linear.transition, k) @ z0.T, axis=0)
+    assert (left <= 1e-6).all()
+    assert k < 2500
+    with pytest.raises(ValueError, match="make them longer"):
+        truncation_step(system, linear, steps=100, epsilon=1e-6, box_factor=2.0)
 
 
 def test_shipped_forward_map_of_reverse_duffing_against_backward_quadrature():
@@ -84,3 +94,98 @@ def test_filter_state_from_T_and_what_is_left_of_its_start():
     found = transients(T, simulated[0], linear=linear, ages=ages)
     assert np.abs(T[1] - simulated[1]).max() > 0.1  # the start is far from T
     np.testing.assert_allclose(found, simulated, atol=1e-6)
+
+
+def points(system, n=20):
+    return torch.as_tensor(np.random.default_rng(0).uniform(*system.box(), (n, system.nx)))
+
+
+@pytest.mark.parametrize("system", ["lorenz", *KINKED], ids=str)
+def test_equations_on_tensors_are_those_on_arrays(system):
+    system = get_system(system)
+    x = points(system)
+    for equations in (system.f, system.h):
+        np.testing.assert_allclose(on_tensors(equations, x).numpy(), on_states(equations, x.numpy()), rtol=1e-14)
+    mixed = on_tensors(lambda x: (1.0, x[0], 2), x.float())
+    assert mixed.dtype == torch.float32
+    np.testing.assert_array_equal(mixed.numpy(), np.stack([np.ones(20), x[:, 0].float(), np.full(20, 2.0)], 1))
+
+
+@pytest.mark.parametrize(
+    ("equations", "message"),
+    [
+        (Late().f, "; x held tensors of shape (4,): use kkl_gym.elementary.sin, which serves"),
+        (Branching().f, "; x held tensors of shape (4,), on which `if`, `and`, `or` and `not` cannot decide: use"),
+        (lambda x: (x[0], x[1].reshape(2, 2)), "of which [1] is of shape (2, 2), where the components of x have shape"),
+        (lambda x: torch.complex(x[0], x[1])[None], "which is complex"),
+    ],
+)
+def test_equations_that_take_no_tensors_are_named(equations, message):
+    with pytest.raises(EquationError, match=re.escape(message)):
+        on_tensors(equations, torch.zeros(4, 2, requires_grad=True))
+
+
+@pytest.mark.parametrize("system", KINKED, ids=str)
+def test_gradients_of_tensors_are_the_derivatives_of_symbols(system):
+    x = points(system).requires_grad_()
+    for equations in (system.f, system.h):
+        expected = evaluate(jacobian(equations, system.nx), x.detach().numpy())
+        for i, component in enumerate(on_tensors(equations, x).T):
+            (slope,) = torch.autograd.grad(component.sum(), x, retain_graph=True, materialize_grads=True)
+            np.testing.assert_allclose(slope.numpy(), expected[:, i], rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_derivatives_along_a_field_by_hand_are_those_of_forward_mode(activation):
+    x, f = torch.randn(2, 10, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    network = Network(3, 2, width=8, depth=2, activation=activation).double()
+    expected = torch.func.jvp(network, (x,), (f,))
+    torch.testing.assert_close(along(network, x, f), expected)
+    with pytest.raises(TypeError, match="no derivative of ReLU"):
+        along(torch.nn.Sequential(torch.nn.ReLU()), x, f)
+
+
+def test_the_residual_is_that_of_the_equation():
+    exact, M = exact_observer(), np.random.default_rng(4).normal(size=(3, 2))
+    A, B = exact.filter.A, exact.filter.B
+    scale, whiten = np.array([1.0, 1.0, 3.0]), np.array([2.0, 1.0])
+    network = MLP([M.astype(np.float32)], [np.full(3, 0.2, np.float32)], "tanh")
+    wrong = dataclasses.replace(exact, forward=ForwardMap(network, np.array([0.3, 0.0]), whiten, np.zeros(3), scale))
+    x = np.random.default_rng(0).uniform(-1, 1, (10, 2))
+    T = np.diag(scale) @ M @ np.diag(1 / whiten)
+    offset = np.diag(scale) @ (0.2 - M @ [0.15, 0.0])
+    expected = x @ (T @ F - A @ T - B @ C).T - A @ offset
+    assert np.allclose(residual(wrong, Oscillator(), x), expected, atol=1e-5)
+    with pytest.raises(ValueError, match="no forward map"):
+        residual(dataclasses.replace(exact, forward=None), Oscillator(), x)
+
+
+def test_the_residual_is_the_same_in_training_and_in_a_certificate():
+    system = get_system("rossler")
+    artifact = random_artifact("rossler", inputs=False, age=False, forward=True)
+    linear, rng = artifact.filter, np.random.default_rng(0)
+    x = rng.uniform(*system.box(), (50, 3))
+    torch.manual_seed(0)
+    problem = ForwardProblem(
+        Network(3, linear.size, width=16, depth=2, activation="tanh"),
+        system,
+        linear=linear,
+        pairs=(x, rng.normal(size=(50, linear.size))),
+        points=x,
+        scale=StateScale.of(x, "relative"),
+        physics_weight=1.0,
+        batch=64,
+        device=CPU,
+    )
+    found, speed = problem.residual(torch.as_tensor(x, dtype=torch.float32))
+    expected = residual(dataclasses.replace(artifact, forward=problem.forward_map()), system, x)
+    np.testing.assert_allclose(found.detach(), expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose(speed, np.linalg.norm(system.drift(x) / problem.scale.scale, axis=1), rtol=1e-5)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_networks_come_back_from_numpy(activation):
+    network, x = Network(3, 2, width=8, depth=2, activation=activation), torch.randn(10, 3)
+    again = from_mlp(network.export())
+    assert not any(parameter.requires_grad for parameter in again.parameters())
+    np.testing.assert_array_equal(again(x), network(x).detach())

@@ -5,7 +5,7 @@ from rollout_observers import observer_of
 
 from observers import Artifact
 from training.records import Record, Signals
-from training.rollouts.gathering import LONGEST, Gathering
+from training.rollouts.callback import LONGEST, Gathering
 
 
 def sample(k):

@@ -3,18 +3,17 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 import time
 
 import gymnasium as gym
 import pytest
 
 from observers import Artifact
+from observers.storage import UNFINISHED
 from training.cli import main
 from training.commands.record import read_argument
 from training.records import Signals, read_records
-from training.records.minari import is_dataset, read_dataset, write_dataset
+from training.records.episodes import is_dataset, read_dataset, write_dataset
 from training.rollouts import make, policy_of, roll_out
 
 minari = pytest.importorskip("minari")
@@ -96,35 +95,15 @@ def test_half_a_data_set_is_none(datasets, monkeypatch):
     assert [path.name for path in (datasets / "cart").iterdir()] == ["namespace_metadata.json"]
 
 
-KILLED = """
-import os, signal
-from minari.dataset.minari_storage import MinariStorage
-from training.records.minari import write_dataset
-from training.rollouts import make, policy_of, roll_out
-
-MinariStorage.update_metadata = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-env = make("CartPole-v1")
-found = roll_out(env, policy_of("random", env), measured=["0"], hidden=["1"], steps=60, name="cart/random-v0")
-write_dataset(found, env.spec, policy="random")
-"""
-
-
-def test_what_a_killed_process_left_is_removed_after_an_hour(datasets):
-    assert subprocess.run([sys.executable, "-c", KILLED], check=False).returncode == -9
-    (left,) = (path for path in (datasets / "cart").iterdir() if path.is_dir())
-    inside = [left, *left.rglob("*")]
-    assert len(inside) > 2
-
-    def names():
-        return sorted(path.name for path in (datasets / "cart").iterdir() if path.is_dir())
-
-    for path in inside[:-1]:  # somebody may be at work on the last of its files
+def test_what_killed_processes_left_is_removed_after_an_hour(datasets):
+    old, new = (datasets / "cart" / f"{UNFINISHED}{name}" for name in ("old", "new"))
+    for folder in (old, new):
+        (folder / "data").mkdir(parents=True)
+    for path in (old, old / "data"):
         os.utime(path, (time.time() - 3700.0,) * 2)
-    write_dataset(*rollouts("cart/first-v0"), policy="random")
-    assert names() == [left.name, "first-v0"]
-    os.utime(inside[-1], (time.time() - 3700.0,) * 2)
-    write_dataset(*rollouts("cart/second-v0"), policy="random")
-    assert names() == ["first-v0", "second-v0"]
+    write_dataset(*rollouts(), policy="random")
+    assert not old.exists()
+    assert new.exists()  # a process may be at work there
 
 
 def test_two_at_once_write_one(datasets, monkeypatch):
@@ -200,8 +179,8 @@ def test_record_and_train(tmp_path, capsys, datasets):
         main(record)
     with pytest.raises(SystemExit):
         main([*record, "--env-kwargs", "g"])
-    train = "train swing --data minari:pendulum-v1/random-v0 --inverse-steps 9 --members 1 --width 4 --samples 4"
-    main([*train.split(), "--windows", "99", "--batch", "64", "--out", str(tmp_path / "run")])
+    train = "train swing --data minari:pendulum-v1/random-v0 --set inverse_steps=9 members=1 width=4 samples=4"
+    main([*train.split(), "windows=99", "batch=64", "--out", str(tmp_path / "run")])
     artifact = Artifact.read(tmp_path / "run" / "swing.safetensors")
     assert artifact.environment == {"id": "Pendulum-v1", "kwargs": {"g": 9}}
     shutil.rmtree(datasets)

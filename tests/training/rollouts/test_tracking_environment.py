@@ -11,7 +11,6 @@ from kkl_gym import KKLObservation, KKLVectorObservation
 from observers import Artifact
 from training import KKLTrainingCallback
 from training.rollouts import callback
-from training.sources.errors import RecordedErrors
 
 FIT = {"members": 1, "inverse_steps": 50, "flow_steps": 50, "width": 8, "samples": 10, "windows": 500, "batch": 128}
 LEARN = {"env_id": "Pendulum-v1", "measured": [0, 1], "steps": 900, **FIT}
@@ -64,7 +63,7 @@ def test_a_refit_without_enough_held_out_is_left_out(path):
 
 def test_a_refit_learns_the_flow_again(path, monkeypatch):
     first, refits, errors = Artifact.read(path), [], iter([1.0, 0.5])  # of the old one, and of the new one
-    monkeypatch.setattr(callback, "recorded_errors", lambda *_, **__: RecordedErrors({"x": next(errors)}, 0.0, 1.0))
+    monkeypatch.setattr(callback, "recorded_errors", lambda *_, **__: {"x": next(errors)})
     model = agent(path, 4, 64)
     model.learn(1300, KKLTrainingCallback(1200, on_refit=refits.append))
     (refit,) = refits

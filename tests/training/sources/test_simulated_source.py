@@ -64,7 +64,7 @@ def test_increments_are_those_of_the_system():
 def test_motions_for_calibration_are_with_and_without_process_noise():
     source = SimulatedSource(Oscillator(), toy(Oscillator(), dt=0.05))
     runs = source.runs()
-    assert runs.x.shape == (241, 100, 2)
+    assert runs.x.shape == (401, 100, 2)
     np.testing.assert_allclose(np.unique(runs.process_noise), [0.0, 0.05])
     np.testing.assert_array_equal(runs.y, runs.x[..., :1])
     driven = (runs.u != 0).any((0, 2))
@@ -72,7 +72,7 @@ def test_motions_for_calibration_are_with_and_without_process_noise():
     assert runs.usual.mean() == pytest.approx(2 / 3, abs=0.05)
     assert (np.abs(runs.x[0]).max(-1)[runs.usual] <= 1).all()
     quiet = runs.process_noise == 0
-    expected = simulate(Oscillator(), runs.x[0], 240, 0.05, u=runs.u)
+    expected = simulate(Oscillator(), runs.x[0], 400, 0.05, u=runs.u)
     off = np.abs(runs.x - expected).max((0, 2))
     assert (off[quiet] == 0).all()
     assert (off[~quiet] > 0.01).all()

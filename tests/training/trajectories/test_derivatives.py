@@ -1,6 +1,5 @@
 """What differentiating a system's equations gives."""
 
-import re
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -9,11 +8,10 @@ import pytest
 import sympy
 from kinked_systems import SYSTEMS as KINKED
 from linear_system import Oscillator
-from wrong_systems import Branching, Flat, Late, Wide
 
-from kkl_gym import EquationError, elementary, get_system
+from kkl_gym import elementary, get_system
 from kkl_gym.system import on_states
-from training.trajectories.derivatives import evaluate, jacobian, output_matrix
+from training.trajectories.equations import evaluate, jacobian, output_matrix
 
 
 def test_output_matrix_of_linear_and_other_outputs():
@@ -79,18 +77,3 @@ def test_what_sympy_cannot_differentiate_is_named():
 
     with pytest.raises(ValueError, match=r"component 1 of rounded\(x\) has no derivative .* knows: ceiling\(x0\)"):
         jacobian(rounded, 1)
-
-
-@pytest.mark.parametrize(
-    ("equations", "message"),
-    [
-        (Late().f, "; x held sympy symbols: use kkl_gym.elementary.sin, which serves floats, arrays, tensors"),
-        (Branching().f, "use kkl_gym.elementary.where, minimum, maximum or clip, and combine conditions by & and |"),
-        (Wide().f, "must return 2 components, one for each state; it returned 3 of them"),
-        (Flat().f, "of which [0] is x1 > 0, which is no number: use kkl_gym.elementary.where(x1 > 0, 1.0, 0.0)"),
-        (lambda x: (np.where(np.equal(x[0], 0), 0.0, x[0]),), "equations of symbols take kkl_gym.elementary"),
-    ],
-)
-def test_equations_that_take_no_symbols_are_named(equations, message):
-    with pytest.raises(EquationError, match=re.escape(message)):
-        jacobian(equations, 2)

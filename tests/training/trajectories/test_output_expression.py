@@ -14,7 +14,7 @@ from kkl_gym import System
 from kkl_gym.elementary import abs as absolute
 from kkl_gym.elementary import atan2, clip, cos, exp, log, maximum, minimum, sign, sin, sqrt, tan, tanh, where
 from observers import Expression
-from training.trajectories.expression import output_expression
+from training.trajectories.equations import output_expression
 
 
 @dataclass(frozen=True)

@@ -79,18 +79,6 @@ def test_in_discrete_time():
     np.testing.assert_allclose(x[:, 0, 1], [0.1, 0.4 * 0.5, 0.4 * (1.0 - 1.4 * 0.25 + 0.1)])
 
 
-def test_a_share_of_the_starts_has_the_nominal_parameters():
-    system = VanDerPol()
-    starts = {share: with_parameters(system, {"mu": (2.0, 5.0)}, share) for share in (0.0, 0.5, 1.0)}
-    nominal = {
-        share: (one.draw_starts(np.random.default_rng(0), 4000)[:, -1] == system.mu).mean()
-        for share, one in starts.items()
-    }
-    assert nominal[0.0] == 0.0
-    assert abs(nominal[0.5] - 0.5) < 0.04  # five standard errors
-    assert nominal[1.0] == 1.0
-
-
 def test_trainings_have_the_nominal_parameters_or_some_towards_the_ends():
     system = Lorenz()
     ranges = relative_ranges(system, {"sigma": 0.1, "beta": 0.3})

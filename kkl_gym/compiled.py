@@ -1,0 +1,314 @@
+"""Sampling intervals as machine code, where Numba is installed and a system's equations can be written as a program.
+
+The equations are run once on symbols (:mod:`kkl_gym.tracing`); the program that comes out is put into the Runge–Kutta
+step that Python and NumPy take, and compiled, which takes a second for each system and set of parameters. Machine code
+adds and multiplies as Python does, in the same order: a single state's step is the same with it and without, to the
+last bit, in a tenth of the time. Equations with powers, which compilers round in their own way, are compiled for
+batches alone. These go through it many rows at a time, one in each lane of the processor's vectors.
+"""
+
+import functools
+import logging
+import math
+import re
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import FunctionType
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from kkl_gym import elementary
+from kkl_gym.equations import blame, rate_at
+from kkl_gym.simulate import (
+    ATTEMPTS,
+    MOST_EQUAL,
+    PER_RATE,
+    advance,
+    advance_batch,
+    equal_substeps,
+    forced,
+    per_tolerance,
+    runge_kutta,
+)
+from kkl_gym.system import Components, System, rate_under
+from kkl_gym.tracing import Program, in_tuple, program
+
+Values = TypeVar("Values")
+Advance = Callable[[Values, Values, Values, float], Values]
+"""(x, u, w, dt) to the next x."""
+
+MAX_OPERATIONS = 500  # of a program; beyond, such as for a network as f, compiling takes many seconds
+_TRIALS = 200  # states of each kind at which machine code is compared
+_MAX_TRIAL_SUBSTEPS = 64  # of a single state that is compared: Python would take long for more
+_LANES = 32  # rows that make a step together: a few of the processor's vectors
+_KEPT = 64  # kernels
+_kept: dict[Any, Any] = {}  # kernels, or what is in the way of one, by what they were made of
+
+logger = logging.getLogger("kkl_gym")
+
+
+@dataclass(frozen=True)
+class SamplingStep(Generic[Values]):
+    """One sampling interval, called as ``step(x, u, w, dt)``, and what is in the way of machine code, if it is not."""
+
+    advance: Advance[Values]
+    obstacle: str | None = None
+
+    def __call__(self, x: Values, u: Values, w: Values, dt: float) -> Values:
+        """Take the step, for arrays of a batch (nx, n) and (nu, n), or for sequences of floats."""
+        return self.advance(x, u, w, dt)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Programs of a system: x' = field(x) + push(u, w), or x' = field(x, u) + push(w), and its rate if a formula."""
+
+    field: Program
+    push: Program
+    rate: Program | None
+    units: tuple[float, ...]  # one over the tolerances of states, and zeros for inputs that the field depends on
+
+
+def single_step(system: System) -> SamplingStep[Components]:
+    """One sampling interval of a single state: compiled if Numba is there and takes the equations, else in Python.
+
+    Numbers that the equations read besides are as they were when this was called. The logger ``kkl_gym`` says at level
+    INFO, once for each system, if they are not compiled and why.
+    """
+    return _shared(system, single_kernel, _single, advance, f"single steps of {system.name} stay in Python")
+
+
+def batch_step(system: System) -> SamplingStep[np.ndarray]:
+    """One sampling interval of a batch: compiled if Numba is there and takes the equations, else NumPy.
+
+    The two agree to rounding. Otherwise as :func:`single_step`; :mod:`kkl_gym.elementary` has functions that serve
+    both. Systems in discrete time are not integrated, and make their steps in NumPy.
+    """
+    return _shared(system, batch_kernel, _batch, advance_batch, f"{system.name} goes on with NumPy, not compiled")
+
+
+def _shared(
+    system: System,
+    compile_kernel: Callable[[System, Motion], Any],
+    around: Callable[[System, Any], Advance[Values]],
+    otherwise: Callable[..., Values],
+    said: str,
+) -> SamplingStep[Values]:
+    """The step of a system around a kernel that is compiled once for all systems of the same programs."""
+    plain = functools.partial(otherwise, system)
+    if system.discrete:
+        return SamplingStep(plain, f"{system.name} makes its step itself")
+    motion: Any
+    try:
+        motion = _motion(system)
+    except Exception as error:  # whatever comes out of a user's equations on symbols
+        motion = _reason(error)
+    of = compile_kernel, type(system), motion
+    if of not in _kept:
+        while len(_kept) >= _KEPT:
+            _kept.pop(next(iter(_kept)), None)
+        try:
+            _kept[of] = motion if isinstance(motion, str) else compile_kernel(system, motion)
+        except Exception as error:  # Python takes the equations as they are, and says what is wrong on numbers, too
+            _kept[of] = _reason(error)
+        if isinstance(_kept[of], str):
+            logger.info("%s: %s", said, _kept[of])
+    found = _kept[of]
+    return SamplingStep(plain, found) if isinstance(found, str) else SamplingStep(around(system, found))
+
+
+def _reason(error: Exception) -> str:
+    """What went wrong, in one line: Numba writes a page, in colours, of which a line says what it cannot take."""
+    lines = re.sub(r"\x1b\[\d*m", "", str(error)).splitlines()
+    said = [line for line in lines if line.strip() and not line.startswith("Failed in ")]
+    return f"{type(error).__name__}: {said[0] if said else ''}"
+
+
+def _motion(system: System) -> Motion:
+    """The programs of a system; ValueError if they are long, or not the same each time."""
+    nx, nu, constant = system.nx, system.nu, type(system).g is System.g
+
+    def field(x: Any, u: Any = ()) -> Any:
+        try:
+            return forced(system, [0.0] * nu if constant else u, [0.0] * nx)[0](x)
+        except Exception as error:
+            blame(error, system, x, [0.0] * nu)
+            raise
+
+    letters = [("x", nx)] if constant else [("x", nx), ("u", nu)]
+    traced = program(field, *letters)
+    if traced != program(field, *letters):
+        raise ValueError(f"{system.name}: the equations are not the same each time they are asked for")
+    rate = None
+    if type(system).rate is not System.rate:
+        rate = program(lambda x: (rate_at(system, x),), ("x", nx))
+    if len(traced.operations) + len(rate.operations if rate else ()) > MAX_OPERATIONS:
+        raise ValueError(f"{system.name}: the equations are too long to compile in seconds")
+    push = program(lambda u, w: forced(system, u, w)[1], ("u", nu), ("w", nx))
+    return Motion(traced, push, rate, per_tolerance(type(system)) + (0.0,) * (len(traced.arguments) - nx))
+
+
+def single_kernel(system: System, motion: Motion) -> Any:
+    """The compiled step of a single state, NaN where substeps of one length do not do."""
+    import numba
+
+    if not (motion.field.exact and motion.push.exact):
+        raise ValueError("there is a power or a remainder; products, such as x * x for x**2, would be compiled")
+    nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
+    x, u, w = ([f"{letter}{i}" for i in range(n)] for letter, n in (("x", nx), ("u", nu), ("w", nx)))
+    lines = [
+        f"def kernel({', '.join([*x, *u, *w, 'dt'])}):",
+        f"    need = {'1.0' if motion.rate is None else f'rate({in_tuple(x)})[0] * dt * {PER_RATE!r}'}",
+        f"    d = push({in_tuple([*u, *w])}) + {in_tuple(['0.0'] * (size - nx))}",
+        f"    for attempt in range({ATTEMPTS}):",
+        f"        if not need <= {MOST_EQUAL}:",
+        "            break",
+        "        n = 1",
+        "        while n < need:",
+        "            n *= 2",
+        f"        end, error = integrate(field, {in_tuple([*x, *u][:size])}, d, dt / n, n, {units!r})",
+        "        if error <= 1.0:",
+        f"            return {in_tuple(f'end[{i}]' for i in range(nx))}",
+        "        need = n * error**0.1",
+        f"    return {in_tuple(['nan'] * nx)}",
+    ]
+    jit: Any = functools.partial(numba.njit, error_model="python")  # which raises where Python does
+    # Of floats alone: a bound of the input that is written as an integer must not compile it again.
+    kernel = jit((numba.float64,) * (nx + nu + nx + 1))(_assembled(motion, lines, jit))
+    rng = np.random.default_rng(0)
+    u_max, scale = np.array(system.u_max), np.array(system.scale) / system.pace
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for at in map(tuple, np.concatenate(_trial_states(system, rng)).tolist()):
+            held, noise = (u_max * rng.uniform(-1, 1, nu)).tolist(), (scale * rng.uniform(-1, 1, nx)).tolist()
+            try:
+                if not rate_under(system, at, held) * system.dt * PER_RATE <= _MAX_TRIAL_SUBSTEPS:
+                    continue
+                end = kernel(*at, *held, *noise, system.dt)
+            except Exception:  # Python takes the step
+                continue
+            if end[0] == end[0] and tuple(end) != tuple(advance(system, at, held, noise, system.dt)):
+                raise ValueError(f"it rounds otherwise than Python at x = {list(at)}")
+    return kernel
+
+
+def _single(system: System, kernel: Any) -> Advance[Components]:
+    def step(x: Components, u: Components, w: Components, dt: float) -> Components:
+        try:
+            end: Components = kernel(*x, *u, *w, dt)
+        except Exception:  # Python says better what is wrong with the equations
+            return advance(system, x, u, w, dt)
+        return end if end[0] == end[0] else advance(system, x, u, w, dt)
+
+    return step
+
+
+def batch_kernel(system: System, motion: Motion) -> Any:
+    """The compiled step of a batch: substeps of one length for each row, in groups of rows that need as many.
+
+    Components and lanes are written out, and lie in one array at distances that the compiler knows. That is what lets
+    it use the processor's vectors.
+    """
+    import numba
+
+    nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
+    lanes = [f"s[{i * _LANES} + j]" for i in range(size + nx + 3)]
+    states, d, (substeps, length, error) = lanes[:size], lanes[size:-3], lanes[-3:]
+    start = [*[f"x[{i}, row]" for i in range(nx)], *[f"u[{i}, row]" for i in range(nu)]]
+    need = "1.0" if motion.rate is None else f"rate({in_tuple(start[:nx])})[0] * dt * {PER_RATE!r}"
+    pushed = f"push({in_tuple([*start[nx:], *[f'w[{i}, row]' for i in range(nx)]])})"
+    given = f"{in_tuple(states)}, {in_tuple(d + ['0.0'] * (size - nx))}"
+    lines = [
+        "def kernel(x, u, w, dt, out):",
+        f"    n, s = x.shape[1], np.empty({len(lanes) * _LANES})",
+        "    needs, order, counts, left = np.empty(n), np.empty(n, np.int64), np.empty(n), n",
+        "    out[:] = nan",
+        "    for row in range(n):",
+        f"        needs[row] = {need}",
+        f"    for attempt in range({ATTEMPTS}):",
+        "        found, least, most = 0, -inf, 1.0",
+        f"        while found < left and most <= {MOST_EQUAL}:",
+        "            for row in range(n):",
+        "                if least < needs[row] <= most:",
+        "                    order[found], counts[found] = row, most",
+        "                    found += 1",
+        "            least, most = most, 2.0 * most",
+        f"        for first in range(0, found, {_LANES}):",
+        f"            for j in range({_LANES}):",
+        "                at = min(first + j, found - 1)  # lanes that are left over do the last row again",
+        f"                row, {substeps}, {length}, {error} = order[at], counts[at], dt / counts[at], 0.0",
+        *[f"                {lane} = {value}" for lane, value in zip(states, start)],
+        f"                {in_tuple(d)} = {pushed}",
+        "            for done in range(int(counts[at])):",
+        f"                for j in range({_LANES}):",
+        f"                    end, e = integrate(field, {given}, {length}, 1, {units!r})",
+        f"                    unfinished = done < {substeps}",
+        f"                    {error} = {error} if e <= {error} or not unfinished else e",
+        *[f"                    {lane} = end[{i}] if unfinished else {lane}" for i, lane in enumerate(states[:nx])],
+        f"            for j in range(min({_LANES}, found - first)):",
+        "                row = order[first + j]",
+        f"                if {error} <= 1.0:",
+        *[f"                    out[{i}, row] = {lane}" for i, lane in enumerate(states[:nx])],
+        "                    needs[row] = nan",
+        "                    left -= 1",
+        "                else:",
+        f"                    needs[row] = {substeps} * {error} ** 0.1",
+        "    return left > 0",
+    ]
+    jit: Any = functools.partial(numba.njit, error_model="numpy")  # a division by zero is infinite
+    inlined = functools.partial(jit, forceinline=True)  # a call would keep rows from going through together
+    kernel = jit(_assembled(motion, lines, inlined))
+    u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None] / system.pace
+    rounding = 1e-9 * np.ptp(system.X, axis=1)[:, None]
+    for points in _trial_states(system, np.random.default_rng(0)):
+        rng, n = np.random.default_rng(0), len(points)
+        at = points.T.copy(), u_max * rng.uniform(-1, 1, (nu, n)), scale * rng.uniform(-1, 1, (nx, n)), system.dt
+        found, expected = np.empty((nx, n)), equal_substeps(system, *at)[0]
+        kernel(*at, found)
+        expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan  # what escapes may be either
+        if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
+            raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
+    return kernel
+
+
+def _batch(system: System, kernel: Any) -> Advance[np.ndarray]:
+    def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
+        out = np.empty(x.shape)
+        lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
+        if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):  # motions that ended stay so
+            out[:, rows] = advance_batch(system, x[:, rows], u[:, rows], w[:, rows], dt)
+        return out
+
+    return step
+
+
+def _assembled(motion: Motion, lines: list[str], jit: Callable[..., Any]) -> Any:
+    """The function ``kernel`` that some lines define, around compiled programs of a motion."""
+    namespace: dict[str, Any] = {"inf": math.inf, "nan": math.nan, "np": np}
+    for name, function in vars(elementary).items():
+        if on_numbers := getattr(function, "on_numbers", None):
+            namespace[name] = jit(on_numbers) if isinstance(on_numbers, FunctionType) else on_numbers
+    namespace["where"] = jit(lambda condition, a, b: a if condition else b)
+    zeros = len(motion.units) - len(motion.field.results)
+    programs = {"field": motion.field.lines("field", zeros), "push": motion.push.lines("push")}
+    if motion.rate is not None:
+        programs["rate"] = motion.rate.lines("rate")
+    for name, code in programs.items():
+        exec("\n".join(code), namespace)
+        namespace[name] = jit(namespace[name])
+    namespace["integrate"] = jit(runge_kutta(len(motion.units)))
+    exec("\n".join(lines), namespace)
+    return namespace["kernel"]
+
+
+def _trial_states(system: System, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """States at which machine code is compared with Python and NumPy, (400, nx) and (600, nx)."""
+    n, (low, high) = _TRIALS, np.array(system.bounds, dtype=float).T
+    random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])
+    ends = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])
+    return random, np.concatenate([ends, np.rint(random[:n]), system.draw_starts(rng, n)])
+
+
+__all__ = ["SamplingStep", "batch_step", "single_step"]

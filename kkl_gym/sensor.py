@@ -1,0 +1,201 @@
+"""A sensor between a system's output and those who read it."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from observers.checks import integer, is_finite, noise_level, shown
+
+MAX_SAMPLES = 10_000  # of a delay, which are kept for each environment, and from one sample to the next
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What a sensor makes of an output: y = range(round(gain h(x) + bias + c + v)), late, and not at every step.
+
+    c is coloured noise, first-order: its autocorrelation over t seconds is exp(-t / time_constant). v is the white
+    ``measurement_noise`` of the environment. Every value is a number for all outputs, or a sequence with one for each.
+    A sample that the sensor does not deliver is NaN in ``info["y"]``, where an observer coasts; an observation that
+    shows the output holds the last one. The first sample of an episode is always there.
+
+    Parameters
+    ----------
+    gain : float or sequence of float, length ny
+        Factor of the output.
+    bias : float or sequence of float, length ny
+        Offset, in the units of y.
+    coloured_noise : float or sequence of float, length ny
+        Standard deviation of c.
+    time_constant : float or sequence of float, length ny, optional
+        Of c, in seconds; needed where there is coloured noise.
+    quantum : float or sequence of float, length ny
+        Resolution: y is rounded to multiples of it. 0 does not round.
+    saturation : tuple of (low, high), optional
+        Limits that y does not leave, each a number or a sequence of length ny.
+    delay : int or sequence of int, length ny
+        Steps by which samples arrive late. Before the first one has arrived, the sensor reads what it read at reset.
+    drop_out : float or sequence of float, length ny
+        Probability, below 1, with which a sample is lost, independently of others.
+    every : int or sequence of int, length ny
+        Only every so many-th step has a sample.
+
+    Raises
+    ------
+    ValueError
+        If a value is not as described.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from kkl_gym import Sensor
+    >>> env = gym.make("KKLLorenz-v0", sensor=Sensor(quantum=0.5, every=2), measurement_noise=0.0)
+    >>> obs, info = env.reset(seed=0)
+    >>> [float(env.step([0.0])[4]["y"][0]) for _ in range(4)]
+    [nan, -11.5, nan, -11.0]
+    """
+
+    gain: float | Sequence[float] = 1.0
+    bias: float | Sequence[float] = 0.0
+    coloured_noise: float | Sequence[float] = 0.0
+    time_constant: float | Sequence[float] | None = None
+    quantum: float | Sequence[float] = 0.0
+    saturation: tuple[float | Sequence[float], float | Sequence[float]] | None = None
+    delay: int | Sequence[int] = 0
+    drop_out: float | Sequence[float] = 0.0
+    every: int | Sequence[int] = 1
+
+    def __post_init__(self) -> None:
+        checks: dict[str, Callable[[str, Any], float]] = {
+            "gain": _finite,
+            "bias": _finite,
+            "coloured_noise": noise_level,
+            "time_constant": _number("positive, finite number of seconds", lambda value: value > 0),
+            "quantum": noise_level,
+            "delay": lambda name, value: integer(name, value, 0, MAX_SAMPLES),
+            "drop_out": _number("probability, from 0 to below 1", lambda value: 0 <= value < 1),
+            "every": lambda name, value: integer(name, value, 1, MAX_SAMPLES),
+        }
+        for name, check in checks.items():
+            if name != "time_constant" or self.time_constant is not None:
+                object.__setattr__(self, name, _each(f"the sensor's {name}", getattr(self, name), check))
+        if np.any(self.coloured_noise) and self.time_constant is None:
+            raise ValueError(f"coloured_noise = {self.coloured_noise} needs a time_constant in seconds")
+        if self.saturation is not None:
+            if not _is_sequence(self.saturation) or len(self.saturation) != 2:
+                raise ValueError(f"the sensor's saturation must be (low, high), got {shown(self.saturation)}")
+            ends = tuple(_each(f"the sensor's saturation[{i}]", end, _finite) for i, end in enumerate(self.saturation))
+            if len({len(end) for end in ends if isinstance(end, tuple)}) < 2 and not np.all(np.less(ends[0], ends[1])):
+                raise ValueError(f"the sensor's saturation must be (low, high), low before high, got {ends}")
+            object.__setattr__(self, "saturation", ends)
+
+    @property
+    def is_random(self) -> bool:
+        """Whether the sensor draws random numbers."""
+        return bool(np.any(self.coloured_noise) or np.any(self.drop_out))
+
+    def columns(self, ny: int) -> dict[str, np.ndarray]:
+        """All values by name, one for each output, (ny, 1); without limits infinite, without time constant 1."""
+        low, high = (-math.inf, math.inf) if self.saturation is None else self.saturation
+        given = vars(self) | {"low": low, "high": high, "time_constant": self.time_constant or 1.0}
+        del given["saturation"]
+        for name, value in given.items():
+            if isinstance(value, tuple) and len(value) != ny:
+                name = "saturation" if name in ("low", "high") else name
+                raise ValueError(
+                    f"the sensor's {name} must be one number, or one for each of {ny} outputs, got {shown(value)}"
+                )
+        return {name: np.broadcast_to(np.array(value), ny)[:, None] for name, value in given.items()}
+
+    def bounds(self, low: np.ndarray, high: np.ndarray, noise: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of y for bounds (ny,) of h(x), widened by six standard deviations of all noise."""
+        of = {name: column[:, 0] for name, column in self.columns(len(low)).items()}
+        ends = of["gain"] * np.stack([low, high]) + of["bias"]
+        margin = 6.0 * np.hypot(noise, of["coloured_noise"]) + of["quantum"] / 2
+        return tuple(np.clip([ends.min(0) - margin, ends.max(0) + margin], of["low"], of["high"]))
+
+
+def sensor_of(value: Any) -> Sensor | None:
+    """The sensor that is given as one or as a mapping, or None."""
+    if value is None or isinstance(value, Sensor):
+        return value
+    names = [field.name for field in dataclasses.fields(Sensor)]
+    if not isinstance(value, Mapping):
+        raise ValueError(f"sensor must be a kkl_gym.Sensor or a dict of {', '.join(names)}, got {shown(value)}")
+    for name in value:
+        if name not in names:
+            raise ValueError(f"a sensor has no {shown(name)}; it has {', '.join(names)}")
+    return Sensor(**value)
+
+
+class Readings:
+    """What the sensors of n environments read, and what they keep for that: coloured noise, and late samples."""
+
+    def __init__(self, sensor: Sensor, ny: int, dt: float, n: int) -> None:
+        self._of = of = sensor.columns(ny)
+        self._ny, self._outputs, self._everyone = ny, np.arange(ny)[:, None], np.arange(n)
+        self._decay = np.exp(-dt / of["time_constant"])
+        self._fresh = np.sqrt(-np.expm1(-2 * dt / of["time_constant"]))
+        self._rounded = bool(of["quantum"].any())
+        self._quantum = np.where(of["quantum"] > 0, of["quantum"], 1.0)
+        self._noise = np.zeros((ny, n))  # of variance 1
+        self._age = np.zeros(n, dtype=np.int64)  # steps since reset
+        self._kept = np.zeros((int(of["delay"].max()) + 1, ny, n))  # the latest samples, at their age modulo its length
+
+    @np.errstate(over="ignore", invalid="ignore")  # of states that have escaped
+    def read(self, h: np.ndarray, v: np.ndarray, rows: np.ndarray | None = None, *, start: bool) -> np.ndarray:
+        """Samples of ``rows`` (m,), at the start of episodes or a step later: (ny, m), NaN where there is none.
+
+        Shapes: ``h`` (ny, m), ``v`` (ny, m) or (3 ny, m): white noise, and what a random sensor draws.
+        """
+        rows, of, drawn = self._everyone if rows is None else rows, self._of, len(v) > self._ny
+        white, fresh, chance = np.split(v, 3) if drawn else (v, None, None)
+        y = of["gain"] * h + of["bias"] + white
+        if fresh is not None:
+            noise = fresh if start else self._decay * self._noise[:, rows] + self._fresh * fresh
+            self._noise[:, rows] = noise
+            y += of["coloured_noise"] * noise
+        if self._rounded:
+            y = np.where(of["quantum"] > 0, self._quantum * np.rint(y / self._quantum), y)
+        y = np.clip(y, of["low"], of["high"])
+        age = self._age[rows] = 0 if start else self._age[rows] + 1
+        if start:
+            self._kept[:, :, rows] = y
+            return y
+        lost = age % of["every"] != 0
+        if chance is not None:
+            lost |= chance < of["drop_out"]
+        y[lost] = np.nan
+        length = len(self._kept)
+        if length == 1:  # nothing is late
+            return y
+        self._kept[age % length, :, rows] = y.T
+        return self._kept[(age - of["delay"]) % length, self._outputs, rows]
+
+
+def _is_sequence(value: Any) -> bool:
+    return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
+
+
+def _each(name: str, value: Any, check: Callable[[str, Any], float]) -> float | tuple[float, ...]:
+    if _is_sequence(value):
+        return tuple(check(f"{name}[{i}]", one) for i, one in enumerate(value))
+    return check(name, value)
+
+
+def _number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str, Any], float]:
+    def check(name: str, value: Any) -> float:
+        if not is_finite(value) or not holds(value):
+            raise ValueError(f"{name} must be a {wanted}, got {shown(value)}")
+        return float(value)
+
+    return check
+
+
+_finite = _number("finite number", lambda value: True)
+
+
+__all__ = ["Sensor"]

@@ -1,0 +1,161 @@
+"""Observers that were learned from rollouts, inside the environment that these are of."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from kkl_gym.identity import check_identity, source_of
+from kkl_gym.named import InputReader, Reader, observed, resolved
+from kkl_gym.signals import Inputs
+from kkl_gym.wrappers.estimator import KKLEstimator, reach, with_deviations
+from observers import Artifact, ArtifactError
+from observers.checks import choice, flag
+
+
+class NamedEstimator(KKLEstimator):
+    """An observer from rollouts: what is measured is shown beside what it estimates."""
+
+    def __init__(
+        self,
+        env: Any,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        artifact: Artifact,
+        *,
+        estimate: str,
+        uncertainty: bool,
+        **how: Any,
+    ) -> None:
+        choice("estimate", estimate, ("x", "z"))
+        uncertainty = flag("uncertainty", uncertainty)
+        check_identity(artifact, env)
+        try:
+            _check_actions(env, action_space)
+            self.samples = Samples(artifact, observation_space, action_space, source=source_of(env))
+        except ValueError as error:
+            raise ArtifactError(f"the observer {artifact.system!r} does not fit: {error}") from error
+        measured, inputs = self.samples.outputs, self.samples.inputs
+        if estimate == "z":
+            with np.errstate(over="ignore"):
+                high = reach(artifact.filter, np.maximum(abs(measured.low), abs(measured.high)), inputs.largest)
+            low = -high
+        else:
+            low, high = _bounds(artifact, observation_space)
+            if uncertainty:
+                low, high = with_deviations(low, high)
+        low, high = np.concatenate([measured.low, low]), np.concatenate([measured.high, high])
+        with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
+            space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        super().__init__(artifact, space, estimate=estimate, uncertainty=uncertainty, **how)
+
+    def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
+        """Forget the past and take in the first samples; see :class:`KKLEstimator`."""
+        self._check_start(x0)
+        super().reset(y0, x0)
+        self._y, self._held = y0.copy(), y0.copy()
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
+        """Forget the past in some rows; see :class:`KKLEstimator`."""
+        self._check_start(x0)
+        super().restart(y0, rows, x0)
+        self._y[rows] = self._held[rows] = y0
+
+    def _check_start(self, x0: np.ndarray) -> None:
+        known = x0.shape[-1] == self.observer.artifact.nx and np.isfinite(x0).all()
+        if self._known_start and not known:
+            hidden = ", ".join((self.observer.artifact.signals or {})["hidden"])
+            raise ValueError(f"known_start: the environment does not show {hidden} at its reset; leave known_start out")
+
+    def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
+        """Take in samples and the inputs that led to them; see :class:`KKLEstimator`."""
+        super().advance(y, u, rows)
+        self._y = y.copy() if rows is None else np.where(rows[..., None], y, self._y)
+        self._held = np.where(np.isnan(self._y), self._held, self._y)
+
+    def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """What ``info`` gains: as :class:`KKLEstimator`, and ``y``, what is measured, NaN where it is missing."""
+        return super().report(rows) | {"y": self._y.copy() if rows is None else self._y[rows]}
+
+    def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
+        """What of a report is the observation: y, its last value where it is missing, then x_hat or z."""
+        y = report["y"]
+        if np.isnan(y).any():  # not in rows that have been restarted, whose first sample is whole
+            y = np.where(np.isnan(y), self._held, y)
+        return np.concatenate([y, super().shown(report)], axis=-1)
+
+    def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
+        """The same of a single sample."""
+        return [*self._held.tolist(), *super().listed(report)]
+
+
+class Samples:
+    """What an observer from rollouts sees of an environment."""
+
+    def __init__(
+        self, artifact: Artifact, observation_space: gym.Space[Any], action_space: gym.Space[Any], *, source: str
+    ) -> None:
+        signals = artifact.signals or {}
+        names = resolved(signals["measured"], observation_space, role="measured", source=source)
+        self.outputs = Reader(observation_space, names, source=source, missing=True)
+        self.inputs = InputReader(action_space, signals["inputs"], source=source)
+        self.hidden = _reader_of_hidden(observation_space, signals["hidden"], source)
+        self.nx, self._nothing = artifact.nx, np.full(artifact.nx, np.nan)
+        self.count = 0
+
+    def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs after a reset, and what is hidden, NaN if that is not shown; ``info`` gains what ours says."""
+        self.count = 0
+        y, x = self.outputs(observation, info), self.states(observation, info)
+        info.pop("x", None)  # whatever else the environment calls so
+        info |= x | {"sample": np.array(0)}
+        return y, x.get("x", self._nothing)
+
+    def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs after a step, and the inputs that led to them; ``info`` gains what ours says."""
+        y, u = self.outputs(observation, info), self.inputs(action)
+        x = self.states(observation, info)
+        info.pop("x", None)
+        info |= x | {"u": u, "sample": np.array(self.count + 1)}
+        return y, u
+
+    def states(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> dict[str, np.ndarray]:
+        """True hidden signals."""
+        if self.hidden is None:
+            return {}
+        try:
+            return {"x": self.hidden(observation, info, batch)}
+        except ValueError:  # a wrapper inside has blanked them, or info does not hold them at this step
+            return {}
+
+
+def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) -> Reader | None:
+    """What reads the hidden signals, which observations need not show."""
+    try:
+        return Reader(space, resolved(names, space, role="hidden", source=source), source=source)
+    except ValueError:
+        return None
+
+
+def _check_actions(env: Any, space: gym.Space[Any]) -> None:
+    """Raise ValueError if a wrapper inside makes other inputs of actions, as ClipAction's are not bounded."""
+    base, source = env.unwrapped, source_of(env)
+    own = base.single_action_space if isinstance(base, gym.vector.VectorEnv) else base.action_space
+    here, there = (Inputs(one, source=source) for one in (space, own))
+    if not (np.array_equal(here.low, there.low) and np.array_equal(here.high, there.high)):
+        raise ValueError(
+            f"actions of {source} are of {own}, and a wrapper inside takes {space}: the observer would misread them; "
+            "put that wrapper outside"
+        )
+
+
+def _bounds(artifact: Artifact, space: gym.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the hidden signals, as the observation has them; infinite where it does not show them."""
+    low, high = np.full(artifact.nx, -np.inf), np.full(artifact.nx, np.inf)
+    there = observed(space)
+    for i, name in enumerate((artifact.signals or {})["hidden"]):
+        if name in there or name.startswith(("cos(", "sin(")):
+            of = Reader(space, [name], source="") if name in there else None
+            low[i], high[i] = (-1.0, 1.0) if of is None else (of.low[0], of.high[0])
+    return low, high

@@ -1,0 +1,97 @@
+"""An observer's step as machine code, where Numba is installed: its numbers, as the kernel orders them."""
+
+from typing import Any
+
+import numpy as np
+
+from observers.artifact import Artifact
+from observers.decoder import Decoder, Decoders
+from observers.tracker import Tracker
+
+MOST_OPERATIONS = 400  # of expressions; beyond, such as for a network as f, compiling takes many seconds
+
+
+class CompiledStep:
+    """The step of :class:`observers.kkl.KKL`, of rows of its state in place.
+
+    Raises ImportError without Numba, and ValueError where an expression is too long to compile.
+    """
+
+    def __init__(self, artifact: Artifact, decoders: Decoders, tracker: Tracker | None) -> None:
+        from observers import kernel
+
+        nx, ny, nu, linear = artifact.nx, artifact.ny, artifact.nu, artifact.filter
+        motion = None if tracker is None else tracker.motion
+        equations, flow = (None, None) if motion is None else (motion.equations, motion.flow)
+        for expression in (None if equations is None else equations.field, artifact.h):
+            if expression is not None and expression.operations > MOST_OPERATIONS:
+                raise ValueError("the expression takes too long to compile")
+        # Machine code is freed with what holds its address.
+        self._move = self._measure = None
+        if equations is not None:
+            self._move = kernel.motion(equations.field, nx, nu, not equations.substeps)
+        if artifact.h is not None:
+            self._measure = kernel.output(artifact.h, nx)
+        self._steps, self._nothing, self.dt = kernel.steps(nx, ny, nu), np.empty((1, 0, 0)), linear.dt
+        driven, free = _of_map(decoders.driven, nx), _of_map(decoders.free or decoders.driven, nx)
+        widest = max(driven[2], free[2], nx + nu)
+        states, r, watched, limit = np.zeros((3, nx)), np.ones(ny), [0.0] * 6, 0.0
+        if tracker is not None:
+            watch = tracker.supervision
+            states, r, limit = np.array([tracker.motion.low, tracker.motion.high, tracker.q]), tracker.r, watch.limit
+            watched = [float(watch.window), watch.share, watch.trend_share, watch.trend_square_share]
+            watched += [watch.trend_gain, watch.trend_limit]
+        scaling, of_flow, packed, shape = (
+            np.zeros((4, nx + nu)),
+            np.zeros((nx, 1)),
+            np.zeros(0, np.float32),
+            np.zeros(1, int),
+        )
+        if motion is not None and flow is not None:
+            assert flow.mlp.compiled is not None
+            scaling[0, :nx], scaling[1, :nx], scaling[2, :nx] = motion.x_offset, motion.x_scale, flow.gain
+            scaling[3, :nu], of_flow = 1.0 / flow.u_scale, flow.linear
+            packed, shape = flow.mlp.compiled.packed, flow.mlp.compiled.shape
+            widest = max(widest, *shape[1:])
+        substeps = -1 if equations is None else max(equations.substeps, 1)
+        addresses = (0 if pointer is None else pointer.address for pointer in (self._move, self._measure))
+        self._model = (
+            (int(tracker is not None), int(artifact.knows_output), len(linear.A), substeps, *addresses, int(widest)),
+            (linear.dt / abs(substeps), 1.0, linear.dt, limit, *watched),
+            states,
+            r,
+            np.zeros((ny, nx)) if artifact.C is None else np.array(artifact.C, dtype=float, order="C"),
+            _of_filter(linear.transition, linear.drive),
+            (driven[0], free[0], driven[1], free[1]),
+            (scaling, np.array(of_flow, order="C"), packed, shape),
+        )
+
+    def __call__(
+        self, rows: np.ndarray, y: np.ndarray, u: np.ndarray, record: np.ndarray | None = None, first: int = 0
+    ) -> None:
+        """Take samples and inputs into rows; a record keeps their columns from ``first`` on at each sample.
+
+        Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu), ``record`` (steps, n, columns).
+        """
+        y, u = np.array(y, order="C"), np.array(u, order="C")  # Numba compiles anew for what is read-only
+        self._steps(*self._model, rows, y, u, self._nothing if record is None else record, first)
+
+
+def _of_map(decoder: Decoder, nx: int) -> tuple[Any, tuple[np.ndarray, np.ndarray], int]:
+    """A map's network, its covariances by age, and its largest width."""
+    machine, error = decoder.compiled, decoder.error
+    assert machine is not None
+    ages, table = np.zeros(1), np.zeros((1, nx * nx))
+    if error is not None:
+        ages, table = error.ages, np.ascontiguousarray(error.covariance.reshape(len(error.ages), -1))
+    return machine.network, (np.array(ages), table), machine.widest
+
+
+def _of_filter(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gains of z itself and of what drives it, and the few entries of the transition off its diagonal."""
+    diagonal = transition.diagonal()
+    places = np.array(np.nonzero(transition - np.diag(diagonal)))
+    return np.vstack([diagonal, drive]), places, transition[*places]
+
+
+__all__ = ["CompiledStep"]

@@ -1,0 +1,95 @@
+"""What every estimator of a state does, whatever it is made of."""
+
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+State = TypeVar("State")
+
+
+class Estimate(NamedTuple):
+    """Estimates of a batch at one time.
+
+    Parameters
+    ----------
+    x_hat : ndarray, shape (n, nx)
+        The estimated states.
+    covariance : ndarray, shape (n, nx, nx), optional
+        Covariances of their errors, where the estimator has them.
+    score : ndarray, shape (n,), optional
+        How well samples fit estimates, where they are watched: beyond 1 a fault is likely.
+    """
+
+    x_hat: np.ndarray
+    covariance: np.ndarray | None = None
+    score: np.ndarray | None = None
+
+
+class Estimator(Protocol[State]):
+    """A batch of n rows, of which each is an estimator of its own; the caller keeps its state.
+
+    No method changes a state that it is given, so that a state is also a snapshot. A single sample is a batch of one.
+    """
+
+    def start(self, n: int) -> State:
+        """Return the state of n rows before their first sample."""
+        ...
+
+    def advance(self, state: State, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> State:
+        """Return the state after samples y (n, ny), NaN where missing, and inputs u (n, nu) held for dt before them.
+
+        The first sample of a row, which must be whole, begins it; the input before it is ignored.
+        """
+        ...
+
+    def estimate(self, state: State) -> Estimate:
+        """Return the estimates at the last samples."""
+        ...
+
+
+class Running:
+    """An estimator with its state, sample by sample, in all rows or in some."""
+
+    def __init__(self, estimator: Estimator[Any]) -> None:
+        self.estimator = estimator
+        self.state: Any = None
+
+    def reset(self, y0: np.ndarray) -> np.ndarray:
+        """Begin with first samples (n, ny); returns the estimates (n, nx)."""
+        self.state = self.estimator.advance(self.estimator.start(len(y0)), y0)
+        return self.decode()
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
+        """Begin again in rows (n,), with their first samples (number of True in rows, ny)."""
+        begun, state = self.estimator.advance(self.estimator.start(len(y0)), y0), []
+        for before, after in zip(self.state, begun, strict=True):
+            state.append(before.copy())
+            state[-1][rows] = after
+        self.state = type(self.state)(*state)
+
+    def advance(self, y: np.ndarray, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
+        """Take in samples (n, ny) after inputs (n, nu), in all rows or in some."""
+        state = self.estimator.advance(self.state, y, u)
+        if rows is not None:
+            for before, after in zip(self.state, state, strict=True):
+                after[~rows] = before[~rows]
+        self.state = state
+
+    def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Take in samples and return the estimates (n, nx)."""
+        self.advance(y, u)
+        return self.decode()
+
+    def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """Return the estimates (n, nx), of all rows or of some."""
+        x_hat = self.estimator.estimate(self.state).x_hat
+        return x_hat if rows is None else x_hat[rows]
+
+    def along(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Return the estimates along records y (steps, n, ny) and inputs u (steps - 1, n, nu); (steps, n, nx)."""
+        found = [self.reset(y[0])]
+        found += [self.step(y[k], None if u is None else u[k - 1]) for k in range(1, len(y))]
+        return np.array(found)
+
+
+__all__ = ["Estimate", "Estimator", "Running"]

@@ -1,0 +1,514 @@
+"""The observer's step as machine code, for one row or many, along one sample or a record. It needs Numba.
+
+One compilation serves all observers of as many states, outputs and inputs, and lies on disk for later processes. What
+differs between systems, a motion and an output that is not linear, is compiled for itself and called by its address.
+"""
+
+import functools
+import math
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from observers.expression import Expression
+from observers.machine import kernel, part, pointer
+from observers.network_kernel import UNROLLED, decode, evaluate
+from observers.supervision import INFLATION, RELINEARISATIONS
+
+_intrinsic: Any = intrinsic  # whose results take other arguments than the functions that it decorates
+_POINTER = types.CPointer(types.float64)
+_SIGNATURE = types.void(_POINTER, _POINTER, types.int64, types.float64)
+_OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
+_kernel, _part = kernel(**_OPTIONS), part(**_OPTIONS)
+
+
+@_intrinsic(prefer_literal=True)
+def stack(typing: Any, count: Any) -> Any:
+    """Memory of a constant number of doubles, which the compiler may keep in registers."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return cgutils.alloca_once(builder, ir.DoubleType(), size=ir.Constant(ir.IntType(64), count.literal_value))
+
+    return (_POINTER(count), code) if isinstance(count, types.IntegerLiteral) else None
+
+
+@_intrinsic
+def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any) -> Any:
+    """Call a motion or an output by its address."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        double = ir.DoubleType()
+        kind = ir.FunctionType(ir.VoidType(), [double.as_pointer(), double.as_pointer(), ir.IntType(64), double])
+        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, _POINTER, _POINTER, types.int64, types.float64), code
+
+
+def lanes(nx: int) -> int:
+    """Sigma points of nx states, and as many more as fill the processor's registers."""
+    return -(-(2 * nx + 1) // 4) * 4
+
+
+@functools.cache
+def motion(expression: Expression, nx: int, nu: int, discrete: bool) -> Any:
+    """The equations' step of all sigma points, (nx, lanes), in place, in so many Runge-Kutta steps of h."""
+    wide, field = lanes(nx), expression.python("field", nx, nu)
+    given = ", ".join([f"x{i}" for i in range(nx)] + [f"u[{j}]" for j in range(nu)])
+    lines = ["def step(s, u, p, h):", *(f"    x{i} = s[{i * wide} + p]" for i in range(nx))]
+    for stage, (before, share) in enumerate((("", ""), ("a", "0.5 * h * "), ("b", "0.5 * h * "), ("c", "h * "))):
+        moved = [f"x{i} + {share}{before}[{i}]" if before else f"x{i}" for i in range(nx)]
+        lines.append(f"    {'abcd'[stage]} = field({', '.join(moved + [f'u[{j}]' for j in range(nu)])})")
+    lines += [
+        f"    s[{i * wide} + p] = x{i} + h / 6.0 * (a[{i}] + 2.0 * (b[{i}] + c[{i}]) + d[{i}])" for i in range(nx)
+    ]
+    if discrete:
+        lines[1 + nx :] = [f"    a = field({given})", *(f"    s[{i * wide} + p] = a[{i}]" for i in range(nx))]
+    step = _function("\n".join(lines), "step", field=field)
+
+    def move(s: Any, u: Any, substeps: int, h: float) -> None:
+        for _ in range(substeps):
+            for p in range(wide):
+                step(s, u, p, h)
+
+    return pointer(move, _SIGNATURE, **_OPTIONS)
+
+
+@functools.cache
+def output(expression: Expression, nx: int) -> Any:
+    """The outputs, (ny, lanes), of the first sigma points, (nx, lanes)."""
+    wide, ny = lanes(nx), len(expression.components)
+    function = expression.python("function", nx, 0)
+    given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))
+    lines = [
+        "def at(s, out, p):",
+        f"    y = function({given})",
+        *(f"    out[{k * wide} + p] = y[{k}]" for k in range(ny)),
+    ]
+    at = _function("\n".join(lines), "at", function=function)
+
+    def measure(s: Any, out: Any, count: int, h: float) -> None:
+        for p in range(count):
+            at(s, out, p)
+
+    return pointer(measure, _SIGNATURE, **_OPTIONS)
+
+
+def _function(source: str, name: str, **names: str) -> Any:
+    """A function by its source, and by the sources of those that it calls."""
+    namespace: dict[str, Any] = {"np": np}
+    for inner, text in names.items():
+        exec(text, namespace)
+        namespace[inner] = _part(namespace[inner])
+    exec(source, namespace)
+    return _part(namespace[name])
+
+
+@functools.cache
+def steps(nx: int, ny: int, nu: int) -> Any:
+    """The kernel for numbers of states, outputs and inputs."""
+    kappa, points, wide = max(3.0 - nx, 0.0), 2 * nx + 1, lanes(nx)
+    far, other = math.sqrt(nx + kappa), 0.5 / (nx + kappa)
+    middle, middle_squares = kappa / (nx + kappa), kappa / (nx + kappa) + 2.0
+    square, cross, inputs, turns, inflation = nx * nx, nx * ny, max(nu, 1), RELINEARISATIONS, INFLATION
+    of_states, of_outputs, of_innovations, of_network = nx * wide, ny * wide, ny * ny, nx + inputs
+    nis = nx + square  # where it lies in a row of the tracker
+
+    @_part
+    def factorise(P: Any, L: Any, inverse: Any) -> None:
+        """P = L L^T, and what divides by L's diagonal; not finite where there is no L."""
+        for i in range(nx):
+            for j in range(i + 1):
+                total = P[i * nx + j]
+                for k in range(j):
+                    total -= L[i * nx + k] * L[j * nx + k]
+                if i > j:
+                    L[i * nx + j] = total * inverse[j]
+                else:
+                    L[i * nx + i] = math.sqrt(total) if total > 0.0 else np.nan
+                    inverse[i] = 1.0 / L[i * nx + i]
+
+    @_part
+    def smoothed(P: Any, L: Any, inverse: Any, across: Any, V: Any, turned: bool, G: Any) -> None:
+        """G = across P^-1 V, or across^T P^-1 V."""
+        b = stack(nx)
+        factorise(P, L, inverse)
+        for k in range(ny):
+            for i in range(nx):
+                b[i] = V[i * ny + k]
+                for j in range(i):
+                    b[i] -= L[i * nx + j] * b[j]
+                b[i] *= inverse[i]
+            for back in range(nx):
+                i = nx - 1 - back
+                for j in range(i + 1, nx):
+                    b[i] -= L[j * nx + i] * b[j]
+                b[i] *= inverse[i]
+            for i in range(nx):
+                total = 0.0
+                for j in range(nx):
+                    total += (across[j * nx + i] if turned else across[i * nx + j]) * b[j]
+                G[i * ny + k] = total
+
+    @_part
+    def spread_out(x: Any, P: Any, L: Any, inverse: Any, at: Any) -> None:
+        """Sigma points (nx, lanes); those that fill the registers are the mean."""
+        factorise(P, L, inverse)
+        for i in range(nx):
+            for p in range(wide):
+                at[i * wide + p] = x[i]
+            for j in range(i + 1):
+                entry = far * L[i * nx + j]
+                at[i * wide + 1 + j] += entry
+                at[i * wide + 1 + nx + j] -= entry
+
+    @_part
+    def moments(at: Any, n: int, mean: Any, S: Any) -> None:
+        """Mean (n,) and covariance (n, n) of points (n, lanes), which become differences from the mean."""
+        for i in range(n):
+            total = 0.0
+            for p in range(1, points):
+                total += at[i * wide + p]
+            mean[i] = middle * at[i * wide] + other * total
+            for p in range(wide):
+                at[i * wide + p] -= mean[i]
+            for j in range(i + 1):
+                total = 0.0
+                for p in range(1, points):
+                    total += at[i * wide + p] * at[j * wide + p]
+                S[i * n + j] = S[j * n + i] = middle_squares * at[i * wide] * at[j * wide] + other * total
+
+    @_part
+    def together(L: Any, at: Any, n: int, across: Any) -> None:
+        """Covariance (nx, n) of the points' differences (n, lanes) with the points that L spread out."""
+        for j in range(n):
+            for i in range(nx):
+                total = 0.0
+                for k in range(i + 1):
+                    total += L[i * nx + k] * (at[j * wide + 1 + k] - at[j * wide + 1 + nx + k])
+                across[i * n + j] = other * far * total
+
+    @_part
+    def flow_step(at: Any, u: Any, flow: Any, scratch: Any) -> None:
+        """A learned motion of the sigma points, in place."""
+        scaling, linear, packed, shape = flow
+        q = stack(of_network)
+        for j in range(nu):
+            q[nx + j] = u[j] * scaling[3, j]
+        for p in range(points):
+            for i in range(nx):
+                q[i] = (at[i * wide + p] - scaling[0, i]) / scaling[1, i]
+            for i in range(nx + nu):
+                scratch[3, i] = q[i]
+            evaluate(scratch[3, : nx + nu], packed, shape, scratch, scratch[4, :nx])
+            for i in range(nx):
+                total = q[i] + linear[i, 0]
+                for j in range(nx + nu):
+                    total += linear[i, 1 + j] * q[j]
+                total += scaling[2, i] * scratch[4, i]
+                at[i * wide + p] = scaling[0, i] + scaling[1, i] * total
+
+    @_part
+    def within(states: Any, at: Any, count: int) -> None:
+        """Cut states (nx, lanes) at their bounds."""
+        for i in range(nx):
+            for p in range(count):
+                s = at[i * wide + p]
+                s = states[0, i] if s < states[0, i] else s
+                at[i * wide + p] = states[1, i] if s > states[1, i] else s
+
+    @_part
+    def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
+        """Mean and covariance a sample later, and the covariance with the state before."""
+        states, flow, substeps, address, h, share = model
+        inverse, at = stack(nx), stack(of_states)
+        spread_out(x, P, L, inverse, at)
+        within(states, at, wide)
+        if substeps < 0:
+            flow_step(at, u, flow, scratch)
+        else:
+            call(address, at, u, substeps, h)
+        moments(at, nx, mean, moved)
+        together(L, at, nx, across)
+        for i in range(nx):
+            moved[i * nx + i] += share * states[2, i]
+
+    @_part
+    def expect(x: Any, P: Any, h: Any, states: Any, L: Any, y: Any, S: Any, V: Any) -> None:
+        """Mean and covariance of the output, and its covariance with the state."""
+        address, C = h
+        if address == 0:
+            for k in range(ny):
+                y[k] = 0.0
+                for i in range(nx):
+                    y[k] += C[k, i] * x[i]
+                    V[i * ny + k] = 0.0
+                    for j in range(nx):
+                        V[i * ny + k] += P[i * nx + j] * C[k, j]
+            for k in range(ny):
+                for j in range(k + 1):
+                    S[k * ny + j] = 0.0
+                    for i in range(nx):
+                        S[k * ny + j] += C[k, i] * V[i * ny + j]
+            return
+        inverse, at, to, near = stack(nx), stack(of_states), stack(of_outputs), stack(of_outputs)
+        spread_out(x, P, L, inverse, at)
+        call(address, at, to, points, 0.0)
+        within(states, at, points)  # sigma points may lie where h is undefined
+        call(address, at, near, points, 0.0)
+        for k in range(ny):
+            for p in range(points):
+                i = k * wide + p
+                to[i] = to[i] if np.isfinite(to[i]) else near[i] if np.isfinite(near[i]) else to[k * wide]
+        moments(to, ny, y, S)
+        together(L, to, ny, V)
+
+    @_part
+    def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
+        """White innovations, by which V moves the state: x + V white and P - V V^T are what is known then."""
+        for k in range(ny):
+            white[k] = y[k] - expected[k]
+        for k in range(ny):
+            root = 0.0 if np.isnan(y[k]) else 1.0 / math.sqrt(S[k * ny + k] + r[k])
+            white[k] = 0.0 if np.isnan(y[k]) else white[k] * root
+            for i in range(nx):
+                V[i * ny + k] *= root
+            for j in range(k + 1, ny):
+                share = S[j * ny + k] * root
+                white[j] -= share * white[k]
+                for i in range(nx):
+                    V[i * ny + j] -= share * V[i * ny + k]
+                for m in range(k + 1, j + 1):
+                    S[j * ny + m] -= share * S[m * ny + k] * root
+
+    @_part
+    def shift(x: Any, sign: float, V: Any, white: Any) -> None:
+        for i in range(nx):
+            for k in range(ny):
+                x[i] += sign * V[i * ny + k] * white[k]
+
+    @_part
+    def add(P: Any, sign: float, V: Any, W: Any) -> None:
+        for i in range(nx):
+            for j in range(nx):
+                for k in range(ny):
+                    P[i * nx + j] += sign * V[i * ny + k] * W[j * ny + k]
+
+    @_part
+    def is_sound(x: Any, P: Any, L: Any, inverse: Any) -> bool:
+        total = 0.0
+        factorise(P, L, inverse)
+        for i in range(nx):
+            total += x[i] + inverse[i]
+        return np.isfinite(total)
+
+    @_part
+    def track(now: Any, y: Any, u: Any, model: Any, h: Any, r: Any, watched: Any, scratch: Any, expected: Any) -> None:
+        """Predict and correct the state of a row's tracker."""
+        window, share, trend_share, square_share, trend_gain, trend_limit = watched
+        states = model[0]
+        x, P, start, spread = stack(nx), stack(square), stack(nx), stack(square)
+        mean, moved, across, L, inverse = stack(nx), stack(square), stack(square), stack(square), stack(nx)
+        again, again_moved, again_across = stack(nx), stack(square), stack(square)
+        S, V, G, D, white = stack(of_innovations), stack(cross), stack(cross), stack(cross), stack(ny)
+        for i in range(nx):
+            x[i] = start[i] = now[i]
+        for i in range(square):
+            P[i] = spread[i] = now[nx + i]
+        last = turns if now[nis + 2] < window else 0
+        for turn in range(last + 1):
+            predict(start, spread, u, model, scratch, L, again, again_moved, again_across)
+            if turn:  # with the motion linearised about the smoothed start of the step
+                smoothed(spread, L, inverse, again_across, G, True, D)
+                shift(again, -1.0, D, white)
+                add(again_moved, 1.0, D, D)
+                add(again_across, 1.0, G, D)
+                if not is_sound(again, again_moved, L, inverse):
+                    break
+            for i in range(nx):
+                mean[i] = again[i]
+            for i in range(square):
+                moved[i], across[i] = again_moved[i], again_across[i]
+            expect(mean, moved, h, states, L, expected, S, V)
+            whiten(y, expected, S, r, white, V)
+            if turn < last:
+                smoothed(moved, L, inverse, across, V, False, G)
+                for i in range(nx):
+                    start[i] = x[i]
+                for i in range(square):
+                    spread[i] = P[i]
+                shift(start, 1.0, G, white)
+                add(spread, -1.0, G, G)
+        shift(mean, 1.0, V, white)
+        add(moved, -1.0, V, V)
+        total = 0.0
+        for i in range(nx):
+            total += mean[i]
+            for j in range(nx):
+                total += moved[i * nx + j]
+        if not np.isfinite(total):
+            now[nis] = np.inf
+            return
+        count, squares, raised, grown = 0.0, 0.0, 0.0, 1.0
+        for k in range(ny):
+            if not np.isnan(y[k]):
+                count += 1.0
+                squares += white[k] * white[k]
+                now[nis + 3 + k] += trend_share * (white[k] - now[nis + 3 + k])
+                raised += now[nis + 3 + k] * now[nis + 3 + k]
+        if count > 0.0:
+            weight = count / ny
+            now[nis] += share * weight * (squares / count - now[nis])
+            now[nis + 1] += square_share * weight * (trend_gain * raised / count - now[nis + 1])
+            now[nis + 2] += 1.0
+            if now[nis + 1] > trend_limit:  # innovations agree with one another
+                grown, now[nis + 1] = inflation, 1.0
+                for k in range(ny):
+                    now[nis + 3 + k] = 0.0
+        for i in range(nx):
+            s = mean[i]
+            s = states[0, i] if s < states[0, i] else s
+            now[i] = states[1, i] if s > states[1, i] else s
+        for i in range(square):
+            now[nx + i] = grown * moved[i]
+
+    @_part
+    def invert(z: Any, age: float, nz: int, maps: Any, scratch: Any, x: Any) -> None:
+        """T_inv, of free motion where no input has acted."""
+        driven, free, _, _ = maps
+        acted = len(z) == nz
+        for i in range(nz, len(z)):
+            acted = acted or z[i] != 0.0
+        if acted:
+            decode(z, age, driven, scratch, x)
+        else:
+            decode(z[:nz], age, free, scratch, x)
+
+    @_part
+    def supervise(now: Any, z: Any, age: float, nz: int, dt: float, watched: Any, limit: float, states: Any, maps: Any,
+                  scratch: Any, x_hat: Any) -> None:  # fmt: skip
+        """Take T_inv's estimate where it is surer within the first window, or where the tracker diverged."""
+        window, lost = watched[0], not now[nis] <= limit
+        if not lost and now[nis + 2] >= window:
+            return
+        acted = len(z) == nz
+        for i in range(nz, len(z)):
+            acted = acted or z[i] != 0.0
+        ages, table = maps[2] if acted else maps[3]
+        seen, at = min(now[nis + 2], window) * dt, 0
+        while at < len(ages) - 2 and seen > ages[at + 1]:
+            at += 1
+        P, L, inverse, own = stack(square), stack(square), stack(nx), stack(square)
+        part = 0.0 if len(ages) == 1 else min((seen - ages[at]) / (ages[at + 1] - ages[at]), 1.0)
+        upper = min(at + 1, len(ages) - 1)
+        for i in range(square):
+            P[i], own[i] = (1.0 - part) * table[at, i] + part * table[upper, i], now[nx + i]
+        larger = 0.0  # the logarithm of the determinants' quotient
+        factorise(P, L, inverse)
+        for i in range(nx):
+            larger -= math.log(inverse[i])
+        factorise(own, L, inverse)
+        for i in range(nx):
+            larger += math.log(inverse[i])
+        if lost or larger < 0.0:
+            invert(z, age, nz, maps, scratch, x_hat)
+            for i in range(nx):
+                s = x_hat[i]
+                s = states[0, i] if s < states[0, i] else s
+                now[i] = states[1, i] if s > states[1, i] else s
+            for i in range(square):
+                now[nx + i] = P[i]
+        if lost:
+            now[nis] = now[nis + 1] = 1.0
+            for k in range(ny):
+                now[nis + 3 + k] = 0.0
+
+    @_part
+    def fill(y: Any, z: Any, age: float, nz: int, h: Any, states: Any, maps: Any, scratch: Any, x_hat: Any, before: Any,
+             filled: Any) -> None:  # fmt: skip
+        """Replace what is missing of a sample by h(T_inv(z)), or by the output before where that is undefined."""
+        invert(z, age, nz, maps, scratch, x_hat)
+        address, C = h
+        at, to = stack(of_states), stack(of_outputs)
+        for i in range(nx):
+            at[i * wide] = x_hat[i]
+        if address:
+            call(address, at, to, 1, 0.0)
+        for k in range(ny):
+            if not address:
+                to[k * wide] = 0.0
+                for i in range(nx):
+                    to[k * wide] += C[k, i] * x_hat[i]
+            if np.isnan(y[k]):
+                filled[k] = to[k * wide] if np.isfinite(to[k * wide]) else before[k]
+
+    @_part
+    def follow(z: Any, before: Any, u: Any, y: Any, linear: Any, out: Any) -> None:
+        """The linear filter, over an interval from the output before to y."""
+        gains, places, mixing = linear
+        size = len(z)
+        for i in range(size):
+            out[i] = gains[0, i] * z[i]
+        for k in range(ny):
+            for i in range(size):
+                out[i] += gains[1 + k, i] * before[k] + gains[1 + ny + nu + k, i] * y[k]
+        for j in range(nu):
+            for i in range(size):
+                out[i] += gains[1 + ny + j, i] * u[j]
+        for i in range(len(mixing)):
+            out[places[0, i]] += mixing[i] * z[places[1, i]]
+
+    @_kernel
+    def run(
+        flags: Any, numbers: Any, states: Any, r: Any, C: Any, linear: Any, maps: Any, flow: Any,
+        state: Any, y: Any, u: Any, record: Any, first: int
+    ) -> None:  # fmt: skip
+        """Samples y (steps, n, ny) and inputs u (steps, n, nu) into rows of the state (n, width).
+
+        Of each sample it keeps a part of the rows, from column ``first`` on, in ``record`` (steps, n, k).
+        """
+        tracks, knows_output, nz, substeps, address, output_address, widest = flags
+        h, noise_share, dt, limit = numbers[:4]
+        watched = numbers[4], numbers[5], numbers[6], numbers[7], numbers[8], numbers[9]
+        model, of_output = (states, flow, substeps, address, h, noise_share), (output_address, C)
+        size = linear[0].shape[1]
+        base, scratch = size + ny + 1, np.empty((5, widest + UNROLLED), np.float32)
+        z, x_hat, filled, expected, held = np.empty(size), np.empty(nx), np.empty(ny), stack(ny), stack(inputs)
+        for row in range(len(state)):
+            now = state[row]
+            past, before, tracked = now[:size], now[size : size + ny], now[base:]
+            for k in range(len(y)):
+                sample, gap = y[k, row], False
+                for j in range(nu):
+                    held[j] = u[k, row, j]
+                if tracks:
+                    track(tracked, sample, held, model, of_output, r, watched, scratch, expected)
+                for i in range(ny):
+                    gap = gap or np.isnan(sample[i])
+                    filled[i] = sample[i]
+                    if np.isnan(sample[i]):
+                        filled[i] = expected[i] if tracks and np.isfinite(expected[i]) else before[i]
+                if gap and knows_output and not tracks:
+                    age = now[base - 1]
+                    fill(sample, past, age * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
+                    follow(past, before, held, filled, linear, z)
+                    fill(sample, z, (age + 1.0) * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
+                follow(past, before, held, filled, linear, z)
+                for i in range(size):
+                    past[i] = z[i]
+                for i in range(ny):
+                    before[i] = filled[i]
+                now[base - 1] += 1.0
+                if tracks:
+                    supervise(tracked, past, now[base - 1] * dt, nz, dt, watched, limit, states, maps, scratch, x_hat)
+                for i in range(record.shape[2]):
+                    record[k, row, i] = now[first + i]
+
+    return run
+
+
+__all__ = ["lanes", "motion", "output", "steps"]

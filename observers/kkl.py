@@ -1,0 +1,196 @@
+"""The observer itself, with a state that the caller keeps: linear filter, T_inv, tracker and monitor."""
+
+import functools
+from typing import Any
+
+import numpy as np
+
+from observers.artifact import Artifact
+from observers.compiled_step import CompiledStep
+from observers.decoder import Decoders
+from observers.estimator import Estimate, Estimator
+from observers.monitor import Monitor
+from observers.tracker import Tracker
+
+_CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
+
+
+class KKL(Estimator[np.ndarray]):
+    """The estimator behind :class:`observers.KKLObserver`, for n rows.
+
+    A row of the state holds z (size), the output before (ny), the age in samples, which is NaN before the first one,
+    and then what the tracker and the monitor keep of it.
+    """
+
+    def __init__(
+        self,
+        artifact: Artifact,
+        *,
+        measurement_noise: float | tuple[float, ...],
+        process_noise: float,
+        tracking: bool,
+        monitored: bool,
+        compiled: bool | None,
+    ) -> None:
+        levels: dict[str, Any] = {"measurement_noise": measurement_noise, "process_noise": process_noise}
+        self.artifact, self._choice = artifact, compiled
+        self._options = levels | {"compiled": compiled}
+        self.decoders = Decoders(artifact, slice(artifact.nx), **self._options)
+        self.tracker = Tracker(artifact, self.decoders, **levels) if tracking else None
+        limits = artifact.limits if monitored else None
+        self.monitor = None if limits is None else Monitor(limits, measurement_noise, artifact.filter.dt)
+        size, ny = artifact.filter.size, artifact.ny
+        self.z, self.y, self.age = slice(size), slice(size, size + ny), size + ny
+        end = self.age + 1 + (0 if self.tracker is None else self.tracker.width)
+        self.tracked, self.watched = slice(self.age + 1, end), slice(end, None)
+        self.width = end + (0 if self.monitor is None else self.monitor.width)
+
+    def start(self, n: int) -> np.ndarray:
+        """Return rows before their first sample; see :class:`Estimator`."""
+        return np.full((n, self.width), np.nan)
+
+    def begin(self, y: np.ndarray, z: np.ndarray, age: Any, x0: np.ndarray | None = None) -> np.ndarray:
+        """Return rows at first samples (n, ny), or at known states (n, nx), of filter states (n, size)."""
+        state = np.empty((len(y), self.width))
+        state[:, self.z], state[:, self.y], state[:, self.age] = z, y, age
+        if self.tracker is not None:
+            state[:, self.tracked] = self.tracker.supervise(self.tracker.begin(y, x0), z, state[:, self.age])
+        if self.monitor is not None:
+            state[:, self.watched] = self.monitor.start(len(y))
+        return state
+
+    def take_over(self, other: "KKL", state: np.ndarray) -> np.ndarray:
+        """Return rows that go on from another's, whose artifact has the same filter; its tracker may begin here."""
+        y = state[:, other.y]
+        new = self.begin(y, state[:, other.z], state[:, other.age])
+        if self.tracker is not None and other.tracker is not None:
+            new[:, self.tracked] = self.tracker.take_over(state[:, other.tracked])
+        return new
+
+    def advance(
+        self, state: np.ndarray, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None
+    ) -> np.ndarray:
+        """Return rows after samples and inputs; see :class:`Estimator`."""
+        u = np.zeros((len(y), self.artifact.nu)) if u is None else u
+        begun = ~np.isnan(state[:, self.age])
+        if begun.all():
+            return self.step(state, y, u)
+        state, first = state.copy(), ~begun & np.isfinite(y).all(-1)
+        state[begun] = self.step(state[begun], y[begun], u[begun])
+        state[first] = self.begin(y[first], self.artifact.filter.start(y[first]), 0.0)
+        return state
+
+    def step(self, state: np.ndarray, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return rows that have begun after samples (n, ny) and inputs (n, nu)."""
+        if self._machine is not None:
+            new = state.copy()
+            self._machine(new, y[None], u[None])
+        else:
+            new = self._stepped(state, y, u)
+        if self.monitor is not None:
+            residual = self.artifact.residual(new[:, self.y], self.decode(new))
+            new[:, self.watched] = self.monitor.update(new[:, self.watched], residual, ~np.isnan(y))
+        return new
+
+    def _stepped(self, state: np.ndarray, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """The step in NumPy, without the monitor."""
+        z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
+        linear, tracker, gaps = self.artifact.filter, self.tracker, np.isnan(y)
+        if tracker is not None:
+            tracked, expected = tracker.advance(state[:, self.tracked], y, u)
+            y = _filled(y, gaps, expected, before)
+        elif gaps.any():
+            y = _filled(y, gaps, before, before)
+            if self.artifact.knows_output:
+                rows = gaps.any(-1)
+                y[rows] = self._predicted(y[rows], gaps[rows], u[rows], state[rows])
+        z = linear.advance(z, before, u, y)
+        parts = [z, y, age[:, None] + 1.0]
+        if tracker is not None:
+            parts.append(tracker.supervise(tracked, z, age + 1.0))
+        return np.concatenate([*parts, state[:, self.watched]], axis=1)
+
+    def _predicted(self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, state: np.ndarray) -> np.ndarray:
+        """Samples with gaps filled by h(T_inv(z)): from the z before, and once more from the z that this leads to."""
+        z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
+        dt, following = self.artifact.filter.dt, z
+        for ahead in range(2):
+            h = self.artifact.output(self.decoders(following, (age + ahead) * dt))
+            y = _filled(y, gaps, h, before)
+            following = self.artifact.filter.advance(z, before, u, y)
+        return y
+
+    def estimate(self, state: np.ndarray) -> Estimate:
+        """Return estimates, covariances and scores; see :class:`Estimator`."""
+        has_covariance = self.tracker is not None or self.artifact.inverse.error_covariance is not None
+        covariance = self.covariance(state) if has_covariance else None
+        score = None if self.monitor is None else self.monitor.score(state[:, self.watched])
+        return Estimate(self.decode(state), covariance, score)
+
+    def decode(self, state: np.ndarray) -> np.ndarray:
+        """Return the estimates, (n, nx)."""
+        if self.tracker is not None:
+            return state[:, self.tracked][:, self.tracker.x].copy()
+        if len(state) == 1:  # the machine code of a batch begins with matrix products
+            return self.decoders(state[0, self.z], state[0, self.age] * self.artifact.filter.dt)[None]
+        return self.decoders(state[:, self.z], state[:, self.age] * self.artifact.filter.dt)
+
+    def covariance(self, state: np.ndarray) -> np.ndarray:
+        """Return the covariances of the estimates' errors, (n, nx, nx)."""
+        if self.tracker is not None:
+            return self.tracker.covariance(state[:, self.tracked], state[:, self.age])
+        return self.decoders.covariances(state[:, self.z], state[:, self.age] * self.artifact.filter.dt)
+
+    def parameters_hat(self, state: np.ndarray) -> np.ndarray:
+        """Return the estimates of the uncertain parameters, (n, number)."""
+        artifact = self.artifact
+        if not artifact.estimated_parameters:
+            raise ValueError(
+                f"this observer for {artifact.system!r} estimates no parameters: train one that does "
+                "with kkl-gym train SYSTEM --uncertain 0.1 --set estimate_parameters=true"
+            )
+        return self._parameters(state[:, self.z], state[:, self.age] * artifact.filter.dt)
+
+    @functools.cached_property
+    def _parameters(self) -> Decoders:
+        return Decoders(self.artifact, slice(self.artifact.nx, None), **self._options)
+
+    def along(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, of: Any) -> np.ndarray:
+        """Return what a function of rows returns at each sample of a record that begins with ``state``.
+
+        Shapes: ``y`` (steps, n, ny), ``u`` (steps - 1, n, nu); returns (steps, n, ...).
+        """
+        parts, rows = [of(state)[None]], max(1, _CHUNK // max(1, len(state)))
+        for first in range(1, len(y), rows):
+            samples, inputs = y[first : first + rows], u[first - 1 : first - 1 + rows]
+            record = np.empty((len(samples), *state.shape))
+            if self._machine is not None:
+                state = state.copy()
+                self._machine(state, samples, inputs, record)
+            else:
+                for k in range(len(samples)):
+                    record[k] = state = self._stepped(state, samples[k], inputs[k])
+            values = of(record.reshape(len(samples) * len(state), self.width))
+            parts.append(values.reshape(len(samples), len(state), *values.shape[1:]))
+        return np.concatenate(parts)
+
+    @functools.cached_property
+    def _machine(self) -> CompiledStep | None:
+        """The step as machine code; None without Numba, or where NumPy is chosen or an expression is too long."""
+        if self._choice is False:
+            return None
+        try:
+            return CompiledStep(self.artifact, self.decoders, self.tracker)
+        except (ImportError, ValueError):
+            return None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_machine"}  # made again where it goes
+
+
+def _filled(y: np.ndarray, gaps: np.ndarray, predicted: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Samples with gaps filled by what is predicted, or by the outputs before where that is undefined."""
+    return np.where(gaps, np.where(np.isfinite(predicted), predicted, before), y)
+
+
+__all__ = ["KKL"]

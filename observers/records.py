@@ -1,0 +1,97 @@
+"""Estimates along whole records."""
+
+from typing import Any
+
+import numpy as np
+
+from observers.artifact import Artifact
+from observers.checks import real_array
+from observers.kkl import KKL
+from observers.samples import checked_record, held_inputs
+
+
+class RecordEstimates:
+    """The methods of :class:`observers.KKLObserver` that go along whole records, and leave its own state as it is."""
+
+    artifact: Artifact
+    _kkl: KKL
+    _begin: Any
+
+    def estimate(self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None) -> np.ndarray:
+        """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
+
+        The observer's own state is left as it was.
+
+        Parameters
+        ----------
+        y : array_like, shape (steps, ..., ny)
+            Outputs; the first row is y_0. Later ones are NaN where they are missing.
+        u : array_like, shape (steps - 1, ..., nu), optional
+            The input held after each row but the last, by default zero. A last row more is ignored.
+        x0 : array_like, shape (..., nx), optional
+            The state at y_0, where it is known, as for :meth:`reset`.
+
+        Returns
+        -------
+        ndarray, shape (steps, ..., nx)
+            Estimates.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`reset` and :meth:`step`.
+        """
+        return self._along(y, u, x0, of=self._kkl.decode)
+
+    def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Estimate the system's uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
+
+        Parameters
+        ----------
+        y, u
+            As for :meth:`estimate`.
+
+        Returns
+        -------
+        ndarray, shape (steps, ..., number)
+            Estimates.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`estimate`, and if the artifact estimates no parameters.
+        """
+        return self._along(y, u, None, of=self._kkl.parameters_hat)
+
+    def estimate_covariance(
+        self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Covariances of the errors of what :meth:`estimate` returns.
+
+        Parameters
+        ----------
+        y, u, x0
+            As for :meth:`estimate`.
+
+        Returns
+        -------
+        ndarray, shape (steps, ..., nx, nx)
+            What :attr:`covariance` would be at each sample.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`estimate`, and if the artifact holds no covariance.
+        """
+        self.artifact.require_covariance()
+        return self._along(y, u, x0, of=self._kkl.covariance)
+
+    def _along(self, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, *, of: Any) -> np.ndarray:
+        """What a function of the state's rows returns at each sample."""
+        y = checked_record(self.artifact, y)
+        u = held_inputs(self.artifact, u, y.shape[:-1])
+        x0 = None if x0 is None else real_array("x0", x0)
+        state = self._begin(y[0], x0)
+        samples, inputs = (each.reshape(len(each), len(state), each.shape[-1]) for each in (y, u))
+        found = self._kkl.along(state, samples, inputs, of)
+        return found.reshape(*y.shape[:-1], *found.shape[2:])

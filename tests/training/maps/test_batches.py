@@ -1,0 +1,208 @@
+"""Batches: what they hold, and that the observer shows its network the same."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import torch
+from linear_system import TwoUnits
+from small_runs import CPU, closed_loop, open_loop, untrained
+
+from observers.decoder import Decoder
+from training.maps.coordinates import noise_covariance
+from training.maps.inverse import ClosedLoopSampler, TrajectorySampler
+from training.spectrum import Spectrum
+from training.trajectories.closed_loop import record_closed_loop
+from training.trajectories.motions import KINDS, Motions, record, recording_ages
+
+
+@pytest.fixture(scope="module")
+def sampler():
+    return open_loop()
+
+
+def test_batches_cover_quiet_and_loud(sampler):
+    sampler, _, _ = sampler
+    inputs, x, weight, cell = sampler(torch.Generator().manual_seed(0))
+    assert inputs.shape == (4096, len(sampler.coordinates.noise_gain) + 2)
+    assert x.shape == (4096, 2)
+    assert torch.isfinite(inputs).all()
+    assert (weight > 0).all()
+    noise_free = inputs[:, -2] == 0
+    assert 0.15 < noise_free.float().mean() < 0.25
+    assert ((cell % 7 == 0) == noise_free).all()
+    assert cell.max() < sampler.cells
+
+
+@pytest.mark.parametrize(("noise_free_share", "high_noise_emphasis"), [(0.2, 2.0), (1.0, 2.0), (0.0, 1e-3)])
+def test_how_often_batches_hold_each_noise_level(sampler, noise_free_share, high_noise_emphasis):
+    _, data, linear = sampler
+    batches = TrajectorySampler(
+        data,
+        linear,
+        measurement_noise_max=0.5,
+        batch=32_768,
+        device=CPU,
+        noise_free_share=noise_free_share,
+        high_noise_emphasis=high_noise_emphasis,
+    )
+    inputs, *_ = batches(torch.Generator().manual_seed(0))
+    assert torch.isfinite(inputs).all()
+    level = (0.02 * torch.expm1(inputs[:, -2].double())).numpy()
+    assert (level == 0).mean() == pytest.approx(noise_free_share, abs=0.01)
+    for below in (0.05, 0.2):  # of which a part of the two decades below 0.5 is left out
+        expected = noise_free_share + (1 - noise_free_share) * (1 + np.log10(below / 0.5) / 2) ** high_noise_emphasis
+        assert (level <= below).mean() == pytest.approx(expected, abs=0.01)
+
+
+def test_motions_of_the_systems_own_parameters_are_in_cells_apart(sampler):
+    _, data, linear = sampler
+    nominal = np.arange(data.x.shape[1]) % 3 == 0
+    size = np.where(nominal, 0.0, 1e6)  # by which the states say whose they are
+    marked = dataclasses.replace(data, x=data.x * 0 + size[:, None] + 1, nominal=nominal)
+    alike, apart = (
+        TrajectorySampler(each, linear, measurement_noise_max=0.5, batch=1024, device=CPU)
+        for each in (dataclasses.replace(marked, nominal=None), marked)
+    )
+    assert apart.cells == 2 * alike.cells
+    together, found = (each(torch.Generator().manual_seed(0)) for each in (alike, apart))
+    torch.testing.assert_close(found.inputs, together.inputs)
+    own = (found.x[:, 0] < found.x[:, 0].mean()).long()
+    torch.testing.assert_close(found.cell, 2 * together.cell + own)
+    assert 0.25 < own.float().mean() < 0.42
+
+
+@functools.cache
+def of_two_outputs():
+    """Batches along trajectories of a system whose outputs have units of their own, and what they are made of."""
+    system = TwoUnits()
+    linear = Spectrum((-0.5, -2.0, -8.0)).filter(2, 0.01, 1)
+    motions, ages = Motions(KINDS), recording_ages(300, 20)
+    data = record(system, linear, n=30, steps=300, ages=ages, rng=np.random.default_rng(0), motions=motions)
+    options = {"measurement_noise_max": (200.0, 0.2), "measurement_noise": system.measurement_noise}
+    sampler = TrajectorySampler(data, linear, batch=4096, device=CPU, **options)
+    return sampler, data, linear
+
+
+def test_each_of_several_outputs_has_a_level_of_its_own():
+    sampler, _, _ = of_two_outputs()
+    inputs, _, _, cell = sampler(torch.Generator().manual_seed(0))
+    assert inputs.shape == (4096, len(sampler.coordinates.whiten) + 3)
+    level = 0.04 * np.array(TwoUnits().measurement_noise) * np.expm1(inputs[:, -3:-1].double().numpy())
+    part = level / sampler.measurement_noise_max
+    assert part.max(0) == pytest.approx(1.0, abs=0.01)
+    alike = np.isclose(part[:, 0], part[:, 1], rtol=1e-3)
+    assert alike.mean() == pytest.approx(0.5 + 0.5 * 0.2**2, abs=0.03)
+    assert (part[~alike] == 0).any(1).mean() == pytest.approx(2 * 0.2 * 0.8 / (1 - 0.2**2), abs=0.03)
+    noise_free = (part == 0).all(1)
+    assert noise_free.mean() == pytest.approx(0.5 * (0.2 + 0.2**2), abs=0.02)
+    assert ((cell.numpy() % 7 == 0) == noise_free).all()
+    loud = cell.numpy() % 7 == 6
+    assert part[loud].mean() > 0.5
+    assert part[~loud].mean() < 0.3
+    assert cell.max() < sampler.cells
+
+
+@pytest.mark.parametrize(("made", "largest"), [(open_loop, 1.0), (of_two_outputs, (200.0, 0.2))])
+def test_batches_hold_the_noise_that_the_filter_would_pass_on(made, largest):
+    sampler, data, linear = made()
+    usual = {"measurement_noise": TwoUnits().measurement_noise} if made is of_two_outputs else {}
+    quiet = TrajectorySampler(
+        data, linear, measurement_noise_max=largest, batch=4096, device=CPU, noise_free_share=1.0, **usual
+    )
+    _, artifact = untrained(sampler, linear)
+    inverse, whiten, ny = artifact.inverse, sampler.coordinates.whiten, np.size(largest)
+    covariance = whiten @ noise_covariance(linear, data.ages) @ whiten.T  # (ages, outputs, modes, modes)
+    gain = np.atleast_2d(sampler.noise_gain)
+    heard = gain.max(0) > 1e-3 * gain.max()  # modes that are about inputs hold no noise
+    measured, expected, count = 0.0, 0.0, 0
+    for seed in range(30):
+        inputs, without = (
+            each(torch.Generator().manual_seed(seed)).inputs.double().numpy() for each in (sampler, quiet)
+        )
+        level = inverse.measurement_noise_unit * np.expm1(inputs[:, len(whiten) : len(whiten) + ny])
+        age = inverse.age_unit * np.expm1(inputs[:, -1])
+        slot = np.abs(np.minimum(age[:, None], inverse.age_max) - data.ages * linear.dt).argmin(1)
+        shrink = 1 + ((level[..., None] * gain) ** 2).sum(1)
+        noise = (inputs[:, : len(whiten)] * shrink - without[:, : len(whiten)])[:, heard]
+        assert np.abs(noise[(level == 0).all(1)]).max() < 1e-5
+        some = (level == 0).sum(1) == (seed % 2 if ny > 1 else 0)  # one of two outputs is exact, or none is
+        predicted = np.einsum("nj,njab->nab", level[some] ** 2, covariance[slot[some]])[:, heard][..., heard]
+        size = np.sqrt(np.einsum("naa->na", predicted))
+        measured += np.einsum("na,nb->ab", noise[some] / size, noise[some] / size)
+        expected += (predicted / size[:, :, None] / size[:, None]).sum(0)
+        count += some.sum()
+    np.testing.assert_allclose(measured / count, expected / count, atol=0.03)
+
+
+def assert_shown(batch, row, artifact, data, exact=False):
+    """A row of a batch holds what the observer gives its network; returns its trajectory."""
+    inverse = artifact.inverse
+    state = batch.x[row].numpy() * inverse.x_scale + inverse.x_offset
+    slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
+    ny = artifact.ny
+    level = np.zeros(ny) if exact else data.measurement_noise[trajectory]
+    process = float(data.process_noise[trajectory]) if "process_noise" in inverse.features else 0.0
+    level_of = tuple(level) if ny > 1 else float(level[0])
+    decoder = Decoder(inverse, slice(None), measurement_noise=level_of, process_noise=process)
+    x_hat = decoder(data.z[slot, trajectory], float(data.ages[slot] * artifact.filter.dt))
+    shown = inverse.x_offset + inverse.x_scale * inverse.mlp(batch.inputs[row].numpy())
+    np.testing.assert_allclose(shown, x_hat, rtol=1e-3, atol=1e-4 * inverse.x_scale.max())
+    return trajectory
+
+
+@pytest.mark.parametrize("made", [open_loop, functools.partial(open_loop, 0.5), of_two_outputs])
+def test_batches_are_what_the_observer_shows_its_network(made):
+    sampler, data, linear = made()
+    _, artifact = untrained(sampler, linear)
+    batch = sampler(torch.Generator().manual_seed(0))
+    modes, ny = len(sampler.coordinates.whiten), artifact.ny
+    quiet = (batch.inputs[:, modes : modes + ny] == 0).all(1)
+    for row in torch.nonzero(quiet)[::50, 0].tolist():
+        trajectory, cell = assert_shown(batch, row, artifact, data, exact=True), batch.cell[row]
+        if sampler.process_noise_max:
+            level = data.process_noise[trajectory]
+            assert cell % 3 == int(level > 0) + int(level > 0.025)
+            cell = cell // 3
+        assert cell % 7 == 0
+
+
+def closed_loop_of_two_outputs():
+    sampler, _, linear = of_two_outputs()
+    _, artifact = untrained(sampler, linear)
+    rest, ages, rng = lambda x_hat: np.zeros((len(x_hat), 1)), np.array([0, 5, 10]), np.random.default_rng(0)
+    data = record_closed_loop(TwoUnits(), artifact, rest, n=50, steps=10, ages=ages, rng=rng)
+    return ClosedLoopSampler(sampler, data, dt=linear.dt, device=CPU), data, artifact, None
+
+
+@pytest.mark.parametrize("made", [functools.partial(closed_loop, 0.5), closed_loop_of_two_outputs])
+def test_closed_loop_batches_are_what_the_observer_shows_its_network(made):
+    sampler, data, artifact, _ = made()
+    batch = sampler(torch.Generator().manual_seed(0))
+    assert {len(part) for part in batch} == {4096}
+    beside = sampler.open_loop
+    assert (batch.cell[:2048] < beside.cells).all()
+    assert ((batch.cell[2048:] >= beside.cells) & (batch.cell[2048:] < sampler.cells)).all()
+    for row in range(2048, 4096, 200):
+        trajectory, cell = assert_shown(batch, row, artifact, data), batch.cell[row] - beside.cells
+        if beside.process_noise_max:
+            level = data.process_noise[trajectory]
+            assert cell % 3 == int(level > 0) + int(level > 0.025)
+            cell = cell // 3
+        assert (cell % 7 == 0) == (data.measurement_noise[trajectory] == 0).all()
+
+
+def test_closed_loop_motions_of_the_systems_own_parameters_are_in_cells_apart(sampler):
+    _, open_data, linear = sampler
+    _, data, _, _ = closed_loop(0.5)
+    nominal = np.arange(data.x.shape[1]) % 2 == 0
+    data = dataclasses.replace(data, x=data.x * 0 + np.where(nominal, 1.0, 1e6)[:, None], nominal=nominal)
+    apart = dataclasses.replace(open_data, nominal=np.arange(open_data.x.shape[1]) % 2 == 0)
+    beside = TrajectorySampler(apart, linear, measurement_noise_max=0.5, batch=4096, device=CPU)
+    both = ClosedLoopSampler(beside, data, dt=linear.dt, device=CPU)
+    _, x, _, cell = both(torch.Generator().manual_seed(0))
+    x, cell = x[2048:, 0], cell[2048:]
+    assert (both.kinds_of_plant, both.cells) == (2, 2 * beside.cells)
+    assert ((cell >= beside.cells) & (cell < both.cells)).all()
+    torch.testing.assert_close(cell % 2, (x < x.mean()).long())

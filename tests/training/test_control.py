@@ -1,0 +1,113 @@
+"""Profiles of the shipped systems, their control tasks and scores, and the classical controllers."""
+
+import numpy as np
+import pytest
+
+from kkl_gym import SYSTEMS, get_system
+from training.agents.environments import vector
+from training.agents.play import play
+from training.agents.tasks import TASKS, TOLERANCE, control_task, get_task, scores, successes
+from training.presets import preset
+from training.systems import PROFILES, Profile, controller, profile
+from training.trajectories.equations import linearised
+from training.trajectories.policies import linear_quadratic
+
+
+def nothing(obs):
+    return np.zeros((len(obs), 1))
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_profile_fits_its_system(name):
+    found, system = PROFILES[name], get_system(name)
+    assert profile(system) is found
+    assert TASKS[name].system == name
+    config = preset(system, "input-aware", "fast")
+    assert {key: getattr(config, key) for key in found.settings} == dict(found.settings)
+    assert found.eigenvalues is None or config.eigenvalues == pytest.approx(found.eigenvalues, abs=1e-6)
+
+
+def test_a_system_of_ones_own_has_the_defaults_and_no_controller_without_input(script):
+    own = get_system(f"{script}:Pendulum")
+    assert profile(own) == Profile()
+    with pytest.raises(ValueError, match="pendulum has no inputs"):
+        controller(own)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_linearisation_equals_finite_differences(name):
+    system = get_system(name)
+    x, eps = np.random.default_rng(0).uniform(*system.box()), 1e-6
+    A, B, C = linearised(system, x)
+    for j, step in enumerate(eps * np.eye(system.nx)):
+        assert np.allclose(A[:, j], (np.array(system.f(x + step)) - system.f(x - step)) / (2 * eps), atol=1e-5)
+        assert np.allclose(C[:, j], (np.array(system.h(x + step)) - system.h(x - step)) / (2 * eps), atol=1e-6)
+    assert B.tolist() == [list(row) for row in system.G]
+
+
+@pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
+def test_the_linear_quadratic_regulator_stabilises_the_target(name):
+    system = get_system(name)
+    A, B, _ = linearised(system, system.target)
+    act = linear_quadratic(system)
+    step = 1e-6 * np.eye(system.nx)
+    K = (act(np.array(system.target) - step) - act(np.array(system.target) + step)) * system.u_max / 2e-6
+    assert (np.linalg.eigvals(A - B @ K.T).real < 0).all()
+    assert act(np.array([system.target])).tolist() == [[0.0]]
+    assert np.abs(act(np.random.default_rng(0).uniform(*system.box(), (50, system.nx)))).max() == 1.0
+
+
+# Of the two others one succeeds in half of all episodes alone, and one is slow to simulate.
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol"])
+def test_the_state_feedback_succeeds_where_nothing_fails(name):
+    task, n, system = TASKS[name], 20, get_system(name)
+    episodes = play(vector(task, n), controller(system), seed=0)
+    idle = play(vector(task, n), nothing, seed=0)
+    assert (episodes.x[0] == idle.x[0]).all()
+    assert episodes.x.shape == (task.steps + 1, n, system.nx)
+    assert episodes.u.shape == (task.steps, n, 1)
+    assert not (episodes.escaped | idle.escaped).any()
+    assert successes(system, episodes.x).mean() >= 0.95
+    assert successes(system, idle.x).mean() <= 0.1
+    assert scores(system, episodes.x).mean() > scores(system, idle.x).mean() + 0.2
+
+
+def test_the_task_acts_once_a_period_and_ends_in_time():
+    task = control_task("van_der_pol", 0.1, period=0.05, duration=1.0, start_box=((1, 1), (0, 0)))
+    assert (task.repeat, task.steps) == (5, 20)
+    env = vector(task, 2)
+    assert env.reset(seed=0)[0].tolist() == [[1.0, 0.0]] * 2
+    for k in range(task.steps):
+        obs, _, _, truncated, info = env.step(np.zeros((2, 1)))
+        assert truncated.all() == (k == task.steps - 1)
+    assert obs.shape == (2, 2)
+    assert info["final_info"]["sample"].tolist() == [100, 100]
+
+
+def test_scores_and_successes_by_hand():
+    system = get_system("reverse_duffing")  # target 0, scale (2, 1.5)
+    x = np.zeros((10, 2, 2))
+    x[:, 1] = [2.0, 1.5]  # one scale off in both states: c = 1
+    assert scores(system, x) == pytest.approx([0.0, np.exp(-4.0) - 1.0])
+    x[:] = 0.0
+    x[:8, 0] = 5.0  # before the last fifth
+    x[9, 1] = [0.0, 1.01 * TOLERANCE * 1.5]
+    assert successes(system, x).tolist() == [True, False]
+    x[9, 1] = [0.0, 0.99 * TOLERANCE * 1.5]
+    assert successes(system, x).tolist() == [True, True]
+
+
+def test_what_is_refused():
+    for wrong in ({"dt": True}, {"dt": np.nan}, {"period": 0.015}, {"duration": 19.97}, {"duration": 1e9}):
+        with pytest.raises(ValueError, match=r"task needs|whole multiple|max_episode_steps must be"):
+            control_task("lorenz", **wrong)
+    with pytest.raises(ValueError, match="unknown system 'lorentz'"):
+        get_task("lorentz")
+    assert [get_task("lorenz", *level).measurement_noise for level in ((), (2.0,))] == [0.5, 2.0]
+
+
+def test_the_law_of_reverse_duffing_follows_its_parameters():
+    """Where x2 is on its way, -cbrt(a x1), the input replaces the drift by one that stays there."""
+    act = controller(get_system("reverse_duffing", {"a": 8.0, "b": 0.5}))
+    assert act(np.array([[1e-3, -0.2]])) == pytest.approx(0.5e-3)
+    assert act(np.array([[-0.5, 0.3]])) == pytest.approx(np.clip(-0.25 - 2.0 * (0.3 - 4.0 ** (1 / 3)), -1, 1))

@@ -1,0 +1,95 @@
+"""Motions under a policy."""
+
+import numpy as np
+import pytest
+from linear_system import Autonomous
+from unstable_system import Falling
+
+from kkl_gym.simulate import simulate
+from training.systems import controller, named_policy
+from training.trajectories.motions import POLICYS_OWN, Motions, trajectories, under_policy
+
+SYSTEM = Falling()
+
+
+def exact(x):
+    """What the policy does on the true states."""
+    return controller(SYSTEM)(x[:-1].reshape(-1, 2)).reshape(len(x) - 1, -1, 1) * SYSTEM.u_max
+
+
+def test_inputs_are_the_policys_on_a_wrong_state_or_its_own():
+    rng, own = np.random.default_rng(0), np.arange(40) % 3 == 1
+    x0 = SYSTEM.draw_starts(rng, 40)
+    x, u = under_policy(SYSTEM, controller(SYSTEM), x0, steps=300, dt=SYSTEM.dt, rng=rng, own=own)
+    apart = np.abs(u - exact(x)).max((0, 2))
+    np.testing.assert_array_equal(apart == 0, own)
+    assert np.median(apart[~own]) > 0.2
+    assert np.abs(u).max() <= SYSTEM.u_max[0]
+    np.testing.assert_array_equal(x, simulate(SYSTEM, x0, 300, SYSTEM.dt, u=u))
+
+
+def test_actions_that_are_no_numbers_are_an_error():
+    own, rng = np.ones(4, dtype=bool), np.random.default_rng(0)
+    with pytest.raises(ValueError, match=r"the policy gives the action \[nan\] at x = \["):
+        under_policy(SYSTEM, lambda x: np.where(x[:, :1] > 0.31, np.nan, 0.0), np.full((4, 2), 0.3), steps=300,
+                     dt=SYSTEM.dt, rng=rng, own=own)  # fmt: skip
+
+
+def test_a_policy_that_fails_on_the_way_says_where(tmp_path):
+    script = tmp_path / "mine.py"
+    script.write_text("def hold(x):\n    gain = [1.0] if len(x) < 30 else []\n    return gain[0] * x[:, :1]\n")
+    policy, own = named_policy(SYSTEM, f"{script}:hold"), np.ones(40, dtype=bool)
+    with pytest.raises(ValueError, match=r"hold' fails on states of shape \(40, 2\): IndexError: .*line 3 \(`return"):
+        under_policy(SYSTEM, policy, np.full((40, 2), 0.3), steps=3, dt=SYSTEM.dt, rng=np.random.default_rng(0),
+                     own=own)  # fmt: skip
+    script = tmp_path / "other.py"
+    script.write_text("def hold(x):\n    return x[:, :1] if len(x) < 30 else x\n")
+    policy = named_policy(SYSTEM, f"{script}:hold")
+    with pytest.raises(ValueError, match=r"into actions of shape \(40, 1\), got \(40, 2\)"):
+        policy(np.zeros((40, 2)))
+
+
+def test_an_unstable_plant_is_held_by_a_policy_alone():
+    sizes = {"n": 30, "steps": 1000, "dt": SYSTEM.dt}
+    with pytest.raises(ValueError, match="--policy"):
+        list(trajectories(SYSTEM, **{**sizes, "n": 120}, rng=np.random.default_rng(0), motions=Motions(("steps",))))
+    motions = Motions(("steps",), process_noise_share=0.5, policy=controller(SYSTEM))
+    found = list(trajectories(SYSTEM, **sizes, rng=np.random.default_rng(0), motions=motions))
+    assert sum(x.shape[1] for x, _, _ in found) == 30
+    (x, u, level), *_ = found
+    np.testing.assert_array_equal((u == exact(x)).all((0, 2)), np.arange(x.shape[1]) % POLICYS_OWN == 0)
+    assert level.any()
+
+
+@pytest.mark.parametrize(
+    ("system", "name", "message"),
+    [
+        (SYSTEM, "{}/bad.py:loud", r"\[-1, 1\]"),
+        (SYSTEM, "{}/bad.py:wrong", "AttributeError"),
+        (SYSTEM, "nothing", "nothing"),
+        (SYSTEM, "nowhere.py:act", "act"),
+        (SYSTEM, "math:pi", "pi"),
+        (Autonomous(), "controller", "no inputs"),
+        (Autonomous(), "numpy:zeros_like", "no inputs"),
+    ],
+)
+def test_what_is_no_policy(tmp_path, system, name, message):
+    (tmp_path / "bad.py").write_text(
+        "def loud(x):\n    return 3.0 * (x[:, :1] > 0)\n\ndef wrong(x):\n    return x.nothing\n"
+    )
+    with pytest.raises(ValueError, match=message):
+        named_policy(system, name.format(tmp_path))
+
+
+def test_a_system_that_no_regulator_holds():
+    class Uncontrolled(Falling):
+        name = "uncontrolled"
+        X = ((-0.3, 0.3), (-0.5, 0.5), (-1, 1))
+        bounds = ((-2, 2), (-5, 5), (-3, 3))
+        G = ((0.0,), (1.0,), (0.0,))
+
+        def f(self, x):
+            return *super().f(x[:2]), x[2]
+
+    with pytest.raises(ValueError, match="policy of your own"):
+        named_policy(Uncontrolled(), "controller")

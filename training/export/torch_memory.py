@@ -1,0 +1,113 @@
+"""The memory of :class:`kkl_gym.KKLMemory` as a module of Torch."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kkl_gym.memory import IMAGINED, Memory
+from training.export.torch_parts import Module
+
+
+class TorchMemory(Module):
+    """The memory of :class:`kkl_gym.KKLMemory` as a module of Torch: batched, differentiable, on any device.
+
+    ``state, shown = memory(state, y, u)`` takes in a step of n rows. ``shown`` is what the wrapper shows: y, the memory
+    of y and the memory of u. A row of zeros has seen nothing, and begins with the outputs that it is given:
+    :meth:`start` returns such rows, and ``state * ~done[:, None]`` restarts some.
+
+    Parameters
+    ----------
+    ny, nu : int
+        Numbers of outputs and inputs.
+    angles : sequence of (int, int), optional
+        Outputs that are cosine and sine of an angle, as for the wrapper.
+    time_constants, input_time_constants : sequence of float
+        In steps, as for the wrapper.
+
+    Raises
+    ------
+    ValueError
+        If time constants are invalid, or ``angles`` are not pairs of outputs.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from training import TorchMemory
+    >>> memory = TorchMemory(3, 1, angles=[(0, 1)])
+    >>> state, shown = memory(memory.start(1024), torch.zeros(1024, 3))
+    >>> shown.shape
+    torch.Size([1024, 13])
+    """
+
+    def __init__(
+        self,
+        ny: int,
+        nu: int,
+        *,
+        angles: Sequence[tuple[int, int]] = (),
+        time_constants: Sequence[float] = (1.0, 2.0, 4.0, 8.0),
+        input_time_constants: Sequence[float] = (1.0, 4.0),
+    ) -> None:
+        pairs = np.array(angles, dtype=int).reshape(-1, 2)
+        if len({*pairs.ravel().tolist()} & {*range(ny)}) < pairs.size:
+            raise ValueError(f"angles must be pairs of different outputs, of 0 to {ny - 1}, got {angles!r}")
+        super().__init__()
+        self.cosines, self.sines = pairs.T.tolist()
+        self.others = [i for i in range(ny) if i not in pairs]
+        signals, self.nu = len(self.others) + len(pairs), nu
+        memory = Memory(signals, nu, time_constants=time_constants, input_time_constants=input_time_constants)
+        self.widths = [1, signals, signals * len(memory.decay), nu * len(memory.input_decay)]
+        self.put(decay=memory.decay[:, None], input_decay=memory.input_decay[:, None], rise=memory.rise[:, None])
+        self.put(mixing=memory.mixing, time_constants=np.array(memory.time_constants)[:, None])
+
+    def start(self, n: int) -> Tensor:
+        """Return the state of n rows that have seen nothing: zeros, (n, width)."""
+        return self.mixing.new_zeros(n, sum(self.widths))
+
+    def forward(self, state: Tensor, y: Tensor, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Take in the next outputs.
+
+        Parameters
+        ----------
+        state : Tensor, shape (n, width)
+            What the last step returned, or :meth:`start`.
+        y : Tensor, shape (n, ny)
+            The outputs.
+        u : Tensor, shape (n, nu), optional
+            The inputs that led to them, by default zero; those at a start count for nothing.
+
+        Returns
+        -------
+        state : Tensor, shape (n, width)
+            The next state.
+        shown : Tensor, shape (n, size)
+            As the wrapper's observation, float32 unless ``y`` is float64.
+        """
+        begins = state[:, :1] == 0
+        age, before, w, v = torch.split(state, self.widths, 1)
+        signals = self._signals(y.to(state.dtype), before)
+        change = torch.where(begins, 0.0, signals - before)
+        u = y.new_zeros(y.shape[0], self.nu) if u is None else u
+        acted = torch.where(begins, 0.0, u.to(state.dtype))
+        w = self.decay * w.reshape(w.shape[0], len(self.decay), -1) + self.rise * change[:, None]
+        v = v.reshape(v.shape[0], len(self.input_decay), self.nu)
+        v = (v + (1.0 - self.input_decay) * (acted[:, None] - v)).flatten(1)
+        steps = age[..., None].clamp(min=1.0)  # at the start w is 0
+        with_past = torch.expm1(-(steps + IMAGINED) / self.time_constants) / torch.expm1(-steps / self.time_constants)
+        parts = [y, (self.mixing @ (w * with_past)).flatten(1), v]
+        kind = torch.promote_types(y.dtype, torch.float32)
+        shown = torch.cat([each.to(kind) for each in parts], 1)
+        return torch.cat([age + 1.0, signals, w.flatten(1), v], 1), shown
+
+    def _signals(self, y: Tensor, before: Tensor) -> Tensor:
+        """What is filtered: the other outputs, then angles, which turn by less than half a turn in a step."""
+        if not self.cosines:
+            return y
+        cosine, sine, before = y[:, self.cosines], y[:, self.sines], before[:, len(self.others) :]
+        known = cosine**2 + sine**2 > 0
+        angle = torch.atan2(sine, torch.where(known, cosine, 1.0))
+        angle = angle - 2 * math.pi * torch.round((angle - before) / (2 * math.pi))
+        return torch.cat([y[:, self.others], torch.where(known, angle, before)], 1)
