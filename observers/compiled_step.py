@@ -6,6 +6,7 @@ import numpy as np
 
 from observers.artifact import Artifact
 from observers.decoder import Decoder, Decoders
+from observers.filter import LinearFilter
 from observers.tracker import Tracker
 
 MOST_OPERATIONS = 400  # of expressions; beyond, such as for a network as f, compiling takes many seconds
@@ -18,7 +19,7 @@ class CompiledStep:
     """
 
     def __init__(self, artifact: Artifact, decoders: Decoders, tracker: Tracker | None) -> None:
-        from observers import kernel
+        from observers import kernel, kernel_functions
 
         nx, ny, nu, linear = artifact.nx, artifact.ny, artifact.nu, artifact.filter
         motion = None if tracker is None else tracker.motion
@@ -29,18 +30,18 @@ class CompiledStep:
         # Machine code is freed with what holds its address.
         self._move = self._measure = None
         if equations is not None:
-            self._move = kernel.motion(equations.field, nx, nu, not equations.substeps)
+            self._move = kernel_functions.motion(equations.field, nx, nu, not equations.substeps)
         if artifact.h is not None:
-            self._measure = kernel.output(artifact.h, nx)
-        self._steps, self._nothing, self.dt = kernel.steps(nx, ny, nu), np.empty((1, 0, 0)), linear.dt
+            self._measure = kernel_functions.output(artifact.h, nx)
+        self._steps, self._nothing = kernel.steps(nx, ny, nu), np.empty((1, 0, 0))
         driven, free = _of_map(decoders.driven, nx), _of_map(decoders.free or decoders.driven, nx)
         widest = max(driven[2], free[2], nx + nu)
-        states, r, watched, limit = np.zeros((3, nx)), np.ones(ny), [0.0] * 6, 0.0
+        states, r, watched, limit = np.zeros((3, nx)), np.ones(ny), [0.0] * 7, 0.0
         if tracker is not None:
             watch = tracker.supervision
             states, r, limit = np.array([tracker.motion.low, tracker.motion.high, tracker.q]), tracker.r, watch.limit
             watched = [float(watch.window), watch.share, watch.trend_share, watch.trend_square_share]
-            watched += [watch.trend_gain, watch.trend_limit]
+            watched += [watch.trend_gain, watch.trend_limit, tracker.gate]
         scaling, of_flow, packed, shape = (
             np.zeros((4, nx + nu)),
             np.zeros((nx, 1)),
@@ -48,43 +49,62 @@ class CompiledStep:
             np.zeros(1, int),
         )
         if motion is not None and flow is not None:
-            assert flow.mlp.compiled is not None
             scaling[0, :nx], scaling[1, :nx], scaling[2, :nx] = motion.x_offset, motion.x_scale, flow.gain
             scaling[3, :nu], of_flow = 1.0 / flow.u_scale, flow.linear
-            packed, shape = flow.mlp.compiled.packed, flow.mlp.compiled.shape
+            packed, shape = flow.mlp.packed()
             widest = max(widest, *shape[1:])
-        substeps = -1 if equations is None else max(equations.substeps, 1)
         addresses = (0 if pointer is None else pointer.address for pointer in (self._move, self._measure))
+        self._equations, self._linear = equations, linear
+        self._flags = int(tracker is not None), int(artifact.knows_output), len(linear.A)
+        self._pointers = *addresses, int(widest)
+        self._numbers = linear.dt, limit, *watched
         self._model = (
-            (int(tracker is not None), int(artifact.knows_output), len(linear.A), substeps, *addresses, int(widest)),
-            (linear.dt / abs(substeps), 1.0, linear.dt, limit, *watched),
             states,
             r,
             np.zeros((ny, nx)) if artifact.C is None else np.array(artifact.C, dtype=float, order="C"),
-            _of_filter(linear.transition, linear.drive),
+        )
+        self._networks = (
             (driven[0], free[0], driven[1], free[1]),
             (scaling, np.array(of_flow, order="C"), packed, shape),
         )
+        self._usual = self._at(linear)
+
+    def _at(self, linear: LinearFilter) -> tuple[Any, ...]:
+        """All that the kernel takes before rows and samples, at the sampling interval of a filter."""
+        samples, h = linear.dt / self._linear.dt, 0.0
+        substeps = -round(samples)  # of a flow
+        if self._equations is not None:
+            substeps = self._equations.steps(samples)
+            h = linear.dt / substeps
+        flags, numbers = (*self._flags, substeps, *self._pointers), (h, samples, *self._numbers)
+        return flags, numbers, *self._model, _of_filter(linear.transition, linear.drive), *self._networks
 
     def __call__(
-        self, rows: np.ndarray, y: np.ndarray, u: np.ndarray, record: np.ndarray | None = None, first: int = 0
+        self,
+        rows: np.ndarray,
+        y: np.ndarray,
+        u: np.ndarray,
+        record: np.ndarray | None = None,
+        *,
+        linear: LinearFilter | None = None,
     ) -> None:
-        """Take samples and inputs into rows; a record keeps their columns from ``first`` on at each sample.
+        """Take samples and inputs into rows, which a record keeps at each sample.
 
-        Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu), ``record`` (steps, n, columns).
+        Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu), ``record`` (steps, n, width).
         """
         y, u = np.array(y, order="C"), np.array(u, order="C")  # Numba compiles anew for what is read-only
-        self._steps(*self._model, rows, y, u, self._nothing if record is None else record, first)
+        usual = linear is None or linear is self._linear
+        model = self._usual if linear is None or usual else self._at(linear)
+        self._steps(*model, rows, y, u, self._nothing if record is None else record)
 
 
 def _of_map(decoder: Decoder, nx: int) -> tuple[Any, tuple[np.ndarray, np.ndarray], int]:
     """A map's network, its covariances by age, and its largest width."""
-    machine, error = decoder.compiled, decoder.error
-    assert machine is not None
+    error, network = decoder.error, decoder.network
     ages, table = np.zeros(1), np.zeros((1, nx * nx))
     if error is not None:
         ages, table = error.ages, np.ascontiguousarray(error.covariance.reshape(len(error.ages), -1))
-    return machine.network, (np.array(ages), table), machine.widest
+    return network, (np.array(ages), table), int(max(*network[-1][1:], nx))
 
 
 def _of_filter(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.compiled import CompiledDecoder, available
 from observers.inverse import InverseMap
+from observers.machine import available
 
 
 class Decoders:
@@ -62,13 +62,17 @@ class Decoder:
         self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
         self._offset = -inverse.z_offset @ self._whiten
         self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
-        self._needs_age, self._choice = inverse.features[-1] == "age", compiled
+        self._needs_age = inverse.features[-1] == "age"
+        self._machine = compiled is not False  # where there is Numba
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the estimate."""
-        machine = None if self._choice is False else self.compiled
-        if machine is not None and z.ndim <= 2 and (z.ndim == 1 or machine.has_layers):
-            return machine.single(z, float(age)) if z.ndim == 1 else machine.batch(z, age)
+        if z.ndim == 1 and self._machine and available():
+            from observers.network_kernel import decode_one
+
+            x_hat = np.empty(len(self._inverse.x_offset))
+            decode_one(z, float(age), self.network, x_hat)
+            return x_hat
         inverse, conditions = self._inverse, self._conditions
         modes = z @ self._whiten
         modes += self._offset
@@ -86,25 +90,22 @@ class Decoder:
         assert self.error is not None
         return self.error(age, z.shape[:-1])
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "compiled"}  # made again where it goes
-
     @functools.cached_property
-    def compiled(self) -> CompiledDecoder | None:
-        """The same as machine code; None without Numba."""
-        if not available():
-            return None
-        inverse = self._inverse
-        return CompiledDecoder(
-            inverse.mlp.layers,
-            inverse.mlp.activation,
-            whiten=self._whiten,
-            offset=self._offset,
-            conditions=self._conditions,
-            age=(inverse.age_unit, inverse.age_max) if self._needs_age else None,
-            x_offset=inverse.x_offset,
-            x_scale=inverse.x_scale,
-        )
+    def network(self) -> tuple[np.ndarray, ...]:
+        """What :func:`observers.network_kernel.decode` takes.
+
+        The coordinates in which the network sees z are a matrix product, as its first layer is: they are one, in
+        doubles. (They are differences of filter states that are much alike, of which float32 would leave little.)
+        """
+        inverse, modes = self._inverse, len(self._offset)
+        weight, bias = (part.astype(float) for part in inverse.mlp.layers[0])
+        given = modes + len(self._conditions)
+        bias = bias + self._offset @ weight[:modes] + np.array(self._conditions, dtype=float) @ weight[modes:given]
+        of_age = weight[given] if self._needs_age else np.zeros_like(bias)
+        first = np.vstack([bias, of_age, self._whiten @ weight[:modes]])  # (2 + size, outputs)
+        units = np.array([inverse.x_offset, inverse.x_scale], dtype=float)
+        ages = np.array([inverse.age_unit, inverse.age_max if self._needs_age else 0.0], dtype=float)
+        return first, units, ages, *inverse.mlp.packed(1)
 
 
 __all__ = ["Decoder", "Decoders"]

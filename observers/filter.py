@@ -1,5 +1,7 @@
 """The linear half of the observer, z' = A z + B y, integrated exactly between samples."""
 
+import copy
+
 import numpy as np
 
 from observers.checks import check_dt, integer, real_array
@@ -71,33 +73,42 @@ class LinearFilter:
         if not np.linalg.cond(V) <= 1e12:
             raise ValueError("A must be diagonalisable; separate its repeated eigenvalues")
 
-        def function_of_A(values: np.ndarray) -> np.ndarray:
-            return np.real((V * values) @ np.linalg.inv(V))
-
-        blocks = 1 + nu
-
-        def acts_on_z_y(matrix: np.ndarray) -> np.ndarray:
-            return np.vstack([matrix, np.zeros((nu * nz, ny))])
-
         A.flags.writeable = B.flags.writeable = False  # what follows from them would not change
-        self.A, self.B, self.dt, self.nu = A, B, dt, nu
+        self.A, self.B, self.nu = A, B, nu
+        self._poles, self._V, self._V_inverse = poles, V, np.linalg.inv(V)
+        with np.errstate(all="ignore"):
+            self.equilibrium = self._on_z_y(-np.linalg.solve(A, B))
+        self._integrate(dt)
+
+    def _integrate(self, dt: float) -> None:
+        """Take another sampling interval."""
+        poles, blocks = self._poles, 1 + self.nu
         with np.errstate(all="ignore"):
             s = poles * dt
             hold = np.expm1(s) / poles  # integral of e^{poles (dt - t)} over [0, dt]
             late = (np.expm1(s) - s) / (poles * s)  # ... of e^{poles (dt - t)} t / dt
-            self.transition = np.kron(np.eye(blocks), function_of_A(np.exp(s)))
-            self.early_y = acts_on_z_y(function_of_A(hold - late) @ B)
-            self.late_y = acts_on_z_y(function_of_A(late) @ B)
-            self.held_u = np.kron(np.eye(blocks, nu, -1), function_of_A(hold) @ B.sum(1, keepdims=True))
-            self.equilibrium = acts_on_z_y(-np.linalg.solve(A, B))
-        matrices = (self.transition, self.early_y, self.late_y, self.held_u, self.equilibrium)
-        if not all(np.isfinite(matrix).all() for matrix in matrices):
-            raise ValueError(
-                f"dt = {dt!r}, B of up to {abs(B).max():g} and the eigenvalues of A, {poles}, lead beyond the range of "
-                "floats"
+            transition, early, late, hold = (
+                np.real((self._V * values) @ self._V_inverse) for values in (np.exp(s), hold - late, late, hold)
             )
+            self.dt, self.transition = dt, np.kron(np.eye(blocks), transition)
+            self.early_y, self.late_y = self._on_z_y(early @ self.B), self._on_z_y(late @ self.B)
+            self.held_u = np.kron(np.eye(blocks, self.nu, -1), hold @ self.B.sum(1, keepdims=True))
         self.drive = np.hstack([self.early_y, self.held_u, self.late_y]).T.copy()
         self._update = np.vstack([self.transition.T, self.drive])
+        if not (np.isfinite(self._update).all() and np.isfinite(self.equilibrium).all()):
+            raise ValueError(
+                f"dt = {dt!r}, B of up to {abs(self.B).max():g} and the eigenvalues of A, {poles}, lead beyond the "
+                "range of floats"
+            )
+
+    def _on_z_y(self, matrix: np.ndarray) -> np.ndarray:
+        return np.vstack([matrix, np.zeros((self.nu * len(self.A), matrix.shape[1]))])
+
+    def at(self, dt: float) -> "LinearFilter":
+        """Return the same filter at another sampling interval."""
+        other = copy.copy(self)
+        other._integrate(dt)
+        return other
 
     @property
     def size(self) -> int:

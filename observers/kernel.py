@@ -14,16 +14,15 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from observers.expression import Expression
-from observers.machine import kernel, part, pointer
-from observers.network_kernel import UNROLLED, decode, evaluate
+from observers.kernel_functions import OPTIONS, lanes
+from observers.machine import kernel, part
+from observers.network import UNROLLED
+from observers.network_kernel import decode, evaluate
 from observers.supervision import INFLATION, RELINEARISATIONS
 
 _intrinsic: Any = intrinsic  # whose results take other arguments than the functions that it decorates
 _POINTER = types.CPointer(types.float64)
-_SIGNATURE = types.void(_POINTER, _POINTER, types.int64, types.float64)
-_OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
-_kernel, _part = kernel(**_OPTIONS), part(**_OPTIONS)
+_kernel, _part, _inlined = kernel(**OPTIONS), part(**OPTIONS), part(forceinline=True, **OPTIONS)
 
 
 @_intrinsic(prefer_literal=True)
@@ -49,65 +48,6 @@ def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any)
     return types.void(types.int64, _POINTER, _POINTER, types.int64, types.float64), code
 
 
-def lanes(nx: int) -> int:
-    """Sigma points of nx states, and as many more as fill the processor's registers."""
-    return -(-(2 * nx + 1) // 4) * 4
-
-
-@functools.cache
-def motion(expression: Expression, nx: int, nu: int, discrete: bool) -> Any:
-    """The equations' step of all sigma points, (nx, lanes), in place, in so many Runge-Kutta steps of h."""
-    wide, field = lanes(nx), expression.python("field", nx, nu)
-    given = ", ".join([f"x{i}" for i in range(nx)] + [f"u[{j}]" for j in range(nu)])
-    lines = ["def step(s, u, p, h):", *(f"    x{i} = s[{i * wide} + p]" for i in range(nx))]
-    for stage, (before, share) in enumerate((("", ""), ("a", "0.5 * h * "), ("b", "0.5 * h * "), ("c", "h * "))):
-        moved = [f"x{i} + {share}{before}[{i}]" if before else f"x{i}" for i in range(nx)]
-        lines.append(f"    {'abcd'[stage]} = field({', '.join(moved + [f'u[{j}]' for j in range(nu)])})")
-    lines += [
-        f"    s[{i * wide} + p] = x{i} + h / 6.0 * (a[{i}] + 2.0 * (b[{i}] + c[{i}]) + d[{i}])" for i in range(nx)
-    ]
-    if discrete:
-        lines[1 + nx :] = [f"    a = field({given})", *(f"    s[{i * wide} + p] = a[{i}]" for i in range(nx))]
-    step = _function("\n".join(lines), "step", field=field)
-
-    def move(s: Any, u: Any, substeps: int, h: float) -> None:
-        for _ in range(substeps):
-            for p in range(wide):
-                step(s, u, p, h)
-
-    return pointer(move, _SIGNATURE, **_OPTIONS)
-
-
-@functools.cache
-def output(expression: Expression, nx: int) -> Any:
-    """The outputs, (ny, lanes), of the first sigma points, (nx, lanes)."""
-    wide, ny = lanes(nx), len(expression.components)
-    function = expression.python("function", nx, 0)
-    given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))
-    lines = [
-        "def at(s, out, p):",
-        f"    y = function({given})",
-        *(f"    out[{k * wide} + p] = y[{k}]" for k in range(ny)),
-    ]
-    at = _function("\n".join(lines), "at", function=function)
-
-    def measure(s: Any, out: Any, count: int, h: float) -> None:
-        for p in range(count):
-            at(s, out, p)
-
-    return pointer(measure, _SIGNATURE, **_OPTIONS)
-
-
-def _function(source: str, name: str, **names: str) -> Any:
-    """A function by its source, and by the sources of those that it calls."""
-    namespace: dict[str, Any] = {"np": np}
-    for inner, text in names.items():
-        exec(text, namespace)
-        namespace[inner] = _part(namespace[inner])
-    exec(source, namespace)
-    return _part(namespace[name])
-
-
 @functools.cache
 def steps(nx: int, ny: int, nu: int) -> Any:
     """The kernel for numbers of states, outputs and inputs."""
@@ -118,7 +58,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
     of_states, of_outputs, of_innovations, of_network = nx * wide, ny * wide, ny * ny, nx + inputs
     nis = nx + square  # where it lies in a row of the tracker
 
-    @_part
+    @_inlined
     def factorise(P: Any, L: Any, inverse: Any) -> None:
         """P = L L^T, and what divides by L's diagonal; not finite where there is no L."""
         for i in range(nx):
@@ -154,7 +94,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                     total += (across[j * nx + i] if turned else across[i * nx + j]) * b[j]
                 G[i * ny + k] = total
 
-    @_part
+    @_inlined
     def spread_out(x: Any, P: Any, L: Any, inverse: Any, at: Any) -> None:
         """Sigma points (nx, lanes); those that fill the registers are the mean."""
         factorise(P, L, inverse)
@@ -166,7 +106,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 at[i * wide + 1 + j] += entry
                 at[i * wide + 1 + nx + j] -= entry
 
-    @_part
+    @_inlined
     def moments(at: Any, n: int, mean: Any, S: Any) -> None:
         """Mean (n,) and covariance (n, n) of points (n, lanes), which become differences from the mean."""
         for i in range(n):
@@ -182,7 +122,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                     total += at[i * wide + p] * at[j * wide + p]
                 S[i * n + j] = S[j * n + i] = middle_squares * at[i * wide] * at[j * wide] + other * total
 
-    @_part
+    @_inlined
     def together(L: Any, at: Any, n: int, across: Any) -> None:
         """Covariance (nx, n) of the points' differences (n, lanes) with the points that L spread out."""
         for j in range(n):
@@ -212,16 +152,20 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 total += scaling[2, i] * scratch[4, i]
                 at[i * wide + p] = scaling[0, i] + scaling[1, i] * total
 
-    @_part
+    @_inlined
+    def clipped(states: Any, s: float, i: int) -> float:
+        """A state cut at its bounds."""
+        s = states[0, i] if s < states[0, i] else s
+        return states[1, i] if s > states[1, i] else s
+
+    @_inlined
     def within(states: Any, at: Any, count: int) -> None:
         """Cut states (nx, lanes) at their bounds."""
         for i in range(nx):
             for p in range(count):
-                s = at[i * wide + p]
-                s = states[0, i] if s < states[0, i] else s
-                at[i * wide + p] = states[1, i] if s > states[1, i] else s
+                at[i * wide + p] = clipped(states, at[i * wide + p], i)
 
-    @_part
+    @_inlined
     def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
         """Mean and covariance a sample later, and the covariance with the state before."""
         states, flow, substeps, address, h, share = model
@@ -229,7 +173,8 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         spread_out(x, P, L, inverse, at)
         within(states, at, wide)
         if substeps < 0:
-            flow_step(at, u, flow, scratch)
+            for _ in range(-substeps):
+                flow_step(at, u, flow, scratch)
         else:
             call(address, at, u, substeps, h)
         moments(at, nx, mean, moved)
@@ -237,7 +182,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         for i in range(nx):
             moved[i * nx + i] += share * states[2, i]
 
-    @_part
+    @_inlined
     def expect(x: Any, P: Any, h: Any, states: Any, L: Any, y: Any, S: Any, V: Any) -> None:
         """Mean and covariance of the output, and its covariance with the state."""
         address, C = h
@@ -267,7 +212,21 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         moments(to, ny, y, S)
         together(L, to, ny, V)
 
-    @_part
+    @_inlined
+    def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
+        """Mark outputs whose innovations are beyond the gate, unless it is open."""
+        measured, far, open_ = 0, 0, now[nis + 4] >= window or now[nis + 2] < window
+        for k in range(ny):
+            measured += not np.isnan(y[k])
+            if (y[k] - expected[k]) ** 2 > gate * gate * (S[k * ny + k] + r[k]):
+                far += 1
+                if not open_:
+                    y[k] = np.nan
+                    now[nis + 3] += 1.0
+        if measured:
+            now[nis + 4] = now[nis + 4] + 1.0 if far == measured else 0.0
+
+    @_inlined
     def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
         """White innovations, by which V moves the state: x + V white and P - V V^T are what is known then."""
         for k in range(ny):
@@ -285,13 +244,13 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 for m in range(k + 1, j + 1):
                     S[j * ny + m] -= share * S[m * ny + k] * root
 
-    @_part
+    @_inlined
     def shift(x: Any, sign: float, V: Any, white: Any) -> None:
         for i in range(nx):
             for k in range(ny):
                 x[i] += sign * V[i * ny + k] * white[k]
 
-    @_part
+    @_inlined
     def add(P: Any, sign: float, V: Any, W: Any) -> None:
         for i in range(nx):
             for j in range(nx):
@@ -306,10 +265,10 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             total += x[i] + inverse[i]
         return np.isfinite(total)
 
-    @_part
+    @_inlined
     def track(now: Any, y: Any, u: Any, model: Any, h: Any, r: Any, watched: Any, scratch: Any, expected: Any) -> None:
-        """Predict and correct the state of a row's tracker."""
-        window, share, trend_share, square_share, trend_gain, trend_limit = watched
+        """Predict and correct the state of a row's tracker; outputs that are rejected become NaN."""
+        window, share, trend_share, square_share, trend_gain, trend_limit, gate = watched
         states = model[0]
         x, P, start, spread = stack(nx), stack(square), stack(nx), stack(square)
         mean, moved, across, L, inverse = stack(nx), stack(square), stack(square), stack(square), stack(nx)
@@ -334,6 +293,8 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             for i in range(square):
                 moved[i], across[i] = again_moved[i], again_across[i]
             expect(mean, moved, h, states, L, expected, S, V)
+            if turn == 0 and gate < np.inf:
+                reject(now, y, expected, S, r, gate, window)
             whiten(y, expected, S, r, white, V)
             if turn < last:
                 smoothed(moved, L, inverse, across, V, False, G)
@@ -358,8 +319,8 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             if not np.isnan(y[k]):
                 count += 1.0
                 squares += white[k] * white[k]
-                now[nis + 3 + k] += trend_share * (white[k] - now[nis + 3 + k])
-                raised += now[nis + 3 + k] * now[nis + 3 + k]
+                now[nis + 5 + k] += trend_share * (white[k] - now[nis + 5 + k])
+                raised += now[nis + 5 + k] * now[nis + 5 + k]
         if count > 0.0:
             weight = count / ny
             now[nis] += share * weight * (squares / count - now[nis])
@@ -368,22 +329,25 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             if now[nis + 1] > trend_limit:  # innovations agree with one another
                 grown, now[nis + 1] = inflation, 1.0
                 for k in range(ny):
-                    now[nis + 3 + k] = 0.0
+                    now[nis + 5 + k] = 0.0
         for i in range(nx):
-            s = mean[i]
-            s = states[0, i] if s < states[0, i] else s
-            now[i] = states[1, i] if s > states[1, i] else s
+            now[i] = clipped(states, mean[i], i)
         for i in range(square):
             now[nx + i] = grown * moved[i]
+
+    @_part
+    def is_driven(z: Any, nz: int) -> bool:
+        """Whether an input has acted, or there is none."""
+        acted = len(z) == nz
+        for i in range(nz, len(z)):
+            acted = acted or z[i] != 0.0
+        return acted
 
     @_part
     def invert(z: Any, age: float, nz: int, maps: Any, scratch: Any, x: Any) -> None:
         """T_inv, of free motion where no input has acted."""
         driven, free, _, _ = maps
-        acted = len(z) == nz
-        for i in range(nz, len(z)):
-            acted = acted or z[i] != 0.0
-        if acted:
+        if is_driven(z, nz):
             decode(z, age, driven, scratch, x)
         else:
             decode(z[:nz], age, free, scratch, x)
@@ -395,10 +359,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         window, lost = watched[0], not now[nis] <= limit
         if not lost and now[nis + 2] >= window:
             return
-        acted = len(z) == nz
-        for i in range(nz, len(z)):
-            acted = acted or z[i] != 0.0
-        ages, table = maps[2] if acted else maps[3]
+        ages, table = maps[2] if is_driven(z, nz) else maps[3]
         seen, at = min(now[nis + 2], window) * dt, 0
         while at < len(ages) - 2 and seen > ages[at + 1]:
             at += 1
@@ -417,15 +378,14 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         if lost or larger < 0.0:
             invert(z, age, nz, maps, scratch, x_hat)
             for i in range(nx):
-                s = x_hat[i]
-                s = states[0, i] if s < states[0, i] else s
-                now[i] = states[1, i] if s > states[1, i] else s
+                now[i] = clipped(states, x_hat[i], i)
             for i in range(square):
                 now[nx + i] = P[i]
         if lost:
             now[nis] = now[nis + 1] = 1.0
+            now[nis + 4] = window
             for k in range(ny):
-                now[nis + 3 + k] = 0.0
+                now[nis + 5 + k] = 0.0
 
     @_part
     def fill(y: Any, z: Any, age: float, nz: int, h: Any, states: Any, maps: Any, scratch: Any, x_hat: Any, before: Any,
@@ -465,24 +425,27 @@ def steps(nx: int, ny: int, nu: int) -> Any:
     @_kernel
     def run(
         flags: Any, numbers: Any, states: Any, r: Any, C: Any, linear: Any, maps: Any, flow: Any,
-        state: Any, y: Any, u: Any, record: Any, first: int
+        state: Any, y: Any, u: Any, record: Any
     ) -> None:  # fmt: skip
         """Samples y (steps, n, ny) and inputs u (steps, n, nu) into rows of the state (n, width).
 
-        Of each sample it keeps a part of the rows, from column ``first`` on, in ``record`` (steps, n, k).
+        A record (steps, n, width) keeps the rows at each sample; (steps, n, 0) keeps none.
         """
         tracks, knows_output, nz, substeps, address, output_address, widest = flags
-        h, noise_share, dt, limit = numbers[:4]
-        watched = numbers[4], numbers[5], numbers[6], numbers[7], numbers[8], numbers[9]
-        model, of_output = (states, flow, substeps, address, h, noise_share), (output_address, C)
+        h, samples, dt, limit = numbers[:4]
+        watched = numbers[4:]
+        model, of_output = (states, flow, substeps, address, h, samples), (output_address, C)
         size = linear[0].shape[1]
         base, scratch = size + ny + 1, np.empty((5, widest + UNROLLED), np.float32)
         z, x_hat, filled, expected, held = np.empty(size), np.empty(nx), np.empty(ny), stack(ny), stack(inputs)
+        sample = np.empty(ny)
         for row in range(len(state)):
             now = state[row]
             past, before, tracked = now[:size], now[size : size + ny], now[base:]
             for k in range(len(y)):
-                sample, gap = y[k, row], False
+                gap = False
+                for i in range(ny):
+                    sample[i] = y[k, row, i]
                 for j in range(nu):
                     held[j] = u[k, row, j]
                 if tracks:
@@ -496,19 +459,19 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                     age = now[base - 1]
                     fill(sample, past, age * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
                     follow(past, before, held, filled, linear, z)
-                    fill(sample, z, (age + 1.0) * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
+                    fill(sample, z, (age + samples) * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
                 follow(past, before, held, filled, linear, z)
                 for i in range(size):
                     past[i] = z[i]
                 for i in range(ny):
                     before[i] = filled[i]
-                now[base - 1] += 1.0
+                now[base - 1] += samples
                 if tracks:
                     supervise(tracked, past, now[base - 1] * dt, nz, dt, watched, limit, states, maps, scratch, x_hat)
                 for i in range(record.shape[2]):
-                    record[k, row, i] = now[first + i]
+                    record[k, row, i] = now[i]
 
     return run
 
 
-__all__ = ["lanes", "motion", "output", "steps"]
+__all__ = ["steps"]

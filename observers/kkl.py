@@ -9,9 +9,12 @@ from observers.artifact import Artifact
 from observers.compiled_step import CompiledStep
 from observers.decoder import Decoders
 from observers.estimator import Estimate, Estimator
+from observers.filter import LinearFilter
 from observers.monitor import Monitor
 from observers.tracker import Tracker
 
+_MAX_FILTERS = 64  # at sampling intervals other than the artifact's, which are kept
+_MAX_SAMPLES = 1000  # in one step
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
 
@@ -31,12 +34,14 @@ class KKL(Estimator[np.ndarray]):
         tracking: bool,
         monitored: bool,
         compiled: bool | None,
+        gate: float | None = None,
     ) -> None:
         levels: dict[str, Any] = {"measurement_noise": measurement_noise, "process_noise": process_noise}
         self.artifact, self._choice = artifact, compiled
+        self._filters: dict[float, LinearFilter] = {}  # at other sampling intervals
         self._options = levels | {"compiled": compiled}
         self.decoders = Decoders(artifact, slice(artifact.nx), **self._options)
-        self.tracker = Tracker(artifact, self.decoders, **levels) if tracking else None
+        self.tracker = Tracker(artifact, self.decoders, **levels, gate=gate) if tracking else None
         limits = artifact.limits if monitored else None
         self.monitor = None if limits is None else Monitor(limits, measurement_noise, artifact.filter.dt)
         size, ny = artifact.filter.size, artifact.ny
@@ -74,50 +79,75 @@ class KKL(Estimator[np.ndarray]):
         u = np.zeros((len(y), self.artifact.nu)) if u is None else u
         begun = ~np.isnan(state[:, self.age])
         if begun.all():
-            return self.step(state, y, u)
+            return self.step(state, y, u, dt)
         state, first = state.copy(), ~begun & np.isfinite(y).all(-1)
-        state[begun] = self.step(state[begun], y[begun], u[begun])
+        state[begun] = self.step(state[begun], y[begun], u[begun], dt)
         state[first] = self.begin(y[first], self.artifact.filter.start(y[first]), 0.0)
         return state
 
-    def step(self, state: np.ndarray, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def step(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
         """Return rows that have begun after samples (n, ny) and inputs (n, nu)."""
-        if self._machine is not None:
-            new = state.copy()
-            self._machine(new, y[None], u[None])
-        else:
-            new = self._stepped(state, y, u)
-        if self.monitor is not None:
-            residual = self.artifact.residual(new[:, self.y], self.decode(new))
+        new = self._stepped_by(state, y, u, dt)
+        if self.monitor is not None:  # outputs that are rejected count too
+            residual = self.artifact.residual(np.where(np.isnan(y), new[:, self.y], y), self.decode(new))
             new[:, self.watched] = self.monitor.update(new[:, self.watched], residual, ~np.isnan(y))
         return new
 
-    def _stepped(self, state: np.ndarray, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def _stepped_by(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
+        """The step by what there is, without the monitor."""
+        if self._machine is None:
+            return self._stepped(state, y, u, dt)
+        new = state.copy()
+        self._machine(new, y[None], u[None], linear=self._filter(dt))
+        return new
+
+    def _filter(self, dt: float | None) -> LinearFilter:
+        """The linear filter at a sampling interval, by default that of the artifact."""
+        linear = self.artifact.filter
+        if dt is None or dt == linear.dt:
+            return linear
+        if dt not in self._filters:
+            if len(self._filters) >= _MAX_FILTERS:
+                self._filters.clear()
+            samples = dt / linear.dt
+            if samples > _MAX_SAMPLES:
+                raise ValueError(
+                    f"dt must be at most {_MAX_SAMPLES * linear.dt:g} s, got {dt:g}: reset after long gaps"
+                )
+            if self.tracker is not None:
+                self.tracker.motion.check_samples(samples)
+            self._filters[dt] = linear.at(dt)
+        return self._filters[dt]
+
+    def _stepped(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
         """The step in NumPy, without the monitor."""
         z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
-        linear, tracker, gaps = self.artifact.filter, self.tracker, np.isnan(y)
+        linear, tracker, gaps = self._filter(dt), self.tracker, np.isnan(y)
+        samples = linear.dt / self.artifact.filter.dt
         if tracker is not None:
-            tracked, expected = tracker.advance(state[:, self.tracked], y, u)
-            y = _filled(y, gaps, expected, before)
+            tracked, y = tracker.advance(state[:, self.tracked], y, u, samples)
+            y = np.where(np.isfinite(y), y, before)
         elif gaps.any():
             y = _filled(y, gaps, before, before)
             if self.artifact.knows_output:
                 rows = gaps.any(-1)
-                y[rows] = self._predicted(y[rows], gaps[rows], u[rows], state[rows])
+                y[rows] = self._predicted(y[rows], gaps[rows], u[rows], state[rows], linear)
         z = linear.advance(z, before, u, y)
-        parts = [z, y, age[:, None] + 1.0]
+        parts = [z, y, age[:, None] + samples]
         if tracker is not None:
-            parts.append(tracker.supervise(tracked, z, age + 1.0))
+            parts.append(tracker.supervise(tracked, z, age + samples))
         return np.concatenate([*parts, state[:, self.watched]], axis=1)
 
-    def _predicted(self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, state: np.ndarray) -> np.ndarray:
+    def _predicted(
+        self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, state: np.ndarray, linear: LinearFilter
+    ) -> np.ndarray:
         """Samples with gaps filled by h(T_inv(z)): from the z before, and once more from the z that this leads to."""
         z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
-        dt, following = self.artifact.filter.dt, z
-        for ahead in range(2):
-            h = self.artifact.output(self.decoders(following, (age + ahead) * dt))
+        following, age = z, age * self.artifact.filter.dt
+        for ahead in (0.0, linear.dt):
+            h = self.artifact.output(self.decoders(following, age + ahead))
             y = _filled(y, gaps, h, before)
-            following = self.artifact.filter.advance(z, before, u, y)
+            following = linear.advance(z, before, u, y)
         return y
 
     def estimate(self, state: np.ndarray) -> Estimate:
@@ -126,6 +156,16 @@ class KKL(Estimator[np.ndarray]):
         covariance = self.covariance(state) if has_covariance else None
         score = None if self.monitor is None else self.monitor.score(state[:, self.watched])
         return Estimate(self.decode(state), covariance, score)
+
+    def ahead(self, state: np.ndarray, u: np.ndarray, waiting: np.ndarray) -> np.ndarray:
+        """Return rows predicted under inputs (n, delay, nu), of which so many act in each row, (n,)."""
+        for k in range(int(waiting.max(initial=0))):
+            rows = waiting > k
+            state = state.copy()
+            state[rows] = self._stepped_by(
+                state[rows], np.full((int(rows.sum()), self.artifact.ny), np.nan), u[rows, k]
+            )
+        return state
 
     def decode(self, state: np.ndarray) -> np.ndarray:
         """Return the estimates, (n, nx)."""
@@ -151,20 +191,30 @@ class KKL(Estimator[np.ndarray]):
             )
         return self._parameters(state[:, self.z], state[:, self.age] * artifact.filter.dt)
 
+    def rejected(self, state: np.ndarray) -> np.ndarray:
+        """Return how many outputs the gate has rejected, (n,)."""
+        assert self.tracker is not None
+        return state[:, self.tracked][:, self.tracker.nis + 3].astype(int)
+
     @functools.cached_property
     def _parameters(self) -> Decoders:
         return Decoders(self.artifact, slice(self.artifact.nx, None), **self._options)
 
-    def along(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, of: Any) -> np.ndarray:
+    def along(
+        self, state: np.ndarray, y: np.ndarray, u: np.ndarray, of: Any, dts: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return what a function of rows returns at each sample of a record that begins with ``state``.
 
-        Shapes: ``y`` (steps, n, ny), ``u`` (steps - 1, n, nu); returns (steps, n, ...).
+        Shapes: ``y`` (steps, n, ny), ``u`` (steps - 1, n, nu), ``dts`` (steps - 1,); returns (steps, n, ...).
         """
         parts, rows = [of(state)[None]], max(1, _CHUNK // max(1, len(state)))
         for first in range(1, len(y), rows):
             samples, inputs = y[first : first + rows], u[first - 1 : first - 1 + rows]
             record = np.empty((len(samples), *state.shape))
-            if self._machine is not None:
+            if dts is not None:
+                for k, dt in enumerate(dts[first - 1 : first - 1 + rows].tolist()):
+                    record[k] = state = self.step(state, samples[k], inputs[k], dt)
+            elif self._machine is not None:
                 state = state.copy()
                 self._machine(state, samples, inputs, record)
             else:

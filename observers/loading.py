@@ -16,6 +16,8 @@ def load(
     monitor: bool = False,
     tracking: bool | None = None,
     compiled: bool | None = None,
+    gate: float | None = None,
+    delay: int = 0,
 ) -> KKLObserver:
     """Return the observer behind a name.
 
@@ -23,7 +25,7 @@ def load(
     ----------
     name_or_path : str or PathLike
         A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
-    measurement_noise, process_noise, monitor, tracking, compiled
+    measurement_noise, process_noise, monitor, tracking, compiled, gate, delay
         As for :class:`KKLObserver`.
 
     Returns
@@ -47,4 +49,6 @@ def load(
         monitor=monitor,
         tracking=tracking,
         compiled=compiled,
+        gate=gate,
+        delay=delay,
     )

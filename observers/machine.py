@@ -9,6 +9,16 @@ from typing import Any, TypeVar
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
+@cache
+def available() -> bool:
+    """Whether Numba is installed."""
+    try:
+        import numba  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
 def kernel(**options: Any) -> Callable[[_F], _F]:
     """Compile a function that Python calls, and keep its machine code on disk for later processes."""
 

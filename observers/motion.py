@@ -1,5 +1,6 @@
 """How a state moves over one sample: by the system's equations, or by a flow that was learned."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,19 +39,25 @@ class Equations:
         if type(self.substeps) is not int or not 0 <= self.substeps <= _MAX_SUBSTEPS:
             raise ArtifactError(f"substeps must be an integer from 0 to {_MAX_SUBSTEPS}, got {self.substeps!r}")
 
-    def __call__(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """Return the states a sample later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
-        f = self.field
+    def __call__(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
+        """Return the states so many samples of dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); (..., nx)."""
+        f, substeps = self.field, self.steps(samples)
         if not self.substeps:
-            return f(x, u)
-        h = dt / self.substeps
-        for _ in range(self.substeps):
+            for _ in range(substeps):
+                x = f(x, u)
+            return x
+        h = samples * dt / substeps
+        for _ in range(substeps):
             k1 = f(x, u)
             k2 = f(x + h / 2 * k1, u)
             k3 = f(x + h / 2 * k2, u)
             k4 = f(x + h * k3, u)
             x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
         return x
+
+    def steps(self, samples: float) -> int:
+        """Number of Runge-Kutta steps, or of steps of the map in discrete time, in so many samples."""
+        return round(samples) if not self.substeps else max(1, math.ceil(self.substeps * samples - 1e-9))
 
 
 @dataclass(frozen=True)
@@ -195,18 +202,25 @@ class Motion:
         """Bounds of scaled states, (nx,) each."""
         return (self.low - self.x_offset) / self.x_scale, (self.high - self.x_offset) / self.x_scale
 
-    def step(self, x: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """Return states a sample later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+    def step(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
+        """Return states so many samples of dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         if self.equations is not None:
-            return self.equations(x, u, dt)
+            return self.equations(x, u, dt, samples)
         assert self.flow is not None
-        return self.x_offset + self.x_scale * self.flow((x - self.x_offset) / self.x_scale, u)
+        s = (x - self.x_offset) / self.x_scale
+        for _ in range(round(samples)):
+            s = self.flow(s, u)
+        return self.x_offset + self.x_scale * s
 
-    def scaled_step(self, s: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """Return scaled states a sample later. Shapes: ``s`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
-        if self.flow is not None:
-            return self.flow(s, u)
-        return np.asarray((self.step(self.x_offset + self.x_scale * s, u, dt) - self.x_offset) / self.x_scale)
+    def check_samples(self, samples: float) -> None:
+        """Raise ValueError if the motion cannot be carried over so many samples."""
+        continuous = self.equations is not None and self.equations.substeps
+        if not continuous and abs(samples - max(1, round(samples))) > 1e-6:
+            what = "a learned flow" if self.flow is not None else "a motion in discrete time"
+            raise ValueError(
+                f"{what} is carried by whole samples, got a dt of {samples:g} of them; pass a whole multiple of the "
+                "sampling interval, or tracking=False"
+            )
 
     def variances(
         self, measurement_noise: float | tuple[float, ...], process_noise: float

@@ -1,15 +1,14 @@
-"""Multilayer perceptrons, evaluated with NumPy, and in large batches with Numba's help where it is installed."""
+"""Multilayer perceptrons."""
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from observers.checks import choice, real_array, shown
-from observers.compiled import CompiledNetwork
-from observers.thresholds import MANY_ROWS
+
+_PIECE = 2**15  # values of a layer that a batch computes at once: they stay in the second cache
+UNROLLED = 4  # inputs that machine code takes at once
 
 
 def _tanh(h: np.ndarray) -> np.ndarray:
@@ -95,39 +94,40 @@ class MLP:
         return MLP([*weights, last[outputs]], [*biases, bias[outputs]], self.activation)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate the network.
-
-        A batch of many rows goes through :mod:`observers.compiled` where Numba is installed, which rounds a little
-        differently.
-
-        Shapes: ``x`` (..., inputs); returns (..., outputs).
-        """
-        activation = ACTIVATIONS[self.activation]
-        *hidden, (weight, bias) = self.layers
+        """Evaluate the network. Shapes: ``x`` (..., inputs); returns (..., outputs)."""
         h: np.ndarray = x.astype(np.float32, copy=False)
         if h.ndim > 2:
             h = h.reshape(-1, h.shape[-1])
-        if h.ndim == 2 and len(h) >= MANY_ROWS and self.compiled is not None:
-            h = self.compiled.batch(h)
+        rows = max(1, _PIECE // max(len(bias) for _, bias in self.layers))
+        if h.ndim == 2 and len(h) > rows:
+            h = np.concatenate([self._evaluated(piece) for piece in np.array_split(h, -(-len(h) // rows))])
         else:
-            for w, b in hidden:
-                h = h.dot(w)
-                h += b
-                h = activation(h)
-            h = h.dot(weight)
-            h += bias
-        return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], len(bias))
+            h = self._evaluated(h)
+        return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], h.shape[-1])
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "compiled"}  # Numba is not everywhere
+    def _evaluated(self, h: np.ndarray) -> np.ndarray:
+        activation = ACTIVATIONS[self.activation]
+        *hidden, (weight, bias) = self.layers
+        for w, b in hidden:
+            h = h.dot(w)
+            h += b
+            h = activation(h)
+        h = h.dot(weight)
+        h += bias
+        return h
 
-    @functools.cached_property
-    def compiled(self) -> CompiledNetwork | None:
-        """The same network as machine code; None without Numba."""
-        try:
-            return CompiledNetwork(self.layers, self.activation, self.inputs)
-        except ImportError:
-            return None
+    def packed(self, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Layers from ``first`` on as :func:`observers.network_kernel.evaluate` takes them.
+
+        These are biases and weights one after another, with rows of zeros up to a multiple of UNROLLED, and the number
+        of the activation with all widths.
+        """
+        layers, (outputs, inputs) = self.layers[first:], np.shape(self.weights[max(first - 1, 0)])
+        padded = [(bias, np.pad(weight, ((0, -len(weight) % UNROLLED), (0, 0)))) for weight, bias in layers]
+        parts = [part.ravel() for both in padded for part in both]
+        shape = [list(ACTIVATIONS).index(self.activation), outputs if first else inputs]
+        packed = np.concatenate([np.zeros(0, np.float32), *parts])
+        return packed, np.array(shape + [len(bias) for _, bias in layers])
 
 
 def _layer(name: str, values: np.ndarray) -> np.ndarray:

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from observers.machine import kernel, part
+from observers.network import UNROLLED
 
-ACTIVATIONS = ("tanh", "silu", "relu")  # by the number that begins a network's shape
-UNROLLED = 4  # inputs that a single sample's loop takes at once
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
 _kernel, _part = kernel(**_OPTIONS), part(**_OPTIONS)  # NaN and infinity keep their meaning
 
@@ -121,32 +120,4 @@ def decode_one(z: Any, age: float, network: Any, out: Any) -> None:
     decode(z, age, network, np.empty((3, widest + UNROLLED), np.float32), out)
 
 
-@_kernel
-def enter(sums: Any, first: Any, ages: Any, kind: int, entered: Any) -> None:
-    """What follows the first layer's matrix product, for the rows of a batch."""
-    for row in range(len(ages)):
-        age = ages[row]
-        for j in range(first.shape[1]):
-            entered[row, j] = sums[row, j] + first[0, j] + age * first[1, j]
-        _activate(entered[row], kind)
-
-
-@_kernel
-def finish(h: Any, bias: Any, units: Any, out: Any) -> None:
-    """What follows the last layer's matrix product."""
-    for row in range(len(out)):
-        for j in range(len(bias)):
-            out[row, j] = units[0, j] + units[1, j] * (h[row, j] + bias[j])
-
-
-@_kernel
-def activate(h: Any, tile: Any, kind: int) -> None:
-    """Bias and activation of a batch's layer in place; biases lie one after another for some rows."""
-    for first in range(0, len(h), len(tile)):
-        part = h[first : first + len(tile)]
-        for j in range(len(part)):
-            part[j] += tile[j]
-        _activate(part, kind)
-
-
-__all__ = ["ACTIVATIONS", "UNROLLED", "activate", "decode", "decode_one", "enter", "evaluate", "finish"]
+__all__ = ["decode", "decode_one", "evaluate"]

@@ -1,19 +1,20 @@
 """The observer at run time: filter the output, invert the map."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.checks import bool_array, noise_level, noise_levels, real_array
-from observers.compiled import available
+from observers.checks import bool_array, check_dt, noise_level, noise_levels, real_array
 from observers.factors import standard_deviations
 from observers.kkl import KKL
+from observers.late import Pending
 from observers.records import RecordEstimates
 from observers.replacement import check_replacement
-from observers.samples import check_arguments, check_output, first_state, held_input
+from observers.samples import check_arguments, check_delay, check_gate, check_output, first_state, held_input
 
 
 class KKLObserver(RecordEstimates):
@@ -52,6 +53,15 @@ class KKLObserver(RecordEstimates):
         it, False takes NumPy. The first process on a machine compiles for some seconds, later ones read the machine
         code from disk. Numba and NumPy agree to rounding.
 
+    gate : float, optional
+        Outputs whose innovation is larger than so many of its standard deviations are rejected: they count as missing,
+        and :attr:`rejected` counts them. The gate is open in the first window, half a second for the maps that ship;
+        and where all that is measured has been rejected for a whole window, or the tracker diverged, until an output
+        fits again. It needs a map that tracks.
+    delay : int, default 0
+        Samples by which outputs are late. ``step(y, u)`` then takes the output of so many samples ago and the input
+        held since the sample before, and the estimate is predicted by the motion to now. It needs a map that tracks.
+
     Raises
     ------
     ImportError
@@ -71,11 +81,15 @@ class KKLObserver(RecordEstimates):
         monitor: bool = False,
         tracking: bool | None = None,
         compiled: bool | None = None,
+        gate: float | None = None,
+        delay: int = 0,
     ) -> None:
         check_arguments(artifact, monitor, compiled, tracking)
+        self._gate, self._delay = check_gate(artifact, tracking, gate), check_delay(artifact, tracking, delay)
         self.artifact, self._monitored = artifact, bool(monitor)
         self._tracking, self._compiled = None if tracking is None else bool(tracking), compiled
         self._kkl: KKL
+        self._warned = False
         self._state: np.ndarray | None = None  # (n, width), never changed in place
         self._batch: tuple[int, ...] = ()
         self._process_noise = self._level(process_noise)
@@ -106,6 +120,25 @@ class KKLObserver(RecordEstimates):
     def process_noise(self, level: float | None) -> None:
         self._set_levels(self._measurement_noise, self._level(level))
 
+    @property
+    def gate(self) -> float | None:
+        """Standard deviations of an innovation beyond which an output is rejected; None rejects none."""
+        return self._gate
+
+    @gate.setter
+    def gate(self, gate: float | None) -> None:
+        self._gate = check_gate(self.artifact, self._tracking, gate)
+        self._set_levels(self._measurement_noise, self._process_noise)
+
+    @property
+    def delay(self) -> int:
+        """Samples by which outputs are late; another delay needs a :meth:`reset`."""
+        return self._delay
+
+    @delay.setter
+    def delay(self, delay: int) -> None:
+        self._delay, self._state = check_delay(self.artifact, self._tracking, delay), None
+
     def _level(self, process_noise: float | None) -> float:
         if process_noise is None:
             return self.artifact.process_noise_max or 0.0
@@ -125,15 +158,11 @@ class KKLObserver(RecordEstimates):
             tracking=self.artifact.motion is not None and self._tracking is not False,
             monitored=self._monitored,
             compiled=self._compiled,
+            gate=self._gate,
         )
         if self._state is not None and kkl.monitor is not None:
             self._state = np.hstack([self._state[:, : kkl.watched.start], kkl.monitor.start(len(self._state))])
         self._kkl, self._measurement_noise, self._process_noise = kkl, measurement_noise, process_noise
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        if self._compiled and not available():
-            self._compiled = None
 
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
@@ -161,9 +190,12 @@ class KKLObserver(RecordEstimates):
             monitor=self._monitored,
             tracking=self._tracking,
             compiled=self._compiled,
+            gate=self._gate,
+            delay=self._delay,
         )
         if self._state is not None:
             other._state, other._batch = other._kkl.take_over(self._kkl, self._state), self._batch
+            other._pending = self._pending
         vars(self).update(vars(other))
 
     @property
@@ -203,6 +235,7 @@ class KKLObserver(RecordEstimates):
         y0, x0 = real_array("y", y0).copy(), None if x0 is None else real_array("x0", x0)  # callers reuse arrays
         check_output(self.artifact, y0, y0.shape[:-1], first=True)
         self._state, self._batch = self._begin(y0, x0), y0.shape[:-1]
+        self._pending = Pending(len(self._state), self._delay, self.artifact.nu)
         return self.decode()
 
     def _begin(self, y0: np.ndarray, x0: np.ndarray | None) -> np.ndarray:
@@ -228,6 +261,19 @@ class KKLObserver(RecordEstimates):
         if self._kkl.monitor is None or self._state is None:
             raise RuntimeError("score needs an observer made with monitor=True, and reset(y0)")
         return self._kkl.monitor.score(self._state[:, self._kkl.watched]).reshape(self._batch)
+
+    @property
+    def rejected(self) -> np.ndarray:
+        """Number of outputs that the gate has rejected since reset, shape (...,).
+
+        Raises
+        ------
+        RuntimeError
+            Before :meth:`reset`, or without a ``gate``.
+        """
+        if self._gate is None or self._state is None:
+            raise RuntimeError("rejected needs an observer made with a gate, and reset(y0)")
+        return self._kkl.rejected(self._state).reshape(self._batch)
 
     @property
     def mismatch(self) -> np.ndarray:
@@ -268,10 +314,10 @@ class KKLObserver(RecordEstimates):
         y0, x0 = real_array("y", y0), None if x0 is None else real_array("x0", x0)
         check_output(self.artifact, y0, (int(rows.sum()),), first=True)
         begun = self._begin(y0, x0)
-        self._state = state.copy()
+        self._state, self._pending = state.copy(), self._pending.restarted(rows.ravel())
         self._state[rows.ravel()] = begun
 
-    def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
+    def step(self, y: np.ndarray | None, u: np.ndarray | None = None, *, dt: float | None = None) -> np.ndarray:
         """Take in the next sample.
 
         Without a sample the observer coasts on its own prediction of the output, h(x_hat), which makes z' = A z + B
@@ -285,6 +331,9 @@ class KKLObserver(RecordEstimates):
             The sample; None if it is missing. NaN marks outputs, or rows of a batch, that are missing.
         u : array_like, shape (..., nu), optional
             The input held since the sample before, by default zero.
+        dt : float, optional
+            Seconds since the sample before, by default those of the map. The filter and the equations are integrated
+            over any, at most 1,000 samples; a learned flow is carried by whole samples.
 
         Returns
         -------
@@ -295,19 +344,27 @@ class KKLObserver(RecordEstimates):
         ------
         ValueError
             If a shape is wrong, an entry is not a finite real number (or NaN as described), or an input that the map
-            does not take is not zero; the observer is then as it was.
+            does not take is not zero, or ``dt`` is beyond what the motion can be carried over, or given beside a delay;
+            the observer is then as it was.
         RuntimeError
             Before :meth:`reset`.
         """
-        self.advance(y, u)
+        self.advance(y, u, dt=dt)
         return self.decode()
 
-    def advance(self, y: np.ndarray | None, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
+    def advance(
+        self,
+        y: np.ndarray | None,
+        u: np.ndarray | None = None,
+        rows: np.ndarray | None = None,
+        *,
+        dt: float | None = None,
+    ) -> None:
         """Take in the next sample without an estimate: the filter's half of :meth:`step`, which raises the same.
 
         Parameters
         ----------
-        y, u
+        y, u, dt
             As for :meth:`step`.
         rows : array_like of bool, shape (...,), optional
             The rows of the batch that take it in, by default all.
@@ -320,15 +377,32 @@ class KKLObserver(RecordEstimates):
         u = held_input(self.artifact, u, batch).reshape(len(state), self.artifact.nu)
         if y is None:
             y = np.full((len(state), self.artifact.ny), np.nan)
+            self._warn_of_gaps()
         else:
             y = real_array("y", y)
-            check_output(self.artifact, y, batch)
+            if check_output(self.artifact, y, batch) is not None:
+                self._warn_of_gaps()
             y = y.reshape(len(state), self.artifact.ny)
+        dt = None if dt is None else check_dt(dt)
+        if self._delay:
+            if dt is not None:
+                raise ValueError("an observer with a delay takes samples at the interval of its map: leave dt out")
+            every = np.ones(len(u), dtype=bool)
+            self._pending, u, rows = self._pending.after(u, every if rows is None else rows)
         if rows is None:
-            self._state = self._kkl.step(state, y, u)
+            self._state = self._kkl.step(state, y, u, dt)
         elif rows.any():
             self._state = state.copy()
-            self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows])
+            self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows], dt)
+
+    def _warn_of_gaps(self) -> None:
+        if not self.artifact.knows_output and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the map for {self.artifact.system!r} holds no output h(x) by which to predict what is missing: it "
+                "holds the last value of a missing output",
+                stacklevel=4,
+            )
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Return the current estimate: T_inv(z), the network's half of :meth:`step`, or the tracker's.
@@ -412,9 +486,13 @@ class KKLObserver(RecordEstimates):
         return self._state
 
     def _some(self, rows: np.ndarray | None) -> tuple[np.ndarray, tuple[int, ...]]:
-        """Some rows of the state, and the shape of the batch that they are."""
-        state = self._begun()
-        if rows is None:
-            return state, self._batch
-        state = state[bool_array("rows", rows, self._batch).ravel()]
-        return state, (len(state),)
+        """Some rows of the state, predicted to now where outputs are late, and the shape of the batch that they are."""
+        state, batch = self._begun(), self._batch
+        chosen: Any = slice(None)
+        if rows is not None:
+            chosen = bool_array("rows", rows, batch).ravel()
+            state = state[chosen]
+            batch = (len(state),)
+        if self._delay:
+            state = self._kkl.ahead(state, self._pending.inputs[chosen], self._pending.count[chosen])
+        return state, batch

@@ -7,7 +7,7 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.checks import real_array
 from observers.kkl import KKL
-from observers.samples import checked_record, held_inputs
+from observers.samples import checked_record, held_inputs, intervals
 
 
 class RecordEstimates:
@@ -15,9 +15,18 @@ class RecordEstimates:
 
     artifact: Artifact
     _kkl: KKL
+    _delay: int
+    _warn_of_gaps: Any
     _begin: Any
 
-    def estimate(self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None) -> np.ndarray:
+    def estimate(
+        self,
+        y: np.ndarray,
+        u: np.ndarray | None = None,
+        *,
+        x0: np.ndarray | None = None,
+        t: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
 
         The observer's own state is left as it was.
@@ -30,6 +39,8 @@ class RecordEstimates:
             The input held after each row but the last, by default zero. A last row more is ignored.
         x0 : array_like, shape (..., nx), optional
             The state at y_0, where it is known, as for :meth:`reset`.
+        t : array_like, shape (steps,), optional
+            Times of the samples in seconds, which rise; by default they are at the map's interval.
 
         Returns
         -------
@@ -41,7 +52,7 @@ class RecordEstimates:
         ValueError
             As :meth:`reset` and :meth:`step`.
         """
-        return self._along(y, u, x0, of=self._kkl.decode)
+        return self._along(y, u, x0, of=self._kkl.decode, t=t)
 
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Estimate the system's uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
@@ -86,12 +97,19 @@ class RecordEstimates:
         self.artifact.require_covariance()
         return self._along(y, u, x0, of=self._kkl.covariance)
 
-    def _along(self, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, *, of: Any) -> np.ndarray:
+    def _along(
+        self, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, *, of: Any, t: np.ndarray | None = None
+    ) -> np.ndarray:
         """What a function of the state's rows returns at each sample."""
+        if self._delay:
+            raise ValueError("a record has no delay: shift its outputs to their times, and make an observer without")
         y = checked_record(self.artifact, y)
+        if np.isnan(y).any():
+            self._warn_of_gaps()
+        dts = None if t is None else intervals(t, len(y))
         u = held_inputs(self.artifact, u, y.shape[:-1])
         x0 = None if x0 is None else real_array("x0", x0)
         state = self._begin(y[0], x0)
         samples, inputs = (each.reshape(len(each), len(state), each.shape[-1]) for each in (y, u))
-        found = self._kkl.along(state, samples, inputs, of)
+        found = self._kkl.along(state, samples, inputs, of, dts)
         return found.reshape(*y.shape[:-1], *found.shape[2:])

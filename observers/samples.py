@@ -1,12 +1,15 @@
 """What an observer takes in, checked at its boundary: samples, inputs, records and starts that are known."""
 
 import math
+from typing import Any
 
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.checks import LARGEST, all_finite, flag, real_array, shown
-from observers.compiled import available
+from observers.checks import LARGEST, all_finite, flag, integer, is_finite, real_array, shown
+from observers.machine import available
+
+MAX_DELAY = 1000  # samples
 
 
 def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tracking: bool | None) -> None:
@@ -25,6 +28,29 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tr
         raise ValueError("the limits of this artifact are those of the observer that tracks: leave tracking=False out")
     if compiled is not None and flag("compiled", compiled) and not available():
         raise ImportError("compiled=True needs Numba: pip install kkl-gym[fast], or leave compiled out")
+
+
+def check_gate(artifact: Artifact, tracking: bool | None, gate: Any) -> float | None:
+    """Return a gate as a float, of an observer that tracks."""
+    if gate is None:
+        return None
+    if not is_finite(gate) or gate <= 0:
+        raise ValueError(f"gate must be a positive number of standard deviations, got {shown(gate)}")
+    _check_tracks(artifact, tracking)
+    return float(gate)
+
+
+def check_delay(artifact: Artifact, tracking: bool | None, delay: Any) -> int:
+    """Return a delay as an int, of an observer that tracks."""
+    if delay := integer("delay, in samples,", delay, 0, MAX_DELAY):
+        _check_tracks(artifact, tracking)
+    return delay
+
+
+def _check_tracks(artifact: Artifact, tracking: bool | None) -> None:
+    if tracking is not None and not tracking:
+        raise ValueError("a gate and a delay need an observer that tracks: leave tracking=False out")
+    artifact.require_motion()
 
 
 def check_output(
@@ -105,6 +131,14 @@ def held_inputs(artifact: Artifact, u: np.ndarray | None, samples: tuple[int, ..
             raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got shape {u.shape}")
         u = u[: steps - 1]
     return held_input(artifact, u, (steps - 1, *batch))
+
+
+def intervals(t: np.ndarray, steps: int) -> np.ndarray:
+    """Return the intervals (steps - 1,) between times (steps,) in seconds."""
+    t = real_array("t", t)
+    if t.shape != (steps,) or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
+        raise ValueError(f"t must be {steps} times in seconds, which rise, got {shown(t)}")
+    return np.diff(t)
 
 
 def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:

@@ -1,5 +1,7 @@
 """The tracker: an unscented Kalman filter that T_inv initialises where it is surer, and again where it diverged."""
 
+import math
+
 import numpy as np
 
 from observers.artifact import Artifact
@@ -28,8 +30,13 @@ class Tracker:
     An estimate that is off by less than the noise does not show in the NIS, but its innovations are not white: where
     the mean square of their running mean exceeds its limit, the covariance is multiplied by ten.
 
+    With a gate, an output whose innovation is larger than so many of its standard deviations is rejected, and counts as
+    missing. The gate is open in the first window; and where all that is measured has been rejected for a whole window,
+    or the filter diverged, until an output fits again: a jump that stays is believed.
+
     A row of the state, which the caller keeps, holds the estimate x (nx), its covariance P (nx^2), the NIS, the mean
-    square of the innovations' running mean, the number of samples seen, and that running mean (ny).
+    square of the innovations' running mean, the number of samples seen, that of outputs rejected, that of samples
+    rejected in a row, and the running mean (ny).
     """
 
     def __init__(
@@ -39,7 +46,9 @@ class Tracker:
         *,
         measurement_noise: float | tuple[float, ...],
         process_noise: float,
+        gate: float | None = None,
     ) -> None:
+        self.gate = math.inf if gate is None else gate
         self._artifact, self._decoders, self._dt = artifact, decoders, artifact.filter.dt
         self.motion = motion = artifact.require_motion()
         self.supervision = Supervision.of(motion, self._dt)
@@ -51,7 +60,7 @@ class Tracker:
         self._log_factors = np.log(motion.factors.at_levels(*shares))
         self.x, self.P = slice(motion.nx), slice(motion.nx, motion.nx + motion.nx**2)
         self.nis = self.P.stop
-        self.width = self.nis + 3 + len(self.r)
+        self.width = self.nis + 5 + len(self.r)
 
     def covariance(self, rows: np.ndarray, age: np.ndarray) -> np.ndarray:
         """Calibrated covariances of the estimates' errors, (n, nx, nx), at ages (n,) in samples."""
@@ -64,14 +73,15 @@ class Tracker:
         if x0 is None:
             x, P = np.tile(motion.mean, (n, 1)), np.tile(motion.covariance, (n, 1, 1))
             with np.errstate(over="ignore", invalid="ignore"):
-                V, white, _ = self._innovations(x, P, y)
+                expected, S, across = self._expected(x, P)
+                V, white = whitened(y - expected, S, across, np.isnan(y))
                 corrected, left = shift(x, V, white), add(P, V, V, -1.0)
             sound = np.isfinite(corrected).all(-1) & np.isfinite(factor(left)).all((1, 2))
             x, P = np.where(sound[:, None], corrected, x), np.where(sound[:, None, None], left, P)
         else:
             x, P = x0, np.tile(np.diag((KNOWN * motion.x_scale) ** 2), (n, 1, 1))
         seen = np.full((n, 1), 0.0 if x0 is None else self.supervision.window)
-        return self._packed(x, P, np.concatenate([np.ones((n, 2)), seen, np.zeros(y.shape)], 1))
+        return self._packed(x, P, np.concatenate([np.ones((n, 2)), seen, np.zeros((n, 2 + y.shape[1]))], 1))
 
     def take_over(self, rows: np.ndarray) -> np.ndarray:
         """Return the rows of a tracker with another motion, within the bounds of this one."""
@@ -79,30 +89,37 @@ class Tracker:
         rows[:, self.x] = self._within(rows[:, self.x])
         return rows
 
-    def advance(self, rows: np.ndarray, y: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predict under inputs (n, nu) and correct by samples (n, ny), NaN where missing.
+    def advance(
+        self, rows: np.ndarray, y: np.ndarray, u: np.ndarray, samples: float = 1.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Predict over so many samples under inputs (n, nu), and correct by outputs (n, ny), NaN where missing.
 
-        Returns the rows, and the predicted outputs (n, ny), which are not finite where a covariance broke down.
+        Returns the rows, and the outputs with predicted ones where they are missing or rejected, (n, ny), which are not
+        finite where a covariance broke down.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            advanced, expected = self._advanced(rows, y, u)
+            advanced, whole = self._advanced(rows, y, u, samples)
         broken = ~np.isfinite(advanced[:, : self.nis].sum(-1))
         if broken.any():
             advanced[broken] = rows[broken]
             advanced[broken, self.nis] = np.inf
-        return advanced, expected
+        return advanced, whole
 
-    def _advanced(self, rows: np.ndarray, y: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _advanced(
+        self, rows: np.ndarray, y: np.ndarray, u: np.ndarray, samples: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         def move(x: np.ndarray) -> np.ndarray:
-            return self.motion.step(self._within(x), u, self._dt)
+            return self.motion.step(self._within(x), u, self._dt, samples)
 
         def predict(x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             mean, moved, across = transformed(x, P, function=move, points=self._points)
-            return mean, moved + self._Q, across
+            return mean, moved + samples * self._Q, across
 
         x, P = rows[:, self.x], self._covariances(rows)
         mean, moved, across = predict(x, P)
-        V, white, expected = self._innovations(mean, moved, y)
+        expected, S, cross = self._expected(mean, moved)
+        y, rejected = self._gated(rows, y, y - expected, S)
+        V, white = whitened(y - expected, S, cross, np.isnan(y))
         new = rows[:, self.nis + 2] < self.supervision.window
         for _ in range(RELINEARISATIONS if new.any() else 0):
             # The sample also corrects the start of the step (Rauch, Tung and Striebel, 1965), by G white.
@@ -114,19 +131,35 @@ class Tracker:
             sound = new & np.isfinite(again[0]).all(-1) & np.isfinite(factor(again[1])).all((1, 2))
             mean = np.where(sound[:, None], again[0], mean)
             moved, across = (np.where(sound[:, None, None], *each) for each in zip(again[1:], (moved, across)))
-            V, white, expected = self._innovations(mean, moved, y)
+            expected, S, cross = self._expected(mean, moved)
+            V, white = whitened(y - expected, S, cross, np.isnan(y))
         P, watched = self._watched(rows[:, self.nis :], add(moved, V, V, -1.0), white, ~np.isnan(y))
-        return self._packed(shift(mean, V, white), P, watched), expected
+        watched[:, 3:5] = rejected
+        return self._packed(shift(mean, V, white), P, watched), np.where(np.isnan(y), expected, y)
 
-    def _innovations(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """V and white innovations, for x + V white and P - V V^T, of samples y; and the predicted outputs."""
+    def _gated(
+        self, rows: np.ndarray, y: np.ndarray, innovation: np.ndarray, S: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Outputs (n, ny), NaN where they are rejected, and how many outputs and samples in a row were, (n, 2)."""
+        count, in_a_row = rows[:, self.nis + 3], rows[:, self.nis + 4]
+        if self.gate == math.inf:
+            return y, np.stack([count, in_a_row], 1)
+        window = self.supervision.window
+        measured, open_ = ~np.isnan(y), (in_a_row >= window) | (rows[:, self.nis + 2] < window)
+        far = measured & (innovation**2 > self.gate**2 * np.diagonal(S, axis1=1, axis2=2))
+        rejected = far & ~open_[:, None]
+        in_a_row = np.where(measured.any(1), np.where((far == measured).all(1), in_a_row + 1, 0.0), in_a_row)
+        return np.where(rejected, np.nan, y), np.stack([count + rejected.sum(1), in_a_row], 1)
+
+    def _expected(self, x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean and covariance of the outputs to measure, and their covariance with the states."""
         C = self._artifact.C
         if C is None:
             expected, S, across = transformed(x, P, function=self._output, points=self._points)
         else:
             expected, across = x @ C.T, P @ C.T
             S = C @ across
-        return *whitened(y - expected, S + self._R, across, np.isnan(y)), expected
+        return expected, S + self._R, across
 
     def _watched(
         self, watched: np.ndarray, P: np.ndarray, white: np.ndarray, seen: np.ndarray
@@ -137,14 +170,14 @@ class Tracker:
         weight = count / seen.shape[1]  # of the outputs that are measured; fewer scatter more
         per_output = 1 / np.maximum(count, 1)
         nis = nis + watch.share * weight * (per_output * (white**2).sum(-1) - nis)
-        trend = watched[:, 3:] + watch.trend_share * np.where(seen, white - watched[:, 3:], 0.0)
+        trend = watched[:, 5:] + watch.trend_share * np.where(seen, white - watched[:, 5:], 0.0)
         square = watch.trend_gain * per_output * (np.where(seen, trend, 0.0) ** 2).sum(-1)
         trend_square = trend_square + watch.trend_square_share * weight * (square - trend_square)
         coloured = (trend_square > watch.trend_limit) & (count > 0)
         if coloured.any():
             P = np.where(coloured[:, None, None], INFLATION * P, P)
             trend_square, trend = np.where(coloured, 1.0, trend_square), np.where(coloured[:, None], 0.0, trend)
-        return P, np.column_stack([nis, trend_square, samples + (count > 0), trend])
+        return P, np.column_stack([nis, trend_square, samples + (count > 0), watched[:, 3:5], trend])
 
     def supervise(self, rows: np.ndarray, z: np.ndarray, age: np.ndarray) -> np.ndarray:
         """Return rows with T_inv's estimate of z, (n, size), at ages (n,) in samples, where that replaces theirs."""
@@ -164,7 +197,8 @@ class Tracker:
         rows[where, self.x] = self._within(self._map_estimates(z[where], age[where] * self._dt, where))
         rows[where, self.P] = P.reshape(len(where), -1)
         rows[lost, self.nis : self.nis + 2] = 1.0
-        rows[lost, self.nis + 3 :] = 0.0
+        rows[lost, self.nis + 4] = watch.window
+        rows[lost, self.nis + 5 :] = 0.0
         return rows
 
     def _map_estimates(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:

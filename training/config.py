@@ -144,6 +144,9 @@ class Config:
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
     values, as a part of these; "all" stands for each that is not named. Some motions keep the values themselves."""
+    bias: float | tuple[float, ...] = 0.0
+    """Largest constant bias of the outputs, of all or of each, that the observer estimates as further states behind x
+    (input-aware, without uncertain parameters)."""
     estimate_parameters: bool = False
     """Whether the map gives the uncertain parameters too."""
     cpu_seconds: Positive | None = None
@@ -162,6 +165,12 @@ class Config:
                 raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
         if self.uncertain and self.pipeline != "input-aware":
             raise ValueError(f"uncertain = {self.uncertain!r} needs the pipeline 'input-aware', not {self.pipeline!r}")
+        biases = self.bias if isinstance(self.bias, tuple) else (self.bias,)
+        if min(biases) < 0 or (any(biases) and (self.uncertain or self.pipeline != "input-aware")):
+            raise ValueError(
+                f"bias = {self.bias!r} must not be negative, and needs the pipeline 'input-aware' without uncertain "
+                "parameters"
+            )
         if self.estimate_parameters and not any(self.uncertain.values()):
             raise ValueError("estimate_parameters needs uncertain parameters, of which there are none")
         if self.policy is not None and (self.pipeline != "input-aware" or not self.inputs):

@@ -90,7 +90,7 @@ class KKLEstimator:
             raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer or system.name))
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
-        space = _filter_space(plant, artifact.filter) if estimate == "z" else plant.state_space
+        space = _filter_space(plant, artifact.filter) if estimate == "z" else _estimate_space(plant, artifact.nx)
         if uncertainty:
             low, high = with_deviations(space.low, space.high)
             space = gym.spaces.Box(low, high, dtype=np.float32)
@@ -158,6 +158,8 @@ class KKLEstimator:
                 found["x_cov"] = self.observer.decode_covariance(rows)
             if self.observer.artifact.estimated_parameters:
                 found["parameters_hat"] = self.observer.parameters_hat[... if rows is None else rows]
+        if self.observer.gate is not None:
+            found["rejected"] = self.observer.rejected if rows is None else self.observer.rejected[rows]
         if self._monitor:
             found["score"] = self.observer.score if rows is None else self.observer.score[rows]
         return found
@@ -204,6 +206,15 @@ def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
     """Bounds (2 nx,) of states and of their standard deviations, which are no larger than the bounds are wide."""
     with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
         return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
+
+
+def _estimate_space(plant: Plant, nx: int) -> gym.spaces.Box:
+    """Bounds of the estimates: those of the states, and none of what an observer estimates behind them."""
+    space, others = plant.state_space, np.full(max(0, nx - plant.system.nx), np.inf, dtype=np.float32)
+    if not len(others):
+        return space
+    low, high = np.concatenate([space.low, -others]), np.concatenate([space.high, others])
+    return gym.spaces.Box(low, high, dtype=np.float32)
 
 
 def _filter_space(plant: Plant, linear: LinearFilter) -> gym.spaces.Box:

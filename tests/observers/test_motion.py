@@ -41,10 +41,6 @@ def test_equations_are_those_of_systems():
 def test_flows_and_equations_of_a_linear_system_agree(by):
     (Phi, Gamma), motion = exact_motion(), linear_motion(by, nu=1)
     np.testing.assert_allclose(motion.step(X, U, 0.05), X @ Phi.T + U @ Gamma.T, rtol=1e-12, atol=1e-14)
-    scaled = (X - motion.x_offset) / motion.x_scale
-    moved = (motion.step(X, U, 0.05) - motion.x_offset) / motion.x_scale
-    np.testing.assert_allclose(motion.scaled_step(scaled, U, 0.05), moved, rtol=1e-12, atol=1e-14)
-    np.testing.assert_allclose(motion.scaled_step(scaled[2, 3], U[3], 0.05), moved[2, 3], rtol=1e-12, atol=1e-14)
 
 
 def test_a_flow_is_an_affine_step_and_a_network():

@@ -342,4 +342,6 @@ def test_load_passes_its_settings_on(saved, make_artifact):
             ("monitor", "KEYWORD_ONLY", False),
             ("tracking", "KEYWORD_ONLY", None),
             ("compiled", "KEYWORD_ONLY", None),
+            ("gate", "KEYWORD_ONLY", None),
+            ("delay", "KEYWORD_ONLY", 0),
         ]

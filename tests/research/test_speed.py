@@ -40,7 +40,7 @@ def test_the_table_of_torch_has_a_row_for_each_observer_and_the_memory(capsys):
     assert [(line[0], line[1], len(line)) for line in lines] == [
         (name, "128", 5) for name in ("reverse_duffing", "van_der_pol", "rossler", "lorenz", "memory")
     ]
-    assert min(float(each) for line in lines for each in line[2:]) > 0
+    assert min(float(each) for line in lines for each in line[2:] if each != "–") > 0
     assert capsys.readouterr().out.count("| lorenz | 128 |") == 1
     with pytest.raises(ValueError, match="rows at least 128, got 3 and"):
         TorchSpeed(rows=(4,)).run(Console())

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -14,7 +15,7 @@ from observers import Artifact, shipped
 from observers.names import resolve
 from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
-from training.trajectories.parameters import EVERY
+from training.trajectories.parameters import EVERY, with_bias
 from training.trajectories.policies import Controller
 
 Pairs = tuple[tuple[str, Any], ...]  # of the words NAME=VALUE behind an option
@@ -235,4 +236,5 @@ def system_of(artifact: Artifact, given: str | None) -> System:
     if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
         base = base.replace(artifact.parameters)
     artifact.check(base.name, base.parameters, dt=artifact.filter.dt, ny=base.ny, nu=base.nu)
-    return base
+    bias = artifact.training.get("bias", 0.0)
+    return with_bias(base, bias) if np.any(bias) else base

@@ -71,7 +71,7 @@ def held_out(source: Source) -> Runs | None:
 def state_names(source: Source, artifact: Artifact) -> tuple[str, ...]:
     """Names of the states."""
     if isinstance(source, SimulatedSource):
-        return source.system.state_names
+        return source.model.state_names
     return tuple((artifact.signals or {})["hidden"])
 
 

@@ -29,7 +29,14 @@ from training.trajectories.motions import (
     trajectories,
     under_policy,
 )
-from training.trajectories.parameters import blind, nominal_share, relative_ranges, uncertain_plant, with_parameters
+from training.trajectories.parameters import (
+    blind,
+    nominal_share,
+    relative_ranges,
+    uncertain_plant,
+    with_bias,
+    with_parameters,
+)
 from training.trajectories.policies import Controller, policy_fingerprint
 
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
@@ -61,12 +68,17 @@ class SimulatedSource:
     """
 
     def __init__(self, system: System, config: Config) -> None:
-        self.system, self.config = system, config
+        self.config, self.system = config, system
+        policy = None if config.policy is None else named_policy(system, config.policy)
+        if np.any(config.bias):
+            policy = policy and blind(policy, system.nx)
+            system = with_bias(system, config.bias)
+        self.model = system
         self.ranges = relative_ranges(system, config.uncertain)
         self.plant = uncertain_plant(system, self.ranges)
         self.estimated = tuple(self.ranges) if config.estimate_parameters else ()
-        self.policy = None if config.policy is None else named_policy(system, config.policy)
-        self.name = system.name
+        self.policy = policy
+        self.name = self.system.name
         self.nx, self.ny, self.dt, self.pace = system.nx, system.ny, config.dt, system.pace
         aware = config.pipeline == "input-aware"
         self.nu = system.nu if aware and config.inputs else 0
@@ -85,15 +97,15 @@ class SimulatedSource:
         if self.ranges:
             identity["nominal_share"] = nominal_share(self.ranges)
         if self.policy:
-            identity["policy_actions"] = policy_fingerprint(self.policy, system)
+            identity["policy_actions"] = policy_fingerprint(self.policy, self.model)
         return identity
 
     def facts(self) -> dict[str, Any]:
         """Arguments of :class:`observers.Artifact`."""
-        system = self.system
+        system = self.model
         return {
-            "system": system.name,
-            "parameters": system.parameters,
+            "system": self.name,
+            "parameters": self.system.parameters,
             "measurement_noise": system.measurement_noise,
             "parameter_ranges": self.ranges,
             "estimated_parameters": self.estimated,
@@ -103,7 +115,7 @@ class SimulatedSource:
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
         """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""
         return {
-            "measurement_noise": self.system.measurement_noise,
+            "measurement_noise": self.model.measurement_noise,
             "process_noise_max": self.process_noise,
             "parameters": len(self.estimated),
         }
@@ -133,14 +145,14 @@ class SimulatedSource:
         """Pairs without the parameters that are not to be estimated, and whether these are the system's own."""
         nominal = None
         if self.ranges:
-            own = [self.system.parameters[name] for name in self.ranges]
+            own = [self.model.parameters[name] for name in self.ranges]
             nominal = (pairs.x[0, :, self.nx :] == own).all(-1)
         return replace(pairs, x=pairs.x[..., : self.nx + len(self.estimated)], nominal=nominal)
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
         """Motions with the system's process noise, and as many without; of each a third from 2X, the others from X."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed), max(1, round(RUN * self.pace / self.dt))
-        plant, levels = with_parameters(self.system, self.ranges), sorted({0.0, self.process_noise})
+        plant, levels = with_parameters(self.model, self.ranges), sorted({0.0, self.process_noise})
         parts = list[tuple[np.ndarray, ...]]()
 
         def part(done: float) -> None:
@@ -166,11 +178,11 @@ class SimulatedSource:
 
     def equations(self) -> Equations:
         """The system's equations as an expression, with as many Runge-Kutta steps as its motions need."""
-        field = field_expression(self.system, inputs=bool(self.nu))
-        if self.system.discrete:
+        field = field_expression(self.model, inputs=bool(self.nu))
+        if self.model.discrete:
             return Equations(field, 0)
         x, u = self._states(4)
-        later = simulate(self.system, x, 1, self.dt, u=u[None] if self.system.nu else None)[-1]
+        later = simulate(self.model, x, 1, self.dt, u=u[None] if self.model.nu else None)[-1]
         inside = np.isfinite(later).all(-1)
         for substeps in (2**i for i in range(SUBSTEPS.bit_length())):
             equations = Equations(field, substeps)
@@ -192,10 +204,10 @@ class SimulatedSource:
         rows = rng.integers(len(along), size=INCREMENTS)
         smallest, largest = np.log(DEVIATIONS)
         size = np.exp(rng.uniform(smallest, largest, (INCREMENTS, 1)))
-        low, high = np.array(self.system.bounds, dtype=float).T
+        low, high = np.array(self.model.bounds, dtype=float).T
         x = np.clip(along[rows] + size * self._scale[1] * rng.standard_normal((INCREMENTS, self.nx)), low, high)
         u = np.where(rng.random((INCREMENTS, 1)) < 0.5, 0.0, u[rows]) if self.nu else np.zeros((INCREMENTS, 0))
-        later = simulate(self.system, x, 1, self.dt, u=u[None] if self.nu else None)[-1]
+        later = simulate(self.model, x, 1, self.dt, u=u[None] if self.nu else None)[-1]
         inside = np.isfinite(later).all(-1)
         both = Increments(x[inside], u[inside], (later - x)[inside])
         held = round(JUDGED * len(both.x))
@@ -207,7 +219,7 @@ class SimulatedSource:
 
     def tracking(self) -> dict[str, Any]:
         """Arguments of :class:`observers.Motion` beside equations or flow; ValueError where nothing can track."""
-        system = self.system
+        system = self.model
         if self.ranges:
             raise ValueError(f"a motion is of one plant, not of a range of {', '.join(self.ranges)}")
         if output_matrix(system) is None:
@@ -241,11 +253,11 @@ class SimulatedSource:
         """States (n, nx) along short motions from X and 2X, and inputs (n, nu)."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed, 6), max(1, round(seconds * self.pace / self.dt))
         motions = Motions(kinds=KINDS if self.nu else (), box_factor=BEYOND, policy=self.policy)
-        chunks = trajectories(self.system, n=100, steps=steps, dt=self.dt, rng=rng, motions=motions)
+        chunks = trajectories(self.model, n=100, steps=steps, dt=self.dt, rng=rng, motions=motions)
         every = max(1, steps // 500)
         xs, us = zip(*((x[:-1:every], u[::every]) for x, u, _ in chunks), strict=True)
         x, u = np.concatenate(xs, 1).reshape(-1, self.nx), np.concatenate(us, 1)
-        return x, u.reshape(-1, self.system.nu) if self.nu else np.zeros((len(x), self.system.nu))
+        return x, u.reshape(-1, self.model.nu) if self.nu else np.zeros((len(x), self.model.nu))
 
 
 def sound_motions(

@@ -1,5 +1,6 @@
 """A system's parameters as further states, which do not move."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -136,6 +137,28 @@ def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False
                     return [*input_matrix(model(x), x[:nx]), *still]
 
     return WithParameters()
+
+
+def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
+    """A system whose states are x and then a constant bias of each output that may have one, up to its half-width."""
+    widths = np.broadcast_to(np.asarray(half_widths, dtype=float), (system.ny,))
+    ranges = {f"y{i + 1}_bias": (-width, width) for i, width in enumerate(widths.tolist()) if width}
+
+    def h(self: System, x: Components) -> Components:
+        values = type(system).h(self, x)
+        return [value + getattr(self, f"y{i + 1}_bias", 0.0) for i, value in enumerate(values)]
+
+    biased: System = object.__new__(
+        dataclasses.make_dataclass(
+            "Biased",
+            [(name, float, 0.0) for name in ranges],
+            bases=(type(system),),
+            namespace={"name": f"{system.name} with a bias", "h": h},
+            frozen=True,
+        )
+    )
+    biased.__dict__.update(vars(system), **dict.fromkeys(ranges, 0.0))
+    return with_parameters(biased, ranges)
 
 
 def blind(policy: Controller, nx: int) -> Controller:

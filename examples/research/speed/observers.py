@@ -9,8 +9,8 @@ import numpy as np
 from kkl_gym.simulate import advance, simulate
 from kkl_gym.system import System
 from observers import Artifact, InverseMap, KKLObserver
-from observers.compiled import available
 from observers.estimator import Running
+from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
 from training.trajectories.equations import jacobian

@@ -45,16 +45,16 @@ class TorchSpeed:
         if self.turns < 1 or not self.rows or min(self.rows) < MANY_ROWS:
             raise ValueError(f"turns must be positive, rows at least {MANY_ROWS}, got {self.turns} and {self.rows}")
         torch.set_num_threads(1)
-        lines = []
+        lines, columns = [], ["NumPy", "Numba", "Torch", *["Torch, compiled"] * self.compile]
         for name in (*kkl_gym.SYSTEMS, "memory"):
             for rows in self.rows:
                 ways = self._memories(rows) if name == "memory" else self._observers(name, rows)
                 with torch.no_grad():
                     seconds = in_turns({way: task for way, (task, _) in ways.items()}, self.turns)
-                each = [f"{1e6 * np.median(seconds[way]) / n:.2f}" for way, (_, n) in ways.items()]
-                lines.append([name, f"{rows:,}", *each])
+                each = {way: f"{1e6 * np.median(seconds[way]) / n:.2f}" for way, (_, n) in ways.items()}
+                lines.append([name, f"{rows:,}", *(each.get(column, "–") for column in columns)])
                 console.print(*lines[-1])
-        console.print("\n".join(table(["", "rows", *ways], lines)), soft_wrap=True, markup=False, highlight=False)
+        console.print("\n".join(table(["", "rows", *columns], lines)), soft_wrap=True, markup=False, highlight=False)
         return lines
 
     def _observers(self, name: str, rows: int) -> dict[str, tuple[Task, int]]:
@@ -83,7 +83,7 @@ class TorchSpeed:
         memory.reset(y[0])
         module = TorchMemory(NY, NU, time_constants=TAU, input_time_constants=TAU_U).to(self.device)
         own = self._timed(lambda k: memory.advance(y[k], u))
-        return {"NumPy": (own, rows), "Numba": (own, rows)} | self._modules(module, y, u)
+        return {"NumPy": (own, rows)} | self._modules(module, y, u)
 
     def _modules(self, module: torch.nn.Module, y: np.ndarray, u: np.ndarray) -> dict[str, tuple[Task, int]]:
         rows = y.shape[1]

@@ -5,6 +5,7 @@ import json
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ from small_runs import CPU, toy
 from unstable_system import Falling
 
 import training.lessons.map
+from kkl_gym import KKLObservation, get_system
 from kkl_gym.equations import EquationError
 from kkl_gym.simulate import simulate
 from observers import Artifact, KKLObserver
@@ -352,3 +354,21 @@ def test_states_in_odd_units_and_states_that_stand_still():
     runs = unseen_trajectories(Still(), 0.05, n=20, duration=20.0, seed=0)
     x_hat = KKLObserver(artifact).estimate(runs.x[..., :1] + 5e-8 * np.random.default_rng(0).normal(size=(401, 20, 1)))
     np.testing.assert_allclose((x_hat - runs.x)[200:] / [1e-6, 1e6, 300.0], 0.0, atol=0.2)
+
+
+@pytest.mark.slow
+def test_an_observer_finds_a_constant_bias(tmp_path):
+    system = get_system("van_der_pol")
+    artifact = train(system, preset(system, changes={"bias": 1.0}), tmp_path).artifact
+    assert artifact.nx == 3
+    assert dict(artifact.parameters) == system.parameters
+    artifact.save(tmp_path / "biased.safetensors")
+    env = gym.make("KKLVanDerPol-v0", measurement_noise=0.1, sensor={"bias": 0.7})
+    env = KKLObservation(env, observer=tmp_path / "biased.safetensors")
+    x_hat, info = env.reset(seed=0)
+    assert env.observation_space.shape == x_hat.shape == (3,)
+    errors = []
+    for k in range(2000):
+        x_hat, *_, info = env.step(np.array([np.sin(k / 50)]))
+        errors.append(x_hat - [*info["x"], 0.7])
+    assert np.sqrt(np.mean(np.square(errors[1000:]), 0)).max() < 0.04

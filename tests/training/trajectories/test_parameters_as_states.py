@@ -11,7 +11,7 @@ from linear_system import Oscillator
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from kkl_gym.systems import Lorenz, VanDerPol
-from training.trajectories.parameters import NOMINAL_SHARE, relative_ranges, uncertain_plant, with_parameters
+from training.trajectories.parameters import NOMINAL_SHARE, relative_ranges, uncertain_plant, with_bias, with_parameters
 
 
 @dataclass(frozen=True)
@@ -93,3 +93,14 @@ def test_trainings_have_the_nominal_parameters_or_some_towards_the_ends():
         assert (np.abs(share) < part).mean(0) == pytest.approx(2 * np.arcsin(part) / np.pi, abs=0.02)
     assert np.corrcoef(share.T)[0, 1] == pytest.approx(0, abs=0.03)
     assert uncertain_plant(system, {}) is system
+
+
+def test_a_bias_of_an_output_is_a_state_that_stands_still():
+    system = with_bias(Motor(gain=3.0, offset=0.25), 0.5)
+    assert (system.nx, system.state_names[1:], system.X[1]) == (2, ("y1_bias",), (-0.5, 0.5))
+    x0 = np.array([[0.4, -0.3]])
+    x = simulate(system, x0, 50, 0.1, u=np.full((50, 1, 1), 0.2))
+    np.testing.assert_array_equal(x[..., 1], -0.3)
+    np.testing.assert_allclose(system.output(x)[..., 0], x[..., 0] + 0.25 - 0.3)
+    alone = simulate(Motor(gain=3.0), x0[:, :1], 50, 0.1, u=np.full((50, 1, 1), 0.2))
+    np.testing.assert_allclose(x[..., :1], alone, rtol=1e-12)
