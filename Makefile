@@ -102,7 +102,7 @@ certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 # The one on y is what `kkl-gym agent train van_der_pol --information y` makes, for the picture of two agents side by side.
 agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: an hour and a half on two cores; resumable
 	$(BIN)/python -m examples.research agents
-	$(BIN)/python -m examples.research agents --systems reverse_duffing van_der_pol --information x_hat_std --no-more-noise
+	$(BIN)/python -m examples.research agents reverse_duffing van_der_pol --information x_hat_std --measurement-noise 0.5
 	mkdir -p docs/results/agents training/agents/shipped
 	cp $(addprefix runs/agents/comparison/,results.csv table.md) docs/results/agents
 	for system in $(SYSTEMS); do cp runs/agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
@@ -123,8 +123,8 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 	$(BIN)/python -m examples.research agents InvertedDoublePendulum-v5 --information state x_hat --seeds 10 \
 		--out runs/agents/double-pendulum
 	cp runs/agents/double-pendulum/results.csv docs/results/environments/double-pendulum.csv
-	$(BIN)/python -m examples.research agents Pendulum-v1 --information z stacked --angles 0,1 --time-constants 1 --frames 2 \
-		--no-past-actions --out runs/agents/short
+	$(BIN)/python -m examples.research agents Pendulum-v1 --information z --angles 0,1 --time-constants 1 --no-past-actions \
+		--out runs/agents/short
 	cp runs/agents/short/results.csv docs/results/environments/short.csv
 	$(MAKE) figures
 

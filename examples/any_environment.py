@@ -16,7 +16,7 @@ import tyro
 import training
 from kkl_gym import KKLObservation
 from observers import Artifact
-from training.agents.any_environment.task import MeasurementNoise
+from training.agents.environments import MeasurementNoise
 from training.rollouts import make, roll_out
 from training.sources.recorded import recorded_errors
 

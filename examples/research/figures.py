@@ -18,7 +18,9 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from examples.research.agents.tables import draw_curves, draw_environments, draw_systems
+from examples.research.agents import picture
+from examples.research.agents.comparison import read_results
+from examples.research.agents.tables import draw_curves, draw_scores
 from examples.research.benchmark.results import draw_results as draw_benchmark
 from examples.research.certificates import command as certify
 from examples.research.certificates.settled import record_settled
@@ -28,13 +30,11 @@ from observers import Artifact, load
 from observers.factors import standard_deviations
 from observers.names import resolve
 from observers.storage import replacing, write
-from training.agents import picture
-from training.agents.agent import Agent
+from training.agents.agent import Agent, find
 from training.agents.play import Episodes, play
 from training.agents.seeds import agent_evaluation_seed
-from training.agents.tasks import ControlTask
+from training.agents.tasks import Task
 from training.commands import demo
-from training.commands.agent_files import find
 from training.commands.options import shown
 from training.commands.portraits import animate
 from training.evaluation.errors import estimates as estimates_of
@@ -82,13 +82,14 @@ def portraits(name: str | None = None, duration: float = 12.0) -> Draw:
     return lambda path: animate(path, [episode.motion for episode in episodes])
 
 
-def agents() -> tuple[ControlTask, Mapping[str, Episodes]]:
+def agents() -> tuple[Task, Mapping[str, Episodes]]:
     """The first episode of ``kkl-gym agent evaluate``, of an agent that sees y and of one that sees an estimate."""
     played = {}
     for title, name in AGENTS.items():
-        player = Agent.read(find(name))
-        played[title] = play(player.make(1), player, steps=player.task.steps, seed=agent_evaluation_seed(0, 1))
-    return player.task, played
+        agent = Agent.read(find(name))
+        env = agent.make()
+        played[title] = play(env, agent.policy(env.single_action_space), seed=agent_evaluation_seed(0, 1))
+    return agent.task, played
 
 
 def agents_moving() -> Draw:
@@ -100,7 +101,7 @@ def agents_moving() -> Draw:
 def agents_over_time() -> Draw:
     """States, outputs and inputs of both agents."""
     task, played = agents()
-    return lambda path: picture.draw_agents(task, played, path)
+    return lambda path: picture.draw(task, played, path)
 
 
 def certificate(name: str, trajectories: int = 200) -> Draw:
@@ -279,10 +280,8 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "results/certificates/rossler-spinn.png": partial(certificate, "rossler-spinn"),
     "results/benchmark/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "benchmark"),
     "results/ablation/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "ablation"),
-    "results/agents/scores.png": lambda: partial(draw_systems, RESULTS / "agents"),
-    "results/environments/scores.png": lambda: partial(
-        draw_environments, results=pd.read_csv(RESULTS / "environments" / "results.csv")
-    ),
+    "results/agents/scores.png": lambda: partial(draw_scores, results=read_results(RESULTS / "agents")),
+    "results/environments/scores.png": lambda: partial(draw_scores, results=read_results(RESULTS / "environments")),
     "results/environments/curves.png": lambda: partial(
         draw_curves, learned=pd.read_csv(RESULTS / "environments" / "curves.csv")
     ),

@@ -5,12 +5,11 @@ import pytest
 
 from observers import Artifact, ArtifactError, shipped
 from observers.names import resolve
-from training.agents.agent import Agent, AgentError
-from training.commands.agent import find
-from training.systems import PROFILES
+from training.agents.agent import Agent, AgentError, find
+from training.agents.tasks import TASKS
 
 FILES = [(resolve(name), Artifact, ArtifactError) for name in shipped()]
-FILES += [(find(name), Agent, AgentError) for name in PROFILES]
+FILES += [(find(name), Agent, AgentError) for name in TASKS]
 
 
 def flip(content, rng):

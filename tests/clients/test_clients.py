@@ -44,6 +44,7 @@ def test_rl_zoo3(algorithm, env_id, row, tmp_path, monkeypatch):
     from stable_baselines3 import PPO, SAC
 
     from training.agents.sb3_files import from_sb3
+    from training.agents.tasks import TASKS
 
     steps = 8192 if algorithm == "ppo" else 2400
     row("rl-zoo3", version("rl_zoo3"), f"{algorithm} on {env_id}", steps)
@@ -57,9 +58,11 @@ def test_rl_zoo3(algorithm, env_id, row, tmp_path, monkeypatch):
     agent = made.load(tmp_path / algorithm / f"{env_id}_1" / f"{env_id}.zip", device="cpu")
     assert agent.num_timesteps == steps
     name = next(name for name in ENV_IDS if ENV_IDS[name] == env_id)
-    ours = from_sb3(tmp_path / algorithm / f"{env_id}_1" / f"{env_id}.zip", name)  # that it fits, among other things
-    obs = np.random.default_rng(0).normal(size=(20, ours.network.inputs)).astype(np.float32)
-    np.testing.assert_allclose(ours(obs), agent.predict(obs, deterministic=True)[0], atol=1e-5)
+    path = tmp_path / algorithm / f"{env_id}_1" / f"{env_id}.zip"
+    ours = from_sb3(path, TASKS[name])  # that it fits, among other things
+    obs = np.random.default_rng(0).normal(size=(20, ours.inputs)).astype(np.float32)
+    actions = ours.policy(agent.action_space)(obs)
+    np.testing.assert_allclose(actions, agent.predict(obs, deterministic=True)[0], atol=1e-5)
 
 
 # Gymnasium 1 asks for an argument that files of CleanRL leave out, also on Gymnasium's own environments.

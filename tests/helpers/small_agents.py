@@ -1,6 +1,6 @@
-"""Settings with which agents in any environment, and their observers, are learned in no time, and badly."""
+"""Settings with which agents and their observers are learned in no time, and badly."""
 
-from training.agents.any_environment import learning, observing
+from training.agents import learning, observing
 from training.lessons import calibrate
 from training.sources import recorded
 
@@ -9,8 +9,10 @@ PPO = {**NET, "n_envs": 2, "n_steps": 16, "batch_size": 16}
 OFF_POLICY = {**NET, "learning_starts": 32}
 SETTINGS = {
     "ppo": {**PPO, "normalize": True},
+    "a2c": {**NET, "n_envs": 2, "n_steps": 16},
     "dqn": OFF_POLICY,
     "sac": OFF_POLICY,
+    "tqc": OFF_POLICY,
     "td3": {**OFF_POLICY, "noise_type": "normal", "noise_std": 0.1},
     "ppo_lstm": {**PPO, "policy": "MlpLstmPolicy"},
 }

@@ -4,48 +4,50 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 from commands import research
+from PIL import Image
 
-from examples.research.agents import environment_agents, system_agents
+from examples.research.agents import comparison, picture
+from examples.research.agents.comparison import KINDS, ComparedAgent, read_results
+from examples.research.agents.filtered import kalman_filters, show_filtered
 from examples.research.agents.statistics import interval, middle, normalised
-from examples.research.agents.tables import report_systems, write_environments
-from examples.research.agents.window import Stacks, WindowEstimator, learn_window, show_window
-from training.agents.any_environment.information import Stacked, part_of
-from training.agents.any_environment.learning import hyperparameters, settings_of
-from training.agents.any_environment.observing import SETTINGS, wander
-from training.agents.any_environment.task import HIDDEN_VELOCITIES
+from examples.research.agents.tables import write_table
+from examples.research.agents.window import Stacks, WindowObservation, learn_window, read
+from observers import MLP
+from training import figures
+from training.agents.agent import Agent, find
+from training.agents.environments import single
+from training.agents.observing import SETTINGS, wander
+from training.agents.play import play
+from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, control_task
 from training.progress import progress_bars
-from training.rollouts.playing import Recorder
 
 PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
 
 
 def test_agents_on_a_system_are_compared_and_not_trained_again(tmp_path):
-    common = ("agents", "--systems", "lorenz", "--seeds", "1", "--timesteps", "1", "--no-more-noise", "--jobs", "1")
+    common = ("agents", "lorenz", "--seeds", "1", "--timesteps", "1", "--measurement-noise", "0.5", "--jobs", "1")
     common += ("--out", str(tmp_path))
-    research(*common, "--episodes", "2", "--information", "state", "y")
+    research(*common, "--episodes", "2", "--information", "state", "ekf")
     results = pd.read_csv(tmp_path / "results.csv")
-    assert results[["system", "noise", "knows", "seed"]].to_numpy().tolist() == [
-        ["lorenz", 0.5, "state", 0],
-        ["lorenz", 0.5, "y", 0],
+    assert results[["environment", "noise", "shown", "seed"]].to_numpy().tolist() == [
+        ["lorenz", 0.5, kind, 0] for kind in ("random", "state", "ekf")
     ]
-    assert ((results.score <= 0) & (results.idle < 0)).all()
-    assert "Partial: 206 of 208 agents are missing" in (tmp_path / "table.md").read_text()
+    assert (results["return"] < 0).all()
     assert (tmp_path / "scores.png").stat().st_size > 1000
     files = {path: path.stat().st_mtime_ns for path in tmp_path.glob("jobs/*/state/0/*")}
-    shutil.rmtree(tmp_path / "jobs" / "lorenz-0.5" / "y")
-    research(*common, "--episodes", "2", "--information", "y")
+    shutil.rmtree(tmp_path / "jobs" / "lorenz-0.5" / "ekf")
+    research(*common, "--episodes", "2", "--information", "ekf")
     again = pd.read_csv(tmp_path / "results.csv")
     assert again.drop(columns="seconds").equals(results.drop(columns="seconds"))  # all is seeded
     assert {path: path.stat().st_mtime_ns for path in files} == files
     with pytest.raises(SystemExit, match="of another comparison: episodes = 2 there, 3 here"):
-        research(*common, "--episodes", "3", "--information", "y")
+        research(*common, "--episodes", "3", "--information", "ekf")
 
 
 def test_agents_in_an_environment_are_compared_beside_earlier_ones(tmp_path, monkeypatch):
@@ -58,20 +60,21 @@ def test_agents_in_an_environment_are_compared_beside_earlier_ones(tmp_path, mon
     }
     for name, rows in kept.items():
         replaced = rows[-1].replace("Ball", "CartPole").replace("v0", "v1")
-        (earlier / name).write_text("\n".join([",".join(environment_agents.COLUMNS[name]), replaced, *rows]) + "\n")
+        columns = [column for column in comparison.COLUMNS[name] if column != "success"]
+        (earlier / name).write_text("\n".join([",".join(columns), replaced, *rows]) + "\n")
     common = ("agents", "CartPole-v1", "--seeds", "1", "--episodes", "2", "--timesteps", "600", "--aggregate", "1")
     common += ("--jobs", "1", "--frames", "4", "--out", str(tmp_path / "out"), "--beside", str(earlier))
-    kinds = ["state", "x_hat", "stacked_x_hat", "y"]
+    kinds = ["state", "stacked_x_hat", "y"]
     research(*common, "--information", *kinds)
     results, curves = (pd.read_csv(tmp_path / "out" / name) for name in kept)
     assert list(results.shown) == ["random", "state", "y", "random", *kinds]
-    assert list(results.environment) == ["Ball-v0"] * 3 + ["CartPole-v1"] * 5
+    assert list(results.environment) == ["Ball-v0"] * 3 + ["CartPole-v1"] * 4
     assert set(curves[curves.environment == "CartPole-v1"].shown) == set(kinds)
     for name, rows in kept.items():
         assert (tmp_path / "out" / name).read_text().splitlines()[1 : 1 + len(rows)] == rows
     table = (tmp_path / "out" / "table.md").read_text()
-    assert "| Ball-v0 | 11.25 (1.00), 1 | – | – | 6 (0.49), 1 | 1 |" in table
-    assert "Agents on z and on stacked observations: `frames` 4." in table
+    assert "| Ball-v0 | 11.25 (1.00), 1 | – | 6 (0.49), 1 | 1 |" in table
+    assert "Agents on z, traces and stacked observations: `frames` 4." in table
     for name in ("scores.png", "curves.png"):
         assert (tmp_path / "out" / name).stat().st_size > 1000
     (earlier / "results.csv").write_text("environment,steps\n")
@@ -82,14 +85,13 @@ def test_agents_in_an_environment_are_compared_beside_earlier_ones(tmp_path, mon
 def test_impossible_comparisons(tmp_path):
     for wrong, message in (
         ("--seeds 0", "must be positive"),
-        ("--systems lorenz lorenz", "give some systems, each once"),
-        ("--information stacked_x_hat", "compared by state"),
-        ("CartPole-v1 --information ekf", "compared by state"),
-        ("--beside runs", "--beside is for environments"),
-        ("--frames 2", "--frames: this is for agents in an environment"),
-        ("--systems lorenz --observers rossler", "the observer rossler is for rossler"),
-        ("--systems lorenz --observers lorenz-spinn", "takes in no inputs"),
-        ("--systems mine.py:Mine", "no file mine.py"),
+        ("lorenz lorenz", "give some names, each once"),
+        ("lorenz CartPole-v1", "on systems or in environments"),
+        ("lorenz --information stacked_x_hat", "are not compared by stacked_x_hat"),
+        ("CartPole-v1 --information ekf", "are not compared by ekf"),
+        ("lorenz --observers rossler", "the observer rossler is for rossler"),
+        ("lorenz --observers lorenz-spinn", "takes in no inputs"),
+        ("mine.py:Mine", "no file mine.py"),
     ):
         with pytest.raises(SystemExit, match=message):
             research("agents", *wrong.split(), "--out", str(tmp_path))
@@ -97,35 +99,32 @@ def test_impossible_comparisons(tmp_path):
 
 
 def test_planned_agents():
-    agents = system_agents.planned(Path())
-    assert len({agent.folder for agent in agents}) == len(agents) == 6 * 6 * 5 + 4 * 2 * 3 + 2 * 2
-    assert {agent.information for agent in agents} == set(system_agents.USUAL_KINDS)
+    how = {"episodes": 2, "timesteps": None, "aggregate": 0}
+    tasks = [TASKS["lorenz"], replace(TASKS["lorenz"], measurement_noise=2.0)]
+    agents = comparison.planned(tasks, Path(), **how)
+    assert len({agent.folder for agent in agents}) == len(agents) == 2 + 2 * 6 * 5 + 2 * 3 + 2 * 1
     tasks = [replace(PENDULUM, measurement_noise=level) for level in (0.1, 0.3)]
-    names = [agent.name for agent in environment_agents.planned(tasks, Path(), kinds=("state", "y"), seeds=2)]
+    names = [agent.name for agent in comparison.planned(tasks, Path(), kinds=("state", "y"), seeds=2, **how)]
     assert len(names) == 7  # levels of noise share the agents on the state
-    assert [name for name in names if "state" in name] == ["Pendulum-v1/state/0", "Pendulum-v1/state/1"]
-    for env_id in ("CartPole-v1", "Pendulum-v1", "LunarLander-v3", "HalfCheetah-v5"):  # all learn from as many steps
-        algorithms = ("ppo_lstm", "sac" if env_id in settings_of("sac") else "ppo")
-        assert len({hyperparameters(name, env_id)["n_timesteps"] for name in algorithms}) == 1
+    assert [name for name in names if "state" in name] == [f"Pendulum-v1 at noise 0/state/{seed}" for seed in (0, 1)]
 
 
 def test_settings_of_memories_and_stacks_concern_those_agents_alone():
     def differ(changed):
         how = {"seed": 0, "episodes": 2, "timesteps": None, "aggregate": 0, "folder": Path()}
-        agents = {kind: [environment_agents.EnvironmentAgent(task, kind, **how) for task in (PENDULUM, changed)]
-                  for kind in ("random", *environment_agents.KINDS)}  # fmt: skip
+        agents = {kind: [ComparedAgent(task, kind, **how) for task in (PENDULUM, changed)]
+                  for kind in ("random", *KINDS)}  # fmt: skip
         return {kind for kind, (one, other) in agents.items() if one.identity != other.identity}
 
-    assert differ(replace(PENDULUM, time_constants=(1, 2, 4), frames=9)) == {"z", "stacked", "stacked_x_hat"}
-    assert differ(replace(PENDULUM, angles=((0, 1),), past_actions=False)) == {"z", "stacked"}
+    changed = replace(PENDULUM, time_constants=(1, 2, 4), frames=9)
+    assert differ(changed) == {"z", "traces", "stacked", "stacked_x_hat"}
+    assert differ(replace(PENDULUM, angles=((0, 1),), past_actions=False)) == {"z", "traces", "stacked"}
 
 
-def test_the_published_tables_follow_from_the_published_results(tmp_path):
-    shutil.copy(PUBLISHED / "agents" / "results.csv", tmp_path)
-    report_systems(tmp_path)
-    assert (tmp_path / "table.md").read_text() == (PUBLISHED / "agents" / "table.md").read_text()
-    write_environments(tmp_path / "table.md", pd.read_csv(PUBLISHED / "environments" / "results.csv"))
-    assert (tmp_path / "table.md").read_text() == (PUBLISHED / "environments" / "table.md").read_text()
+@pytest.mark.parametrize("name", ["agents", "environments"])
+def test_the_published_tables_follow_from_the_published_results(name, tmp_path):
+    write_table(tmp_path / "table.md", read_results(PUBLISHED / name))
+    assert (tmp_path / "table.md").read_text() == (PUBLISHED / name / "table.md").read_text()
 
 
 def test_statistics_by_hand():
@@ -145,17 +144,21 @@ def test_statistics_by_hand():
 
 @pytest.mark.parametrize("task", [PENDULUM, CART], ids=["pendulum", "cart"])
 def test_the_rival_is_fitted_to_the_stacks_that_it_will_see(task):
-    whole = task.make()
-    recorder = Recorder(whole, **task.signals(whole.observation_space.shape[0]))
-    env = gym.wrappers.Autoreset(Stacked(part_of(recorder, task.measured), 5))
-    env.action_space.seed(0)
-    seen = [env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(450))]
-    records = recorder.rollouts().records()
+    task, seen = replace(task, frames=5), []
+    env = WindowObservation(task, 1, MLP([np.eye(1)], [np.zeros(1)], "tanh"))
+    inside = env.env
+    inside.action_space.seed(0)
+    obs, _ = inside.reset(seed=0)
+    seen.append(obs[0])
+    for _ in range(450):
+        obs, *_, info = inside.step(inside.action_space.sample())
+        seen += [row for row in info.get("final_obs", []) if row is not None] + [obs[0]]
+    records = env.recorders[0].rollouts().records()
     states = np.concatenate([record.x for record in records])
-    stacks = Stacks(replace(task, frames=5), records)
+    stacks = Stacks(task, records)
     batch = stacks(torch.Generator().manual_seed(0))
     inputs = batch.inputs.numpy() * stacks.scale + stacks.mean
-    apart = np.abs(inputs[:, None] - np.array(seen)).max(-1)
+    apart = np.abs(inputs[:, None] - np.array(seen)[: len(states)]).max(-1)
     here = apart.argmin(1)
     np.testing.assert_allclose(apart.min(1), 0.0, atol=1e-5)
     np.testing.assert_allclose(batch.x.numpy() * stacks.x_scale + stacks.x_mean, states[here], atol=1e-5)
@@ -169,13 +172,57 @@ def test_the_rival_estimates_hidden_signals(noise, tmp_path):
     task = replace(PENDULUM, measurement_noise=noise)
     with progress_bars(None) as bars:
         path = learn_window(task, wander(task, 5000, seed=0, progress=bars), tmp_path, seed=0, progress=bars)
-    env, plain = show_window(task, path), PENDULUM.make()
-    seen, exact = [env.reset(seed=7)[0]], [plain.reset(seed=7)[0]]
+    env, plain = WindowObservation(task, 1, read(path)), single(PENDULUM)
+    seen, exact = [env.reset(seed=7)[0][0]], [plain.reset(seed=7)[0]]
     for _ in range(150):
         action = env.action_space.sample()
-        seen.append(env.step(action)[0])
-        exact.append(plain.step(action)[0])
+        seen.append(env.step(action)[0][0])
+        exact.append(plain.step(action[0])[0])
     apart = np.std(np.subtract(seen, exact)[8:], 0) / np.std(exact, 0)
     assert (apart[:2] < (0.25 if noise else 1e-6)).all()
     assert apart[2] < (0.5 if noise else 0.1)
-    assert WindowEstimator.read(path).network.inputs == 8 * 3
+
+
+def test_kalman_filters_that_know_the_input_follow_a_driven_state():
+    env = show_filtered(control_task("van_der_pol", 0.1, period=0.01, duration=5.0), "x_hat", 3, None)
+    env.reset(seed=0)
+    errors = []
+    for action in np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3, 1)):
+        *_, info = env.step(action)
+        errors.append(np.abs(info["x_hat"] - info["x"]).max())
+    assert max(errors[200:]) < 0.1 < errors[0]
+    y, unknown = np.ones((3, 1)), np.full((3, 2), np.nan)  # states, at which they are not to look
+    filters, rows = kalman_filters(env.unwrapped), np.array([True, False, False])
+    filters.reset(y, unknown)
+    first = filters.report()["x_hat"]
+    filters.advance(-y, np.zeros((3, 1)))
+    assert (filters.report()["x_hat"] != first).any(1).all()
+    filters.restart(y[:1], rows, unknown[:1])
+    assert ((filters.report()["x_hat"] == first).all(1) == rows).all()
+
+
+def test_pictures_show_states_outputs_and_inputs(tmp_path, monkeypatch):
+    """Each in a row; nothing of the legend is cut off."""
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda path, figure: drawn.append(figure))
+    agent = Agent.read(find("van_der_pol"))
+    task = replace(agent.task, env_kwargs={**agent.task.env_kwargs, "max_episode_steps": 50})
+    env = replace(agent, task=task).make()
+    episodes = play(env, agent.policy(env.single_action_space), seed=0)
+    picture.draw(task, {"one": episodes}, tmp_path / "a.png")
+    (figure,) = drawn
+    assert [ax.get_ylabel() for ax in figure.axes] == ["x1", "x2", "y", "u"]
+    found = [{line.get_label(): line.get_ydata() for line in ax.lines} for ax in figure.axes]
+    for row, label, values in (
+        (0, "state", episodes.x[:, 0, 0]),
+        (1, "estimate", episodes.x_hat[:, 0, 1]),
+        (2, "measured output", episodes.y[:, 0, 0]),
+        (3, "input", episodes.u[:, 0, 0]),
+    ):
+        np.testing.assert_array_equal(found[row][label], values)
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert -10 < box.x0 < box.x1 < figure.bbox.x1 + 10
+    picture.animate(task, {"": episodes}, tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as animation:
+        assert animation.n_frames == task.steps

@@ -2,52 +2,105 @@
 
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, get_args
 
+import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
-from kkl_gym import SYSTEMS, System, get_system
+from kkl_gym import SYSTEMS, get_system
+from kkl_gym.wrappers.vector import VectorEnv
 from observers import MLP, storage
+from observers.checks import choice, shown
 from observers.errors import ArtifactError
-from observers.names import resolve
-from training.agents.information import EKF_PROCESS_NOISE, INFORMATION, OBSERVED, STACKED, Features, Information, make
-from training.agents.tasks import ControlTask
+from observers.names import matching, resolve
+from training.agents.information import ESTIMATED, INFORMATION, Information, make
+from training.agents.tasks import Task
 from training.jobs import describe
 
-FORMAT = 1
-_KEY = "kkl-gym-agent"
+FORMAT = 2
+KEY = "kkl-gym-agent"
+MAX_SCALED = 10.0  # of a normalised observation, as stable-baselines3 clips it
+Head = Literal["tanh", "clip", "argmax"]
 
 
 class AgentError(ValueError):
-    """A file that is no agent, or an agent that does not fit what it is to be played with."""
+    """Raised for invalid or corrupt files of agents, and for agents that do not fit what they are played with."""
+
+
+@dataclass(frozen=True)
+class LSTM:
+    """One layer of long short-term memory, with PyTorch's order of gates.
+
+    Shapes: ``weight`` (4 k, inputs + k), ``bias`` (4 k,); a state is (h, c), each (n, k).
+    """
+
+    weight: np.ndarray
+    bias: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Number of cells, k."""
+        return len(self.bias) // 4
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs."""
+        return self.weight.shape[1] - self.size
+
+    def __call__(self, x: np.ndarray, state: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Advance a state by the inputs (n, inputs)."""
+        i, f, g, o = np.split(np.concatenate([x, state[0]], axis=1) @ self.weight.T + self.bias, 4, axis=1)
+        c = _sigmoid(f) * state[1] + _sigmoid(i) * np.tanh(g)
+        return _sigmoid(o) * np.tanh(c), c
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)))
 
 
 @dataclass(frozen=True)
 class Agent:
-    """A deterministic policy, the task it was trained on and what it knows of the state."""
+    """A deterministic policy, the task it was trained on and what it sees of it.
+
+    Shapes: ``mean`` and ``scale``, of normalised observations, (inputs,).
+    """
 
     network: MLP
-    squashed: bool
-    task: ControlTask
+    head: Head
+    task: Task
     information: Information
+    mean: np.ndarray | None = None
+    scale: np.ndarray | None = None
+    lstm: LSTM | None = None
     observer: str | None = None
     fingerprint: str | None = None
     rules: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.squashed, bool):
-            raise AgentError(f"squashed must be a bool, got {self.squashed!r}")
-        if self.information not in INFORMATION:
-            raise AgentError(f"an agent knows one of {', '.join(INFORMATION)}, got {self.information!r}")
-        if not isinstance(self.task.system, str):
-            raise AgentError(f"the task's system must be a name, got {self.task.system!r}")
+        for name, known in (("head", get_args(Head)), ("information", INFORMATION)):
+            try:
+                choice(name, getattr(self, name), known)
+            except ValueError as error:
+                raise AgentError(str(error)) from None
         for name in ("observer", "fingerprint"):
             if not isinstance(getattr(self, name), str | None):
                 raise AgentError(f"{name} must be a string, got {getattr(self, name)!r}")
+        if (self.mean is None) != (self.scale is None):
+            raise AgentError(f"mean and scale belong together, {'scale' if self.scale is None else 'mean'} is missing")
+        for name in ("mean", "scale"):
+            values = getattr(self, name)
+            if values is not None and (values.shape != (self.inputs,) or not np.isfinite(values).all()):
+                raise AgentError(f"{name} must be {self.inputs} finite numbers, got {shown(values)}")
+        if self.lstm is not None and (
+            self.lstm.weight.shape != (4 * self.lstm.size, self.inputs + self.lstm.size)
+            or self.lstm.size != self.network.inputs
+        ):
+            raise AgentError(f"the lstm's weight {self.lstm.weight.shape} does not fit its bias and the network")
         for name in ("rules", "training"):
             if not isinstance(getattr(self, name), Mapping):
                 raise AgentError(f"{name} must be a mapping, got {getattr(self, name)!r}")
@@ -56,61 +109,85 @@ class Agent:
 
     @property
     def seed(self) -> int:
-        """Seed of the training; 0 if nobody said."""
+        """Seed of the training, 0 if unknown."""
         return self.training.get("seed", 0)
 
-    def __call__(self, obs: np.ndarray) -> np.ndarray:
-        """Act. Shapes: ``obs`` (n, width); returns (n, nu)."""
-        action = self.network(obs)
-        bounded: np.ndarray = np.tanh(action) if self.squashed else np.clip(action, -1.0, 1.0)
-        return bounded
+    @property
+    def inputs(self) -> int:
+        """Size of the observations that the policy takes."""
+        return self.network.inputs if self.lstm is None else self.lstm.inputs
 
-    def make(
-        self,
-        num_envs: int,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.DISABLED,
-        *,
-        system: str | System | type[System] | None = None,
-    ) -> Features:
-        """Make the environment that the agent was trained in.
+    def policy(self, action_space: gym.Space[Any]) -> Callable[[np.ndarray], Any]:
+        """Return the policy at the beginning of episodes, (n, inputs) to n actions; it remembers if it is recurrent."""
+        space: Any = action_space
+        memory: tuple[np.ndarray, np.ndarray] | None = None
 
-        An agent may come from a stranger's file, and to make a system of a name imports the module or the script that
-        it names. So the name of a system that does not ship does nothing unless the caller says it too.
+        def act(observation: np.ndarray) -> Any:
+            nonlocal memory
+            if self.mean is not None:
+                observation = np.clip((observation - self.mean) / self.scale, -MAX_SCALED, MAX_SCALED)
+            out = np.asarray(observation, dtype=np.float32)
+            if self.lstm is not None:
+                if memory is None:
+                    memory = (np.zeros((len(out), self.lstm.size), np.float32),) * 2
+                memory = self.lstm(out, memory)
+                out = memory[0]
+            out = self.network(out)
+            if isinstance(space, gym.spaces.Discrete):
+                return out.argmax(-1) + int(space.start)
+            low, high = space.low.ravel(), space.high.ravel()
+            if self.head == "tanh":
+                out = (low + high) / 2 + (high - low) / 2 * np.tanh(out)
+            return np.clip(out, low, high).reshape(*out.shape[:-1], *space.shape)
+
+        return act
+
+    def make(self, num_envs: int = 1, *, trusted: str | None = None, observer: str | None = None) -> VectorEnv:
+        """Make the environment that the agent was trained in; ``observer`` is where its observer lies now.
+
+        An agent may come from a stranger's file, and to make an environment may import the module or script that it
+        names. So one that is neither Gymnasium's nor a shipped system's is made only if the caller names it too.
         """
-        task = self.task
-        if not isinstance(system, str | None):
-            task = replace(task, system=get_system(system))
-        elif system not in (None, task.system) or (system is None and task.system not in SYSTEMS):
+        named = self.task.system or self.task.env_id
+        spec = gym.registry.get(named)
+        harmless = named in SYSTEMS or (spec is not None and str(spec.entry_point).startswith("gymnasium.envs."))
+        if trusted != named and (trusted is not None or not harmless):
             raise AgentError(
-                f"the agent's system is {task.system!r}, and system={system!r}: give system={task.system!r} if you "
-                "trust the agent's file with what that imports, or give the class"
+                f"the agent's environment is {named!r}, and {trusted!r} is trusted: trust {named!r} if you trust the "
+                "agent's file with what that imports"
             )
-        if self.information in OBSERVED and self.observer is None:
-            raise AgentError(f"an agent that knows {self.information} must name its observer")
-        if self.observer is not None and fingerprint(self.observer) != self.fingerprint:
-            raise AgentError(
-                f"the observer {self.observer!r} is not the one that the agent was trained on: its file has changed"
-            )
-        now = rules(task)
+        if self.information in ESTIMATED and self.observer is None:
+            raise AgentError(f"an agent that sees {self.information} must name its observer")
+        observer = observer or self.observer
+        if observer is not None and fingerprint(observer) != self.fingerprint:
+            raise AgentError(f"the agent was trained on another observer than what is in {observer!r} now")
+        now = rules(self.task)
         for name in now:
             if self.rules.get(name) != now[name]:
                 raise AgentError(f"the agent was trained with {name} = {self.rules.get(name)}; it is {now[name]} now")
-        env = make(task, self.information, num_envs, autoreset_mode=autoreset_mode, observer=self.observer)
-        sizes = (env.single_observation_space.shape[0], env.single_action_space.shape[0])  # type: ignore[index]
-        if sizes != (self.network.inputs, self.network.outputs):
+        env = make(self.task, self.information, num_envs, observer=observer)
+        sizes = tuple(map(gym.spaces.flatdim, (env.single_observation_space, env.single_action_space)))
+        if sizes != (self.inputs, self.network.outputs):
             raise AgentError(
-                f"the policy has {self.network.inputs} inputs and {self.network.outputs} outputs, the task {sizes}"
+                f"the policy has {self.inputs} inputs and {self.network.outputs} outputs, the environment {sizes[0]} "
+                f"and {sizes[1]}"
             )
+        if isinstance(env.single_action_space, gym.spaces.Discrete) != (self.head == "argmax"):
+            raise AgentError(f"a policy whose head is {self.head} cannot act in {env.single_action_space}")
         return env
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write weights and description to one safetensors file, whole or not at all."""
         tensors: dict[str, np.ndarray] = {}
         storage.put_mlp(tensors, "", self.network)
+        if self.mean is not None and self.scale is not None:
+            tensors |= {"mean": self.mean, "scale": self.scale}
+        if self.lstm is not None:
+            tensors |= {"lstm.weight": self.lstm.weight, "lstm.bias": self.lstm.bias}
         described = {
             "format": FORMAT,
             "activation": self.network.activation,
-            "squashed": self.squashed,
+            "head": self.head,
             "task": asdict(self.task),
             "information": self.information,
             "observer": self.observer,
@@ -118,36 +195,34 @@ class Agent:
             "rules": dict(self.rules),
             "training": dict(self.training),
         }
-        storage.save(path, tensors, key=_KEY, described=described)
+        storage.save(path, tensors, key=KEY, described=described)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> "Agent":
         """Read an agent."""
-        tensors, described = storage.read(path, key=_KEY, error=AgentError, what="an agent")
+        tensors, described = storage.read(path, key=KEY, error=AgentError, what="an agent")
         with storage.explained(path, AgentError):
             if (number := described.pop("format")) != FORMAT:
                 raise AgentError(f"it has format {number!r}, kkl-gym reads {FORMAT}: train the agent again")
-            if unknown := sorted(described.keys() - {"activation", *(entry.name for entry in fields(cls))}):
+            known = {entry.name for entry in fields(cls)} - {"network", "mean", "scale", "lstm"}
+            if unknown := sorted(described.keys() - known - {"activation"}):
                 raise AgentError(f"unknown metadata keys: {', '.join(unknown)}")
             network = storage.get_mlp(tensors, "", described.pop("activation"))
-            task = described.pop("task")
-            if task["start_box"] is not None:
-                task["start_box"] = tuple(tuple(ends) for ends in task["start_box"])
-            if isinstance(task["measurement_noise"], list):
-                task["measurement_noise"] = tuple(task["measurement_noise"])
-            return cls(network=network, task=ControlTask(**task), **described)
+            lstm = LSTM(tensors["lstm.weight"], tensors["lstm.bias"]) if "lstm.weight" in tensors else None
+            task = Task(**described.pop("task"))
+            return cls(network, task=task, mean=tensors.get("mean"), scale=tensors.get("scale"), lstm=lstm, **described)
 
 
-def rules(task: ControlTask) -> dict[str, Any]:
-    """Return what an agent's observations follow from beside its task and observer."""
+def rules(task: Task) -> dict[str, Any]:
+    """Return what the observations of a system follow from beside the task and the observer."""
+    if task.system is None:
+        return {}
     system = get_system(task.system)
     described = {
         "equations": describe(system)["equations"],
         "target": system.target,
         "scale": system.scale,
         "process_noise": system.process_noise,
-        "stacked": STACKED,
-        "ekf_process_noise": EKF_PROCESS_NOISE,
     }
     return dict(json.loads(json.dumps(described)))
 
@@ -158,3 +233,14 @@ def fingerprint(observer: str) -> str:
         return storage.checksum(resolve(observer), ArtifactError)
     except ArtifactError as error:
         raise AgentError(f"the agent's observer cannot be read: {error}") from error
+
+
+def find(name: str) -> Path:
+    """Return the file of an agent that ships, by its name, or of a path that ends in .safetensors."""
+    if name.endswith(".safetensors"):
+        return Path(name)
+    folder = files("training.agents").joinpath("shipped")
+    names = sorted(entry.name.removesuffix(".safetensors") for entry in folder.iterdir())
+    if (known := matching(name, names)) is None:
+        raise AgentError(f"no agent {name!r} ships; there are {', '.join(names)}; a file ends in .safetensors")
+    return Path(str(folder.joinpath(f"{known}.safetensors")))

@@ -47,18 +47,7 @@ class SB3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Reset all rows, with the seeds and options that were set for the next reset.
-
-        Returns
-        -------
-        ndarray or dict
-            First observations of all rows.
-
-        Raises
-        ------
-        ValueError
-            If different options were set for different rows.
-        """
+        """Reset all rows, with the seeds and options that were set for the next reset; returns their observations."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         options = self._options
         self._reset_seeds()
@@ -74,13 +63,7 @@ class SB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all rows.
-
-        Returns
-        -------
-        obs, rewards, done, infos
-            As stable-baselines3 expects them: what ended shows the next episode's first observation.
-        """
+        """Step all rows; where an episode ended, the observation is the next one's first."""
         obs, reward, terminated, truncated, info = self.env.step(self._actions)
         done = terminated | truncated
         infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
@@ -96,30 +79,12 @@ class SB3VecEnv(VecEnv):
         self.env.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Frames of all rows, None where the environment renders nothing."""
+        """Return frames of all rows, None where the environment renders nothing."""
         frames: Any = self.env.render() if self.render_mode == "rgb_array" else None
         return [None] * self.num_envs if frames is None else list(frames)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Look up an attribute of each row: of the vector environment's wrappers, or its own in Sync and Async vectors.
-
-        Parameters
-        ----------
-        attr_name : str
-            Its name.
-        indices : int or iterable of int, optional
-            Rows; by default all.
-
-        Returns
-        -------
-        list
-            One value for each row.
-
-        Raises
-        ------
-        AttributeError
-            If there is none.
-        """
+        """Return an attribute of each row: of the vector environment's wrappers, else of its own environments."""
         rows = list(self._get_indices(indices))
         owner = self._owner(attr_name)
         if owner is not None:
@@ -128,22 +93,7 @@ class SB3VecEnv(VecEnv):
         return [values[row] for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute where :meth:`get_attr` finds it.
-
-        Parameters
-        ----------
-        attr_name : str
-            Its name.
-        value : object
-            The same for all rows.
-        indices : int or iterable of int, optional
-            Rows; only all together.
-
-        Raises
-        ------
-        ValueError
-            For some rows only.
-        """
+        """Set an attribute of all rows, where :meth:`get_attr` finds it."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("attributes of a vector environment are set for all rows at once")
         owner = self._owner(attr_name)
@@ -153,31 +103,7 @@ class SB3VecEnv(VecEnv):
             self._rows_of("set_attr", attr_name)(attr_name, [value] * self.num_envs)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **options: Any) -> list[Any]:
-        """Call a method of each row in Sync and Async vectors.
-
-        Parameters
-        ----------
-        method_name : str
-            Its name.
-        *args
-            Passed on.
-        indices : int or iterable of int, optional
-            Rows; only all together.
-        **options
-            Passed on.
-
-        Returns
-        -------
-        list
-            What each row's method returns.
-
-        Raises
-        ------
-        AttributeError
-            For other vectors, whose rows are no environments.
-        ValueError
-            For some rows only.
-        """
+        """Call a method of all rows' environments, which Sync and Async vectors have, and return the results."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("methods of a vector environment's rows are called in all rows at once")
         return list(self._rows_of("call", method_name)(method_name, *args, **options))
@@ -197,28 +123,15 @@ class SB3VecEnv(VecEnv):
         return getattr(self.env.unwrapped, how)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Whether a wrapper of this class is around the vector environment.
-
-        Parameters
-        ----------
-        wrapper_class : type
-            The class.
-        indices : int or iterable of int, optional
-            Rows; by default all.
-
-        Returns
-        -------
-        list of bool
-            The same for each row.
-        """
+        """Return for each row whether a wrapper of this class is around the vector environment."""
         env: Any = self.env
-        while not (found := isinstance(env, wrapper_class)) and hasattr(env, "env"):
+        while not (wrapped := isinstance(env, wrapper_class)) and hasattr(env, "env"):
             env = env.env
-        return [found for _ in self._get_indices(indices)]
+        return [wrapped for _ in self._get_indices(indices)]
 
 
 def _row(info: dict[str, Any], row: int, keys: Sequence[str]) -> dict[str, Any]:
-    """What ``info`` reports of a row; environments need not say for which rows they report a key."""
+    """The part of ``info`` that belongs to a row; environments need not say for which rows they report a key."""
     out = {}
     for key in keys:
         if key in info and (f"_{key}" not in info or info[f"_{key}"][row]):
@@ -229,6 +142,3 @@ def _row(info: dict[str, Any], row: int, keys: Sequence[str]) -> dict[str, Any]:
 
 def _keys(info: dict[str, Any]) -> list[str]:
     return [key for key in info if not key.startswith("_") and key not in ("final_obs", "final_info")]
-
-
-__all__ = ["SB3VecEnv"]

@@ -1,49 +1,74 @@
-"""Where an agent's training stands: what stable-baselines3 needs to go on, without its own files, which are pickled."""
+"""Where an agent's training stands, without stable-baselines3's own files, which are pickled."""
 
+import csv
 import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import CSVOutputFormat
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 
+from observers.storage import replacing
 from training import checkpoints
+from training.records import Record
 
-CURVE = "progress.csv"  # the learning curve, as stable-baselines3 calls it
-_STORED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")  # in SAC's replay buffer
+CURVE = "curve.csv"
+_STORED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")  # in replay buffers
+_ARRAYS = ("t", "y", "u", "x")  # of a record
 
 
 class Checkpoint(BaseCallback):
-    """Writes a checkpoint now and then, between two rollouts, and at the end.
+    """Writes a checkpoint and the learning curve now and then, between two rollouts, and at the end.
 
-    It holds networks, optimisers, counters, the learning curve and SAC's replay buffer. It holds neither the
-    environments nor random generators: a training that goes on begins new episodes, with random numbers of its own.
+    A checkpoint holds networks, optimisers, counters, the scaling of observations, the replay buffer, the learning
+    curve and the steps from which an observer is learned. It holds neither the environments nor random generators: a
+    training that goes on begins new episodes, with random numbers of its own. The learning curve has a row for each
+    episode: steps, CPU seconds and return.
     """
 
-    def __init__(self, path: Path, fingerprint: str) -> None:
+    def __init__(self, path: Path, fingerprint: str, *, resume: bool) -> None:
         super().__init__()
-        self.path, self.fingerprint, self.resumed = path, fingerprint, 0
-        self._curve = path.with_name(CURVE)
+        self.path, self._fingerprint, self._curve_path = path, fingerprint, path.with_name(CURVE)
+        self.resumed = self.restarts = 0
+        self.spent = 0  # steps before those of the algorithm
+        self.privileged = False  # whether the agent sees hidden signals in place of estimates
+        self.records: Callable[[], Sequence[Record]] = list  # those to keep
+        self._curve, self._began = list[tuple[float, ...]](), time.process_time()
+        if not resume:
+            path.unlink(missing_ok=True)
+        self.saved = checkpoints.load(path, fingerprint=fingerprint) if path.exists() else None
 
-    def restore(self, model: BaseAlgorithm, timesteps: int) -> None:
-        """Take up what was saved, if anything was; the learning curve's file is as it was then."""
-        if not self.path.exists():
+    def restore(self, model: BaseAlgorithm, steps: int) -> None:
+        """Take up what was saved, if anything was."""
+        if (saved := self.saved) is None:
             return
-        found = checkpoints.load(self.path, fingerprint=self.fingerprint)
         with checkpoints.restoring(self.path):
-            model.set_parameters(found["parameters"], device="cpu")
-            model.num_timesteps, model._n_updates, model._episode_num = map(int, found["counters"])
-            if isinstance(model, SAC):
-                _restore_buffer(model, found)
-            self.resumed = int(found["resumed"]) + (model.num_timesteps < timesteps)
-            for curve in model.logger.output_formats:
-                if isinstance(curve, CSVOutputFormat) and found["curve"]:
-                    curve.file.write(found["curve"])
-                    curve.file.flush()
-                    curve.keys = found["curve"].partition("\n")[0].split(",")
+            model.set_parameters(saved["parameters"], device="cpu")
+            for name, value in saved["counters"].items():
+                setattr(model, name, int(value))
+            if isinstance(model, OffPolicyAlgorithm):
+                _restore_buffer(model, saved)
+            for name, moments in saved["moments"].items():
+                running = getattr(model.get_vec_normalize_env(), name)
+                running.mean, running.var = (moments[key].numpy() for key in ("mean", "var"))
+                running.count = float(moments["count"])
+            goes_on = model.num_timesteps < steps
+            self.resumed, self.restarts = (int(saved[name]) + goes_on for name in ("resumed", "restarts"))
+            self._curve = [tuple(row) for row in saved["curve"].tolist()]
+            self._began -= self._curve[-1][1] if self._curve else 0.0
+        self.saved = None  # which may be large
+
+    def saved_records(self, like: Record) -> list[Record]:
+        """Return the records that were saved, which are ``like`` another one but for their samples."""
+        if self.saved is None:
+            return []
+        with checkpoints.restoring(self.path):
+            return [replace(like, **{key: one[key].numpy() for key in _ARRAYS}) for one in self.saved["records"]]
 
     def _on_training_start(self) -> None:
         self._saved_at = time.monotonic()
@@ -54,6 +79,10 @@ class Checkpoint(BaseCallback):
             self._saved_at = time.monotonic()
 
     def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            if "episode" in info:  # of VecMonitor
+                seconds = round(time.process_time() - self._began, 2)
+                self._curve.append((self.num_timesteps + self.spent, seconds, round(float(info["episode"]["r"]), 4)))
         return True
 
     def _on_training_end(self) -> None:
@@ -61,33 +90,53 @@ class Checkpoint(BaseCallback):
 
     def _save(self) -> None:
         model = self.model
+        counters = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls")  # the last one is DQN's
+        kept = [{key: torch.from_numpy(getattr(one, key)) for key in _ARRAYS} for one in self.records()]
         state: dict[str, Any] = {
             "parameters": model.get_parameters(),
-            "counters": [model.num_timesteps, model._n_updates, model._episode_num],
+            "counters": {name: getattr(model, name) for name in counters if hasattr(model, name)},
             "resumed": self.resumed,
-            "curve": self._curve.read_text(encoding="utf-8") if self._curve.exists() else "",
+            "restarts": self.restarts,
+            "privileged": self.privileged,
+            "records": kept,
+            "curve": torch.tensor(self._curve, dtype=torch.float64).reshape(-1, 3),
+            "moments": _moments(model.get_vec_normalize_env()),
         }
-        if isinstance(model, SAC):
+        if isinstance(model, OffPolicyAlgorithm):
             state |= _buffer(model)
-        checkpoints.save(self.path, state, fingerprint=self.fingerprint)
+        with replacing(self._curve_path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(("steps", "seconds", "return"))
+            writer.writerows((int(steps), seconds, value) for steps, seconds, value in self._curve)
+        checkpoints.save(self.path, state, fingerprint=self._fingerprint)
 
 
-def _buffer(model: SAC) -> dict[str, Any]:
-    """What SAC keeps beside its networks: the replay buffer, as far as it is filled, and the weight of the entropy."""
-    buffer, weight = model.replay_buffer, model.log_ent_coef
+def _moments(scaling: VecNormalize | None) -> dict[str, Any]:
+    """The running moments of observations and returns."""
+    if scaling is None:
+        return {}
+    pairs: dict[str, Any] = {name: getattr(scaling, name) for name in ("obs_rms", "ret_rms")}
+    return {
+        name: {"mean": torch.tensor(one.mean), "var": torch.tensor(one.var), "count": float(one.count)}
+        for name, one in pairs.items()
+    }
+
+
+def _buffer(model: OffPolicyAlgorithm) -> dict[str, Any]:
+    """The replay buffer, as far as it is filled, and SAC's weight of the entropy."""
+    buffer, weight = model.replay_buffer, getattr(model, "log_ent_coef", None)
     assert buffer is not None
-    assert weight is not None
     rows = buffer.size()
     stored = {name: torch.from_numpy(getattr(buffer, name)[:rows].copy()) for name in _STORED}
-    return {"stored": stored, "position": buffer.pos, "log_ent_coef": weight.detach().clone()}
+    weights = {} if weight is None else {"log_ent_coef": weight.detach().clone()}
+    return {"stored": stored, "position": buffer.pos, **weights}
 
 
-def _restore_buffer(model: SAC, found: dict[str, Any]) -> None:
-    buffer, weight = model.replay_buffer, model.log_ent_coef
-    assert buffer is not None
-    assert weight is not None
-    rows = len(found["stored"]["rewards"])
+def _restore_buffer(model: OffPolicyAlgorithm, saved: dict[str, Any]) -> None:
+    buffer: Any = model.replay_buffer
+    rows = len(saved["stored"]["rewards"])
     for name in _STORED:
-        getattr(buffer, name)[:rows] = found["stored"][name].numpy()
-    buffer.pos, buffer.full = int(found["position"]), rows == buffer.buffer_size
-    weight.data.copy_(found["log_ent_coef"])
+        getattr(buffer, name)[:rows] = saved["stored"][name].numpy()
+    buffer.pos, buffer.full = int(saved["position"]), rows == buffer.buffer_size
+    if "log_ent_coef" in saved:
+        model.log_ent_coef.data.copy_(saved["log_ent_coef"])  # type: ignore[attr-defined]

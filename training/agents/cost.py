@@ -1,20 +1,20 @@
-"""What agents are paid in training."""
+"""What agents of systems are paid in training."""
 
 from typing import Any
 
 import numpy as np
 
 from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
-from training.agents.tasks import ControlTask
+from training.agents.tasks import Task
 
-WORST = 10.0  # of the cost, three scales off in every state; beyond it, networks would learn little else
+MAX_COST = 10.0  # three scales off in every state; beyond it, networks would learn little else
 
 
-def paid(task: ControlTask, total: Any, age: Any, terminated: Any) -> Any:
-    """Minus the cost c, at most ``WORST``, from the reward 1/(1 + 4c) averaged over an action's samples."""
+def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
+    """Minus the cost c, at most ``MAX_COST``, from the reward 1/(1 + 4c) averaged over an action's samples."""
     samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
     remaining = np.where(terminated, task.steps - np.ceil(age / task.repeat), 0.0)
-    cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, WORST)
+    cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, MAX_COST)
     return -cost * (1.0 + remaining)
 
 
@@ -25,7 +25,7 @@ class Cost(VectorWrapper):
     pays.
     """
 
-    def __init__(self, env: VectorEnv, task: ControlTask) -> None:
+    def __init__(self, env: VectorEnv, task: Task) -> None:
         super().__init__(env)
         self._task = task
 

@@ -10,7 +10,7 @@ from kkl_gym import ActionRepeat, KKLEnv, KKLObservation
 from observers.checks import shown
 from training.agents.cost import paid
 from training.agents.information import observer_of
-from training.agents.tasks import deviation, get_task
+from training.agents.tasks import deviation, task_of
 
 
 class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -19,9 +19,9 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     The agent sees (x_hat - target) / scale and acts once in a period of the task, while the observer sees every sample.
     It is paid minus the cost. Row i of the task's vector environment behaves as this one does with that row's seed.
 
-    Noise, starts and length of the episodes are the environment's: make it with
-    ``gym.make(ID, **training.agents.tasks.get_task(SYSTEM).options)``. The files in training/agents/hyperparameters do
-    so for rl-zoo3.
+    Noise, starts and length of the episodes are the environment's: make it with the
+    ``env_kwargs`` of ``training.agents.tasks.get_task(SYSTEM)``. The files in training/agents/hyperparameters do so for
+    rl-zoo3.
     """
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], observer: str | None = None) -> None:
@@ -29,9 +29,9 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
         if not isinstance(base, KKLEnv):
             raise ValueError(f"OnTask needs an environment of a system, got {shown(env)}")
         RecordConstructorArgs.__init__(self, observer=observer)
-        self._system, self._task = base.system, get_task(base.system)
-        if base.dt != self._task.dt:
-            raise ValueError(f"the environment has dt = {base.dt} s, the task {self._task.dt} s: make it with that")
+        self._system, self._task = base.system, task_of(base.system)
+        if base.dt != (dt := self._task.env_kwargs["dt"]):
+            raise ValueError(f"the environment has dt = {base.dt} s, the task {dt} s: make it with that")
         seen = KKLObservation(env, observer or observer_of(base.system))
         gym.Wrapper.__init__(self, ActionRepeat(seen, self._task.repeat))
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (base.system.nx,), np.float32)
@@ -51,6 +51,3 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
 
     def _seen(self, info: dict[str, Any]) -> np.ndarray:
         return deviation(self._system, info["x_hat"]).astype(np.float32)
-
-
-__all__ = ["OnTask"]

@@ -1,50 +1,62 @@
-"""Play episodes of a control task."""
+"""Play episodes of a task."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
 from kkl_gym.wrappers.vector import VectorEnv
 
-Policy = Callable[[np.ndarray], np.ndarray]
+Policy = Callable[[np.ndarray], Any]
+SIGNALS = ("x", "x_hat", "y")  # of info, kept at each instant at which the agent acts
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes side by side, (steps + 1, n, signals), at the instants at which the agent acts."""
+    """Episodes side by side; where one has ended, its last values stay.
 
-    x: np.ndarray
-    x_hat: np.ndarray | None
-    y: np.ndarray
-    u: np.ndarray
+    Shapes: ``returns``, ``lengths`` and ``escaped`` (n,), ``x``, ``x_hat`` and ``y`` (steps + 1, n, signals), None
+    where the environment does not show them; ``u`` (steps, n, nu).
+    """
+
+    returns: np.ndarray
+    lengths: np.ndarray
     escaped: np.ndarray
+    x: np.ndarray | None = None
+    x_hat: np.ndarray | None = None
+    y: np.ndarray | None = None
+    u: np.ndarray | None = None
 
-    def row(self, i: int) -> "Episodes":
-        """One of them, as a batch of one."""
-        x_hat = None if self.x_hat is None else self.x_hat[:, [i]]
-        return Episodes(self.x[:, [i]], x_hat, self.y[:, [i]], self.u[:, [i]], self.escaped[[i]])
+    def signals(self, name: str) -> np.ndarray:
+        """Return x, x_hat, y or u; raises ValueError if the environment did not show it."""
+        if (values := getattr(self, name)) is None:
+            raise ValueError(f"these episodes hold no {name}: the environment does not show it")
+        return np.asarray(values)
 
 
 def play(
-    env: VectorEnv, policy: Policy, *, steps: int, seed: int, report: Callable[[int], object] = lambda done: None
+    env: VectorEnv, policy: Policy, *, seed: int, report: Callable[[float], object] = lambda ended: None
 ) -> Episodes:
-    """Play one episode in each row of an environment that does not reset by itself."""
-    if env.metadata["autoreset_mode"] is not AutoresetMode.DISABLED:
-        raise ValueError(
-            'play needs an environment made with autoreset_mode="Disabled", or episodes would run together'
-        )
+    """Play one episode in each row of an environment that resets in the same step, row i with the seed ``seed`` + i."""
     obs, info = env.reset(seed=seed)
-    x, x_hat, y, u = [info["x"]], [info.get("x_hat")], [info["y"]], []
-    escaped = np.zeros(env.num_envs, dtype=bool)
-    for done in range(1, steps + 1):
-        obs, _, terminated, _, info = env.step(policy(obs))
-        escaped |= terminated
-        x.append(info["x"])
-        x_hat.append(info.get("x_hat"))
-        y.append(info["y"])
-        u.append(info["u"])
-        report(done)
-    estimates = None if x_hat[0] is None else np.array(x_hat)
-    return Episodes(np.array(x), estimates, np.array(y), np.array(u), escaped)
+    kept = {key: [info[key]] for key in SIGNALS if key in info}
+    inputs = list[np.ndarray]()
+    n = env.num_envs
+    returns, lengths, over, escaped = np.zeros(n), np.zeros(n, dtype=int), np.zeros(n, dtype=bool), np.zeros(n, bool)
+    while not over.all():
+        obs, reward, terminated, truncated, info = env.step(policy(obs))
+        ended, final = terminated | truncated, info.get("final_info", {})
+        returns += np.where(over, 0.0, reward)
+        lengths += ~over
+        escaped |= ended & ~over & terminated
+        for key, values in kept.items():
+            now = np.where(ended[:, None], final[key], info[key]) if ended.any() else info[key]
+            values.append(np.where(over[:, None], values[-1], now))
+        if "u" in info:
+            now = np.where(ended[:, None], final["u"], info["u"]) if ended.any() else info["u"]
+            inputs.append(np.where(over[:, None], 0.0, now))
+        over |= ended
+        report(int(over.sum()))
+    signals = {key: np.array(values) for key, values in kept.items()}
+    return Episodes(returns, lengths, escaped, **signals, u=np.array(inputs) if inputs else None)

@@ -1,18 +1,48 @@
-"""What all agents of stable-baselines3 have here: policies as perceptrons, and schedules that end at zero."""
+"""Policies of stable-baselines3 as perceptrons, and where their layers are."""
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from sb3_contrib import TQC
-from stable_baselines3 import DQN, SAC, TD3
+from sb3_contrib import TQC, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from observers import MLP
+from training.agents.agent import LSTM, Head
 
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "ppo": PPO,
+    "a2c": A2C,
+    "dqn": DQN,
+    "sac": SAC,
+    "td3": TD3,
+    "tqc": TQC,
+    "ppo_lstm": RecurrentPPO,
+}
+CONTINUOUS = ("sac", "td3", "tqc")  # whose actions are bounded numbers
 ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.SiLU: "silu"}
+
+
+def head_of(algorithm: str, *, discrete: bool) -> Head:
+    """How the output of an algorithm's network becomes an action."""
+    if discrete:
+        return "argmax"
+    return "tanh" if algorithm in CONTINUOUS else "clip"
+
+
+def actor(model: BaseAlgorithm) -> list[nn.Module]:
+    """The modules of an agent's deterministic policy behind the LSTM, linear ones and activations, in their order."""
+    policy: Any = model.policy
+    if isinstance(model, SAC | TQC):
+        return [*policy.actor.latent_pi, policy.actor.mu]
+    if isinstance(model, TD3):
+        return list(policy.actor.mu)
+    if isinstance(model, DQN):
+        return list(policy.q_net.q_net)
+    return [*policy.mlp_extractor.policy_net, policy.action_net]
 
 
 def perceptron(model: BaseAlgorithm) -> MLP:
@@ -23,16 +53,13 @@ def perceptron(model: BaseAlgorithm) -> MLP:
     return MLP([_array(layer.weight) for layer in layers], [_array(layer.bias) for layer in layers], activation)
 
 
-def actor(model: BaseAlgorithm) -> list[nn.Module]:
-    """The modules of an agent's deterministic policy, linear ones and activations, in their order."""
-    policy: Any = model.policy
-    if isinstance(model, SAC | TQC):
-        return [*model.actor.latent_pi, model.actor.mu]
-    if isinstance(model, TD3):
-        return list(model.actor.mu)
-    if isinstance(model, DQN):
-        return list(policy.q_net.q_net)
-    return [*policy.mlp_extractor.policy_net, policy.action_net]
+def lstm_in(weights: dict[str, torch.Tensor]) -> LSTM | None:
+    """The LSTM in the tensors of a policy, if there is one."""
+    parts = [weights.get(f"lstm_actor.{name}_l0") for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
+    if any(part is None for part in parts):
+        return None
+    ih, hh, bias_ih, bias_hh = (_array(part) for part in parts if part is not None)
+    return LSTM(np.concatenate([ih, hh], axis=1), bias_ih + bias_hh)
 
 
 def linear(start: float) -> Callable[[float], float]:

@@ -8,97 +8,130 @@ import zipfile
 from pickle import UnpicklingError
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
-from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from kkl_gym import System, get_system
+from kkl_gym import get_system
 from observers import MLP
 from observers.storage import explained
 from training.agents.agent import Agent, AgentError, fingerprint, rules
 from training.agents.bridge import SB3VecEnv
-from training.agents.information import observer_of
-from training.agents.policy import ACTIVATIONS, actor
-from training.agents.tasks import get_task
+from training.agents.information import OBSERVED, Information, make, observer_of
+from training.agents.policy import ACTIVATIONS, ALGORITHMS, CONTINUOUS, actor, head_of, lstm_in
+from training.agents.tasks import Task
 
-_LAYERS = {  # of the deterministic policy in a file of each algorithm
-    False: re.compile(r"mlp_extractor\.policy_net\.\d+|action_net"),
-    True: re.compile(r"actor\.latent_pi\.\d+|actor\.mu"),
+_LAYERS = {  # of the deterministic policy in a file of each algorithm; SAC's are TQC's, and PPO's A2C's
+    "sac": re.compile(r"actor\.latent_pi\.\d+|actor\.mu"),
+    "td3": re.compile(r"actor\.mu\.\d+"),
+    "dqn": re.compile(r"q_net\.q_net\.\d+"),
+    "ppo": re.compile(r"mlp_extractor\.policy_net\.\d+|action_net"),
 }
-_LARGEST = 1 << 28  # bytes of a policy, unpacked
+_MAX_BYTES = 1 << 28  # of a policy, unpacked
 
 
-def to_sb3(agent: Agent, *, system: str | System | None = None) -> BaseAlgorithm:
+def to_sb3(agent: Agent, *, trusted: str | None = None) -> BaseAlgorithm:
     """Make an agent of stable-baselines3 that acts as this one; its ``save`` writes the zip.
 
-    Its value functions are not trained, since agents are kept without: it is for playing, not for training on.
+    Its value functions are not trained: it is for playing. Where observations are normalised, its first layer does so,
+    without clipping them to ±10.
     """
     network = agent.network
+    hidden = [len(bias) for bias in network.biases[:-1]]
     activation = {name: module for module, name in ACTIVATIONS.items()}[network.activation]
-    kwargs = {"net_arch": [len(bias) for bias in network.biases[:-1]], "activation_fn": activation}
-    env = SB3VecEnv(agent.make(1, "SameStep", system=system))
-    options: dict[str, Any] = {"policy_kwargs": kwargs, "device": "cpu"}
-    model: BaseAlgorithm = (
-        SAC("MlpPolicy", env, buffer_size=1, **options) if agent.squashed else PPO("MlpPolicy", env, **options)
-    )
+    options: dict[str, Any] = {"policy_kwargs": {"net_arch": hidden, "activation_fn": activation}, "device": "cpu"}
+    name = agent.training.get("algorithm")
+    if name not in ALGORITHMS:
+        raise AgentError(f"the agent's algorithm must be one of {', '.join(ALGORITHMS)}, got {name!r}")
+    if name in (*CONTINUOUS, "dqn"):
+        options["buffer_size"] = 1
+    if agent.lstm is not None:
+        options["policy_kwargs"] |= {"lstm_hidden_size": agent.lstm.size}
+    policy = "MlpPolicy" if agent.lstm is None else "MlpLstmPolicy"
+    model: BaseAlgorithm = ALGORITHMS[name](policy, SB3VecEnv(agent.make(trusted=trusted)), **options)
+    first = agent.network.weights[0] if agent.lstm is None else agent.lstm.weight[:, : agent.inputs]
+    offset = np.zeros(len(first))
+    if agent.mean is not None:
+        first = first / agent.scale
+        offset = -first @ agent.mean
     layers = [layer for layer in actor(model) if isinstance(layer, nn.Linear)]
     with torch.no_grad():
         for layer, weight, bias in zip(layers, network.weights, network.biases, strict=True):
             layer.weight.copy_(torch.from_numpy(np.array(weight)))
             layer.bias.copy_(torch.from_numpy(np.array(bias)))
+        if agent.lstm is None:
+            layers[0].weight.copy_(torch.from_numpy(np.array(first)))
+            layers[0].bias.add_(torch.from_numpy(offset))
+        else:
+            cells: Any = model.policy.lstm_actor
+            cells.weight_ih_l0.copy_(torch.from_numpy(np.array(first)))
+            cells.weight_hh_l0.copy_(torch.from_numpy(np.array(agent.lstm.weight[:, agent.inputs :])))
+            cells.bias_ih_l0.copy_(torch.from_numpy(agent.lstm.bias + offset))
+            cells.bias_hh_l0.zero_()
     return model
 
 
-def from_sb3(path: str | os.PathLike[str], system: str | System, observer: str | None = None) -> Agent:
-    """Read an agent that stable-baselines3 or rl-zoo3 has trained on :class:`training.agents.OnTask`.
+def from_sb3(
+    path: str | os.PathLike[str], task: Task, information: Information = "x_hat", observer: str | None = None
+) -> Agent:
+    """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task, without VecNormalize.
 
     Of the file, its tensors and its text are read; what is pickled in it stays so.
     """
+    if task.system is not None and information in OBSERVED and observer is None:
+        observer = observer_of(get_system(task.system))
     with explained(path, AgentError):
-        try:
-            with zipfile.ZipFile(path) as files:
-                if max(files.getinfo(name).file_size for name in ("policy.pth", "data")) > _LARGEST:
-                    raise AgentError(f"a policy of more than {_LARGEST >> 20} MiB is none of ours")
-                weights = torch.load(io.BytesIO(files.read("policy.pth")), map_location="cpu", weights_only=True)
-                described = json.loads(files.read("data"))
-        except (KeyError, zipfile.BadZipFile, RuntimeError, UnpicklingError) as error:
-            raise AgentError(f"it is no agent of stable-baselines3: {error}") from error
-        except OSError as error:
-            raise AgentError(f"it cannot be read: {error.strerror}") from error
-        squashed = any(name.startswith("actor.") for name in weights)
+        weights, described = _content(path)
         names = [name.removesuffix(".weight") for name in weights if name.endswith(".weight")]
-        layers = [name for name in names if _LAYERS[squashed].fullmatch(name)]
-        if len(layers) < 2:
-            raise AgentError(f"it holds no perceptron of PPO or SAC, but {', '.join(names)}")
+        layers_of = {known: [name for name in names if layer.fullmatch(name)] for known, layer in _LAYERS.items()}
+        algorithm = next((known for known, layers in layers_of.items() if len(layers) > 1), None)
+        if algorithm is None:
+            raise AgentError(f"it holds no perceptron of {', '.join(ALGORITHMS)}, but {', '.join(names)}")
+        layers = layers_of[algorithm]
         network = MLP(
             [weights[f"{name}.weight"].numpy() for name in layers],
             [weights[f"{name}.bias"].numpy() for name in layers],
-            _activation(described, squashed),
+            _activation(described, "Tanh" if algorithm == "ppo" else "ReLU"),
         )
-    task, named = get_task(system), (observer or observer_of(get_system(system)))
-    agent = Agent(
-        network=network,
-        squashed=squashed,
-        task=task,
-        information="x_hat",
-        observer=named,
-        fingerprint=fingerprint(named),
-        rules=rules(task),
-        training={"algorithm": "sac" if squashed else "ppo", "from": os.path.basename(path)},
-    )
-    agent.make(1, system=system).close()  # which says whether it fits
+        lstm = lstm_in(weights)
+        env = make(task, information, 1, observer=observer)
+        discrete = isinstance(env.single_action_space, gym.spaces.Discrete)
+        env.close()
+        agent = Agent(
+            network,
+            head_of(algorithm, discrete=discrete),
+            task,
+            information,
+            lstm=lstm,
+            observer=observer,
+            fingerprint=None if observer is None else fingerprint(observer),
+            rules=rules(task),
+            training={"algorithm": algorithm if lstm is None else "ppo_lstm", "from": os.path.basename(path)},
+        )
+        agent.make(trusted=task.system or task.env_id).close()  # raises AgentError if it does not fit
     return agent
 
 
-def _activation(described: dict[str, Any], squashed: bool) -> str:
-    """What is between the layers: named in the text that stands beside the pickled settings, or the default."""
-    said = str(described.get("policy_kwargs", {}).get("activation_fn", "ReLU" if squashed else "Tanh"))
+def _content(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """The tensors of a policy and the text beside them."""
+    try:
+        with zipfile.ZipFile(path) as files:
+            if max(files.getinfo(name).file_size for name in ("policy.pth", "data")) > _MAX_BYTES:
+                raise AgentError(f"its policy has more than {_MAX_BYTES >> 20} MiB")
+            weights = torch.load(io.BytesIO(files.read("policy.pth")), map_location="cpu", weights_only=True)
+            return weights, json.loads(files.read("data"))
+    except (KeyError, zipfile.BadZipFile, RuntimeError, UnpicklingError) as error:
+        raise AgentError(f"it is no agent of stable-baselines3: {error}") from error
+    except OSError as error:
+        raise AgentError(f"it cannot be read: {error.strerror}") from error
+
+
+def _activation(described: dict[str, Any], default: str) -> str:
+    """The activation between the layers, as the text beside the pickled settings names it."""
+    named = str(described.get("policy_kwargs", {}).get("activation_fn", default))
     for module, name in ACTIVATIONS.items():
-        if said.rpartition(".")[2].removesuffix("'>") == module.__name__:
+        if named.rpartition(".")[2].removesuffix("'>") == module.__name__:
             return name
-    raise AgentError(f"the activation {said} is none of {', '.join(m.__name__ for m in ACTIVATIONS)}")
-
-
-__all__ = ["from_sb3", "to_sb3"]
+    raise AgentError(f"the activation {named} is none of {', '.join(m.__name__ for m in ACTIVATIONS)}")

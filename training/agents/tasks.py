@@ -1,98 +1,195 @@
-"""What agents are to do, and how well they do it."""
+"""Control tasks: an environment, how long each action is held, and what of it is measured; and scores of systems'."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
-from kkl_gym import KKLVectorEnv, VectorActionRepeat, get_system
+from kkl_gym import ENV_IDS, OWN_ID, SYSTEMS, get_system
+from kkl_gym.memory import output_time_constants
 from kkl_gym.system import Box, System
-from kkl_gym.wrappers.vector import VectorEnv
-from observers.checks import is_finite
+from observers.checks import LARGEST, flag, integer, is_finite, shown
+from observers.names import matching
 from training.evaluation.levels import Level
 
-MOST_SAMPLES = 100_000  # of an episode: all of them are kept while it is played
+MAX_SAMPLES = 100_000  # of an episode: all of them are kept while it is played
+MAX_FRAMES = 1_000  # which may come from a stranger's file
+TOLERANCE = 0.2  # distance from the target over the scale, within which an agent holds it
 
 
 @dataclass(frozen=True)
-class ControlTask:
-    """Bring a system to its target and hold it there."""
+class Task:
+    """An environment and what agents may see of it.
 
-    system: str | System
-    measurement_noise: float | tuple[float, ...] = 0.5
-    period: float = 0.05
-    duration: float = 20.0
-    start_box: Box | None = None
-    tolerance: float = 0.2
-    dt: float = 0.01
+    Of a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` stay empty. ``env_id`` and
+    ``env_kwargs`` are those of ``gym.make``; ``repeat`` is in samples, ``time_constants`` and ``frames`` in actions.
+    """
+
+    env_id: str
+    measured: tuple[int, ...] = ()
+    hidden: tuple[int, ...] | None = None
+    measurement_noise: Level = 0.0
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    repeat: int = 1
+    time_constants: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
+    frames: int = 8
+    past_actions: bool = True
+    angles: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("period", "duration", "tolerance", "dt"):
-            if not is_finite(getattr(self, name)):
-                raise ValueError(f"a task's {name} must be a finite number, got {getattr(self, name)!r}")
-        if not self.tolerance > 0 or not 0 < self.dt <= self.period <= self.duration:
-            raise ValueError(f"a task needs tolerance > 0 and 0 < dt <= period <= duration, got {self}")
-        if self.duration / self.dt > MOST_SAMPLES:
-            raise ValueError(
-                f"an episode has at most {MOST_SAMPLES} samples, got {self.duration} s at dt = {self.dt} s"
-            )
-        for name, time, unit in (("period", self.period, self.dt), ("duration", self.duration, self.period)):
-            if abs(time / unit - round(time / unit)) > 1e-6:
-                raise ValueError(f"{name} = {time} s must be a whole multiple of {unit} s")
+        if not isinstance(self.env_id, str):
+            raise ValueError(f"env_id must be a string, got {shown(self.env_id)}")
+        try:  # as a file holds them
+            object.__setattr__(self, "env_kwargs", json.loads(json.dumps(dict(self.env_kwargs))))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"env_kwargs must be JSON, got {shown(self.env_kwargs)}: {error}") from None
+        for name in ("measured", "hidden"):
+            if (given := getattr(self, name)) is not None:
+                entries = tuple(integer(f"an entry of {name}", entry, 0) for entry in given)
+                empty = name == "measured" and not entries and self.system is None
+                if len(set(entries)) < len(entries) or empty:
+                    raise ValueError(f"{name} must name entries of the observation, each once, got {shown(given)}")
+                object.__setattr__(self, name, entries)
+        object.__setattr__(self, "angles", _pairs(self.env_id, self.angles, self.measured))
+        if self.system is None:
+            if not is_finite(self.measurement_noise) or not 0 <= self.measurement_noise < LARGEST:  # type: ignore[operator]
+                raise ValueError(
+                    "measurement_noise must be one number from 0 on, for all that is measured, got "
+                    f"{shown(self.measurement_noise)}"
+                )
+            object.__setattr__(self, "measurement_noise", float(self.measurement_noise))  # type: ignore[arg-type]
+            if self.repeat != 1:
+                raise ValueError(f"only environments of systems repeat actions, and {self.env_id} is none")
+        else:
+            if isinstance(self.measurement_noise, list):
+                object.__setattr__(self, "measurement_noise", tuple(self.measurement_noise))
+            limit = integer("max_episode_steps", self.env_kwargs.get("max_episode_steps"), 1, MAX_SAMPLES)
+            object.__setattr__(self, "repeat", integer("repeat", self.repeat, 1, limit))
+        object.__setattr__(self, "time_constants", output_time_constants("time_constants", self.time_constants))
+        object.__setattr__(self, "past_actions", flag("past_actions", self.past_actions))
+        object.__setattr__(self, "frames", integer("frames", self.frames, 1, MAX_FRAMES))
 
     @property
-    def repeat(self) -> int:
-        """Samples in a period."""
-        return round(self.period / self.dt)
+    def system(self) -> str | None:
+        """Name of the system whose environment this is, None if it is another environment."""
+        if self.env_id == OWN_ID:
+            return str(self.env_kwargs.get("system"))
+        return next((name for name, env_id in ENV_IDS.items() if env_id == self.env_id), None)
+
+    @property
+    def name(self) -> str:
+        """Name of the system or the environment, for folders and tables."""
+        return self.env_id.replace("/", "-") if self.system is None else get_system(self.system).name
 
     @property
     def steps(self) -> int:
-        """Actions in an episode."""
-        return round(self.duration / self.period)
+        """Actions in an episode of a system."""
+        return int(self.env_kwargs["max_episode_steps"]) // self.repeat
 
     @property
-    def options(self) -> dict[str, Any]:
-        """Arguments of ``gym.make`` for the system's environment as the task has it."""
-        return {
-            "dt": self.dt,
-            "measurement_noise": self.measurement_noise,
-            "start_box": self.start_box,
-            "max_episode_steps": self.steps * self.repeat,
-        }
-
-    def make(
-        self,
-        num_envs: int,
-        wrap: Callable[[VectorEnv], VectorEnv] | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
-    ) -> VectorEnv:
-        """The task as a vector environment that acts once a period."""
-        env: VectorEnv = KKLVectorEnv(self.system, num_envs, **self.options, autoreset_mode=AutoresetMode.DISABLED)
-        return VectorActionRepeat(env if wrap is None else wrap(env), self.repeat, autoreset_mode)
+    def without_noise(self) -> "Task":
+        """The same environment, measured exactly."""
+        return replace(self, measurement_noise=0.0)
 
 
-TASKS: dict[str, ControlTask] = {
+def _pairs(env_id: str, values: Any, measured: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
+    """Angles as pairs of entries, or ValueError."""
+    given = values.tolist() if isinstance(values, np.ndarray) else values
+    if not (
+        isinstance(given, list | tuple) and all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in given)
+    ):
+        raise ValueError(f"angles must be pairs of entries, cosine and sine, such as 0,1; got {shown(values)}")
+    pairs = tuple((integer("a cosine", cosine, 0), integer("a sine", sine, 0)) for cosine, sine in given)
+    named = [entry for pair in pairs for entry in pair]
+    if len(set(named)) < len(named) or not set(named) <= set(measured):
+        raise ValueError(
+            f"angles must name entries of {env_id} that are measured, {shown(measured)}, each once, got {shown(values)}"
+        )
+    return pairs
+
+
+def control_task(
+    system: str,
+    measurement_noise: Level = 0.5,
+    *,
+    period: float = 0.05,
+    duration: float = 20.0,
+    start_box: Box | None = None,
+    dt: float = 0.01,
+) -> Task:
+    """Return the task to bring a system to its target and hold it there; times are in seconds."""
+    for name, time, unit in (("period", period, dt), ("duration", duration, period)):
+        if not (is_finite(time) and is_finite(unit)) or not 0 < unit <= time:
+            raise ValueError(f"a task needs 0 < dt <= period <= duration, got {dt}, {period} and {duration}")
+        if abs(time / unit - round(time / unit)) > 1e-6:
+            raise ValueError(f"{name} = {time} s must be a whole multiple of {unit} s")
+    repeat = round(period / dt)
+    options = {"dt": dt, "start_box": start_box, "max_episode_steps": repeat * round(duration / period)}
+    own = {} if system in ENV_IDS else {"system": system}
+    env_id = ENV_IDS.get(system, OWN_ID)
+    return Task(env_id, measurement_noise=measurement_noise, env_kwargs=own | options, repeat=repeat)
+
+
+TASKS: dict[str, Task] = {
     # Marginally stable: an agent that does not know the state cannot take energy out.
-    "reverse_duffing": ControlTask("reverse_duffing", period=0.1),
+    "reverse_duffing": control_task("reverse_duffing", period=0.1),
     # The target is unstable. Starts keep to |x1| < 3: beyond it a slow manifold holds the motion under any input.
-    "van_der_pol": ControlTask("van_der_pol", start_box=((-3, 3), (-6, 6))),
-    "rossler": ControlTask("rossler", period=0.1, duration=30.0),
-    "lorenz": ControlTask("lorenz", duration=5.0),  # the input is weak
+    "van_der_pol": control_task("van_der_pol", start_box=((-3, 3), (-6, 6))),
+    "rossler": control_task("rossler", period=0.1, duration=30.0),
+    "lorenz": control_task("lorenz", duration=5.0),  # the input is weak
 }
 PREFERRED = {"reverse_duffing": "sac"}  # algorithm; ppo for all others
 
-
-def get_task(name: str | System, measurement_noise: Level | None = None) -> ControlTask:
-    """The task of a system, with another noise level if one is given."""
-    system = get_system(name)
-    if not system.nu:
-        raise ValueError(f"{name} has no inputs for an agent to act on")
-    task = TASKS.get(system.name) or ControlTask(
-        name, system.measurement_noise, period=5 * system.dt, duration=2000 * system.dt, dt=system.dt
+# Positions are measured and velocities are not, as in rl-zoo3's tasks. ``hidden`` where an observer estimates less than
+# all the rest: of the double pendulum not the forces of its constraints.
+HIDDEN_VELOCITIES: dict[str, Task] = {
+    task.env_id: task
+    for task in (
+        Task("Pendulum-v1", (0, 1)),
+        Task("CartPole-v1", (0, 2)),
+        Task("MountainCarContinuous-v0", (0,)),
+        Task("LunarLander-v3", (0, 1, 4, 6, 7)),
+        Task("InvertedPendulum-v5", (0, 1)),
+        Task("InvertedDoublePendulum-v5", (0, 1, 2, 3, 4), hidden=(5, 6, 7)),
+        Task("Reacher-v5", (0, 1, 2, 3, 4, 5, 8, 9)),
+        Task("Hopper-v5", (0, 1, 2, 3, 4)),
+        Task("HalfCheetah-v5", (0, 1, 2, 3, 4, 5, 6, 7)),
     )
-    return task if measurement_noise is None else replace(task, measurement_noise=measurement_noise)
+}
+
+
+def get_task(name: str, measurement_noise: Level | None = None, **changes: Any) -> Task:
+    """Return the task of a system, of a script's class or of any environment id, with changes of its fields."""
+    name = matching(name, SYSTEMS) or name
+    if name not in SYSTEMS and (name in gym.registry or re.search(r"-v\d+$", name)):
+        known = HIDDEN_VELOCITIES.get(name)
+        if known is None and not changes.get("measured"):
+            raise ValueError(
+                f"say what is measured of {name}, as in --measured 0,1; it is known of {', '.join(HIDDEN_VELOCITIES)}"
+            )
+        task = known if known is not None and not changes.get("measured") else Task(name, tuple(changes["measured"]))
+        return replace(task, **{"measurement_noise": measurement_noise or 0.0, **changes})
+    system = get_system(name)
+    if given := {"measured", "hidden", "angles"} & changes.keys():
+        raise ValueError(f"{', '.join(sorted(given))}: of the system {name} y is measured; these are for environments")
+    task = task_of(system, name)
+    if measurement_noise is not None:
+        changes["measurement_noise"] = measurement_noise
+    return replace(task, **{**changes, "env_kwargs": {**task.env_kwargs, **changes.get("env_kwargs", {})}})
+
+
+def task_of(system: System, name: str | None = None) -> Task:
+    """Return the task of a system, whose ``name`` imports it if it does not ship."""
+    if not system.nu:
+        raise ValueError(f"{system.name} has no inputs for an agent to act on")
+    dt = system.dt
+    return TASKS.get(system.name) or control_task(
+        name or system.name, system.measurement_noise, period=5 * dt, duration=2000 * dt, dt=dt
+    )
 
 
 def deviation(system: System, x: np.ndarray) -> np.ndarray:
@@ -107,8 +204,7 @@ def scores(system: System, x: np.ndarray) -> np.ndarray:
     return np.asarray(np.expm1(-4.0 * c).mean(0))
 
 
-def successes(task: ControlTask, x: np.ndarray) -> np.ndarray:
-    """Whether ``x`` (steps, n, nx) stay within the task's tolerance of the target for their last fifth."""
+def successes(system: System, x: np.ndarray) -> np.ndarray:
+    """Whether ``x`` (steps, n, nx) stay within the tolerance of the target for their last fifth."""
     late = x[-max(1, round(0.2 * len(x))) :]
-    distance = np.linalg.norm(deviation(get_system(task.system), late), axis=-1)
-    return np.asarray((distance <= task.tolerance).all(0))
+    return np.asarray((np.linalg.norm(deviation(system, late), axis=-1) <= TOLERANCE).all(0))

@@ -108,16 +108,17 @@ class RecordCommand:
 
 def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
     """What an agent of this package does that is shown the whole observation."""
-    from training.agents.any_environment.player import Player
+    from training.agents.agent import Agent
 
-    player, here = Player.read(path), env.spec.id if env.spec else ""
-    if player.information != "state" or player.task.env_id != here:
+    agent, here = Agent.read(path), env.spec.id if env.spec else ""
+    if agent.information != "state" or agent.task.env_id != here:
         raise ValueError(
-            f"{path} is an agent for {player.task.env_id} that is shown {player.information}; to be recorded in {here} "
-            "it must be shown the state of that"
+            f"{path} is an agent for {agent.task.env_id} that sees {agent.information}; to be recorded in {here} it "
+            "must see the state of that"
         )
+    policy = agent.policy(env.action_space)
     flatten: Any = gym.spaces.flatten
-    return lambda observation: player.act(flatten(env.observation_space, observation), env.action_space)
+    return lambda observation: policy(flatten(env.observation_space, observation)[None])[0]
 
 
 def read_argument(text: str) -> tuple[str, Any]:

@@ -4,10 +4,8 @@ It learns from the same steps as an observer does, with as many batches, the sam
 observer's filter is worth is the difference between the two.
 """
 
-import os
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +14,22 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
+from kkl_gym.wrappers.vector import VectorEnv
 from observers import MLP, storage
-from training.agents.any_environment.information import Stacked, part_of
-from training.agents.any_environment.observing import KEPT, OBSERVER, SETTINGS, Estimation, oldest_first
-from training.agents.any_environment.task import HiddenTask
+from training.agents.environments import single, vector
+from training.agents.history import stacked
+from training.agents.information import FeatureObservation, Information, Values, outputs
+from training.agents.observing import (
+    KEPT,
+    OBSERVER,
+    SETTINGS,
+    Estimation,
+    estimated_entries,
+    latest,
+    oldest_first,
+    signals,
+)
+from training.agents.tasks import Task
 from training.config import Config
 from training.lessons.run import Stage, optimise
 from training.maps.inverse import Batch, InverseProblem
@@ -34,81 +44,52 @@ KEY = "kkl-gym-window"
 DEFAULT = Config("input-aware", eigenvalues=(-1.0,), dt=1.0, **RECORDED)  # for the size of its network
 
 
-@dataclass(frozen=True)
-class WindowEstimator:
-    """A network from the last outputs, each with the input before it, to hidden signals.
-
-    Shapes: ``mean``, ``scale`` (inputs,).
-    """
-
-    network: MLP
-    mean: np.ndarray
-    scale: np.ndarray
-
-    def __call__(self, stack: np.ndarray) -> np.ndarray:
-        """Estimate.
-
-        Shapes: ``stack`` (..., inputs); returns (..., outputs).
-        """
-        return self.network((stack - self.mean) / self.scale)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it to one safetensors file, whole or not at all."""
-        tensors: dict[str, np.ndarray] = {"mean": self.mean, "scale": self.scale}
-        storage.put_mlp(tensors, "", self.network)
-        storage.save(path, tensors, key=KEY, described={"activation": self.network.activation})
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> "WindowEstimator":
-        """Read what :meth:`save` wrote."""
-        tensors, described = storage.read(path, key=KEY, error=ValueError, what="an estimator on stacked observations")
-        with storage.explained(path, ValueError):
-            network = storage.get_mlp(tensors, "", described["activation"])
-            return cls(network, tensors["mean"], tensors["scale"])
+def save(path: Path, network: MLP) -> None:
+    """Write a network from stacks to hidden signals."""
+    tensors: dict[str, np.ndarray] = {}
+    storage.put_mlp(tensors, "", network)
+    storage.save(path, tensors, key=KEY, described={"activation": network.activation})
 
 
-class WindowObservation(gym.ObservationWrapper[np.ndarray, Any, np.ndarray]):
-    """Shows y and the estimates from stacked observations; under noise the estimates alone."""
-
-    def __init__(self, env: gym.Env[np.ndarray, Any], task: HiddenTask, estimator: WindowEstimator) -> None:
-        super().__init__(env)
-        self._estimator = estimator
-        stacked = gym.spaces.flatdim(env.observation_space)
-        latest = stacked - stacked // task.frames
-        self._outputs = slice(latest, latest if task.measurement_noise else latest + len(task.measured))
-
-    def replace_estimator(self, estimator: WindowEstimator) -> None:
-        """Go on with another estimator for the same task."""
-        self._estimator = estimator
-
-    def observation(self, observation: np.ndarray) -> np.ndarray:
-        """Show the latest outputs of a stack, and estimates."""
-        shown = np.concatenate([observation[self._outputs], self._estimator(observation)])
-        space: Any = self.observation_space
-        return np.clip(shown, space.low, space.high, dtype=np.float32)
+def read(path: Path | str) -> MLP:
+    """Read such a network."""
+    tensors, described = storage.read(path, key=KEY, error=ValueError, what="an estimator on stacked observations")
+    with storage.explained(path, ValueError):
+        return storage.get_mlp(tensors, "", described["activation"])
 
 
-def show_window(task: HiddenTask, path: str | os.PathLike[str], *, keep: int | None = None) -> gym.Env[np.ndarray, Any]:
-    """Make a task's environment with the estimator of a file; ``keep`` records so many of the last steps."""
-    env = task.make()
-    whole: Any = env.observation_space
-    size = whole.shape[0]
-    entries = list(task.estimated_entries(size) if task.measurement_noise else task.told(size))
-    low, high = whole.low[entries], whole.high[entries]
-    if task.measurement_noise:  # estimates are not clipped, as those of observers are not
-        low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
-    if keep is not None:
-        env = Recorder(env, **task.signals(size), keep=keep)
-    stacked = Stacked(part_of(env, task.measured), task.frames)
-    shown = WindowObservation(stacked, task, WindowEstimator.read(path))
-    shown.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-    return shown
+class WindowObservation(FeatureObservation):
+    """Shows y and the estimates from stacked observations, under noise the estimates alone, and records the steps."""
+
+    def __init__(self, task: Task, rows: int, network: MLP) -> None:
+        self.network, self.recorders = network, list[Recorder]()
+        entries: list[int] = []
+        low = high = np.empty(0)
+
+        def each() -> gym.Env[Any, Any]:
+            nonlocal entries, low, high
+            env = single(task)
+            space: Any = env.observation_space
+            entries = list(estimated_entries(task, len(space.low)))
+            low, high = space.low[entries], space.high[entries]
+            self.recorders.append(Recorder(env, **signals(task, env), keep=max(1, KEPT // rows)))
+            return self.recorders[-1]
+
+        env = stacked(outputs(task, vector(task, rows, each=each)), task.frames)
+        ny, width = len(task.measured), gym.spaces.flatdim(env.single_observation_space)
+        latest_y = slice(width - width // task.frames, width - width // task.frames + ny)
+
+        def feature(at: Values) -> np.ndarray:
+            estimates = self.network(at["obs"])
+            if task.measurement_noise:
+                return estimates
+            return np.concatenate([at["obs"][:, latest_y], np.clip(estimates, low, high)], axis=1)
+
+        super().__init__(env, feature, len(entries) + (0 if task.measurement_noise else ny))
 
 
-def learn_window(
-    task: HiddenTask, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars
-) -> Path:
-    """Fit an estimator to an agent's first steps; each batch draws noise of the task's level on the outputs."""
+def learn_window(task: Task, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars) -> Path:
+    """Fit a network to an agent's first steps; each batch draws noise of the task's level on the outputs."""
     torch.manual_seed(seed)
     stacks = Stacks(task, records)
     width, depth, activation = DEFAULT.width, DEFAULT.depth, DEFAULT.activation
@@ -126,9 +107,8 @@ def learn_window(
             optimiser="soap",
         )
         optimise(stage, problem, problem.loss, progress, resume=False)
-    path = folder / OBSERVER
-    WindowEstimator(stacks.in_units(network.export()), stacks.mean, stacks.scale).save(path)
-    return path
+    save(folder / OBSERVER, stacks.in_units(network.export()))
+    return folder / OBSERVER
 
 
 class Stacks:
@@ -139,7 +119,7 @@ class Stacks:
 
     parameters = 0
 
-    def __init__(self, task: HiddenTask, records: Sequence[Record]) -> None:
+    def __init__(self, task: Task, records: Sequence[Record]) -> None:
         entries, states, begins = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
         noise, ny, first = task.measurement_noise, len(task.measured), 0
         for record in records:
@@ -147,7 +127,7 @@ class Stacks:
             assert record.x is not None
             y = record.y
             if noise:  # the measured signals are among the states, without noise
-                estimated = task.estimated_entries(record.x.shape[1])
+                estimated = estimated_entries(task, record.x.shape[1])
                 y = record.x[:, [estimated.index(entry) for entry in task.measured]]
             acted = np.concatenate([np.zeros_like(record.u[:1]), record.u[:-1]])  # before each output
             entries.append(np.concatenate([y, acted], axis=1))
@@ -181,16 +161,19 @@ class Stacks:
         return Batch(seen.flatten(1), self._x[rows], torch.ones(len(rows)), cell)
 
     def in_units(self, network: MLP) -> MLP:
-        """A network whose outputs are scaled signals, with outputs in their units."""
-        (*weights, weight), (*biases, bias) = network.weights, network.biases
-        scale = self.x_scale
-        return MLP([*weights, weight * scale[:, None]], [*biases, bias * scale + self.x_mean], network.activation)
+        """A network between scaled signals as one between signals in their units."""
+        weights, biases = [w.astype(float) for w in network.weights], [b.astype(float) for b in network.biases]
+        weights[0] = weights[0] / self.scale
+        biases[0] = biases[0] - weights[0] @ self.mean
+        weights[-1] = weights[-1] * self.x_scale[:, None]
+        biases[-1] = biases[-1] * self.x_scale + self.x_mean
+        return MLP(weights, biases, network.activation)
 
 
 class WindowRefits(BaseCallback):
-    """Fits an estimator again to an agent's own episodes, as :class:`training.KKLTrainingCallback` fits an observer.
+    """Fits the network again to an agent's own episodes, as :class:`training.KKLTrainingCallback` fits an observer.
 
-    Nothing is held out, and no fit is refused.
+    Nothing is held out, and every fit is taken.
     """
 
     def __init__(
@@ -215,28 +198,24 @@ class WindowRefits(BaseCallback):
         self._refit()
 
     def _refit(self) -> None:
-        played = self.training_env.env_method("rollouts", going_on=True)
-        records = [*self._records, *oldest_first([one.records() for one in played])]
-        left = sum(len(record.t) - 1 for record in records)
-        while left - (oldest := len(records[0].t) - 1) >= KEPT:
-            left -= oldest
-            del records[0]
+        bridge: Any = self.training_env.unwrapped
+        window: WindowObservation = bridge.env
+        rows = [recorder.rollouts(going_on=True).records() for recorder in window.recorders]
         with torch.random.fork_rng():  # the agent's random numbers stay its own
-            estimator = WindowEstimator.read(self._learn(records))
-        self.training_env.env_method("replace_estimator", estimator)
+            window.network = read(self._learn(latest([*self._records, *oldest_first(rows)])))
 
 
-def _show(task: HiddenTask, path: str, keep: int | None) -> gym.Env[np.ndarray, Any]:
-    return show_window(task, path, keep=keep)
+def _show(task: Task, information: Information, rows: int, path: str | None) -> VectorEnv:
+    return WindowObservation(task, rows, read(str(path)))
 
 
 def _refits(
-    task: HiddenTask, learn: Callable[[Sequence[Record]], Path], every: int, rehearsal: int, path: Path, records: Any
+    task: Task, learn: Callable[[Sequence[Record]], Path], every: int, rehearsal: int, path: Path, records: Any
 ) -> BaseCallback:
     return WindowRefits(learn, every, rehearsal, records)
 
 
-STACKED = Estimation(learn_window, _show, _refits)
+STACKED = Estimation(_show, learn_window, _refits)
 
 
 def _or_one(scale: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from kkl_gym import KKLObservation, KKLVectorEnv, KKLVectorObservation
 from training.agents import SB3VecEnv
@@ -74,18 +74,6 @@ def test_escapes_are_no_time_limits():
     assert info["TimeLimit.truncated"] is False
     assert info["escaped"]
     assert (np.abs(env.reset()) < 25).all()  # options are used once
-
-
-def test_stable_baselines3s_wrappers_on_top(saved):
-    env = VecMonitor(VecNormalize(VecFrameStack(SB3VecEnv(vector(saved())), 4)))
-    assert env.reset().shape == (N, 8)
-    lengths = []
-    for action in actions(2 * STEPS):
-        _, _, done, infos = env.step(action)
-        over = [info for info, ended in zip(infos, done, strict=True) if ended]
-        lengths += [info["episode"]["l"] for info in over]
-        assert all(info["terminal_observation"].shape == (8,) for info in over)
-    assert lengths == [STEPS] * 2 * N
 
 
 def test_any_vector_environment():

@@ -10,12 +10,11 @@ import yaml
 
 from kkl_gym import ENV_IDS
 from training.agents import OnTask
-from training.agents.agent import Agent
-from training.agents.cost import WORST, Cost
+from training.agents.agent import Agent, find
+from training.agents.cost import MAX_COST, Cost
 from training.agents.information import make
-from training.agents.learn import hyperparameters
+from training.agents.play import play
 from training.agents.tasks import TASKS
-from training.commands.agent import find
 
 
 def settings(algorithm, name):
@@ -27,7 +26,7 @@ def settings(algorithm, name):
 def test_one_environment_is_a_row_of_the_task(name, x0):
     """Of what an agent sees and is paid, with the environment made as rl-zoo3 makes it; from x0 it escapes."""
     one = OnTask(gym.make(ENV_IDS[name], **settings("ppo", name)["env_kwargs"]))
-    rows = Cost(make(TASKS[name], "x_hat", 2), TASKS[name])
+    rows = Cost(make(TASKS[name], "x_hat", 2, observer=name), TASKS[name])
     options = None if x0 is None else {"x0": x0}
     obs, _ = one.reset(seed=4, options=options)
     expected, _ = rows.reset(seed=[4, 5], options=options)
@@ -44,7 +43,7 @@ def test_one_environment_is_a_row_of_the_task(name, x0):
         assert (ended, truncated) == (terminated[0], truncated_rows[0])
     assert ended == (x0 is not None)
     if ended:  # is paid for the rest of the episode
-        assert reward == -WORST * (TASKS[name].steps - done + 1)
+        assert reward == -MAX_COST * (TASKS[name].steps - done + 1)
 
 
 def test_the_settings_for_rl_zoo3_make_our_task():
@@ -54,18 +53,9 @@ def test_the_settings_for_rl_zoo3_make_our_task():
             assert found["env_wrapper"] == "training.agents.OnTask"
             env = gym.make(ENV_IDS[name], **found["env_kwargs"])
             plant = env.unwrapped.plant
-            assert env.spec.max_episode_steps == task.steps * task.repeat == task.options["max_episode_steps"]
-            assert (plant.dt, plant.measurement_noise) == (task.dt, task.measurement_noise)
-            np.testing.assert_array_equal(plant.start_box, np.transpose(task.start_box or plant.system.X))
-
-
-def test_the_settings_of_training_are_those_for_rl_zoo3():
-    _, found = hyperparameters(TASKS["lorenz"], "sac")
-    written = settings("sac", "lorenz")
-    assert found["policy_kwargs"] == {"net_arch": [64, 64]}
-    assert "activation_fn=nn.Tanh" in written["policy_kwargs"]  # which learn gives to all
-    assert written.keys() - found.keys() == {"env_kwargs", "env_wrapper"}
-    assert all(found[key] == written[key] for key in found.keys() - {"policy_kwargs"})
+            assert env.spec.max_episode_steps == task.steps * task.repeat == task.env_kwargs["max_episode_steps"]
+            assert (plant.dt, plant.measurement_noise) == (task.env_kwargs["dt"], task.measurement_noise)
+            np.testing.assert_array_equal(plant.start_box, np.transpose(task.env_kwargs["start_box"] or plant.system.X))
 
 
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name != "lorenz"]
@@ -75,16 +65,13 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name != 
 def test_the_shipped_agent_reaches_the_reward_threshold(name):
     """On the registered environment, acting as slowly as in its task; without acting the threshold is not reached."""
     agent, spec = Agent.read(find(name)), gym.spec(ENV_IDS[name])
-    duration = spec.max_episode_steps * agent.task.dt
-    task = replace(agent.task, duration=duration, start_box=None)
-    env = make(task, "x_hat", 8, autoreset_mode="Disabled", observer=agent.observer)
-    for act, reached in ((agent, True), (lambda obs: np.zeros((len(obs), 1)), False)):
-        obs, _ = env.reset(seed=70_000)
-        total = np.zeros(8)
-        for _ in range(task.steps):
-            obs, reward, *_ = env.step(act(obs))
-            total += reward
-        assert (total.mean() > spec.reward_threshold) == reached
+    options = {**agent.task.env_kwargs, "start_box": None, "max_episode_steps": spec.max_episode_steps}
+    env = make(replace(agent.task, env_kwargs=options), "x_hat", 8, observer=agent.observer)
+    for act, reached in (
+        (agent.policy(env.single_action_space), True),
+        (lambda obs: np.zeros((len(obs), 1)), False),
+    ):
+        assert (play(env, act, seed=70_000).returns.mean() > spec.reward_threshold) == reached
 
 
 def test_refusals():

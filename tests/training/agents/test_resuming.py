@@ -4,33 +4,27 @@ import errno
 import os
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from stable_baselines3.common.logger import CSVOutputFormat
 
-from kkl_gym import KKLVectorEnv
 from training import checkpoints
 from training.agents.agent import Agent
-from training.agents.learn import learn
-from training.agents.play import play
-from training.agents.tasks import ControlTask
+from training.agents.learning import learn
+from training.agents.tasks import HIDDEN_VELOCITIES, control_task
 from training.cli import main
 
-TASK = ControlTask("van_der_pol", measurement_noise=0.2, duration=0.5)
-ROLLOUT = {"ppo": 256 * 32, "sac": 16}
-OBS = np.ones((3, 2), np.float32)
+PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
+SHORT = control_task("van_der_pol", 0.2, duration=0.5)
 
 
 @pytest.fixture
 def saves(monkeypatch):
-    """What checkpoints hold that are due at each rollout's beginning; number ``saves.stop`` is the first to be written.
-
-    Then the training is interrupted.
-    """
+    """Checkpoints, due at each rollout's beginning; the training is interrupted after number ``saves.stop``."""
 
     class Saves(list):
         stop = None
@@ -38,9 +32,6 @@ def saves(monkeypatch):
     saved, save = Saves(), checkpoints.save
 
     def noted(path, state, **options):
-        if len(saved) + 1 < saved.stop:
-            saved.append(None)
-            return
         save(path, state, **options)
         saved.append(checkpoints.load(path))
         if len(saved) == saved.stop:
@@ -51,65 +42,56 @@ def saves(monkeypatch):
     return saved
 
 
-@pytest.fixture
-def seeds(monkeypatch):
-    """Seeds of the episodes that trainings begin with."""
-    given, reset = [], KKLVectorEnv.reset
-
-    def noted(self, *, seed=None, options=None):
-        if seed is not None:
-            given.append(set(seed))
-        return reset(self, seed=seed, options=options)
-
-    monkeypatch.setattr(KKLVectorEnv, "reset", noted)
-    return given
+def same(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(one.network.weights, other.network.weights, strict=True))
 
 
-@pytest.mark.parametrize(("algorithm", "rollouts"), [("ppo", 2), ("sac", 130)])
-def test_all_but_the_episodes_goes_on(algorithm, rollouts, tmp_path, saves, seeds):
-    timesteps = (rollouts + 1) * ROLLOUT[algorithm]
-
-    def go_on(folder, resume=True):
-        return learn(TASK, "state", folder, timesteps=timesteps, algorithm=algorithm, resume=resume)
-
-    saves.stop = rollouts + 1
+@pytest.mark.parametrize(
+    ("task", "information", "options", "stop"),
+    [
+        (SHORT, "state", {"algorithm": "ppo", "timesteps": 128}, 3),
+        (SHORT, "state", {"algorithm": "sac", "timesteps": 60}, 50),
+        (CART, "z", {"algorithm": "ppo", "timesteps": 128}, 3),  # whose observations are normalised
+        (CART, "y", {"algorithm": "dqn", "timesteps": 60}, 12),
+        (CART, "recurrent", {"timesteps": 128}, 3),
+        (CART, "x_hat", {"timesteps": 600, "observer_steps": 400}, 8),  # which sees hidden signals
+        (CART, "x_hat", {"timesteps": 600, "observer_steps": 300, "aggregate": 1}, 14),  # which sees estimates
+        (replace(CART, measurement_noise=0.1), "x_hat", {"timesteps": 600, "observer_steps": 300}, 5),
+    ],
+)
+def test_all_but_the_episodes_goes_on(task, information, options, stop, tmp_path, small, saves):
+    out = tmp_path / "run"
+    saves.stop = stop
     with pytest.raises(KeyboardInterrupt):
-        go_on(tmp_path, resume=False)
-    assert not (tmp_path / "agent.safetensors").exists()
-    curve = (tmp_path / "progress.csv").read_text()
-    shutil.copytree(tmp_path, tmp_path / "copy")
-
-    agent = go_on(tmp_path)
-    before, after = saves[rollouts], saves[rollouts + 1]  # the last before the end, and the first of what goes on
-    assert before["counters"][0] == rollouts * ROLLOUT[algorithm]
+        learn(task, information, out, **options)
+    assert not (out / "agent.safetensors").exists()
+    shutil.copytree(out, tmp_path / "copy")
+    agent = learn(task, information, out, resume=True, **options)
+    before, after = saves[stop - 1], saves[stop]  # the last before the end, and the first of what goes on
+    assert before["counters"]["num_timesteps"] > 0
     assert (before.pop("resumed"), after.pop("resumed")) == (0, 1)
-    assert before.pop("curve") == after.pop("curve") == curve
-    assert before.keys() == after.keys()
-    torch.testing.assert_close(after, before, rtol=0, atol=0)  # networks, optimisers, counters, replay buffer
-    assert agent.training["timesteps"] == timesteps
+    assert before.pop("restarts") + 1 == after.pop("restarts")
+    moments = [state.pop("moments").get("obs_rms", {"count": 0}) for state in (before, after)]
+    assert moments[1]["count"] - moments[0]["count"] in (0, 2)  # which have seen two more observations since
+    torch.testing.assert_close(after, before, rtol=0, atol=0)  # networks, optimisers, counters, replay buffer, steps
     assert agent.training["resumed"] == 1
-    first, second = seeds
-    assert not first & second
-
-    assert np.array_equal(go_on(tmp_path / "copy")(OBS), agent(OBS))  # random by seed and checkpoint alone
-    whole = (tmp_path / "progress.csv").read_text()
-    if algorithm == "ppo":
-        assert whole.startswith(curve)
-        assert pd.read_csv(tmp_path / "progress.csv")["time/total_timesteps"].tolist() == [8192, 16384, 24576]
-
-    done = go_on(tmp_path)  # nothing is left to do
-    assert np.array_equal(done(OBS), agent(OBS))
-    assert done.training == agent.training
-    assert (tmp_path / "progress.csv").read_text() == whole
+    assert agent.training["timesteps"] >= 0.95 * options["timesteps"]  # the rest is rehearsal
+    again = learn(task, information, tmp_path / "copy", resume=True, **options)
+    assert same(again, agent)  # random by seed and checkpoint alone
+    assert pd.read_csv(out / "curve.csv").steps.is_monotonic_increasing
+    whole = (out / "agent.safetensors").read_bytes()
+    assert same(learn(task, information, out, resume=True, **options), agent)  # nothing is left to do
+    assert (out / "agent.safetensors").read_bytes() == whole
 
 
-def test_what_is_resumed_must_be_the_same_training_and_whole(tmp_path):
-    agent = learn(TASK, "state", tmp_path, timesteps=1)
+def test_what_is_resumed_must_be_the_same_training_and_whole(tmp_path, small):
+    agent = learn(CART, "y", tmp_path)
     assert "resumed" not in agent.training
-    for changed in ({"seed": 1}, {"timesteps": 2}, {"algorithm": "sac"}, {"information": "y"}):
-        options = {"information": "state", "timesteps": 1, **changed}
+    for changed in ({"seed": 1}, {"timesteps": 2}, {"algorithm": "dqn"}, {"information": "z"}):
+        options = {"information": "y", **changed}
         with pytest.raises(ValueError, match="belongs to another configuration"):
-            learn(TASK, options.pop("information"), tmp_path, resume=True, **options)
+            learn(CART, options.pop("information"), tmp_path, resume=True, **options)
+    (tmp_path / "agent.safetensors").unlink()
     path = tmp_path / "agent.checkpoint.pt"
     whole = path.read_bytes()
     for lacking in ("parameters", "curve"):
@@ -118,18 +100,20 @@ def test_what_is_resumed_must_be_the_same_training_and_whole(tmp_path):
         del state[lacking]
         torch.save(state, path)
         with pytest.raises(ValueError, match=rf"agent\.checkpoint\.pt is damaged.* it lacks '{lacking}'"):
-            learn(TASK, "state", tmp_path, timesteps=1, resume=True)
+            learn(CART, "y", tmp_path, resume=True)
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 1
     path.write_bytes(flipped)
     with pytest.raises(ValueError, match=r"agent\.checkpoint\.pt is damaged"):
-        learn(TASK, "state", tmp_path, timesteps=1, resume=True)
-    learn(TASK, "state", tmp_path, timesteps=1)  # from the beginning
-    assert np.array_equal(Agent.read(tmp_path / "agent.safetensors")(OBS), agent(OBS))
+        learn(CART, "y", tmp_path, resume=True)
+    learn(CART, "y", tmp_path)  # from the beginning
+    assert same(Agent.read(tmp_path / "agent.safetensors"), agent)
 
 
-def test_the_command_goes_on(tmp_path, capsys, saves):
-    command = ["agent", "train", "van_der_pol", "--information", "y", "--timesteps", "16384", "--out", str(tmp_path)]
+@pytest.mark.parametrize("name", ["van_der_pol", "CartPole-v1"])
+def test_the_command_goes_on(name, tmp_path, capsys, small, saves):
+    out = tmp_path / "out"
+    command = ["agent", "train", name, "--information", "y", "--timesteps", "128", "--out", str(out)]
     saves.stop = 2
     with pytest.raises(SystemExit):
         main(command)
@@ -137,33 +121,23 @@ def test_the_command_goes_on(tmp_path, capsys, saves):
     with pytest.raises(SystemExit, match="holds the checkpoint of a training"):
         main(command)
     main([*command, "--resume"])
-    assert [state["counters"][0] for state in saves[1:]] == [8192, 8192, 16384]
-    path = tmp_path / "agent.safetensors"
-    agent, whole = Agent.read(path), path.read_bytes()
-    assert play(agent.make(2), agent, steps=3, seed=0).x.shape == (4, 2, 2)
+    counts = [state["counters"]["num_timesteps"] for state in saves[1:]]
+    assert counts == [32, 32, 64, 96, 128]
+    whole = (out / "agent.safetensors").read_bytes()
     main([*command, "--resume"])
-    assert path.read_bytes() == whole
+    assert (out / "agent.safetensors").read_bytes() == whole
     with pytest.raises(SystemExit, match="holds an agent already"):
         main(command)
-    assert sorted(path.name for path in tmp_path.glob("[!.]*")) == [
-        "agent.checkpoint.pt",
-        "agent.safetensors",
-        "log.txt",
-        "progress.csv",
-    ]
+    files = ["agent.checkpoint.pt", "agent.safetensors", "curve.csv", "log.txt"]
+    assert sorted(path.name for path in out.glob("[!.]*")) == files
 
 
-def test_a_full_disk_is_told_by_the_name_of_the_file(tmp_path, monkeypatch):
+def test_the_error_of_a_full_disk_names_the_file(tmp_path, small, monkeypatch):
     def full(self, *arguments):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    for owner, method, name in (
-        (CSVOutputFormat, "write", "progress.csv"),
-        (Path, "write_bytes", "agent.checkpoint.pt"),
-    ):
-        says = re.escape(f"No space left on device: '{tmp_path / name}'")
-        with monkeypatch.context() as patched:
-            patched.setattr(owner, method, full)
-            with pytest.raises(OSError, match=says):
-                learn(TASK, "y", tmp_path, timesteps=1)
-    assert os.listdir(tmp_path) == ["progress.csv"]
+    monkeypatch.setattr(Path, "write_bytes", full)
+    says = re.escape(f"No space left on device: '{tmp_path / 'agent.checkpoint.pt'}'")
+    with pytest.raises(OSError, match=says):
+        learn(CART, "y", tmp_path)
+    assert os.listdir(tmp_path) == ["curve.csv"]

@@ -2,32 +2,68 @@
 
 import pickle
 import zipfile
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import SAC
 
 from training.agents import OnTask
-from training.agents.agent import Agent, AgentError
-from training.agents.sb3_files import from_sb3
+from training.agents.agent import Agent, AgentError, find
+from training.agents.learning import learn
+from training.agents.policy import ALGORITHMS
+from training.agents.sb3_files import from_sb3, to_sb3
+from training.agents.tasks import HIDDEN_VELOCITIES, TASKS
 from training.cli import main
-from training.commands.agent import find
+
+PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
+
+
+def actions(agent, obs):
+    return agent.policy(agent.make().single_action_space)(obs)
 
 
 @pytest.mark.parametrize("name", ["reverse_duffing", "lorenz"])  # SAC's and PPO's
 def test_there_and_back(name, tmp_path):
     agent, path = Agent.read(find(name)), tmp_path / "agent.zip"
     main(["agent", "export", name, "--out", str(path)])
-    played = (SAC if agent.squashed else PPO).load(path, device="cpu")
-    obs = np.random.default_rng(0).normal(size=(50, agent.network.inputs)).astype(np.float32)
-    np.testing.assert_allclose(played.predict(obs, deterministic=True)[0], agent(obs), atol=1e-5)
+    played = ALGORITHMS[agent.training["algorithm"]].load(path, device="cpu")
+    obs = np.random.default_rng(0).normal(size=(50, agent.inputs)).astype(np.float32)
+    np.testing.assert_allclose(played.predict(obs, deterministic=True)[0], actions(agent, obs), atol=1e-5)
     back = tmp_path / "agent.safetensors"
     main(["agent", "import", str(path), name, "--out", str(back), "--observer", agent.observer])
     again = Agent.read(back)
     assert (again.task, again.observer, again.fingerprint) == (agent.task, agent.observer, agent.fingerprint)
     assert again.network.activation == agent.network.activation
-    assert (again(obs) == agent(obs)).all()
+    assert (actions(again, obs) == actions(agent, obs)).all()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "task", "information"),
+    [
+        ("ppo", CART, "z"),
+        ("a2c", PENDULUM, "traces"),
+        ("dqn", CART, "y"),
+        ("sac", PENDULUM, "y"),
+        ("td3", PENDULUM, "state"),
+        ("tqc", PENDULUM, "stacked"),
+        ("ppo_lstm", CART, "recurrent"),
+    ],
+)
+def test_agents_in_any_environment_there_and_back(algorithm, task, information, tmp_path, small):
+    agent = learn(task, information, tmp_path, algorithm=algorithm, timesteps=40)
+    to_sb3(agent).save(tmp_path / "agent.zip")
+    again = from_sb3(tmp_path / "agent.zip", task, information)
+    assert again.mean is None  # its first layer scales
+    env = agent.make(5)
+    policies = [one.policy(env.single_action_space) for one in (agent, again)]
+    obs, _ = env.reset(seed=0)
+    for _ in range(5):
+        here, there = (policy(obs) for policy in policies)
+        np.testing.assert_allclose(there, here, atol=1e-4)
+        obs, *_ = env.step(here)
+    assert ALGORITHMS[algorithm].load(tmp_path / "agent.zip", device="cpu").predict(obs)[0].shape[0] == 5
 
 
 class _Bomb:
@@ -57,16 +93,19 @@ def test_what_is_refused(parts, match, trained):
             if content is not None:
                 files.writestr(name, content)
     with pytest.raises(AgentError, match=match):
-        from_sb3(trained, "rossler")
+        from_sb3(trained, TASKS["rossler"])
 
 
 def test_files_that_are_something_else(tmp_path, trained):
-    assert from_sb3(trained, "rossler").network.activation == "relu"  # SAC's by default
+    assert from_sb3(trained, TASKS["rossler"]).network.activation == "relu"  # SAC's by default
     other = tmp_path / "other.zip"
     other.write_bytes(b"PK")
     with pytest.raises(AgentError, match="no agent of stable-baselines3"):
-        from_sb3(other, "rossler")
+        from_sb3(other, TASKS["rossler"])
     with pytest.raises(AgentError, match=r"missing\.zip: it cannot be read: No such file"):
-        from_sb3(tmp_path / "missing.zip", "rossler")
-    with pytest.raises(AgentError, match="the policy has 3 inputs and 1 outputs, the task"):
-        from_sb3(trained, "van_der_pol")
+        from_sb3(tmp_path / "missing.zip", TASKS["rossler"])
+    with pytest.raises(AgentError, match="the policy has 3 inputs and 1 outputs, the environment"):
+        from_sb3(trained, TASKS["van_der_pol"])
+    strange = replace(Agent.read(find("lorenz")), training={"algorithm": "reinforce"})
+    with pytest.raises(AgentError, match=r"algorithm must be one of .* got 'reinforce'"):
+        to_sb3(strange)

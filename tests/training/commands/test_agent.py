@@ -1,26 +1,34 @@
-"""``kkl-gym agent``: episodes, intervals, and systems of one's own; tests/training/agents has the rest."""
+"""``kkl-gym agent``: episodes, systems of one's own, any environment; tests/training/agents has the rest."""
 
 from functools import partial
 
+import gymnasium as gym
 import linear_system
 import numpy as np
 import pytest
+from rich.console import Console
+from small_agents import make_small
 
-import training.agents.learn
-import training.agents.picture
 from kkl_gym.compiled import SamplingStep
 from kkl_gym.simulate import advance_batch
 from training.agents.agent import Agent
+from training.agents.learning import learn
 from training.agents.seeds import AGENT_EVALUATION_SEED, agent_evaluation_seed
+from training.agents.tasks import HIDDEN_VELOCITIES
 from training.cli import main
-from training.commands.agent import Evaluate, interval
+from training.commands.agent import Evaluate
+from training.commands.agent_task import TaskOptions
+from training.commands.record import PlayOptions, RecordCommand
+from training.records import read_records
 
 OWN = f"{linear_system.__file__}:Oscillator"
+CART = HIDDEN_VELOCITIES["CartPole-v1"]
 
 
 @pytest.fixture(autouse=True)
 def _nothing_is_compiled(monkeypatch):
     monkeypatch.setattr("kkl_gym.vector.batch_step", lambda system: SamplingStep(partial(advance_batch, system)))
+    make_small(monkeypatch)
 
 
 def test_seeds_of_the_evaluation_share_no_episode():
@@ -31,40 +39,82 @@ def test_seeds_of_the_evaluation_share_no_episode():
             agent_evaluation_seed(seed, episodes)
 
 
-def test_intervals_over_episodes():
-    values = np.random.default_rng(0).normal(size=500)
-    error = 1.96 * values.std() / np.sqrt(500)
-    assert interval(values) == pytest.approx((values.mean(), values.mean() - error, values.mean() + error), abs=0.01)
-    assert interval(np.ones(10)) == (1.0, 1.0, 1.0)  # all hold the target
-    assert np.isnan(interval(np.ones(1))[1:]).all()
-
-
-def test_an_agent_is_played_on_the_episodes_of_a_seed(capsys, monkeypatch):
-    for name in ("draw", "animate"):  # which take most of the time
-        monkeypatch.setattr(training.agents.picture, name, lambda task, episodes, path: None)
+def test_an_agent_is_played_on_the_episodes_of_a_seed(capsys):
     assert Evaluate("lorenz").episodes == 500
     shown = []
     for seed in ("0", "0", "1"):
         main(["agent", "evaluate", "lorenz", "--episodes", "2", "--seed", seed])
         lines = capsys.readouterr().out.splitlines()
         shown.append("\n".join(line for line in lines if " passed" not in line))  # progress, on a slow machine
-    assert "[" in shown[0]
+    assert "±" in shown[0]
+    assert "holds the target" in shown[0]
     assert shown[0] == shown[1] != shown[2]
 
 
-def test_an_agent_for_a_system_of_ones_own(tmp_path, saved, script, monkeypatch):
-    small = {"n_envs": 2, "n_epochs": 1, "batch_size": 32}
-    of = training.agents.learn.hyperparameters
-    monkeypatch.setattr("training.agents.learn.hyperparameters", lambda *task: (of(*task)[0], of(*task)[1] | small))
-    monkeypatch.setattr("training.agents.picture.animate", lambda task, episodes, path: None)
-    observer = saved(system=OWN)
-    main(["agent", "train", OWN, "--observer", observer, "--timesteps", "1"])
+def test_an_agent_for_a_system_of_ones_own(saved, script):
+    main(["agent", "train", OWN, "--observer", saved(system=OWN), "--timesteps", "1"])
     path = "runs/agents/oscillator-x_hat-0/agent.safetensors"
     agent = Agent.read(path)
-    assert (agent.observer, agent.training["algorithm"]) == (observer, "ppo")
-    with pytest.raises(SystemExit, match="if you trust that, give --system"):
+    assert (agent.observer, agent.training["algorithm"]) == (saved(system=OWN), "ppo")
+    with pytest.raises(SystemExit, match=r"trust .* if you trust the agent's file"):
         main(["agent", "evaluate", path, "--episodes", "2"])
-    main(["agent", "evaluate", path, "--episodes", "2", "--system", OWN])
-    assert (tmp_path / "runs" / "agents" / "oscillator-x_hat-0.1-0.png").exists()
-    with pytest.raises(SystemExit, match="Pendulum has no inputs"):
+    main(["agent", "evaluate", path, "--episodes", "2", "--trust", OWN])
+    with pytest.raises(SystemExit, match="pendulum has no inputs"):
         main(["agent", "train", f"{script}:Pendulum", "--information", "y"])
+
+
+@pytest.mark.parametrize("information", ["z", "traces", "recurrent", "x_hat"])
+def test_an_agent_in_any_environment(information, capsys):
+    steps = ["--timesteps", "300"] if information == "x_hat" else []
+    main(["agent", "train", "CartPole-v1", "--information", information, "--measured", "0,2", *steps])
+    main(["agent", "evaluate", f"runs/agents/CartPole-v1-{information}-0/agent.safetensors", "--episodes", "3"])
+    shown = capsys.readouterr().out
+    assert shown.count("return") == 2
+    with pytest.raises(SystemExit, match="holds an agent already"):
+        main(["agent", "train", "CartPole-v1", "--information", information])
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("CartPole-v1 --measurement-noise 0.1,0.2", "one number"),
+        ("Acrobot-v1", "say what is measured of Acrobot-v1"),
+        ("lorenz --measured 0", "of the system lorenz y is measured"),
+        ("lorenz --aggregate 2", "no observer to fit again"),
+    ],
+)
+def test_commands_that_make_no_sense(command, says):
+    with pytest.raises(SystemExit, match=says):
+        main(["agent", "train", *command.split()])
+
+
+def test_options_become_a_task():
+    options = {"time_constants": "1,2", "frames": 4, "no_past_actions": True, "angles": ("3,1", "4,2")}
+    task = TaskOptions(**options).task("InvertedDoublePendulum-v5")
+    assert (task.time_constants, task.frames, task.past_actions) == ((1.0, 2.0), 4, False)
+    assert task.angles == ((3, 1), (4, 2))
+    for wrong, says in (
+        ({"measured": "x"}, "takes indices"),
+        ({"time_constants": "1;2"}, "--time-constants takes numbers of steps"),
+        ({"angles": ("cos",)}, "--angles takes indices"),
+        ({"angles": ("0,1,2",)}, r"--angles takes the cosine's entry and the sine's, .* got '0,1,2'"),
+        ({"angles": ("0,1",)}, r"angles must name entries of CartPole-v1 that are measured, \(0, 2\)"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            TaskOptions(**wrong).task("CartPole-v1")
+
+
+def test_an_agent_on_the_state_is_recorded_as_a_policy(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+    learn(CART, "state", tmp_path)
+    path = tmp_path / "agent.safetensors"
+    options = {"measured": "0,2", "hidden": "1,3", "policy": str(path), "play": PlayOptions(steps=30)}
+    name = RecordCommand("CartPole-v1", **options).run(Console())
+    assert name == "cartpole-v1/agent-v0"
+    (record, *_) = read_records((f"minari:{name}",))
+    policy = Agent.read(path).policy(gym.make("CartPole-v1").action_space)
+    for k in range(len(record.t) - 1):
+        obs = np.float32([record.y[k, 0], record.x[k, 0], record.y[k, 1], record.x[k, 1]])
+        assert record.u[k].argmax() == policy(obs[None])[0]
+    with pytest.raises(ValueError, match="see the state of that"):
+        RecordCommand("Acrobot-v1", **{**options, "measured": "0", "hidden": "1"}).run(Console())

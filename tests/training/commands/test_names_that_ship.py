@@ -35,7 +35,7 @@ def test_maps_has_a_row_for_each_file_and_cuts_no_name():
         ("evaluate NAME --faults --trajectories 2 --duration 4", None),
         ("export NAME --format c", None),
         ("demo lorenz --observer NAME --duration 1", None),
-        ("agent train lorenz --observer NAME --timesteps 1", "training.agents.learn.learn"),
+        ("agent train lorenz --observer NAME --timesteps 1", "training.agents.learning.learn"),
     ],
 )
 def test_a_name_that_ships_works_in_every_command(command, work, name, monkeypatch):

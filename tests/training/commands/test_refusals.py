@@ -115,7 +115,6 @@ def test_refused(arguments, message, capsys):
     [
         "evaluate lorenz --csv file/errors.csv",
         "demo --out file",
-        "agent evaluate van_der_pol --out file",
         "diagnose lorenz --json file/found.json",
     ],
 )

@@ -1,0 +1,271 @@
+"""Agents that see different things of one task: which there are, and the training and value of each."""
+
+import json
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+
+import numpy as np
+
+import kkl_gym
+from examples.research.resumable import Job
+from kkl_gym import get_system
+from kkl_gym.memory import IMAGINED
+from observers.storage import explained, write
+from training.agents.agent import fingerprint, rules
+from training.agents.environments import vector
+from training.agents.information import OBSERVED, Information, make, observer_of
+from training.agents.play import play
+from training.agents.seeds import AGENT_EVALUATION_SEED
+from training.agents.tasks import Task, scores, successes
+from training.evaluation.levels import as_cell, as_name
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# An information set, or one with another source of estimates or another learner.
+Kind = Literal[
+    "state",
+    "ekf",
+    "x_hat",
+    "x_hat_std",
+    "stacked_x_hat",
+    "z",
+    "traces",
+    "stacked",
+    "y",
+    "recurrent",
+    "recurrent-state",
+]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+ON_SYSTEMS: tuple[Kind, ...] = ("state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state")
+IN_ENVIRONMENTS: tuple[Kind, ...] = ("state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y")
+IDLE: Literal["random"] = "random"  # no action on systems, random ones elsewhere: the normalised score 0
+SEEN: dict[str, Information] = {
+    "ekf": "x_hat",
+    "stacked_x_hat": "x_hat",
+    "recurrent-state": "state",
+}  # where a kind is not an information set
+REFITTED = ("x_hat", "stacked_x_hat")  # whose estimates are learned from the hidden signals of environments
+CONCERNED = {  # by settings of a task that matter to some agents alone
+    "time_constants": ("z", "traces"),
+    "frames": ("stacked", "stacked_x_hat"),
+    "past_actions": ("z", "traces", "stacked"),
+    "angles": ("z",),
+}
+SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # further levels at which agents are trained
+SEEDS = 5
+RECURRENT_SEEDS, SECOND_NOISE_RECURRENT_SEEDS = 3, 1  # on systems, at most; their trainings take longest
+COLUMNS = {
+    "results.csv": ["environment", "noise", "shown", "seed", "return", "success", "seconds"],
+    "curves.csv": ["environment", "noise", "shown", "steps", "seconds", "return"],
+}
+
+
+@dataclass(frozen=True)
+class ComparedAgent(Job):
+    """One agent: trained, then played on the evaluation's episodes."""
+
+    task: Task
+    kind: Kind | Literal["random"]
+    seed: int
+    episodes: int
+    timesteps: int | None
+    aggregate: int
+    folder: Path
+    observer: str | None = None
+
+    result: ClassVar[str] = "result.json"
+    other: ClassVar[str] = "an agent of another comparison"
+
+    @property
+    def name(self) -> str:
+        """Task, noise, kind and seed."""
+        return f"{self.task.name} at noise {as_name(self.task.measurement_noise)}/{self.kind}/{self.seed}"
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Task, hyperparameters, the observer's content and the package's version, as far as they concern the agent."""
+        task = asdict(self.task)
+        for setting, kinds in CONCERNED.items():
+            if self.kind not in kinds:
+                del task[setting]
+        described: dict[str, Any] = {"episodes": self.episodes, "task": task, "version": kkl_gym.__version__}
+        if self.kind == IDLE:
+            return described
+        from training.agents.learning import PRIVILEGED, REHEARSAL, WANDERED, hyperparameters
+
+        algorithm = self._algorithm
+        described |= {
+            "rules": rules(self.task),
+            "timesteps": self.timesteps,
+            "algorithm": algorithm,
+            "hyperparameters": hyperparameters(algorithm, self.task),
+        }
+        if self._observer is not None:
+            described["observer"] = [self._observer, fingerprint(self._observer)]
+        elif self.kind in REFITTED:
+            begins = WANDERED if self.task.measurement_noise else PRIVILEGED
+            described |= {"aggregate": self.aggregate, "begins": begins, "rehearsal": REHEARSAL}
+        elif self.kind == "z":
+            described["past"] = IMAGINED
+        return described
+
+    @property
+    def _observer(self) -> str | None:
+        """The observer that the agent begins with, if it does."""
+        if self.task.system is None or self.kind not in OBSERVED:
+            return None
+        return self.observer or observer_of(get_system(self.task.system))
+
+    @property
+    def _information(self) -> Information:
+        return SEEN.get(self.kind, self.kind)  # type: ignore[arg-type]
+
+    @property
+    def _algorithm(self) -> str:
+        from training.agents.learning import RECURRENT, algorithm_for
+
+        if self.kind.startswith("recurrent"):
+            return RECURRENT
+        with closing(vector(self.task, 1)) as env:
+            return algorithm_for(self.task, self._information, env.single_action_space)
+
+    def work(self) -> None:
+        """Train the agent, play it and write the value of each episode."""
+        began, task = time.process_time(), self.task
+        if self.kind == IDLE:
+            env = make(task, "state", self.episodes)
+            policy = _still(env) if task.system is not None else _random(env)
+        else:
+            from examples.research.agents.filtered import EKF
+            from examples.research.agents.window import STACKED
+            from training.agents.learning import learn
+            from training.agents.observing import KKL, OBSERVER
+
+            estimation = {"ekf": EKF, "stacked_x_hat": STACKED}.get(self.kind, KKL)
+            agent = learn(
+                task,
+                self._information,
+                self.folder,
+                algorithm=self._algorithm,
+                timesteps=self.timesteps,
+                seed=self.seed,
+                observer=self._observer,
+                aggregate=self.aggregate if task.system is None and self.kind in REFITTED else 0,
+                estimation=estimation,
+            )
+            learned = str(self.folder / OBSERVER) if task.system is None and self.kind in REFITTED else self._observer
+            env = estimation.show(task, self._information, self.episodes, learned)
+            policy = agent.policy(env.single_action_space)
+        seconds = time.process_time() - began
+        with closing(env):
+            played = play(env, policy, seed=AGENT_EVALUATION_SEED)
+        values, held = played.returns, None
+        if task.system is not None:
+            system, x = get_system(task.system), played.signals("x")
+            values, held = scores(system, x), successes(system, x).tolist()
+        result = {"returns": values.round(6).tolist(), "successes": held, "seconds": round(seconds, 1)}
+        write(self.folder / self.result, json.dumps(result) + "\n")
+
+
+def _still(env: Any) -> Any:
+    return lambda obs: np.zeros((len(obs), *env.single_action_space.shape))
+
+
+def _random(env: Any) -> Any:
+    env.action_space.seed(AGENT_EVALUATION_SEED)
+    return lambda obs: env.action_space.sample()
+
+
+def planned(
+    tasks: Sequence[Task],
+    out: Path,
+    *,
+    kinds: Sequence[Kind] | None = None,
+    seeds: int = SEEDS,
+    observers: dict[str, str] | None = None,
+    **how: Any,
+) -> list[ComparedAgent]:
+    """All agents of a comparison, the first seed of each first; environments' levels of noise share some agents."""
+    agents: dict[Path, ComparedAgent] = {}
+    for seed in range(seeds):
+        for task in tasks:
+            usual = IN_ENVIRONMENTS if task.system is None else ON_SYSTEMS
+            for kind in (*((IDLE,) if seed == 0 else ()), *(usual if kinds is None else kinds)):
+                own = task.without_noise if task.system is None and kind in ("state", IDLE) else task
+                if task.system is not None and kind.startswith("recurrent") and seed >= _most(task):
+                    continue
+                folder = out / "jobs" / f"{own.name}-{as_name(own.measurement_noise)}" / kind / str(seed)
+                observer = (observers or {}).get(own.name)
+                agents.setdefault(folder, ComparedAgent(own, kind, seed, **how, folder=folder, observer=observer))
+    return list(agents.values())
+
+
+def _most(task: Task) -> int:
+    """Recurrent agents of a system's task, at most."""
+    second = SECOND_NOISE.get(task.name) == task.measurement_noise
+    return SECOND_NOISE_RECURRENT_SEEDS if second else RECURRENT_SEEDS
+
+
+def seeds_in(out: Path) -> int:
+    """One more than the largest seed of the agents' folders, OUT/jobs/TASK/KIND/SEED."""
+    return 1 + max((int(path.name) for path in out.glob("jobs/*/*/*") if path.name.isdigit()), default=-1)
+
+
+def collect(agents: Sequence[ComparedAgent]) -> "pd.DataFrame":
+    """Results of agents that are done, a row each."""
+    import pandas as pd
+
+    rows = []
+    for agent in agents:
+        with explained(agent.folder / agent.result, ValueError):
+            result = json.loads((agent.folder / agent.result).read_text())
+            value = round(float(np.mean(result["returns"])), 6)
+            success = np.nan if result["successes"] is None else float(np.mean(result["successes"]))
+            noise = as_cell(agent.task.measurement_noise)
+            rows.append((agent.task.name, noise, agent.kind, agent.seed, value, success, result["seconds"]))
+    return pd.DataFrame(rows, columns=COLUMNS["results.csv"])
+
+
+def read_results(folder: Path | None, name: str = "results.csv") -> "pd.DataFrame":
+    """Rows of an earlier comparison, none without one; raises ValueError or OSError if they cannot be used."""
+    import pandas as pd
+
+    columns = COLUMNS[name]
+    if folder is None:
+        return pd.DataFrame(columns=columns)
+    with explained(folder / name, ValueError):
+        rows = pd.read_csv(folder / name, index_col=False)
+        needed = [column for column in columns if column != "success"]  # which only systems have
+        if [column for column in rows.columns if column != "success"] != needed:
+            raise ValueError(f"its columns are {', '.join(rows.columns)}, not {', '.join(columns)}")
+        if rows[needed].isna().any(axis=None):
+            raise ValueError(f"row {rows.index[rows[needed].isna().any(axis=1)][0] + 2} lacks a value")
+        if unknown := set(rows.shown) - {*KINDS, IDLE}:
+            raise ValueError(f"unknown agents {', '.join(sorted(unknown))}; there are {', '.join(KINDS)}")
+    return rows.reindex(columns=columns)
+
+
+def beside(earlier: "pd.DataFrame", rows: "pd.DataFrame", here: "pd.DataFrame") -> "pd.DataFrame":
+    """Put rows below earlier ones, without those of the environments, levels of noise and kinds in ``here``."""
+    import pandas as pd
+
+    task = ["environment", "noise", "shown"]
+    others = earlier[~pd.MultiIndex.from_frame(earlier[task]).isin(pd.MultiIndex.from_frame(here[task]))]
+    if others.empty:
+        return rows
+    joined = pd.concat([others, rows])
+    return joined.iloc[np.argsort(pd.factorize(joined.environment)[0], kind="stable")]
+
+
+def unusual_settings(tasks: Sequence[Task]) -> str:
+    """Settings of agents on memories and stacks that are not the defaults, as a sentence; empty if there are none."""
+    changed = []
+    for field in fields(Task):
+        values = {getattr(task, field.name) for task in tasks} if field.name in CONCERNED else set()
+        changed += [f"`{field.name}` {value}" for value in values if value != field.default]
+    return f"Agents on z, traces and stacked observations: {', '.join(changed)}." if changed else ""

@@ -1,0 +1,367 @@
+"""Agents of stable-baselines3 learn a task."""
+
+import ast
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from copy import deepcopy
+from dataclasses import asdict
+from functools import cache, partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import yaml
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
+from torch import nn
+
+from kkl_gym import OWN_ID, get_system
+from kkl_gym.wrappers.vector import VectorEnv
+from training.agents.agent import Agent, fingerprint, rules
+from training.agents.bridge import SB3VecEnv
+from training.agents.checkpoint import Checkpoint
+from training.agents.cost import Cost
+from training.agents.environments import CLEAN_Y, vector
+from training.agents.information import ESTIMATED, OBSERVED, Information, observer_of
+from training.agents.observing import KKL, OBSERVER, Estimation, Privileged, estimated_entries, wander
+from training.agents.policy import ALGORITHMS, CONTINUOUS, head_of, linear, lstm_in, perceptron
+from training.agents.seeds import agent_training_seed
+from training.agents.tasks import PREFERRED, Task
+from training.checkpoints import SUFFIX
+from training.progress import ProgressBars, progress_bars
+
+RECURRENT = "ppo_lstm"
+# Share of the steps of a training, the first ones, in which there are no estimates yet.
+PRIVILEGED = 0.9  # without noise: estimates come so near to the truth that what is right with the one is with the other
+WANDERED = 0.1  # under noise
+REHEARSAL = 0.05  # of the steps, the last ones, in which the agent acts without exploration and learns no more
+FILE = "agent.safetensors"
+_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
+_OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # what rl-zoo3 makes a system's task of
+
+
+def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:
+    """Choose the algorithm: recurrent PPO for recurrent agents, SAC where it is tuned, else PPO."""
+    if information == "recurrent":
+        return RECURRENT
+    if task.system is not None:
+        return PREFERRED.get(task.name, "ppo")
+    return "sac" if isinstance(actions, spaces.Box) and task.env_id in settings_of("sac") else "ppo"
+
+
+@cache
+def settings_of(algorithm: str) -> dict[str, dict[str, Any]]:
+    """The content of hyperparameters/ALGORITHM.yml, by environment; rl-zoo3 reads these files too."""
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
+    text = files("training.agents").joinpath("hyperparameters", f"{algorithm}.yml").read_text()
+    return dict(yaml.safe_load(text))
+
+
+def hyperparameters(algorithm: str, task: Task, timesteps: int | None = None) -> dict[str, Any]:
+    """Return the settings of an algorithm for a task."""
+    known = settings_of(algorithm)
+    other = OWN_ID if task.system is not None and OWN_ID in known else "default"
+    settings = deepcopy(known.get(task.env_id, known[other]))
+    for key in _OF_RL_ZOO3:
+        settings.pop(key, None)
+    if timesteps is not None:
+        if timesteps < 1:
+            raise ValueError(f"timesteps must be positive, got {timesteps}")
+        settings["n_timesteps"] = timesteps
+    return settings
+
+
+def learn(
+    task: Task,
+    information: Information,
+    folder: Path,
+    *,
+    algorithm: str | None = None,
+    timesteps: int | None = None,
+    seed: int = 0,
+    observer: str | None = None,
+    observer_steps: int | None = None,
+    aggregate: int = 0,
+    resume: bool = False,
+    estimation: Estimation = KKL,
+    progress: ProgressBars | None = None,
+) -> Agent:
+    """Train one agent, with checkpoints; writes agent.safetensors, curve.csv and maybe observer.safetensors.
+
+    Where an observer has to be learned, the agent's first steps are for both. Without noise, the agent sees the hidden
+    signals in place of estimates; the observer is learned from these steps, and the agent goes on with estimates. Under
+    noise estimates are far from the truth; these steps are then fewer, and random actions, from which the observer
+    alone is learned. They count too.
+
+    A training that goes on from a checkpoint begins new episodes, so that it makes another agent than one that never
+    stopped; ``Agent.training`` then says how many times it was resumed.
+    """
+    with closing(vector(task.without_noise, 1)) as env:
+        actions, size = env.single_action_space, gym.spaces.flatdim(env.single_observation_space)
+    name = algorithm or algorithm_for(task, information, actions)
+    settings = hyperparameters(name, task, timesteps)
+    steps, rows = settings["n_timesteps"], settings.get("n_envs", 1)
+    _check_actions(name, actions, task.env_id)
+    if information == "recurrent" and name != RECURRENT:
+        raise ValueError(f"recurrent agents learn by {RECURRENT}, got {name!r}")
+    if observer is not None and information not in OBSERVED:
+        raise ValueError(f"an agent that sees {information!r} has no use for the observer {observer!r}")
+    if aggregate and (task.system is not None or information not in ESTIMATED):
+        raise ValueError(f"an agent that sees {information!r} of {task.env_id} has no observer to fit again")
+    if task.system is not None and information in OBSERVED and observer is None and estimation is KKL:
+        observer = observer_of(get_system(task.system))
+    rehearsal = round(REHEARSAL * steps) if aggregate else 0
+    # Whether an observer is learned on the way.
+    fits = task.system is None and information in ESTIMATED and observer is None
+    if fits and information != "x_hat":
+        raise ValueError(f"{information}: train an observer with error bars first, and name it (--observer FILE)")
+    if fits and not estimated_entries(task, size):
+        raise ValueError(f"all entries of {task.env_id} are measured, without noise: nothing is left to estimate")
+    if observer_steps is not None and not fits:
+        raise ValueError("observer_steps is for agents on x_hat that are given no observer")
+    first = _first_steps(task, steps, rehearsal, observer_steps) if fits else 0
+    how = {"algorithm": name, **settings, "seed": seed, "observer_steps": first, "aggregate": aggregate}
+    observed = None if observer is None else [observer, fingerprint(observer)]
+    identity = json.dumps([asdict(task), information, observed, rules(task), how], sort_keys=True)
+    checkpoint = Checkpoint(folder / f"agent{SUFFIX}", hashlib.sha256(identity.encode()).hexdigest(), resume=resume)
+    resumes = checkpoint.saved is not None
+    if resumes and (folder / FILE).exists():
+        return Agent.read(folder / FILE)  # nothing is left to do
+    with progress_bars(progress) as bars:
+        fit = partial(estimation.learn, task, folder=folder, seed=seed, progress=bars)
+        privileged = None
+        if fits and task.measurement_noise:  # what is right with the truth is not with estimates then
+            checkpoint.spent = first
+            if not resumes:
+                fit(wander(task, first, seed=seed, progress=bars))
+        elif fits:
+            privileged = Privileged(task, rows, checkpoint.saved_records(_like(task)) if resumes else ())
+            checkpoint.privileged = not resumes or checkpoint.saved["privileged"]  # type: ignore[index]
+        if fits:
+            observer = str(folder / OBSERVER)
+        left = steps - rehearsal - checkpoint.spent
+
+        def make() -> VectorEnv:
+            if privileged is not None and checkpoint.privileged:
+                return privileged.make()
+            return estimation.show(task, information, rows, observer)
+
+        keys = ("y", "u", "x", "sample", CLEAN_Y) if aggregate else ()
+        description = f"{task.name} {information} {seed}"
+        with closing(_Learner(name, settings, seed, task, make(), keys)) as learner:
+            learner.begin(checkpoint, left)
+            if privileged is not None and checkpoint.privileged:
+                checkpoint.records = privileged.records
+                with bars.phase(f"{description}, hidden signals shown", first) as report:
+                    learner.learn(left, [_Bar(report), checkpoint], until=first)
+                if learner.steps >= left:
+                    raise ValueError(
+                        f"the agent would never see an estimate: {name} collects {learner.steps} steps before it goes "
+                        f"on; give it more than {steps} (--timesteps)"
+                    )
+                fit(privileged.records())
+                checkpoint.privileged = False
+                checkpoint.restarts += 1
+                learner.move(make(), checkpoint.restarts)
+            callbacks: list[BaseCallback] = [checkpoint]
+            if aggregate:
+                before = [] if privileged is None else privileged.records()  # no random actions
+                checkpoint.records = lambda: before
+                every = max(1, (left - (first - checkpoint.spent)) // (aggregate + 1))
+                callbacks.append(estimation.refits(task, fit, every, rehearsal, folder / OBSERVER, before))
+            else:
+                checkpoint.records = list
+            with bars.phase(description, left) as report:
+                learner.learn(left, [_Bar(report), *callbacks])
+    model = learner.model
+    if aggregate:
+        observer = str(folder / OBSERVER)  # which is what the agent has seen last
+    resumed = {"resumed": checkpoint.resumed} if checkpoint.resumed else {}
+    training = {**how, "timesteps": model.num_timesteps + checkpoint.spent, **resumed}
+    agent = agent_of(model, task, information, observer=observer, training=training)
+    agent.save(folder / FILE)
+    return agent
+
+
+def _first_steps(task: Task, steps: int, rehearsal: int, given: int | None) -> int:
+    """Number of steps from which an observer is learned."""
+    first = round((WANDERED if task.measurement_noise else PRIVILEGED) * steps) if given is None else given
+    if 0 < first < steps - rehearsal:
+        return first
+    if given is None:
+        raise ValueError(f"{steps} steps are too few for an observer and an agent; give it more (--timesteps)")
+    raise ValueError(f"observer_steps must be some, and fewer than all {steps - rehearsal} of learning; got {given}")
+
+
+def _like(task: Task) -> Any:
+    """Make a record of two samples of a task's environment."""
+    alone = Privileged(task, 1)
+    with closing(alone.make()) as env:
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        return alone.records()[0]
+
+
+def _check_actions(algorithm: str, space: gym.Space[Any], env_id: str) -> None:
+    """Raise ValueError unless an algorithm can act in a space."""
+    if isinstance(space, spaces.Discrete):
+        fits, others = algorithm not in CONTINUOUS, "ppo, a2c or dqn"
+    elif isinstance(space, spaces.Box) and len(space.shape) == 1:
+        fits, others = algorithm != "dqn", "ppo, a2c, sac, td3 or tqc"
+        if algorithm in CONTINUOUS and not space.is_bounded():
+            fits, others = False, "ppo or a2c, as there are no bounds"
+    else:
+        raise ValueError(f"agents learn where actions are Discrete or a row of numbers; those of {env_id} are {space}")
+    if not fits:
+        raise ValueError(f"{algorithm} cannot learn in {env_id}, whose actions are {space}: take {others}")
+
+
+class _Learner:
+    """An algorithm and its environments, with settings that mean what they mean in rl-zoo3."""
+
+    def __init__(
+        self,
+        algorithm: str,
+        settings: Mapping[str, Any],
+        seed: int,
+        task: Task,
+        env: VectorEnv,
+        info_keys: Sequence[str],
+    ) -> None:
+        given = deepcopy({key: value for key, value in settings.items() if key not in _OF_THE_RUN})
+        self._seed, self._pays, self._keys = seed, task if task.system is not None else None, info_keys
+        vec_env = self._monitored(env)
+        for key in ("learning_rate", "clip_range"):
+            if isinstance(given.get(key), str):
+                given[key] = linear(float(given[key].removeprefix("lin_")))
+        if isinstance(given.get("policy_kwargs"), str):
+            given["policy_kwargs"] = _keywords(given["policy_kwargs"])
+        if settings.get("noise_type") == "normal":
+            size = np.full(vec_env.action_space.shape or (), settings["noise_std"])
+            given["action_noise"] = NormalActionNoise(np.zeros_like(size), size)
+        if settings.get("normalize"):
+            vec_env = VecNormalize(vec_env, gamma=given.get("gamma", 0.99))
+        try:
+            self.model = ALGORITHMS[algorithm](env=vec_env, seed=seed, device="cpu", **given)
+        except BaseException:
+            vec_env.close()
+            raise
+
+    @property
+    def steps(self) -> int:
+        """Steps that it has learned from."""
+        return self.model.num_timesteps
+
+    def begin(self, checkpoint: Checkpoint, steps: int) -> None:
+        """Seed the episodes, and go on from a checkpoint if there is one."""
+        checkpoint.restore(self.model, steps)
+        vec_env: Any = self.model.get_env()
+        first = agent_training_seed(self._seed, checkpoint.restarts, vec_env.num_envs)
+        if checkpoint.restarts:
+            self.model.set_random_seed(first)
+        vec_env.seed(first)  # the model has seeded it with its own
+
+    def learn(self, steps: int, callbacks: list[BaseCallback], *, until: int | None = None) -> None:
+        """Learn until there were so many steps.
+
+        ``until`` stops before, where an algorithm begins to collect, and at the latest where it would collect for the
+        last time.
+        """
+        stop = [] if until is None else [_Until(until, steps)]
+        self.model.learn(steps - self.steps, callback=[*callbacks, *stop], reset_num_timesteps=False)
+
+    def move(self, env: VectorEnv, restarts: int) -> None:
+        """Go on in other environments, which show what the ones before showed; these are closed."""
+        vec_env, before = self._monitored(env), self.model.get_env()
+        if isinstance(before, VecNormalize):
+            moments = before.obs_rms, before.ret_rms
+            vec_env = VecNormalize(vec_env, gamma=before.gamma)
+            vec_env.obs_rms, vec_env.ret_rms = moments
+        vec_env.seed(agent_training_seed(self._seed, restarts, vec_env.num_envs))
+        self.close()
+        self.model.set_env(vec_env)
+
+    def close(self) -> None:
+        """Close the environments."""
+        env = self.model.get_env()
+        assert env is not None
+        env.close()
+
+    def _monitored(self, env: VectorEnv) -> VecEnv:
+        return VecMonitor(SB3VecEnv(env if self._pays is None else Cost(env, self._pays), self._keys))
+
+
+class _Until(BaseCallback):
+    """Stops a training once there were so many steps, where an algorithm collects anew, and before the last time."""
+
+    def __init__(self, steps: int, last: int) -> None:
+        super().__init__()
+        self._steps, self._last, self._over = steps, last, False
+
+    def _on_training_start(self) -> None:
+        self._begun = self.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        collects = self.num_timesteps - self._begun  # as the time before
+        self._begun = self.num_timesteps
+        stopping = self.training_env.num_envs  # steps that it takes: a callback can stop nothing but a step
+        self._over = self.num_timesteps >= min(self._steps, max(1, self._last - stopping - collects))
+
+    def _on_step(self) -> bool:
+        return not self._over
+
+
+class _Bar(BaseCallback):
+    """Reports the number of steps."""
+
+    def __init__(self, report: Callable[[float], object]) -> None:
+        super().__init__()
+        self._report = report
+
+    def _on_step(self) -> bool:
+        self._report(self.num_timesteps)
+        return True
+
+
+def _keywords(call: str) -> dict[str, Any]:
+    """The arguments of ``dict(...)``, as rl-zoo3 needs it for a class of torch.nn."""
+    tree: Any = ast.parse(call, mode="eval")
+    return {
+        k.arg: getattr(nn, k.value.attr) if isinstance(k.value, ast.Attribute) else ast.literal_eval(k.value)
+        for k in tree.body.keywords
+    }
+
+
+def agent_of(
+    model: BaseAlgorithm,
+    task: Task,
+    information: Information,
+    *,
+    observer: str | None = None,
+    training: Mapping[str, Any] | None = None,
+) -> Agent:
+    """Take the deterministic policy out of a trained agent."""
+    scaling = model.get_vec_normalize_env()
+    moments: Any = None if scaling is None else scaling.obs_rms
+    name = next(name for name, algorithm in ALGORITHMS.items() if type(model) is algorithm)
+    return Agent(
+        perceptron(model),
+        head_of(name, discrete=isinstance(model.action_space, spaces.Discrete)),
+        task,
+        information,
+        mean=None if moments is None else moments.mean.copy(),
+        scale=None if moments is None else np.sqrt(moments.var + scaling.epsilon),  # type: ignore[union-attr]
+        lstm=lstm_in(model.policy.state_dict()),
+        observer=observer,
+        fingerprint=None if observer is None else fingerprint(observer),
+        rules=rules(task),
+        training=training or {},
+    )

@@ -1,0 +1,158 @@
+"""An observer for an agent: from the first steps that it makes in an environment, and from later ones."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+from kkl_gym.wrappers.vector import VectorEnv
+from training.agents.environments import CLEAN, CLEAN_Y, single, vector
+from training.agents.information import FeatureObservation, Information, make
+from training.agents.tasks import Task
+from training.maps.coordinates import SETTLED
+from training.progress import ProgressBars
+from training.records import Record
+from training.rollouts.callback import KKLTrainingCallback
+from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
+from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset, split
+from training.spectrum import evenly_spaced
+from training.train_observer import train
+
+OBSERVER = "observer.safetensors"
+HEADROOM = 1.5  # of the noise that a map is trained for over the noise that there is
+# Per step, of filters under noise: more and slower modes, which average over more steps.
+MODES_UNDER_NOISE, SLOWEST_UNDER_NOISE, FASTEST_UNDER_NOISE = 8, 0.05, 1.0
+HELD_OUT = 0.2  # of the episodes
+KEPT = 100_000  # steps that an observer is learned from, the latest
+SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
+
+
+def hidden_entries(task: Task, size: int) -> tuple[int, ...]:
+    """Which entries of an observation of some size are hidden."""
+    return tuple(i for i in range(size) if i not in task.measured) if task.hidden is None else task.hidden
+
+
+def estimated_entries(task: Task, size: int) -> tuple[int, ...]:
+    """Which entries of an observation of some size an observer estimates; under noise also what is measured."""
+    hidden = hidden_entries(task, size)
+    return tuple(sorted({*hidden, *task.measured})) if task.measurement_noise else hidden
+
+
+def signals(task: Task, env: gym.Env[Any, Any]) -> dict[str, Any]:
+    """The signals to record in an environment of a task, as :class:`Recorder` takes them."""
+    source = f"info[{CLEAN}]" if task.measurement_noise else "obs"
+    hidden = [f"{source}[{i}]" for i in estimated_entries(task, gym.spaces.flatdim(env.observation_space))]
+    return {"measured": [str(i) for i in task.measured], "hidden": hidden}
+
+
+class Privileged:
+    """Environments that show what an observer is to estimate in place of the estimates, and record the latest steps.
+
+    ``earlier`` are records of an interrupted training, the oldest first.
+    """
+
+    def __init__(self, task: Task, rows: int, earlier: Sequence[Record] = ()) -> None:
+        self._task, self._rows, self._earlier = task, rows, list(earlier)
+        self._recorders = list[Recorder]()
+
+    def make(self) -> VectorEnv:
+        """Make the environments."""
+        env = vector(self._task, self._rows, each=self._each)
+        entries = [*self._task.measured, *hidden_entries(self._task, gym.spaces.flatdim(env.single_observation_space))]
+        return FeatureObservation(env, lambda at: at["obs"][:, entries], len(entries))
+
+    def _each(self) -> gym.Env[Any, Any]:
+        env = single(self._task)
+        self._recorders.append(Recorder(env, **signals(self._task, env), keep=max(1, KEPT // self._rows)))
+        return self._recorders[-1]
+
+    def records(self) -> list[Record]:
+        """Return what was recorded, the episodes that ended first at the beginning."""
+        rows = [recorder.rollouts(going_on=True).records() for recorder in self._recorders]
+        return latest([*self._earlier, *oldest_first(rows)])
+
+
+def latest(records: Sequence[Record]) -> list[Record]:
+    """Return the latest records, of at least as many steps as an observer is learned from."""
+    kept, steps = list[Record](), 0
+    for record in reversed(records):
+        if steps >= KEPT:
+            break
+        kept.insert(0, record)
+        steps += len(record.t) - 1
+    return kept
+
+
+def oldest_first(rows: Sequence[Sequence[Record]]) -> list[Record]:
+    """Put together the records of environments that were stepped together."""
+    dated = list[tuple[int, Record]]()
+    for records in rows:
+        after = 0  # steps that were made since
+        for record in reversed(records):
+            dated.append((after, record))
+            after += len(record.t) - 1
+    return [record for _, record in sorted(dated, key=lambda one: -one[0])]
+
+
+def wander(task: Task, steps: int, *, seed: int, progress: ProgressBars) -> list[Record]:
+    """Act at random, each action held for a while."""
+    with single(task, noisy=False) as env, progress.phase(f"playing {task.env_id}", steps) as report:
+        policy = policy_of(WANDERING, env)
+        rollouts = roll_out(env, policy, **signals(task, env), steps=steps, seed=seed, report=report)
+    return rollouts.records()
+
+
+def learn_observer(task: Task, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars) -> Path:
+    """Learn an observer from an agent's first steps."""
+    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, "tracking": False, **SETTINGS}
+    if task.measurement_noise:
+        spread = np.std(np.concatenate([record.y for record in records]), 0)
+        changes["measurement_noise_max"] = tuple(
+            np.maximum(RECORDED_NOISE * spread, HEADROOM * np.asarray(task.measurement_noise))
+        )
+        dt = float(np.diff(records[0].t[:2])[0])
+        # The filter has to settle in one episode at least of those that are trained on; a beginner's may be short.
+        longest = max(record.duration for record in split(records, HELD_OUT, seed)[0])
+        fastest = FASTEST_UNDER_NOISE / dt
+        slowest = min(max(SLOWEST_UNDER_NOISE / dt, 1.1 * SETTLED / longest), fastest / 2)
+        changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, -slowest, -fastest))
+    source = RecordedSource(records, recorded_preset(records, changes), task.env_id)
+    artifact = train(source, console=progress).artifact
+    path = folder / OBSERVER
+    artifact.save(path)
+    return path
+
+
+def refits(
+    task: Task,
+    learn: Callable[[Sequence[Record]], Path],
+    every: int,
+    rehearsal: int,
+    path: Path,
+    records: Sequence[Record],
+) -> BaseCallback:
+    """Make what fits an observer again to an agent's own steps, beside those of ``records``."""
+    outputs = CLEAN_Y if task.measurement_noise else "y"
+    return KKLTrainingCallback(
+        every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
+    )
+
+
+def _show(task: Task, information: Information, rows: int, observer: str | None) -> VectorEnv:
+    return make(task, information, rows, observer=observer)
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """How estimates are shown to an agent, learned from its steps and learned again; by default, by KKL observers."""
+
+    show: Callable[[Task, Information, int, str | None], VectorEnv] = _show
+    learn: Callable[..., Path] = learn_observer
+    refits: Callable[..., BaseCallback] = refits
+
+
+KKL = Estimation()
