@@ -11,7 +11,9 @@ FILES = [*(ROOT / "examples").rglob("*.py"), *Path(__file__).parent.glob("*.py")
 
 
 def private(name):
-    return name.startswith("_") and not name.startswith("__") and name != "_exit"  # of os
+    return (
+        name.startswith("_") and not name.startswith("__") and name not in ("_exit", "_replace")
+    )  # of os, of named tuples
 
 
 def used(source):

@@ -119,15 +119,15 @@ def test_some_rows_restart_and_others_go_on(filters):
     together.reset(y[0])
     for k in range(1, 10):
         together.step(y[k])
-    before = together.x.copy()
+    before = together.state.x.copy()
     together.restart(y[0, rows], rows)
-    np.testing.assert_array_equal(together.x[~rows], before[~rows])
-    np.testing.assert_array_equal(together.x[rows], whole[0, rows])
+    np.testing.assert_array_equal(together.state.x[~rows], before[~rows])
+    np.testing.assert_array_equal(together.state.x[rows], whole[0, rows])
     for k in range(1, 10):
         together.advance(y[k], rows=rows)
-    np.testing.assert_allclose(together.x, whole[9], rtol=1e-12)
+    np.testing.assert_allclose(together.state.x, whole[9], rtol=1e-12)
     together.advance(y[10], rows=np.zeros(3, dtype=bool))
-    np.testing.assert_allclose(together.x, whole[9], rtol=1e-12)
+    np.testing.assert_allclose(together.state.x, whole[9], rtol=1e-12)
 
 
 def test_a_filter_that_leaves_the_bounds_starts_anew_without_the_others(filters):

@@ -1,13 +1,11 @@
 """Shipped maps are what the preset makes; tests/guard holds how accurate they are."""
 
-import json
-from dataclasses import asdict
-
 import numpy as np
 import pytest
 
 import observers
 from kkl_gym import get_system
+from training.config import settings_of
 from training.evaluation.errors import unseen_trajectories
 from training.presets import preset
 
@@ -17,8 +15,7 @@ def test_shipped_maps_are_what_the_preset_makes(name):
     artifact = observers.load(name).artifact
     kind = name.removeprefix(artifact.system).removeprefix("-")
     pipeline, size = ("spinn", "default") if kind == "spinn" else ("input-aware", kind or "default")
-    config = json.loads(json.dumps(asdict(preset(get_system(artifact.system), pipeline, "fast", size=size))))
-    assert {key: artifact.training[key] for key in config} == config
+    assert settings_of(artifact.training) == preset(get_system(artifact.system), pipeline, "fast", size=size)
     assert (artifact.motion is not None and artifact.motion.equations is not None) == (pipeline == "input-aware")
 
 
