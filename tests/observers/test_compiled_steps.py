@@ -118,18 +118,6 @@ def test_records_are_steps(make, batch):
     assert np.array_equal(observer.decode(), found)
 
 
-def test_t_inv_alone():
-    artifact = static()
-    y, u, masks = record(artifact, 200, (ROWS,))
-    batch, whole = along(KKLObserver(artifact, 0.1), y, u, masks)[0], KKLObserver(artifact, 0.1).estimate(y, u)
-    for row in (0, ROWS - 1):
-        of = y[:, row], u[:, row]
-        alone = [along(KKLObserver(artifact, 0.1, compiled=c), *of, masks[:, row])[0] for c in (True, False)]
-        for found, expected in ((alone[0], alone[1]), (batch[:, row], alone[1]),
-                                (whole[:, row], KKLObserver(artifact, 0.1).estimate(*of))):  # fmt: skip
-            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
-
-
 def test_known_starts_and_parameters():
     artifact = replace(with_error_bars(random_artifact(estimated=True)), forward=random_artifact(forward=True).forward)
     y, u, _ = record(artifact, 30)
@@ -268,43 +256,6 @@ def test_threads_do_not_share_memory(batch):
         assert all(map(np.array_equal, before, found[i]))
 
 
-def test_a_run_compiles_nothing_in_its_midst():
-    """Whatever may come: inputs that are read-only or have strides, missing samples, restarts, other levels."""
-    artifact = EQUATIONS()
-    observer, other = (KKLObserver(artifact, 0.1, compiled=choice) for choice in (True, False))
-    frozen, y = np.array([0.2]), np.array([0.1, 0.2])
-    frozen.flags.writeable = False
-    KKLObserver(artifact, 0.1).estimate(np.zeros((2, 2)))
-    with numba.core.event.install_recorder("numba:compile") as recorder:
-        for each in (observer, other):
-            each.reset(y)
-            for u in (np.broadcast_to(0.3, (1,)), frozen, np.zeros((3, 2))[:1, 1], np.float32([0.1]), [0], None):
-                each.step(y, u)
-            each.measurement_noise = (0.1, 0.3)
-            for sample in (None, [np.nan, 0.3], [np.nan, np.nan], np.full((2, 2), 0.1)[:, 1], [0, 0]):
-                each.advance(sample)
-                each.advance(sample, rows=np.array(True))
-                each.advance(sample, rows=np.broadcast_to(False, ()))
-            each.restart([y], np.array(True))
-            each.step(y + 1e6)
-        np.testing.assert_allclose(observer.step(y), other.step(y), rtol=1e-4)
-    assert not [event.data["dispatcher"].py_func.__qualname__ for _, event in recorder.buffer]
-
-
-def test_long_expressions_stay_with_numpy_and_maps_may_have_no_hidden_layers():
-    artifact, rng = tracking(), np.random.default_rng(0)
-    long = Expression(
-        [["+", *[["*", 0.0, ["x", 0]]] * 300, *(["*", c, ["x", i]] for i, c in enumerate(artifact.C[0]))]]
-    )
-    mlp = MLP([rng.normal(size=(2, artifact.inverse.mlp.inputs))], [rng.normal(size=2)], "tanh")
-    shallow = replace(random_artifact(), inverse=replace(random_artifact().inverse, mlp=mlp))
-    y, u, _ = record(artifact, 30)
-    for one, other in ((artifact, replace(artifact, C=None, h=long)), (shallow, shallow)):
-        one, other = KKLObserver(one, 0.1, compiled=False), KKLObserver(other, 0.1, compiled=True)
-        found = [[each.reset(y[0]), *(each.step(*step) for step in zip(y[1:], u))] for each in (one, other)]
-        np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-4)
-
-
 @pytest.mark.parametrize("batch", [(), (ROWS,)])
 def test_who_stands_still_says_the_same(batch):
     """To the last bit: a copy, rows that take no sample in, rows beside those that begin anew, what was looked at."""
@@ -347,3 +298,40 @@ def test_a_covariance_that_breaks_down_is_lost(batch, compiled):
         assert np.isfinite(observer.covariance).all()
         taken += np.isclose(x_hat, of_t_inv, rtol=1e-4).all(-1).any()
     assert taken
+
+
+def test_a_run_compiles_nothing_in_its_midst():
+    """Whatever may come: inputs that are read-only or have strides, missing samples, restarts, other levels."""
+    artifact = EQUATIONS()
+    observer, other = (KKLObserver(artifact, 0.1, compiled=choice) for choice in (True, False))
+    frozen, y = np.array([0.2]), np.array([0.1, 0.2])
+    frozen.flags.writeable = False
+    KKLObserver(artifact, 0.1).estimate(np.zeros((2, 2)))
+    with numba.core.event.install_recorder("numba:compile") as recorder:
+        for each in (observer, other):
+            each.reset(y)
+            for u in (np.broadcast_to(0.3, (1,)), frozen, np.zeros((3, 2))[:1, 1], np.float32([0.1]), [0], None):
+                each.step(y, u)
+            each.measurement_noise = (0.1, 0.3)
+            for sample in (None, [np.nan, 0.3], [np.nan, np.nan], np.full((2, 2), 0.1)[:, 1], [0, 0]):
+                each.advance(sample)
+                each.advance(sample, rows=np.array(True))
+                each.advance(sample, rows=np.broadcast_to(False, ()))
+            each.restart([y], np.array(True))
+            each.step(y + 1e6)
+        np.testing.assert_allclose(observer.step(y), other.step(y), rtol=1e-4)
+    assert not [event.data["dispatcher"].py_func.__qualname__ for _, event in recorder.buffer]
+
+
+def test_long_expressions_stay_with_numpy_and_maps_may_have_no_hidden_layers():
+    artifact, rng = tracking(), np.random.default_rng(0)
+    long = Expression(
+        [["+", *[["*", 0.0, ["x", 0]]] * 300, *(["*", c, ["x", i]] for i, c in enumerate(artifact.C[0]))]]
+    )
+    mlp = MLP([rng.normal(size=(2, artifact.inverse.mlp.inputs))], [rng.normal(size=2)], "tanh")
+    shallow = replace(random_artifact(), inverse=replace(random_artifact().inverse, mlp=mlp))
+    y, u, _ = record(artifact, 30)
+    for one, other in ((artifact, replace(artifact, C=None, h=long)), (shallow, shallow)):
+        one, other = KKLObserver(one, 0.1, compiled=False), KKLObserver(other, 0.1, compiled=True)
+        found = [[each.reset(y[0]), *(each.step(*step) for step in zip(y[1:], u))] for each in (one, other)]
+        np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-4)
