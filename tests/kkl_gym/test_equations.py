@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from wrong_systems import Late, Wide
 
-from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, System, elementary, get_system
+from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, elementary, get_system
 from kkl_gym.compiled import batch_step, single_step
 from kkl_gym.simulate import advance, advance_batch
 
@@ -274,14 +274,6 @@ def test_a_target_that_does_not_exist_is_for_environments_to_miss(tank, make):
     with pytest.raises(EquationError, match=r"\(`raise ValueError\('no equilibrium'\)`\): ValueError: no eq") as raised:
         make(system)
     assert str(raised.value).startswith(f"target of 'tank' failed in {path}, line ")
-
-
-def test_what_is_not_implemented_says_so_itself():
-    kind = type("Partial", (System,), {"name": "partial", "X": ((0, 1),), "bounds": ((0, 1),)})
-    with pytest.raises(NotImplementedError, match="Partial does not define f"):
-        kind().drift(np.zeros((3, 1)))
-    with pytest.raises(NotImplementedError, match="Partial does not define h"):
-        kind().h((0.5,))
 
 
 def test_bounds_within_which_an_output_is_lost():

@@ -256,30 +256,6 @@ def test_threads_do_not_share_memory(batch):
         assert all(map(np.array_equal, before, found[i]))
 
 
-@pytest.mark.parametrize("batch", [(), (ROWS,)])
-def test_who_stands_still_says_the_same(batch):
-    """To the last bit: a copy, rows that take no sample in, rows beside those that begin anew, what was looked at."""
-    artifact = FLOW()
-    y, u, _ = record(artifact, 20, batch)
-    observer, seen = KKLObserver(artifact, 0.1, compiled=True), []
-    observer.reset(y[0])
-    rows = np.arange(ROWS) < 3 if batch else np.array(False)
-    for k in range(1, 20):
-        seen += [observer.step(y[k], u[k]), observer.covariance]
-        kept = [each.copy() for each in seen]
-        seen[-2] += 1.0  # the caller's own
-        x_hat = observer.decode()
-        assert np.array_equal(x_hat, kept[-2])
-        assert np.array_equal(copy.copy(observer).decode(), x_hat)
-        observer.advance(y[k], rows=rows)
-        assert np.array_equal(observer.decode()[~rows], x_hat[~rows])
-        if batch:
-            observer.restart(y[k][rows], rows)
-            assert np.array_equal(observer.decode()[~rows], x_hat[~rows])
-        seen[-2] -= 1.0
-        assert all(np.allclose(each, before, rtol=1e-12) for each, before in zip(seen, kept, strict=True))
-
-
 @pytest.mark.parametrize(("batch", "compiled"), [((), False), ((), True), ((2,), False), ((ROWS,), True)])
 def test_a_covariance_that_breaks_down_is_lost(batch, compiled):
     """Where outputs are all but exact, rounding makes some of them none."""

@@ -120,19 +120,6 @@ def test_rows_restart_with_known_and_unknown_starts(make_artifact):
         assert np.allclose(together.mismatch, [one.mismatch for one in alone], **CLOSE)
 
 
-def test_artifacts_without_T_say_where_to_get_one(make_artifact):
-    observer = KKLObserver(make_artifact())
-    with pytest.raises(ValueError, match="'van_der_pol' can begin at no known state: it holds neither a motion nor T"):
-        observer.reset([0.5], [0.1, 0.2])
-    with pytest.raises(RuntimeError, match="reset"):
-        _ = observer.z  # it was not reset
-    observer.reset([0.5])
-    with pytest.raises(ValueError, match="neither a motion nor T"):
-        observer.restart([[0.5]], np.array(True), [[0.1, 0.2]])
-    with pytest.raises(ValueError, match="no forward map"):
-        _ = observer.mismatch
-
-
 def test_the_shipped_map_of_reverse_duffing_starts_where_it_is_told():
     system, observer = get_system("reverse_duffing"), observers.load("reverse_duffing-spinn", 0.0)
     x0 = np.random.default_rng(1).uniform(*system.box(), (50, 2))

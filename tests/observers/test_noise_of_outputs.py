@@ -40,18 +40,12 @@ class Spy(MLP):
 
 def test_levels_beyond_the_range_of_an_output(make_artifact):
     artifact = make_artifact(outputs=2)
-    for wrong, inside in (((0.5, 2.5), "(0.5, 2.0)"), (1.5, "(1.0, 1.5)"), ((3.0, 3.0), "(1.0, 2.0)")):
-        with pytest.raises(
-            ValueError, match=r"is beyond the map's range, 0 to \(1, 2\); pass measurement_noise"
-        ) as raised:
+    for wrong, inside in (((0.5, 2.5), r"\(0\.5, 2\.0\)"), (1.5, r"\(1\.0, 1\.5\)")):
+        with pytest.raises(ValueError, match=rf"range, 0 to \(1, 2\); pass measurement_noise={inside} to use it"):
             KKLObserver(artifact, wrong)
-        assert f"measurement_noise={inside} to use it all the same" in str(raised.value)
     assert KKLObserver(artifact, (1.0, 2.0)).measurement_noise == (1.0, 2.0)
-    for wrong in ((0.1,), [], np.zeros(3)):
-        with pytest.raises(ValueError, match="measurement_noise must be one number, or one for each of 2 outputs"):
-            KKLObserver(artifact, wrong)
-    for wrong in ((0.1, -0.2), (0.1, "0.2")):
-        with pytest.raises(ValueError, match=r"measurement_noise\[1\] must be a finite number"):
+    for wrong in ((0.1,), [], (0.1, -0.2), (0.1, "0.2")):
+        with pytest.raises(ValueError, match=r"measurement_noise(\[1\])? must be"):
             KKLObserver(artifact, wrong)
 
 

@@ -16,7 +16,7 @@ from safetensors.numpy import save_file
 from safetensors_bytes import content, sealed
 
 import observers
-from observers import MLP, storage
+from observers import storage
 
 
 class UnreadableError(ValueError):
@@ -247,24 +247,6 @@ def test_files_that_are_too_large_are_not_looked_into(path, monkeypatch):
         os.truncate(path, size)  # a sparse file, which takes no room on disk
         with named(path, f"has {size} bytes, more than the {storage.MOST_BYTES}"):
             read(path)
-
-
-@pytest.mark.parametrize("prefix", ["", "inverse.", "a+b."])
-def test_networks_come_back_unless_they_lack_a_layer(prefix):
-    rng, sizes = np.random.default_rng(0), [(4, 3), (4, 4), (2, 4)]
-    mlp = MLP([rng.normal(size=size) for size in sizes], [rng.normal(size=size[0]) for size in sizes], "silu")
-    layers = {}
-    storage.put_mlp(layers, prefix, mlp)
-    tensors = {"bias": np.zeros(2), "other.0.weight": np.zeros(2), f"{prefix}whiten": np.zeros(2), **layers}
-    assert tensors[f"{prefix}2.bias"].dtype == np.float32
-    again, x = storage.get_mlp(tensors, prefix, "silu"), rng.normal(size=(5, 3))
-    assert np.array_equal(again(x), mlp(x))
-    assert len(again.weights) == 3
-    for name in layers:
-        with pytest.raises(KeyError, match=re.escape(name)):
-            storage.get_mlp({key: value for key, value in tensors.items() if key != name}, prefix, "silu")
-    with pytest.raises(ValueError, match="0 weights"):
-        storage.get_mlp(tensors, "nothing.", "silu")
 
 
 KILLED = """
