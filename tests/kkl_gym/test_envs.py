@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import kkl_gym
 from kkl_gym import ENV_IDS, KKLEnv, Lorenz, System, get_system
 from kkl_gym.elementary import sin
 from kkl_gym.plant import NOISE_BLOCK, output_bounds
@@ -338,3 +339,11 @@ def test_actions_are_scaled_and_clipped_and_without_noise_a_step_is_a_step():
         assert info["u"] == pytest.approx([u], rel=1e-12)
         assert info["x"].tolist() == list(x)
         assert info["y"].tolist() == list(env.system.h(x))
+
+
+@pytest.mark.parametrize(("dt", "fps"), [(0.01, 100), (0.05, 20), (0.001, 100), (3.0, 1)])
+def test_a_video_shows_motions_as_they_are(dt, fps):
+    env, batch = KKLEnv("lorenz", dt=dt), kkl_gym.KKLVectorEnv("lorenz", dt=dt, autoreset_mode="Disabled")
+    assert env.metadata["render_fps"] == batch.metadata["render_fps"] == fps
+    for slow in (kkl_gym.ActionRepeat(env, 5), kkl_gym.VectorActionRepeat(batch, 5)):
+        assert slow.metadata["render_fps"] == max(1, fps // 5)
