@@ -30,7 +30,7 @@ test-slow: $(VENV)/ready  ## the tests that train for minutes
 test-research: $(VENV)/ready  ## the longer tests of examples/research, five minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m research
 
-test-long: $(VENV)/ready  ## campaigns of kills, flipped bits and bad input, half an hour; they print counts
+test-long: $(VENV)/ready  ## campaigns of kills and random steps, half an hour; they print counts
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m long -s
 
 test-browser: $(VENV)/ready  ## the demo in headless Chromium; it says what to install

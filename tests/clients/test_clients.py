@@ -171,15 +171,3 @@ def test_record_video(row, tmp_path):
     with VideoFileClip(str(video)) as clip:
         assert clip.fps == env.metadata["render_fps"] == 100
         assert clip.n_frames == 200
-
-
-def test_play(row, monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    pytest.importorskip("pygame")
-    from gymnasium.utils.play import PlayableGame
-
-    row("utils.play", version("gymnasium"), "PlayableGame, without a screen")
-    env = gym.make("KKLVanDerPol-v0", render_mode="rgb_array")
-    env.reset(seed=0)
-    game = PlayableGame(env, {"a": np.array([-1.0]), "d": np.array([1.0])})
-    assert len(game.relevant_keys) == 2

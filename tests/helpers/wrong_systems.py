@@ -2,8 +2,6 @@
 
 import math
 
-import numpy as np
-
 from kkl_gym import System
 
 
@@ -44,15 +42,3 @@ class Wide(Late):
 
     def f(self, x):
         return x[1], x[0], 0.0
-
-
-class Flat(Late):
-    """A comparison as a component, and a function of NumPy."""
-
-    name = "flat"
-
-    def f(self, x):
-        return x[1] > 0, x[0]
-
-    def h(self, x):
-        return x[0], np.sin(x[0])

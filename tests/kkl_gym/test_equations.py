@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from wrong_systems import Late, Wide
 
-from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, System, elementary, get_system
+from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, elementary, get_system
 from kkl_gym.compiled import batch_step, single_step
-from kkl_gym.equations import components
 from kkl_gym.simulate import advance, advance_batch
 
 HEAD = """
@@ -78,13 +77,9 @@ def test_scripts_without_mistake(tank):
 MOTIONS = [
     ("(x[1] if x[0] > 0 else 0.0), x[0]", ["ValueError", ARRAYS, NO_IF]),
     ("x[1], -math.sin(x[0])", ["TypeError", ARRAYS, f"use kkl_gym.elementary.sin, {SERVES}"]),
-    ("x[1], max(x[0], 0.0)", [ARRAYS, f"use kkl_gym.elementary.maximum, {SERVES}"]),
-    ("x[1], float(x[0])", [ARRAYS, "equations take arithmetic and the functions of kkl_gym.elementary"]),
     ("x[1], math.sqrt(-x[0])", ["ValueError", "x = (", f"use kkl_gym.elementary.sqrt, {SERVES}"]),
-    ("x[1], elementary.where(x[0], 1.0, 0.0)", ["where takes a comparison such as x[0] > 0"]),
     ("x[1], self.kk * x[0]", ["AttributeError: 'Tank' object has no attribute 'kk'; x = ("]),
     ("x[2], x[0]", ["IndexError", ", 2 of them"]),
-    ("(lambda a, b, c: a)(*x), x[0]", ["TypeError", "missing 1 required positional argument"]),
 ]  # fmt: skip
 
 
@@ -104,17 +99,10 @@ def test_an_equation_that_raises(tank, f, said):
 RETURNED = [
     ({"f": "x[1]"}, FROM_F, "it returned -"),
     ({"f": "x[1], x[0], 0.0"}, FROM_F, "it returned 3 of them: ("),
-    ({"f": "(x[1],)"}, FROM_F, "it returned 1 of them: ("),
-    ({"f": "{0: x[0], 1: x[1]}"}, FROM_F, "it returned {0: "),
-    ({"f": "x[0], 'b'"}, FROM_F, "of which [1] is 'b', of type str"),
     ({"f": "x[0], (-x[0]) ** 0.5"}, FROM_F, "which is complex: take fractional powers of negative numbers by"),
-    ({"f": "np.array([x[1], x[0]]).T"}, FROM_F, "it returned 5 of them: an array of shape (5, 2)"),
     ({"f": "x[1], 1e400 * x[0]"}, FINITE, ", inf]; x = ("),
     ({"f": "x[1], np.sum(x)"}, ALIKE, "sum, max and norm mix states"),
-    ({"f": "x[1], np.random.default_rng().random()"}, ALIKE, "it returned ["),
     ({"h": "x[0]"}, FROM_H, "it returned 0."),
-    ({"h": "()"}, FROM_H, "it returned 0 of them: ()"),
-    ({"h": "(math.inf,)"}, FINITE, "it returned [inf]"),
 ]
 
 
@@ -130,22 +118,13 @@ def test_an_equation_that_returns_something_else(tank, changes, wanted, found):
 # Further definitions in the class, and what is said of them.
 DEFINITIONS = [
     ("def f(x):\n return x", ["f(x) of 'tank' (", "must be defined as f(self, x): TypeError: Tank.f() takes 1"]),
-    ("def f(self, x, u):\n return x", ["must be defined as f(self, x): TypeError: Tank.f() missing 1"]),
-    ("def f(self, x):\n a, b, c = x\n return a, b", ["(`a, b, c = x`): ValueError: not enough values", ", 2 of them"]),
-    ("def f(self, x):\n x, y = x\n return y, math.sin(x)", ["(`return y, math.sin(x)`)", "use kkl_gym.elementary.sin"]),
     ("def f(self, x):\n return x[1], -friction(x[1])", ["(`return math.tanh(v)`)", "kkl_gym.elementary.tanh"]),
     ("def g(self, x):\n return (0.0,),", [FROM_G, "it returned ((0.0,),)"]),
-    ("def g(self, x):\n return (0.0,), (math.cos(x[0]),)", ["g(x) of 'tank' failed in", "use kkl_gym.elementary.cos"]),
-    ("def rate(self, x):\n return (1.0,)", [FROM_RATE, "it returned (1.0,), of type tuple"]),
     ("def rate(self, x):\n return -1.0", [FINITE, ", not below zero; it returned [-1.0]"]),
-    ("def rate(self, x):\n return max(1.0, x[0])", ["rate(x) of 'tank' failed in", "use kkl_gym.elementary.maximum"]),
     ("dt = 0.1\ndef step(self, x, u):\n return x[0], x[1], u[0]", ["step(x, u) of 'tank' (", FROM_F, "3 of them"]),
-    ("dt = 0.1\ndef step(self, x, u):\n return x[0], math.sin(x[1])", ["step(x, u) of 'tank' failed", "elementary"]),
     ("def target(self):\n return 0.0, 0.0", ["target of 'tank' is a method: write @property above its def"]),
-    ("target = (0.0, 0.0, 0.0)", ["target of 'tank' must be 2 finite numbers, one for each state, got (0.0"]),
     ("@property\ndef target(self):\n return self.kk, 0.0", ["target of 'tank' failed in", "(`return self.kk, 0.0`)"]),
     ("def draw_starts(self, rng, n, factor=1.0):\n return rng.random(2)", ["shape (n, 2), got an array of shape (2,)"]),
-    ("def draw_starts(self, rng, n, factor=1.0):\n return 99 * np.ones((n, 2))", ["must stay within ((-9.0, 9.0), "]),
     ("def draw_starts(self, rng, n):\n return rng.unifrom(n)", ["draw_starts(rng, n) of 'tank' failed in", "unifrom"]),
 ]  # fmt: skip
 
@@ -161,12 +140,8 @@ def test_a_definition_that_is_wrong(tank, definition, said):
     ("old", "new", "message"),
     [
         ("k: float = 2.0", "k: float", "Tank has no default for k: give one, or pass an instance"),
-        ("k: float = 2.0", "k: float = None", "parameter k of tank must be a finite number, got None"),
         ("@dataclass(frozen=True)\n", "", "Tank has a parameter k, but lacks @dataclass(frozen=True)"),
-        ("(frozen=True)", "", "line 10 (`@dataclass`): TypeError: cannot inherit non-frozen dataclass"),
-        ("u_max = (1.0,)", "u_max = 1.0", "line 11 (`class Tank(System):`): TypeError: Tank: u_max = 1.0 must"),
         ("import numpy", "import nunpy", "line 3 (`import nunpy as np`): ModuleNotFoundError: No module named 'nunpy'"),
-        ("import math", "import math as (", "invalid syntax (tank0.py, line 2)"),
         ("class Tank", "class Barrel", "tank0.py defines no Tank; it defines Barrel"),
     ],
 )  # fmt: skip
@@ -231,12 +206,6 @@ def test_what_a_loop_cannot_take_is_looked_at_again(system):
         advance_batch(system, many, none, 0.0 * many, 0.01)
 
 
-def test_what_is_not_the_equations_fault_stays_as_it_is():
-    with pytest.raises(ValueError, match="not enough values to unpack") as raised:
-        advance(Late(), (0.5, 0.5), (0.0,), (0.0,), 0.01)
-    assert raised.type is ValueError
-
-
 class Draining(Late):
     """A tank that runs empty, after which its level is no number any more."""
 
@@ -250,13 +219,6 @@ class Draining(Late):
 
     def h(self, x):
         return (x[0],)
-
-
-class Checked(Draining):
-    name = "checked"
-
-    def root(self, level):
-        return math.sqrt(level) if isinstance(level, float) else level**0.5
 
 
 class Stepping(Draining):
@@ -277,7 +239,6 @@ REAL = "must return real numbers; it returned complex ones on the way from x"
     [
         (Draining(), rf"f\(x\) of 'draining' \(.*\) {REAL}"),
         (Stepping(), rf"step\(x, u\) of 'stepping' \(.*\) {REAL}"),
-        (Checked(), r"f\(x\) of 'checked' failed in .*: ValueError: math domain error; x = \(-0.*elementary\.sqrt"),
     ],
 )
 def test_steps_that_leave_the_real_numbers(system, message):
@@ -290,12 +251,6 @@ def test_steps_that_leave_the_real_numbers(system, message):
 def test_equations_that_write_to_the_state(tank):
     path = tank(more="def g(self, x):\n    a, b = x\n    a *= 0.0\n    return (a,), (1.0 + a,)", h="(x[0] + 0.0,)")
     with pytest.raises(EquationError, match=r"g\(x\) of 'tank' .* changed the state that it was given: write a = a"):
-        KKLEnv(f"{path}:Tank")
-
-
-def test_constants_of_single_precision(tank):
-    path = tank(f="x[1], np.float32(-2.0) * x[0]")
-    with pytest.raises(EquationError, match="would make a whole motion that coarse: write constants as Python's"):
         KKLEnv(f"{path}:Tank")
 
 
@@ -312,26 +267,6 @@ def test_where_leaves_out_what_is_divided_by_zero():
     assert single[0] == pytest.approx(math.sin(0.01), abs=1e-7)
 
 
-class Blinking(Stepping):
-    """An output that is lost away from X, which a look at the bounds does not find."""
-
-    name = "blinking"
-
-    def step(self, x, u):
-        return x[0] + 0.6, x[1]
-
-    def h(self, x):
-        return (None if np.all((np.asarray(x[0]) > 1.5) & (np.asarray(x[0]) < 2.0)) else x[0],)
-
-
-@pytest.mark.parametrize("make", [lambda: KKLEnv(Blinking()), lambda: KKLVectorEnv(Blinking(), 2)])
-def test_outputs_that_fail_on_the_way(make):
-    env = make()
-    env.reset(seed=0, options={"x0": [1.0, 0.0]})
-    with pytest.raises(EquationError, match=r"h\(x\) of 'blinking' \(.*\) must return its .* \(None,\), of which"):
-        env.step(np.zeros(env.action_space.shape))
-
-
 @pytest.mark.parametrize("make", [KKLEnv, lambda system: KKLVectorEnv(system, 2)])
 def test_a_target_that_does_not_exist_is_for_environments_to_miss(tank, make):
     path = tank(more="@property\ndef target(self):\n    raise ValueError('no equilibrium')")
@@ -339,22 +274,6 @@ def test_a_target_that_does_not_exist_is_for_environments_to_miss(tank, make):
     with pytest.raises(EquationError, match=r"\(`raise ValueError\('no equilibrium'\)`\): ValueError: no eq") as raised:
         make(system)
     assert str(raised.value).startswith(f"target of 'tank' failed in {path}, line ")
-
-
-def test_equations_without_source():
-    names = {}
-    exec("import math\ndef f(self, x):\n    return x[1], math.sin(x[0])", names)
-    kind = type("Typed", (Draining,), {"name": "typed", "f": names["f"]})
-    with pytest.raises(EquationError, match=r"^f\(x\) of 'typed' failed in <string>, line 3: TypeError: .* equations"):
-        get_system(kind)
-
-
-def test_what_is_not_implemented_says_so_itself():
-    kind = type("Partial", (System,), {"name": "partial", "X": ((0, 1),), "bounds": ((0, 1),)})
-    with pytest.raises(NotImplementedError, match="Partial does not define f"):
-        kind().drift(np.zeros((3, 1)))
-    with pytest.raises(NotImplementedError, match="Partial does not define h"):
-        kind().h((0.5,))
 
 
 def test_bounds_within_which_an_output_is_lost():
@@ -368,9 +287,15 @@ def test_bounds_within_which_an_output_is_lost():
         KKLEnv(Lost())
 
 
-def test_any_function_of_components():
-    assert components(lambda x: (x[0], 1), (0.5,)) == (0.5, 1)
-    with pytest.raises(EquationError, match=r"^<lambda>\(x\) \(tests/.*\) must return its components"):
-        components(lambda x: x[0], (0.5,))
-    with pytest.raises(EquationError, match=r"^sin\(x\) failed: TypeError: .*; x = \(0\.5\)$"):
-        components(math.sin, (0.5,))
+def test_constants_of_single_precision(tank):
+    path = tank(f="x[1], np.float32(-2.0) * x[0]")
+    with pytest.raises(EquationError, match="would make a whole motion that coarse: write constants as Python's"):
+        KKLEnv(f"{path}:Tank")
+
+
+def test_equations_without_source():
+    names = {}
+    exec("import math\ndef f(self, x):\n    return x[1], math.sin(x[0])", names)
+    kind = type("Typed", (Draining,), {"name": "typed", "f": names["f"]})
+    with pytest.raises(EquationError, match=r"^f\(x\) of 'typed' failed in <string>, line 3: TypeError: .* equations"):
+        get_system(kind)

@@ -1,6 +1,5 @@
 """``render_mode="human"``: a window that shows a motion as fast as it is, and playing with keys."""
 
-import copy
 import sys
 import time
 
@@ -11,7 +10,6 @@ from gymnasium.utils.play import PlayableGame
 from pushed_systems import TwoInputs
 
 from kkl_gym import ActionRepeat, KKLEnv, KKLObservation
-from kkl_gym.rendering import samples_a_frame
 
 pygame = pytest.importorskip("pygame")
 pytest.importorskip("matplotlib")
@@ -72,11 +70,6 @@ def test_the_outermost_observer_draws(estimate, shown, saved):
     windows.close()
 
 
-@pytest.mark.parametrize(("dt", "every"), [(0.001, 20), (0.01, 2), (0.02, 1), (0.05, 1), (0.009, 3)])
-def test_frames_that_screens_can_show(dt, every):
-    assert samples_a_frame(dt) == every
-
-
 def test_it_plays_in_real_time(shown):
     env = KKLEnv("lorenz", dt=0.1, render_mode="human")
     env.reset(seed=0)
@@ -86,22 +79,6 @@ def test_it_plays_in_real_time(shown):
         env.step(np.zeros(1))
     assert time.perf_counter() - begun > 0.9 * 0.4 - 2 * 0.1
     env.close()
-
-
-def test_a_copy_draws_anew(shown):
-    env = KKLEnv("rossler", render_mode="human")
-    env.reset(seed=0)
-    twin = copy.deepcopy(env)
-    assert np.array_equal(env.step(np.zeros(1))[0], twin.step(np.zeros(1))[0])
-    env.close()
-    twin.render()
-    twin.close()
-
-
-def test_without_pygame(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(ImportError, match=r'pip install "kkl-gym\[human\]"'):
-        KKLEnv("lorenz", render_mode="human").reset(seed=0)
 
 
 def test_keys_for_people():
@@ -132,3 +109,9 @@ def test_what_another_environment_has_closed_opens_again(shown):
     assert pygame.display.get_init()
     env.close()
     assert not pygame.display.get_init()
+
+
+def test_without_pygame(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ImportError, match=r'pip install "kkl-gym\[human\]"'):
+        KKLEnv("lorenz", render_mode="human").reset(seed=0)

@@ -1,4 +1,3 @@
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -35,11 +34,6 @@ def test_an_entry_that_is_not_there_is_named(wrong):
         names(wrong)
 
 
-def test_a_function_is_of_one_entry():
-    with pytest.raises(ValueError, match="name one entry of it"):
-        names("cos(arm)", space=KEYED)
-
-
 def test_reads_one_and_many_alike():
     rng = np.random.default_rng(0)
     reader = Reader(PLAIN, names("3", "cos(0)", "info[speed][1]", "0"), source="Env-v0")
@@ -69,12 +63,6 @@ def test_of_a_dict_entries_that_are_not_read_are_not_looked_at():
     assert reader({"arm": np.arange(4.0).reshape(2, 2), "arm[x]": np.array([0.1, 0.2])}, {}).tolist() == [0.2, 2.0]
 
 
-@pytest.mark.parametrize("wrong", ["01", 0, None])
-def test_names_are_a_sequence(wrong):
-    with pytest.raises(ValueError, match=r"measured must be a sequence of names or indices, such as \[0, 1\], got"):
-        resolved(wrong, PLAIN, role="measured", source="Env-v0")
-
-
 @pytest.mark.parametrize(
     ("name", "info", "told"),
     [
@@ -98,9 +86,3 @@ def test_inputs_are_scaled_or_one_hot():
     assert one_of.largest.tolist() == [1.0, 1.0, 1.0]
     with pytest.raises(ValueError, match=r"inputs names 'action\[3\]'"):
         InputReader(spaces.Discrete(3), ["action[3]"], source="Env-v0")
-
-
-def test_what_has_no_numbers_has_no_names():
-    assert observed(gym.spaces.Sequence(spaces.Discrete(2))) == ()
-    with pytest.raises(ValueError, match="is no numbers"):
-        names("0", space=gym.spaces.Sequence(spaces.Discrete(2)))

@@ -5,21 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from kinked_systems import SYSTEMS as KINKED
 from pushed_systems import Pendulum, TwoInputs
 
 from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.compiled import batch_step, single_step
 from kkl_gym.elementary import exp, sign, sin, where
 from kkl_gym.simulate import (
-    MAX_SUBSTEPS,
-    MOST_EQUAL,
-    PER_RATE,
     SubstepsError,
     advance,
     advance_batch,
-    check_dt,
     equal_substeps,
     runge_kutta,
     simulate,
@@ -179,7 +174,7 @@ def one_by_one(system, x0, u, w, dt):
     return np.array(out)
 
 
-@pytest.mark.parametrize("system", [*map(get_system, SYSTEMS), Pendulum(), TwoInputs()], ids=lambda s: s.name)
+@pytest.mark.parametrize("system", [*map(get_system, SYSTEMS), Pendulum(), TwoInputs(), *KINKED], ids=lambda s: s.name)
 def test_scalar_and_batch_agree_to_rounding_in_each_step(system):
     rng, n, steps = np.random.default_rng(4), 20, 15
     x0 = rng.uniform(*system.box(2), (n, system.nx))
@@ -192,27 +187,6 @@ def test_scalar_and_batch_agree_to_rounding_in_each_step(system):
         assert stays.sum() >= n // 2
         error = np.abs(batch[1:, stays] - scalar[:, stays]).max(-1)
         assert (error <= 1e-13 * (1.0 + np.abs(scalar[:, stays]).max(-1))).all()
-
-
-@settings(deadline=None, max_examples=30, derandomize=True)
-@given(k=st.integers(0, 9), above=st.integers(-2, 2), dt=st.floats(1e-4, 0.5))
-def test_scalar_and_batch_choose_the_same_substeps(k, above, dt):
-    """Also where rate * dt falls within rounding of the next power of two."""
-    rate = 2**k / (PER_RATE * dt)
-    for _ in range(abs(above)):
-        rate = math.nextafter(rate, math.inf if above > 0 else 0.0)
-    alone, together = fixed_rate(rate), fixed_rate(rate)
-    advance(alone, (1.0, 0.5), (1.0,), (0.0, 0.0), dt)
-    advance_batch(together, np.array([[1.0], [0.5]]), np.ones((1, 1)), np.zeros((2, 1)), dt)
-    assert len(alone.calls) == len(together.calls) >= 7 * 2**k
-
-
-@pytest.mark.parametrize("dt", [0.001, 0.03, 0.1, 0.3, 1.0])
-def test_scalar_and_batch_choose_the_same_substeps_by_the_error(dt):
-    alone, together = (counting(Relaxing if dt < 0.03 else type(without_formula("van_der_pol"))) for _ in range(2))
-    advance(alone, (1.3, 0.5), (0.0,) * alone.nu, (0.0, 0.0), dt)
-    advance_batch(together, np.array([[1.3], [0.5]]), np.zeros((alone.nu, 1)), np.zeros((2, 1)), dt)
-    assert len(alone.calls) == len(together.calls)
 
 
 def counting(kind):
@@ -241,16 +215,6 @@ def test_a_jump_takes_a_few_substeps():
     assert len(system.calls) / 300 < 1000
 
 
-def fixed_rate(value):
-    class Fixed(ReverseDuffing):
-        name = "fixed"
-
-        def rate(self, x):
-            return value + 0.0 * x[0]
-
-    return counting(Fixed)
-
-
 def test_escape_leaves_nan_rows_and_no_warning():
     system = Rossler()
     x0 = np.array([[43.5, 44.2, -3.6], [1.0, 1.0, 1.0], [-48.3, 43.9, 455.9], [5.0, 5.0, 5.0]])
@@ -275,30 +239,6 @@ def test_huge_states_are_nan_without_warning(name):
             assert not np.isfinite(advance(system, x, u, w, DT)).any()
             batch = advance_batch(system, np.array(x)[:, None], np.zeros((1, 1)), np.zeros((system.nx, 1)), DT)
             assert not np.isfinite(batch).any()
-
-
-def test_huge_steps_of_a_batch_are_refused():
-    x, none = np.ones((2, 1)), np.zeros((2, 1))
-    with pytest.raises(SubstepsError, match=r"dt = 1e\+06 s of two_inputs, .* at x = \[.*take a smaller dt"):
-        advance_batch(TwoInputs(), x, none, none, 1e6)
-
-
-def test_number_of_substeps_is_limited():
-    system = counting(ReverseDuffing)
-
-    def counted(x, dt):
-        system.calls.clear()
-        return np.isfinite(advance(system, x, (0.0,), (0.0, 0.0), dt)).all(), len(system.calls)
-
-    dt = MOST_EQUAL / (PER_RATE * system.rate((1.0, 1.0)))
-    assert counted((1.0, 1.0), dt * 0.999) == (True, 7 * MOST_EQUAL)
-    finite, substeps = counted((1.0, 1.0), dt * 1.001)  # of lengths by the error
-    assert finite
-    assert 7 * MOST_EQUAL / 3 < substeps < 7 * MOST_EQUAL * 1.5
-    with pytest.raises(SubstepsError, match=f"{MAX_SUBSTEPS} substeps are not enough"):
-        counted((1.0, 1.0), dt * 1000)
-    assert len(system.calls) == 7 * MAX_SUBSTEPS
-    assert counted((1.0, 3000.0), dt) == (False, 0)  # beyond the bounds, where a motion need not be followed
 
 
 class Igniting(System):
@@ -378,10 +318,6 @@ def test_inputs_and_noise(system):
         assert np.allclose(x[-1, row], state, rtol=1e-5, atol=1e-7)
 
 
-def test_rates_that_do_not_depend_on_the_state():
-    assert np.allclose(simulate(Drift(), [[0.0], [1.0]], 4, 0.5)[:, :, 0].T, [[0, 1, 2, 3, 4], [1, 2, 3, 4, 5]])
-
-
 def test_no_starts_no_steps_and_signals_that_are_left_out():
     assert simulate(Lorenz(), np.empty((0, 3)), 2, DT).shape == (3, 0, 3)
     x0 = np.random.default_rng(6).uniform(-30, 30, (5, 3))
@@ -439,11 +375,6 @@ def test_a_pump_that_stops_at_zero_takes_no_more_substeps():
             assert step((0.0,), [1.0], [0.0], dt)[0] == 0.0
 
 
-def test_an_own_rate_stands_for_inputs_too():
-    rated = type("Rated", (Flushed,), {"name": "rated", "rate": lambda self, x: 7.0})
-    assert rate_under(rated(), (0.3,), (400.0,)) == 7.0
-
-
 def test_a_step_in_discrete_time_that_leaves_out_a_division_by_zero():
     class Kicked(System):
         name = "kicked"
@@ -458,21 +389,6 @@ def test_a_step_in_discrete_time_that_leaves_out_a_division_by_zero():
     assert advance(Kicked(), (0.0,), [], [0.0], 0.1)[0] == 1.0
 
 
-@pytest.mark.parametrize("dt", [0, -0.01, math.nan, math.inf, "0.01", None])
-def test_check_dt(dt):
-    with pytest.raises(ValueError, match="dt must be a positive, finite number of seconds"):
-        check_dt(dt)
-    assert type(check_dt(np.float32(0.25))) is float
-
-
-def test_long_simulations_tell_how_far_they_are():
-    told = []
-    x0 = np.ones((3, 3))
-    reported = simulate(Lorenz(), x0, 120, 0.01, report=told.append)
-    assert told == [0, 50, 100]
-    assert np.array_equal(reported, simulate(Lorenz(), x0, 120, 0.01))
-
-
 def test_a_compiled_step_may_take_the_steps():
     pytest.importorskip("numba")
     system, rng = Lorenz(), np.random.default_rng(0)
@@ -483,3 +399,18 @@ def test_a_compiled_step_may_take_the_steps():
     np.testing.assert_allclose(compiled, in_numpy, rtol=1e-8)
     steady = simulate(system, x0, 40, DT, u=u, step=lambda x, u, w, dt: x)
     assert (steady[:, 5:] == x0[5:]).all()
+
+
+def test_huge_steps_of_a_batch_are_refused():
+    x, none = np.ones((2, 1)), np.zeros((2, 1))
+    with pytest.raises(SubstepsError, match=r"dt = 1e\+06 s of two_inputs, .* at x = \[.*take a smaller dt"):
+        advance_batch(TwoInputs(), x, none, none, 1e6)
+
+
+def test_rates_that_do_not_depend_on_the_state():
+    assert np.allclose(simulate(Drift(), [[0.0], [1.0]], 4, 0.5)[:, :, 0].T, [[0, 1, 2, 3, 4], [1, 2, 3, 4, 5]])
+
+
+def test_an_own_rate_stands_for_inputs_too():
+    rated = type("Rated", (Flushed,), {"name": "rated", "rate": lambda self, x: 7.0})
+    assert rate_under(rated(), (0.3,), (400.0,)) == 7.0

@@ -118,18 +118,6 @@ def test_records_are_steps(make, batch):
     assert np.array_equal(observer.decode(), found)
 
 
-def test_t_inv_alone():
-    artifact = static()
-    y, u, masks = record(artifact, 200, (ROWS,))
-    batch, whole = along(KKLObserver(artifact, 0.1), y, u, masks)[0], KKLObserver(artifact, 0.1).estimate(y, u)
-    for row in (0, ROWS - 1):
-        of = y[:, row], u[:, row]
-        alone = [along(KKLObserver(artifact, 0.1, compiled=c), *of, masks[:, row])[0] for c in (True, False)]
-        for found, expected in ((alone[0], alone[1]), (batch[:, row], alone[1]),
-                                (whole[:, row], KKLObserver(artifact, 0.1).estimate(*of))):  # fmt: skip
-            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
-
-
 def test_known_starts_and_parameters():
     artifact = replace(with_error_bars(random_artifact(estimated=True)), forward=random_artifact(forward=True).forward)
     y, u, _ = record(artifact, 30)
@@ -268,6 +256,26 @@ def test_threads_do_not_share_memory(batch):
         assert all(map(np.array_equal, before, found[i]))
 
 
+@pytest.mark.parametrize(("batch", "compiled"), [((), False), ((), True), ((2,), False), ((ROWS,), True)])
+def test_a_covariance_that_breaks_down_is_lost(batch, compiled):
+    """Where outputs are all but exact, rounding makes some of them none."""
+    artifact, tiny = FLOW(), np.full(2, 1e-9)
+    changes = {"least_measurement_noise": np.full(1, 1e-13), "error": tiny, "process_noise": tiny}
+    artifact = replace(artifact, motion=replace(artifact.motion, **changes))
+    options = {"process_noise": 0.0, "compiled": compiled}
+    observer, plain = (KKLObserver(artifact, 0.0, tracking=choice, **options) for choice in (True, False))
+    x, taken = np.random.default_rng(0).normal(size=(*batch, 2)), 0
+    for each in (observer, plain):
+        each.reset(x @ artifact.C.T, x if each is observer else None)
+    for _ in range(200):
+        x = artifact.motion.step(x, np.zeros((*batch, 1)), 0.01)
+        x_hat, of_t_inv = (each.step(x @ artifact.C.T) for each in (observer, plain))
+        assert np.isfinite(x_hat).all()
+        assert np.isfinite(observer.covariance).all()
+        taken += np.isclose(x_hat, of_t_inv, rtol=1e-4).all(-1).any()
+    assert taken
+
+
 def test_a_run_compiles_nothing_in_its_midst():
     """Whatever may come: inputs that are read-only or have strides, missing samples, restarts, other levels."""
     artifact = EQUATIONS()
@@ -303,47 +311,3 @@ def test_long_expressions_stay_with_numpy_and_maps_may_have_no_hidden_layers():
         one, other = KKLObserver(one, 0.1, compiled=False), KKLObserver(other, 0.1, compiled=True)
         found = [[each.reset(y[0]), *(each.step(*step) for step in zip(y[1:], u))] for each in (one, other)]
         np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("batch", [(), (ROWS,)])
-def test_who_stands_still_says_the_same(batch):
-    """To the last bit: a copy, rows that take no sample in, rows beside those that begin anew, what was looked at."""
-    artifact = FLOW()
-    y, u, _ = record(artifact, 20, batch)
-    observer, seen = KKLObserver(artifact, 0.1, compiled=True), []
-    observer.reset(y[0])
-    rows = np.arange(ROWS) < 3 if batch else np.array(False)
-    for k in range(1, 20):
-        seen += [observer.step(y[k], u[k]), observer.covariance]
-        kept = [each.copy() for each in seen]
-        seen[-2] += 1.0  # the caller's own
-        x_hat = observer.decode()
-        assert np.array_equal(x_hat, kept[-2])
-        assert np.array_equal(copy.copy(observer).decode(), x_hat)
-        observer.advance(y[k], rows=rows)
-        assert np.array_equal(observer.decode()[~rows], x_hat[~rows])
-        if batch:
-            observer.restart(y[k][rows], rows)
-            assert np.array_equal(observer.decode()[~rows], x_hat[~rows])
-        seen[-2] -= 1.0
-        assert all(np.allclose(each, before, rtol=1e-12) for each, before in zip(seen, kept, strict=True))
-
-
-@pytest.mark.parametrize(("batch", "compiled"), [((), False), ((), True), ((2,), False), ((ROWS,), True)])
-def test_a_covariance_that_breaks_down_is_lost(batch, compiled):
-    """Where outputs are all but exact, rounding makes some of them none."""
-    artifact, tiny = FLOW(), np.full(2, 1e-9)
-    changes = {"least_measurement_noise": np.full(1, 1e-13), "error": tiny, "process_noise": tiny}
-    artifact = replace(artifact, motion=replace(artifact.motion, **changes))
-    options = {"process_noise": 0.0, "compiled": compiled}
-    observer, plain = (KKLObserver(artifact, 0.0, tracking=choice, **options) for choice in (True, False))
-    x, taken = np.random.default_rng(0).normal(size=(*batch, 2)), 0
-    for each in (observer, plain):
-        each.reset(x @ artifact.C.T, x if each is observer else None)
-    for _ in range(200):
-        x = artifact.motion.step(x, np.zeros((*batch, 1)), 0.01)
-        x_hat, of_t_inv = (each.step(x @ artifact.C.T) for each in (observer, plain))
-        assert np.isfinite(x_hat).all()
-        assert np.isfinite(observer.covariance).all()
-        taken += np.isclose(x_hat, of_t_inv, rtol=1e-4).all(-1).any()
-    assert taken

@@ -8,7 +8,6 @@ import pytest
 from error_bars import AGES, LEVELS, covariances, with_error_bars
 
 from observers import Artifact, ArtifactError, ErrorCovariance, Factors, KKLObserver
-from observers.decoder import Decoder
 
 OPTIONS = {"process": True, "free_inverse": True}
 
@@ -88,19 +87,6 @@ def test_single_and_batch_are_those_of_the_map_in_use(make_artifact, options):
     np.testing.assert_array_equal(along[-1], batch.covariance)
 
 
-def test_parts_that_do_not_fit(make_artifact):
-    plain = make_artifact("van_der_pol", free_inverse=True)
-    artifact = with_error_bars(plain)
-    with pytest.raises(ArtifactError, match="one has a covariance"):
-        dataclasses.replace(artifact, free_inverse=plain.free_inverse)
-    with pytest.raises(ArtifactError, match="3 states does not fit 2"):
-        dataclasses.replace(
-            plain, inverse=dataclasses.replace(plain.inverse, error_covariance=covariances(3)), free_inverse=None
-        )
-    with pytest.raises(ArtifactError, match="depends on the level"):
-        with_error_bars(make_artifact("van_der_pol", noise=False))
-
-
 def test_without_it_or_before_a_sample(make_artifact):
     plain = KKLObserver(make_artifact("van_der_pol"))
     plain.reset([0.1])
@@ -109,19 +95,6 @@ def test_without_it_or_before_a_sample(make_artifact):
             ask()
     with pytest.raises(RuntimeError, match="reset"):
         _ = KKLObserver(with_error_bars(make_artifact("van_der_pol"))).covariance
-
-
-def test_it_is_not_evaluated_unless_it_is_asked_for(make_artifact, monkeypatch):
-    asked, call = [], Decoder.covariance
-    monkeypatch.setattr(Decoder, "covariance", lambda self, *a: asked.append(1) or call(self, *a))
-    observer = KKLObserver(with_error_bars(make_artifact("van_der_pol", forward=True)), 0.1)
-    observer.reset([0.3])
-    observer.step([0.2], [0.1])
-    observer.estimate(np.zeros((4, 1)))
-    _ = observer.mismatch
-    assert not asked
-    _ = observer.covariance
-    assert len(asked) == 1
 
 
 @pytest.mark.parametrize("batch", [(), (4,)])

@@ -168,19 +168,6 @@ def test_a_copy_is_a_snapshot_from_which_late_samples_are_taken_in():
     np.testing.assert_array_equal(x_hat, whole[-1])
 
 
-def test_outputs_at_rates_of_their_own():
-    artifact = tracking(outputs=2)
-    y, u = signals(artifact, 200, (2,))
-    slow = y.copy()
-    slow[np.arange(200) % 5 != 0, :, 1] = np.nan
-    observer = KKLObserver(artifact, 0.1)
-    fused, first = observer.estimate(slow, u), y.copy()
-    first[1:, :, 1] = np.nan
-    assert np.isfinite(fused).all()
-    both, alone = observer.estimate(y, u), observer.estimate(first, u)
-    assert np.abs(fused - both)[100:].mean() < np.abs(alone - both)[100:].mean()
-
-
 def test_wrappers_have_the_gate_and_the_delay_of_their_observers():
     env = kkl_gym.KKLObservation(gym.make("KKLLorenz-v0", measurement_noise=0.5))
     env.observer.gate, env.observer.delay = 5.0, 2
@@ -211,12 +198,6 @@ def test_the_first_gap_that_no_map_fills_warns_once():
 
 def test_what_is_wrong_is_named():
     artifact = tracking()
-    for wrong in (0, -1.0, np.nan, "5", True):
-        with pytest.raises(ValueError, match="gate must be a positive number of standard deviations"):
-            KKLObserver(artifact, gate=wrong)
-    for wrong in (-1, 1.5, "1", 1001):
-        with pytest.raises(ValueError, match="delay, in samples, must be an integer from 0 to 1,000"):
-            KKLObserver(artifact, delay=wrong)
     for options in ({"gate": 5.0}, {"delay": 2}):
         with pytest.raises(ValueError, match="does not track"):
             KKLObserver(random_artifact(), **options)
@@ -227,15 +208,7 @@ def test_what_is_wrong_is_named():
         each.reset([0.0])
     with pytest.raises(RuntimeError, match="made with a gate"):
         _ = observer.rejected
-    for wrong in (0.0, -1.0, np.inf, "1"):
-        with pytest.raises(ValueError, match="dt must be a positive, finite number"):
-            observer.step([0.0], dt=wrong)
-    with pytest.raises(ValueError, match="dt must be at most"):
-        observer.step([0.0], dt=1e4)
     with pytest.raises(ValueError, match="leave dt out"):
         late.step([0.0], dt=0.02)
     with pytest.raises(ValueError, match="a record has no delay"):
         late.estimate([[0.0], [0.1]])
-    for wrong in ([0.0], [0.0, 0.0], [1.0, 0.0], [0.0, np.nan]):
-        with pytest.raises(ValueError, match="t must be 2 times in seconds, which rise"):
-            observer.estimate([[0.0], [0.1]], t=wrong)

@@ -92,37 +92,14 @@ def test_batches_equal_their_rows(A, ny, nu, batch):
     np.testing.assert_array_equal(run(pickle.loads(pickle.dumps(linear)), y, u), z)
 
 
-@pytest.mark.parametrize("rows", [3, MANY_ROWS])
-def test_batches_that_do_not_go_together(rows):
-    linear, zeros = random_filter(PAIR, 2, 0), np.zeros
-    for z, y in ((2, 2), (3, 1)):
-        with pytest.raises(ValueError):  # noqa: PT011 - NumPy's words or ours
-            linear.advance(zeros((rows, z)), zeros((rows, y)), zeros((rows, 0)), zeros((rows, y)))
-    with pytest.raises(ValueError):  # noqa: PT011
-        linear.advance(zeros((2 * rows, 3)), zeros((rows, 2)), zeros((rows, 0)), zeros((rows, 2)))
-
-
-def test_lists_are_taken():
-    linear = LinearFilter([[-1, 0], [0, -2]], [[1], [1]], 1)
-    assert linear.A.dtype == linear.B.dtype == float
-    assert np.allclose(linear.transition, np.diag(np.exp([-1, -2])))
-    assert np.allclose(LinearFilter(-np.eye(2), np.ones((2, 1)), DT).transition, np.exp(-DT) * np.eye(2))
-
-
 @pytest.mark.parametrize(
     ("A", "B", "match"),
     [
         (np.eye(2) * [-1, 0.5], np.ones((2, 1)), r"Hurwitz.*0\.5"),
         (np.diag([-1.0, 0.0]), np.ones((2, 1)), "Hurwitz"),
-        ([[0.1, 3.0], [-3.0, 0.1]], np.ones((2, 1)), "Hurwitz"),
         ([[0.0, 1.0], [-1.0, 0.0]], np.ones((2, 1)), "Hurwitz"),
         ([[-1.0, 1.0], [0.0, -1.0]], np.ones((2, 1)), "diagonalisable"),
-        (-np.ones(2), np.ones((2, 1)), "must be"),
-        (-np.ones((2, 3)), np.ones((2, 1)), r"\(2, 3\)"),
         (-np.eye(2), np.ones((3, 1)), r"\(3, 1\)"),
-        (-np.eye(2), np.ones(2), r"\(2,\)"),
-        (np.diag([-1.0, np.nan]), np.ones((2, 1)), "finite"),
-        (-np.eye(2), np.full((2, 1), np.inf), "finite"),
     ],
 )
 def test_wrong_matrices_raise(A, B, match):
@@ -130,18 +107,11 @@ def test_wrong_matrices_raise(A, B, match):
         LinearFilter(A, B, DT)
 
 
-def test_wrong_intervals_and_numbers_of_inputs_raise():
+def test_intervals_beyond_floats():
     B = np.ones((3, 1))
-    for dt in (0.0, np.nan, np.inf, True, "0.1", None, 10**400):
-        with pytest.raises(ValueError, match="dt must be"):
-            LinearFilter(DIAGONAL, B, dt)
     for A, dt in ((DIAGONAL, 1e308), (-1e-320 * np.eye(3), DT)):
         with pytest.raises(ValueError, match="beyond the range of floats"):
             LinearFilter(A, B, dt)
-    for nu in (-1, 65, 1.0, True, "1", None):
-        with pytest.raises(ValueError, match=f"number of inputs must be an integer from 0 to 64, got {nu!r}"):
-            LinearFilter(DIAGONAL, B, DT, nu)
-    assert LinearFilter(DIAGONAL, B, DT, np.int64(64)).size == 65 * 3
 
 
 def test_a_filter_keeps_what_it_was_made_of():
@@ -151,3 +121,13 @@ def test_a_filter_keeps_what_it_was_made_of():
     assert linear.A[0, 0] == -1.0
     with pytest.raises(ValueError, match="read-only"):
         linear.B[0] = 2.0
+
+
+@pytest.mark.parametrize("rows", [3, MANY_ROWS])
+def test_batches_that_do_not_go_together(rows):
+    linear, zeros = random_filter(PAIR, 2, 0), np.zeros
+    for z, y in ((2, 2), (3, 1)):
+        with pytest.raises(ValueError):  # noqa: PT011 - NumPy's words or ours
+            linear.advance(zeros((rows, z)), zeros((rows, y)), zeros((rows, 0)), zeros((rows, y)))
+    with pytest.raises(ValueError):  # noqa: PT011
+        linear.advance(zeros((2 * rows, 3)), zeros((rows, 2)), zeros((rows, 0)), zeros((rows, 2)))

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from linear_system import C, F, exact_observer, sylvester
-from random_tracking import tracking
 from scipy.linalg import expm
 
 import observers
@@ -121,44 +120,6 @@ def test_rows_restart_with_known_and_unknown_starts(make_artifact):
         assert np.allclose(together.mismatch, [one.mismatch for one in alone], **CLOSE)
 
 
-def test_a_refused_start_changes_nothing(make_artifact):
-    observer = observer_with_T(make_artifact)
-    with pytest.raises(RuntimeError, match="reset"):
-        _ = observer.mismatch
-    observer.reset([0.5])
-    z = observer.z
-    for x0, match in (
-        ([0.1], r"x0 must have shape \(.*2,?\), got \(.*1,?\)"),
-        ([[0.1, 0.2]], r"x0 must have shape \(.*2,?\), got \(.*1, 2\)"),
-        ([0.1, math.nan], "x0 holds NaN, infinity"),
-        ([0.1, -math.inf], "leave x0 out"),
-        (["a", "b"], "x0 must hold real numbers"),
-        (np.ma.masked_array([0.1, 0.2], [False, True]), "x0 holds masked entries"),
-    ):
-        for call in (
-            lambda: observer.reset([0.6], x0),  # noqa: B023 - called at once
-            lambda: observer.restart([[0.6]], np.array(True), np.ma.stack([x0]) if np.ma.isMA(x0) else [x0]),  # noqa: B023
-            lambda: observer.estimate([[0.6]], x0=x0),  # noqa: B023
-        ):
-            with pytest.raises(ValueError, match=match):
-                call()
-    assert np.array_equal(observer.z, z)
-    assert np.array_equal(observer.decode(), KKLObserver(observer.artifact, 0.3).reset([0.5]))
-
-
-def test_artifacts_without_T_say_where_to_get_one(make_artifact):
-    observer = KKLObserver(make_artifact())
-    with pytest.raises(ValueError, match="'van_der_pol' can begin at no known state: it holds neither a motion nor T"):
-        observer.reset([0.5], [0.1, 0.2])
-    with pytest.raises(RuntimeError, match="reset"):
-        _ = observer.z  # it was not reset
-    observer.reset([0.5])
-    with pytest.raises(ValueError, match="neither a motion nor T"):
-        observer.restart([[0.5]], np.array(True), [[0.1, 0.2]])
-    with pytest.raises(ValueError, match="no forward map"):
-        _ = observer.mismatch
-
-
 def test_the_shipped_map_of_reverse_duffing_starts_where_it_is_told():
     system, observer = get_system("reverse_duffing"), observers.load("reverse_duffing-spinn", 0.0)
     x0 = np.random.default_rng(1).uniform(*system.box(), (50, 2))
@@ -176,14 +137,3 @@ def test_the_shipped_map_of_reverse_duffing_starts_where_it_is_told():
         observer.reset(y[0], start)
         scores.append(np.median(observer.mismatch))
     assert scores[1] > 5 * scores[0]
-
-
-def test_a_known_start_may_be_any_array_of_numbers():
-    """Of a tracker, which begins there, too."""
-    torch = pytest.importorskip("torch")
-    observer = KKLObserver(tracking())
-    expected = observer.reset([1.0], np.array([1.0, 0.5]))
-    for x0 in (torch.tensor([1.0, 0.5]), np.ma.array([1.0, 0.5]), [1, 0.5]):
-        found = observer.reset([1.0], x0)
-        assert type(found) is type(observer.step([1.0])) is np.ndarray
-        np.testing.assert_array_equal(found, expected)

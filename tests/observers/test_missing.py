@@ -87,26 +87,6 @@ def test_where_all_outputs_are_missing_the_sample_is(batch):
     assert np.array_equal(one.z, other.z)
 
 
-def test_only_rows_with_gaps_are_filled_and_only_rows_that_are_told_to_step():
-    y = np.random.default_rng(2).normal(size=(3, 2))
-    observer, plain = (KKLObserver(exact()) for _ in range(2))
-    for each in (observer, plain):
-        each.reset(y)
-    gaps = y.copy()
-    gaps[1, 0] = gaps[2] = math.nan
-    rows = np.array([True, True, False])
-    observer.advance(gaps, rows=rows)
-    plain.advance(y, rows=rows)
-    assert np.array_equal(observer.z[[0, 2]], plain.z[[0, 2]])
-    assert not np.array_equal(observer.z[1], plain.z[1])
-    assert np.isfinite(observer.step(y)).all()
-    other = KKLObserver(exact())
-    other.reset(y)
-    gaps[1, 1] += 0.3  # what is there is taken in beside what is not
-    other.advance(gaps, rows=rows)
-    assert not np.array_equal(observer.z[1], other.z[1])
-
-
 @pytest.mark.parametrize("make", [tracking, random_artifact])
 def test_of_one_output_samples_of_rows_and_of_records_may_be_missing(make):
     def fresh():
@@ -145,21 +125,6 @@ def test_what_is_neither_there_nor_missing():
             ):
                 call(wrong)
     assert np.array_equal(observer.z, z)
-
-
-def test_what_is_wrong_in_a_record_is_named_by_its_place():
-    single, several = KKLObserver(random_artifact()), KKLObserver(exact())
-    y, u, rows = np.zeros((10, 1)), np.zeros((10, 1)), np.zeros((10, 4, 2))
-    u[9] = math.nan  # after the last sample, which is ignored
-    single.estimate(y, u)
-    u[7], rows[0, 2, 1] = math.nan, math.nan
-    with pytest.raises(ValueError, match=r"u\[7, 0\] = nan"):
-        single.estimate(y, u)
-    with pytest.raises(ValueError, match=r"y\[0, 2, 1\] = nan"):
-        several.estimate(rows)
-    rows[3, 1, 0] = math.inf
-    with pytest.raises(ValueError, match=r"y\[3, 1, 0\] = inf"):
-        several.estimate(rows)
 
 
 def test_a_prediction_that_is_no_number_is_not_taken():

@@ -48,18 +48,6 @@ def test_limits_between_levels_add_as_variances():
         limits().at(1.01)
 
 
-def test_impossible_limits():
-    for wrong in (
-        {"levels": np.array([0.1, 1.0])}, {"levels": np.array([0.0, 0.0])}, {"levels": np.array([0.0])},
-        {"mean": np.array([[0.3], [0.0]])}, {"low": np.array([[-1.0], [0.0]])}, {"high": np.array([[0.1], [0.3]])},
-        {"levels": np.array([[0.0, 0.0], [1.0, 1.0]])}, {"levels": np.array([0.0, np.nan])}, {"duration": np.nan},
-        {"high": np.array([[0.1], [np.inf]])}, {"window": 0.0}, {"window": np.inf}, {"window": True},
-        {"warm_up": -1.0}, {"warm_up": 50.0}, {"false_alarms": 1.0}, {"false_alarms": [0.01]}, {"duration": "50"},
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match=r"limits|levels|window"):
-            limits(**wrong)
-
-
 def watched_artifact(**options):
     return dataclasses.replace(random_artifact(**options), C=np.array([[1.0, 0.0]]), limits=limits())
 

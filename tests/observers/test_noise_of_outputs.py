@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from linear_system import exact_observer
 
-from observers import Artifact, ArtifactError, Expression, KKLObserver, Limits, Monitor, load
+from observers import ArtifactError, Expression, KKLObserver, Limits, Monitor, load
 from observers.network import MLP
 
 
@@ -38,34 +38,14 @@ class Spy(MLP):
         return super().__call__(inputs)
 
 
-def test_levels_change_the_estimate_output_by_output(make_artifact):
-    artifact = make_artifact(outputs=2)
-    y = np.random.default_rng(0).normal(size=(5, 2))
-    estimates = [KKLObserver(artifact, levels).estimate(y) for levels in ((0.1, 0.1), (0.3, 0.1), (0.1, 0.3))]
-    for i in range(3):
-        assert not np.allclose(estimates[i], estimates[i - 1], atol=1e-6)
-    np.testing.assert_array_equal(KKLObserver(artifact, 0.1).estimate(y), estimates[0])
-    observer = KKLObserver(artifact)
-    for levels in ([0.3, 0.1], np.array([0.3, 0.1])):
-        observer.measurement_noise = levels
-        np.testing.assert_allclose(observer.estimate(y), estimates[1], atol=1e-6)
-        assert observer.measurement_noise == (0.3, 0.1)
-
-
 def test_levels_beyond_the_range_of_an_output(make_artifact):
     artifact = make_artifact(outputs=2)
-    for wrong, inside in (((0.5, 2.5), "(0.5, 2.0)"), (1.5, "(1.0, 1.5)"), ((3.0, 3.0), "(1.0, 2.0)")):
-        with pytest.raises(
-            ValueError, match=r"is beyond the map's range, 0 to \(1, 2\); pass measurement_noise"
-        ) as raised:
+    for wrong, inside in (((0.5, 2.5), r"\(0\.5, 2\.0\)"), (1.5, r"\(1\.0, 1\.5\)")):
+        with pytest.raises(ValueError, match=rf"range, 0 to \(1, 2\); pass measurement_noise={inside} to use it"):
             KKLObserver(artifact, wrong)
-        assert f"measurement_noise={inside} to use it all the same" in str(raised.value)
     assert KKLObserver(artifact, (1.0, 2.0)).measurement_noise == (1.0, 2.0)
-    for wrong in ((0.1,), [], np.zeros(3)):
-        with pytest.raises(ValueError, match="measurement_noise must be one number, or one for each of 2 outputs"):
-            KKLObserver(artifact, wrong)
-    for wrong in ((0.1, -0.2), (0.1, "0.2")):
-        with pytest.raises(ValueError, match=r"measurement_noise\[1\] must be a finite number"):
+    for wrong in ((0.1,), [], (0.1, -0.2), (0.1, "0.2")):
+        with pytest.raises(ValueError, match=r"measurement_noise(\[1\])? must be"):
             KKLObserver(artifact, wrong)
 
 
@@ -164,21 +144,6 @@ def test_impossible_levels_of_limits():
             limits(levels=np.array(wrong, dtype=float))
 
 
-def test_limits_and_outputs_are_stored(make_artifact, tmp_path):
-    h = Expression([["*", ["x", 0], ["x", 1]], ["sin", ["x", 1]]])
-    artifact = dataclasses.replace(make_artifact(outputs=2), h=h, limits=limits())
-    artifact.save(tmp_path / "a.safetensors")
-    read = Artifact.read(tmp_path / "a.safetensors")
-    assert read.h == h
-    np.testing.assert_array_equal(read.limits.levels, limits().levels)
-    x = np.random.default_rng(0).normal(size=(4, 3, 2))
-    np.testing.assert_array_equal(read.output(x), np.stack([x[..., 0] * x[..., 1], np.sin(x[..., 1])], -1))
-    observer = KKLObserver(read, (0.1, 0.3), monitor=True)
-    observer.reset(np.zeros((3, 2)))
-    observer.step(np.ones((3, 2)))
-    assert np.isfinite(observer.score).all()
-
-
 def test_residuals_where_the_output_is_not_defined_count_as_none(make_artifact):
     artifact = dataclasses.replace(make_artifact(), h=Expression([["log", ["x", 0]]]))
     x_hat, y = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]), np.full((3, 1), 0.5)
@@ -189,13 +154,3 @@ def test_residuals_where_the_output_is_not_defined_count_as_none(make_artifact):
     assert not make_artifact().knows_output
     with pytest.raises(ArtifactError, match="does not fit 1 outputs and 2 states"):
         dataclasses.replace(make_artifact(), h=Expression([["x", 2]]))
-
-
-def test_who_has_no_limits_is_told_where_to_get_them(make_artifact):
-    knows = dataclasses.replace(make_artifact(), C=np.array([[1.0, 0.0]]))
-    with pytest.raises(
-        ValueError, match=r"holds no limits .* training\.calibrate\(artifact, system\) finds them, and re"
-    ):
-        KKLObserver(knows, monitor=True)
-    with pytest.raises(ValueError, match=r"finds them, and the output h\(x\), which this artifact lacks as well"):
-        KKLObserver(make_artifact(), monitor=True)

@@ -36,12 +36,6 @@ def test_the_filter_goes_on(artifact):
     assert observer.measurement_noise == 0.3
 
 
-def test_before_a_reset(artifact):
-    observer = KKLObserver(artifact)
-    observer.replace(other_maps(artifact))
-    np.testing.assert_allclose(observer.reset([0.2]), KKLObserver(artifact).reset([0.2]) + 1.0, rtol=1e-5)
-
-
 def changed_filter(artifact, **changes):
     linear = artifact.filter
     return dataclasses.replace(

@@ -42,14 +42,6 @@ def test_every_map_can_be_monitored(name):
     assert (observer.score > 1).all()
 
 
-def test_lorenz_serves_noise_up_to_three_and_the_others_up_to_one():
-    for name in NAMES:
-        limit = 3.0 if name == "lorenz" else 1.0
-        observers.load(name, measurement_noise=limit)
-        with pytest.raises(ValueError, match=str(limit)):
-            observers.load(name, measurement_noise=limit + 0.1)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_the_worst_start_of_many_beyond_x_is_found_and_kept(name):
     system = get_system(name)

@@ -16,7 +16,7 @@ from safetensors.numpy import save_file
 from safetensors_bytes import content, sealed
 
 import observers
-from observers import MLP, storage
+from observers import storage
 
 
 class UnreadableError(ValueError):
@@ -117,15 +117,6 @@ def test_files_have_the_rights_that_the_umask_gives(tmp_path, monkeypatch):
         assert stat.S_IMODE((tmp_path / str(umask) / "b.txt").stat().st_mode) == rights
 
 
-def test_temporary_files_lie_beside_and_keep_the_ending(tmp_path):
-    with storage.replacing(tmp_path / "film.gif") as temporary:
-        assert (temporary.parent, temporary.suffix) == (tmp_path, ".gif")
-        assert os.listdir(tmp_path) == [temporary.name]
-        temporary.write_bytes(b"whole")
-    assert os.listdir(tmp_path) == ["film.gif"]
-    assert (tmp_path / "film.gif").read_bytes() == b"whole"
-
-
 def test_the_file_is_on_disk_before_it_takes_its_place_and_the_folder_after(tmp_path, monkeypatch):
     events, fsync, replace, opened = [], os.fsync, os.replace, os.open
 
@@ -185,14 +176,6 @@ def test_a_folder_that_one_may_not_write_to(path, monkeypatch):
     assert os.listdir(path.parent) == [path.name]
 
 
-def test_other_errors_while_writing_stay_as_they_are(tmp_path):
-    with pytest.raises(FileNotFoundError, match="'other'"), storage.replacing(tmp_path / "a"):
-        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "other")
-    with pytest.raises(KeyboardInterrupt), storage.replacing(tmp_path / "a"):
-        raise KeyboardInterrupt
-    assert not os.listdir(tmp_path)
-
-
 def test_missing_files_and_folders(tmp_path):
     (tmp_path / "file").write_text("")
     os.mkfifo(tmp_path / "pipe")
@@ -204,16 +187,6 @@ def test_missing_files_and_folders(tmp_path):
             read(tmp_path / name)
     with pytest.raises(UnreadableError, match="there is no file"):
         read("a\0b")
-
-
-@pytest.mark.parametrize("call", ["is_file", "read_bytes"])
-def test_files_that_one_may_not_read(path, monkeypatch, call):
-    def refuse(self):
-        raise PermissionError(13, "Permission denied", str(self))
-
-    monkeypatch.setattr(Path, call, refuse)
-    with named(path, "cannot be read: Permission denied"):
-        read(path)
 
 
 def test_damage_is_noticed_wherever_it_is(path):
@@ -274,33 +247,6 @@ def test_files_that_are_too_large_are_not_looked_into(path, monkeypatch):
         os.truncate(path, size)  # a sparse file, which takes no room on disk
         with named(path, f"has {size} bytes, more than the {storage.MOST_BYTES}"):
             read(path)
-
-
-@pytest.mark.parametrize("raised", [KeyError, TypeError, IndexError, AttributeError, ValueError, OverflowError,
-                                    RecursionError])  # fmt: skip
-def test_whatever_contents_lead_to_names_the_file(raised):
-    with named("some.file", "mass"), storage.explained("some.file", UnreadableError):
-        raise raised("mass")
-    with pytest.raises(ZeroDivisionError), storage.explained("some.file", UnreadableError):
-        _ = 1 / 0
-
-
-@pytest.mark.parametrize("prefix", ["", "inverse.", "a+b."])
-def test_networks_come_back_unless_they_lack_a_layer(prefix):
-    rng, sizes = np.random.default_rng(0), [(4, 3), (4, 4), (2, 4)]
-    mlp = MLP([rng.normal(size=size) for size in sizes], [rng.normal(size=size[0]) for size in sizes], "silu")
-    layers = {}
-    storage.put_mlp(layers, prefix, mlp)
-    tensors = {"bias": np.zeros(2), "other.0.weight": np.zeros(2), f"{prefix}whiten": np.zeros(2), **layers}
-    assert tensors[f"{prefix}2.bias"].dtype == np.float32
-    again, x = storage.get_mlp(tensors, prefix, "silu"), rng.normal(size=(5, 3))
-    assert np.array_equal(again(x), mlp(x))
-    assert len(again.weights) == 3
-    for name in layers:
-        with pytest.raises(KeyError, match=re.escape(name)):
-            storage.get_mlp({key: value for key, value in tensors.items() if key != name}, prefix, "silu")
-    with pytest.raises(ValueError, match="0 weights"):
-        storage.get_mlp(tensors, "nothing.", "silu")
 
 
 KILLED = """
