@@ -215,7 +215,8 @@ class Motion:
     def check_samples(self, samples: float) -> None:
         """Raise ValueError if the motion cannot be carried over so many samples."""
         continuous = self.equations is not None and self.equations.substeps
-        if not continuous and abs(samples - max(1, round(samples))) > 1e-6:
+        # Times in seconds since 1970 are rounded to 2e-7 s, and clocks jitter.
+        if not continuous and abs(samples - max(1, round(samples))) > 1e-3:
             what = "a learned flow" if self.flow is not None else "a motion in discrete time"
             raise ValueError(
                 f"{what} is carried by whole samples, got a dt of {samples:g} of them; pass a whole multiple of the "

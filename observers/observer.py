@@ -289,7 +289,8 @@ class KKLObserver(RecordEstimates):
             Before :meth:`reset`; if the artifact holds no T.
         """
         z, T = self.z, self.artifact.require_forward()
-        apart = (T(self.decode()) - z[..., : len(T.z_scale)]) / T.z_scale
+        x_hat = self._kkl.decode(self._begun()).reshape(*self._batch, self.artifact.nx)  # as late as z
+        apart = (T(x_hat) - z[..., : len(T.z_scale)]) / T.z_scale
         return np.sqrt(np.mean(apart**2, axis=-1, keepdims=True))[..., 0]
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray | None = None) -> None:

@@ -163,10 +163,10 @@ class Config:
         if self.uncertain and self.pipeline != "input-aware":
             raise ValueError(f"uncertain = {self.uncertain!r} needs the pipeline 'input-aware', not {self.pipeline!r}")
         biases = self.bias if isinstance(self.bias, tuple) else (self.bias,)
-        if min(biases) < 0 or (any(biases) and (self.uncertain or self.pipeline != "input-aware")):
+        if min(biases, default=-1.0) < 0 or (any(biases) and (self.uncertain or self.pipeline != "input-aware")):
             raise ValueError(
-                f"bias = {self.bias!r} must not be negative, and needs the pipeline 'input-aware' without uncertain "
-                "parameters"
+                f"bias = {self.bias!r} must be a number that is not negative, or one of each output, and needs the "
+                "pipeline 'input-aware' without uncertain parameters"
             )
         if self.estimate_parameters and not any(self.uncertain.values()):
             raise ValueError("estimate_parameters needs uncertain parameters, of which there are none")

@@ -109,7 +109,7 @@ class ExtendedKalmanFilter:
         missing = ~(np.isfinite(innovation) & np.isfinite(H).all(-1))
         if missing.any():
             innovation, H = np.where(missing, 0.0, innovation), np.where(missing[..., None], 0.0, H)
-            R = np.where(missing[:, None, :] | missing[..., None], np.eye(len(R)), R)  # apart from those measured
+            R = np.where(missing[:, None, :] | missing[..., None], np.eye(R.shape[-1]), R)  # apart from those measured
         S = H @ P @ H.mT + R
         K = np.linalg.solve(S, H @ P).mT
         x = x + (K @ innovation[..., None])[..., 0]

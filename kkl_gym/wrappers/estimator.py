@@ -90,6 +90,10 @@ class KKLEstimator:
             raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer or system.name))
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
+        if flag("known_start", known_start) and artifact.nx > system.nx:
+            raise ValueError(
+                "known_start=True: no start is known of the bias that this observer estimates; leave it out"
+            )
         space = _filter_space(plant, artifact.filter) if estimate == "z" else _estimate_space(plant, artifact.nx)
         if uncertainty:
             low, high = with_deviations(space.low, space.high)

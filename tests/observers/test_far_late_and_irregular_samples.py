@@ -121,6 +121,9 @@ def test_motions_that_know_whole_samples_alone(by):
     expected = artifact.motion.step(artifact.motion.step(observer.decode(), u, dt), u, dt)
     found = artifact.motion.step(observer.decode(), u, dt, 2.0)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+    y, t = np.linspace(0.0, 0.3, 9)[:, None], dt * np.arange(9)
+    rounded = observer.estimate(y, t=1.7e9 + t)  # the seconds since 1970 have 2e-7 s as their last digit
+    np.testing.assert_allclose(rounded, observer.estimate(y, t=t), atol=1e-4)
     slow = KKLObserver(artifact, 0.1, compiled=False)
     slow.reset(np.zeros(1))
     np.testing.assert_allclose(twice.step([0.1], u, dt=2 * dt), slow.step([0.1], u, dt=2 * dt), rtol=1e-4)
@@ -128,7 +131,7 @@ def test_motions_that_know_whole_samples_alone(by):
 
 @pytest.mark.parametrize("compiled", [None, False])
 def test_late_samples_are_those_of_then_predicted_to_now(compiled):
-    artifact, late = tracking(), 3
+    artifact, late = tracking(forward=True), 3
     y, u = signals(artifact, 40, (2,))
     observer, then = (KKLObserver(artifact, 0.1, compiled=compiled, delay=d) for d in (late, 0))
     observer.reset(y[0])
@@ -144,6 +147,7 @@ def test_late_samples_are_those_of_then_predicted_to_now(compiled):
         np.testing.assert_allclose(found, expected, **EXACT)
         np.testing.assert_allclose(observer.covariance, ahead.covariance, **EXACT)
         np.testing.assert_allclose(observer.z, then.z, **EXACT)
+        np.testing.assert_allclose(observer.mismatch, then.mismatch, **EXACT)
     rows = np.array([False, True])
     before = observer.decode()
     observer.restart(y[0, :1], rows)

@@ -201,3 +201,14 @@ def test_missing_outputs_correct_nothing(filters):
     Phi = expm(F * dt)
     np.testing.assert_allclose(both.state.x, x @ Phi.T, rtol=1e-8)
     np.testing.assert_allclose(both.state.P, Phi @ P @ Phi.T + Q * dt, rtol=1e-7)
+
+
+def test_noise_of_each_row_beside_a_missing_output():
+    system, R = TwoOutputs(), np.array([[0.3, 0.1], [0.1, 0.2]])
+    y = np.random.default_rng(0).normal(size=(20, 3, 2))
+    y[5:9, 1, 0] = np.nan
+    alike, each = (
+        running(ExtendedKalmanFilter, system, 0.02, Q=0.01 * np.eye(2), R=of).along(y)
+        for of in (R, np.tile(R, (3, 1, 1)))
+    )
+    np.testing.assert_allclose(each, alike, rtol=1e-12)

@@ -142,6 +142,7 @@ def play(
             break
     x, x_hat, y = (np.array([info[key] for info in infos]) for key in ("x", "x_hat", "y"))
     system, level = environment.system, env.unwrapped.measurement_noise  # type: ignore[attr-defined]
+    x_hat = x_hat[:, : system.nx]  # without a bias behind the states
     ships = acting is None and type(system) in kkl_gym.SYSTEMS.values()  # SPINN's maps know no inputs
     paper = f"{system.name}-spinn" if ships else None
     return Episode(

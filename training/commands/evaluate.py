@@ -25,6 +25,7 @@ from training.commands.options import (
     merged,
     read_observers,
     read_policy,
+    system_of,
 )
 from training.evaluation.errors import (
     Domain,
@@ -264,7 +265,7 @@ class Evaluate:
                 duration=of.duration,
                 measurement_noise=level,
                 seed=self.motions.seed,
-                policy=read_policy(of.artifact, of.system, self.policy),
+                policy=read_policy(of.artifact, system_of(of.artifact, self.system), self.policy),
                 report=report,
             )
         runs.insert(0, "observer", of.name)
@@ -322,7 +323,7 @@ class Evaluate:
             "seed": self.motions.seed,
             "driven": driven,
             "process_noise": self.motions.process_noise,
-            "policy": read_policy(of.artifact, of.system, self.policy),
+            "policy": read_policy(of.artifact, system_of(of.artifact, self.system), self.policy),
             "plant": of.plant,
         }
 

@@ -15,7 +15,7 @@ from observers import Artifact, shipped
 from observers.names import resolve
 from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
-from training.trajectories.parameters import EVERY, with_bias
+from training.trajectories.parameters import EVERY, blind, with_bias
 from training.trajectories.policies import Controller
 
 Pairs = tuple[tuple[str, Any], ...]  # of the words NAME=VALUE behind an option
@@ -71,7 +71,8 @@ def merged(option: str, repeated: Iterable[Pairs]) -> dict[str, Any]:
     """The values of an option by name; ValueError if one has two."""
     names = [name for pairs in repeated for name, _ in pairs]
     if len({*names}) < len(names):
-        raise ValueError(f"{option} names a parameter twice: {', '.join(names)}")
+        twice = sorted({name for name in names if names.count(name) > 1})
+        raise ValueError(f"{option} names {', '.join(twice)} twice")
     return {name: value for pairs in repeated for name, value in pairs}
 
 
@@ -177,7 +178,7 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
     if not names:
         raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
     artifacts = [(name, Artifact.read(resolve(name))) for name in names]
-    return [(name, artifact, system_of(artifact, own_system)) for name, artifact in artifacts]
+    return [(name, artifact, model_of(artifact, own_system)) for name, artifact in artifacts]
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,8 @@ def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> C
         return None
     if not artifact.nu:
         raise ValueError(f"the policy {name!r} needs an observer that takes in inputs; this one takes none")
-    return named_policy(system, name)
+    found = named_policy(system, name)
+    return blind(found, system.nx) if np.any(artifact.training.get("bias", 0.0)) else found
 
 
 def system_of(artifact: Artifact, given: str | None) -> System:
@@ -236,5 +238,10 @@ def system_of(artifact: Artifact, given: str | None) -> System:
     if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
         base = base.replace(artifact.parameters)
     artifact.check(base.name, base.parameters, dt=artifact.filter.dt, ny=base.ny, nu=base.nu)
-    bias = artifact.training.get("bias", 0.0)
+    return base
+
+
+def model_of(artifact: Artifact, given: str | None) -> System:
+    """The system of an artifact, with the biases that it estimates as further states."""
+    base, bias = system_of(artifact, given), artifact.training.get("bias", 0.0)
     return with_bias(base, bias) if np.any(bias) else base

@@ -34,7 +34,7 @@ NAME = r"[\w][\w.-]*"  # of an observer, and so of a file
 OF_SYSTEMS = ("pipeline", "preset", "size", "uncertain", "policy", "parameters")  # options
 SIMULATED = (  # settings that say how motions are simulated
     *("trajectories", "duration", "process_noise_share", "free_inverse", "lead_in_input", "runs"),
-    *("estimate_parameters", "false_alarms"),
+    *("estimate_parameters", "false_alarms", "bias"),
 )
 MOTIONS = {"equations": "the system's equations", "flow": "a learned flow"}
 OF_RECORDS = ("windows", "arbitrary_zero", "held_out")

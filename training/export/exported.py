@@ -93,10 +93,12 @@ class Exported:
 
     @property
     def estimates(self) -> list[str]:
-        """Names of what is estimated: states, then parameters."""
+        """Names of what is estimated: states, biases of outputs, then parameters."""
         artifact, system = self.artifact, SYSTEMS.get(self.artifact.system)
-        states = list(system.state_names) if system else _numbered("x", artifact.nx)
-        return [*self._signals("hidden", states), *artifact.estimated_parameters]
+        bias = np.broadcast_to(artifact.training.get("bias", 0.0), artifact.ny)
+        biases = [f"y{i + 1}_bias" for i in np.flatnonzero(bias)]
+        states = list(system.state_names) if system else _numbered("x", artifact.nx - len(biases))
+        return [*self._signals("hidden", [*states, *biases]), *artifact.estimated_parameters]
 
     @property
     def outputs(self) -> list[str]:

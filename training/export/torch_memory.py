@@ -87,7 +87,7 @@ class TorchMemory(Module):
             As the wrapper's observation, float32 unless ``y`` is float64.
         """
         begins = state[:, :1] == 0
-        age, before, w, v = torch.split(state, self.widths, 1)
+        age, before, w, v = torch.split(torch.where(begins, 0.0, state), self.widths, 1)
         signals = self._signals(y.to(state.dtype), before)
         change = torch.where(begins, 0.0, signals - before)
         u = y.new_zeros(y.shape[0], self.nu) if u is None else u

@@ -154,9 +154,14 @@ def adapt(
     Raises
     ------
     ValueError
-        As for :func:`identify`, and if the observer's settings are not those of a training.
+        As for :func:`identify`, and if the observer's settings are not those of a training, or it estimates a bias.
     """
     config = override(settings_of(observer.training), settings or {})
+    if np.any(config.bias):
+        raise ValueError(
+            f"this observer estimates a bias of up to {config.bias}, which identification does not: pass bias = 0, or "
+            "identify the parameters from records without a bias and train again"
+        )
     dt, seed = observer.filter.dt, config.seed
     found, result = _learned(
         system, unknown, records, folder, lambda found: config, dt=dt, seed=seed, resume=resume, console=console

@@ -136,7 +136,10 @@ def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False
 
 def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
     """A system whose states are x and then a constant bias of each output that may have one, up to its half-width."""
-    widths = np.broadcast_to(np.asarray(half_widths, dtype=float), (system.ny,))
+    given = np.atleast_1d(np.asarray(half_widths, dtype=float))
+    if len(given) not in (1, system.ny):
+        raise ValueError(f"bias must be one number, or one of each of {system.ny} outputs, got {half_widths}")
+    widths = np.broadcast_to(given, (system.ny,))
     ranges = {f"y{i + 1}_bias": (-width, width) for i, width in enumerate(widths.tolist()) if width}
 
     def h(self: System, x: Components) -> Components:

@@ -3,16 +3,18 @@
 from dataclasses import replace
 from itertools import pairwise
 
+import gymnasium as gym
 import linear_system
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 from random_artifacts import random_artifact
 
+from kkl_gym import KKLObservation, get_system
 from training.cli import main
 from training.commands import portraits
 from training.commands.demo import play
-from training.commands.options import shown
+from training.commands.options import model_of, read_policy, shown, system_of
 
 OWN = f"{linear_system.__file__}:Oscillator"
 
@@ -34,6 +36,22 @@ def test_a_system_of_ones_own(saved, tmp_path, capsys):
     assert " autonomous " in out
     assert "SPINN" not in out
     assert (tmp_path / "estimates-autonomous.png").stat().st_size > 10_000
+
+
+def test_an_observer_of_a_bias(capsys):
+    system, artifact = get_system("van_der_pol"), random_artifact(system="lorenz")
+    training = artifact.training | {"bias": 1.0, "policy": "controller"}
+    artifact = replace(artifact, system=system.name, parameters=system.parameters, training=training)
+    artifact.save("biased.safetensors")
+    main(["demo", "van_der_pol", "--observer", "biased.safetensors", "--out", ".", "--duration", "1"])
+    assert "KKLVanDerPol-v0" in capsys.readouterr().out
+    assert system_of(artifact, None) == system
+    assert model_of(artifact, None).nx == 3
+    policy, x = read_policy(artifact, system, None), np.array([[0.3, -0.2, 0.9]])
+    np.testing.assert_array_equal(policy(x), policy(x[:, :2]))
+    env = gym.make("KKLVanDerPol-v0")
+    with pytest.raises(ValueError, match="this observer estimates a bias too, of which no start is known"):
+        KKLObservation(env, "biased.safetensors", known_start=True)
 
 
 def test_a_moving_picture(tmp_path, monkeypatch, capsys):

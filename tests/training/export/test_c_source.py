@@ -17,8 +17,10 @@ from exported_steps import (
     motion,
     noise,
 )
+from random_artifacts import random_artifact
 from rollout_observers import observer_of
 
+from kkl_gym import get_system
 from observers import shipped
 from training.export import Exported
 from training.export.c_source import c_files
@@ -113,6 +115,17 @@ def test_names():
         "lorenz_spinn", "Pendulum_v1", "observer_3d", "observer", "a_b"
     ]  # fmt: skip
     assert Exported.read("lorenz-spinn").estimates == ["x1", "x2", "x3"]
+
+
+def test_biases_are_estimates_too(tmp_path):
+    artifact, system = random_artifact(system="lorenz"), get_system("van_der_pol")
+    training = artifact.training | {"bias": 1.0}
+    replace(artifact, system=system.name, parameters=system.parameters, training=training).save(
+        tmp_path / "b.safetensors"
+    )
+    exported = Exported.read(tmp_path / "b.safetensors")
+    assert exported.estimates == ["x1", "x2", "y1_bias"]
+    assert "_NX 3 /*" in "".join(c_files(exported).values())
 
 
 def test_an_unknown_precision():
