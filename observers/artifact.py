@@ -456,6 +456,3 @@ def _get(kind: type, tensors: Mapping[str, np.ndarray], prefix: str, described: 
     if left:
         raise ArtifactError(f"unknown metadata keys: {', '.join(f'{prefix}{name}' for name in sorted(left))}")
     return kind(**values)
-
-
-__all__ = ["USUAL_NOISE", "Artifact"]

@@ -14,6 +14,3 @@ def check_shapes(owner: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
         found = getattr(owner, name).shape
         if found != shape:
             raise ArtifactError(f"{name} does not fit the network: it must have shape {shape}, got {found}")
-
-
-__all__ = ["ArtifactError", "check_shapes"]

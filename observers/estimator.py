@@ -90,6 +90,3 @@ class Running:
         found = [self.reset(y[0])]
         found += [self.step(y[k], None if u is None else u[k - 1]) for k in range(1, len(y))]
         return np.array(found)
-
-
-__all__ = ["Estimate", "Estimator", "Running"]

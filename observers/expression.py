@@ -178,6 +178,3 @@ def _count(part: Any, letter: str) -> int:
     if part[0] in ("x", "u"):
         return int(part[1]) + 1 if part[0] == letter else 0
     return max(_count(each, letter) for each in part[1:])
-
-
-__all__ = ["Expression"]

@@ -143,13 +143,3 @@ def check_positive_definite(covariance: np.ndarray) -> None:
 def standard_deviations(covariance: np.ndarray) -> np.ndarray:
     """Return the standard deviations (..., nx) of covariances (..., nx, nx)."""
     return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-
-
-__all__ = [
-    "COVERAGE",
-    "CovarianceByAge",
-    "ErrorCovariance",
-    "Factors",
-    "check_positive_definite",
-    "standard_deviations",
-]

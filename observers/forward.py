@@ -41,6 +41,3 @@ class ForwardMap:
         """Evaluate T. Shapes: ``x`` (..., nx); returns (..., nz)."""
         z = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
         return self.z_offset + self.z_scale * z
-
-
-__all__ = ["ForwardMap"]

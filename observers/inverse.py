@@ -177,6 +177,3 @@ class InverseMap:
         if isinstance(age, float):  # a single step: numpy's own overhead would be felt
             return math.log1p(min(age, self.age_max) / self.age_unit)
         return np.log1p(np.minimum(age, self.age_max) / self.age_unit)
-
-
-__all__ = ["FEATURES", "InverseMap"]

@@ -29,6 +29,3 @@ class Pending:
         other = Pending(*inputs.shape)
         other.inputs, other.count = inputs, count
         return other
-
-
-__all__ = ["Pending"]

@@ -156,6 +156,3 @@ class Monitor:
     def _parts(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         ny = len(self._sound)
         return rows[..., :ny], rows[..., ny : 2 * ny], rows[..., 2 * ny :]
-
-
-__all__ = ["Limits", "Monitor"]

@@ -231,6 +231,3 @@ class Motion:
             (level * self.process_noise) ** 2 + self.error**2,
             np.maximum(measurement_noise, self.least_measurement_noise) ** 2,
         )
-
-
-__all__ = ["Equations", "Flow", "Motion"]

@@ -54,6 +54,3 @@ def _plain(name: str) -> str:
 
 def _maps() -> Path:
     return Path(str(files("observers").joinpath("maps")))
-
-
-__all__ = ["matching", "resolve", "shipped", "suggestion"]

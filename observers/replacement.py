@@ -41,6 +41,3 @@ def _serves(artifact: Artifact) -> dict[str, Any]:
         "number of states": artifact.nx,
         "number of inputs": artifact.nu,
     }
-
-
-__all__ = ["check_replacement"]

@@ -224,6 +224,3 @@ class Tracker:
 
     def _within(self, x: np.ndarray) -> np.ndarray:
         return np.minimum(np.maximum(x, self.motion.low), self.motion.high)
-
-
-__all__ = ["Tracker"]

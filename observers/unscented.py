@@ -101,6 +101,3 @@ def factor(P: np.ndarray) -> np.ndarray:
             for half in np.array_split(rows, 2):
                 found[half] = factor(P[half])
     return found
-
-
-__all__ = ["Gaussian", "Points", "add", "factor", "shift", "solved", "transformed", "whitened"]

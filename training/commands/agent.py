@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.table import Table
 
 from kkl_gym import SYSTEMS, System, get_system
-from observers.storage import is_kind, require_writable
 from training.agents.agent import Agent
 from training.agents.any_environment.player import KEY, Player
 from training.agents.information import INFORMATION
@@ -23,6 +22,7 @@ from training.commands.agent_files import Export, Import, find
 from training.commands.environment import EnvironmentOptions, is_environment, show_returns, train_in_environment
 from training.commands.options import NoiseLevel
 from training.evaluation.levels import as_name, show_level
+from training.files import is_kind, require_writable
 from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
 

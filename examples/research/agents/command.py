@@ -19,10 +19,10 @@ from examples.research.resumable import Workers, run_and_report
 from kkl_gym import get_system
 from observers import Artifact
 from observers.names import resolve
-from observers.storage import write
 from training.agents.information import OBSERVED, observer_of
 from training.agents.tasks import TASKS
 from training.commands.environment import EnvironmentOptions
+from training.files import write
 from training.progress import ProgressBars
 
 # On systems or in environments; tyro would list those in both twice in a union of the two.

@@ -13,10 +13,11 @@ import numpy as np
 import kkl_gym
 from examples.research.resumable import Job
 from kkl_gym.memory import IMAGINED
-from observers.storage import explained, write
+from observers.storage import explained
 from training.agents.any_environment.information import Shown, show
 from training.agents.any_environment.task import HiddenTask
 from training.agents.seeds import AGENT_EVALUATION_SEED
+from training.files import write
 
 if TYPE_CHECKING:
     import pandas as pd

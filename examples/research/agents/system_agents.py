@@ -12,13 +12,14 @@ import numpy as np
 import kkl_gym
 from examples.research.resumable import Job
 from kkl_gym import get_system
-from observers.storage import explained, write
+from observers.storage import explained
 from training.agents.agent import fingerprint, rules
 from training.agents.information import OBSERVED, make, observer_of
 from training.agents.play import Policy, play
 from training.agents.seeds import AGENT_EVALUATION_SEED
 from training.agents.tasks import TASKS, get_task, scores, successes
 from training.evaluation.levels import Level, as_cell, as_name
+from training.files import write
 
 if TYPE_CHECKING:
     import pandas as pd

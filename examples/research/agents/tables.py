@@ -11,11 +11,11 @@ import numpy as np
 from examples.research.agents import environment_agents, system_agents
 from examples.research.agents.environment_agents import RANDOM, EnvironmentAgent
 from examples.research.agents.statistics import interval, middle, normalised
-from observers.storage import write
 from training import markdown
 from training.agents.tasks import TASKS
 from training.evaluation.levels import as_name
 from training.figures import MEASURED, RIVAL, drawing
+from training.files import write
 
 if TYPE_CHECKING:
     import pandas as pd
