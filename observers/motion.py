@@ -197,11 +197,6 @@ class Motion:
         assert self.equations is not None
         return self.equations.field.inputs <= nu
 
-    @property
-    def scaled_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of scaled states, (nx,) each."""
-        return (self.low - self.x_offset) / self.x_scale, (self.high - self.x_offset) / self.x_scale
-
     def step(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
         """Return states so many samples of dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         if self.equations is not None:

@@ -13,8 +13,15 @@ from observers.factors import standard_deviations
 from observers.kkl import KKL
 from observers.late import Pending
 from observers.records import RecordEstimates
-from observers.replacement import check_replacement
-from observers.samples import check_arguments, check_delay, check_gate, check_output, first_state, held_input
+from observers.samples import (
+    check_arguments,
+    check_delay,
+    check_gate,
+    check_output,
+    check_replacement,
+    first_state,
+    held_input,
+)
 
 
 class KKLObserver(RecordEstimates):

@@ -153,7 +153,7 @@ def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
 
 def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
     """Scaling of the states; bounds, and mean and covariance of where motions start, of scaled states."""
-    low, high = motion.scaled_bounds
+    low, high = ((bound - motion.x_offset) / motion.x_scale for bound in (motion.low, motion.high))
     mean = (motion.mean - motion.x_offset) / motion.x_scale
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}
