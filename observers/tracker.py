@@ -1,6 +1,7 @@
 """The tracker: an unscented Kalman filter that T_inv initialises where it is surer, and again where it diverged."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -186,7 +187,8 @@ class Tracker:
         where = np.flatnonzero(lost | (seen < watch.window))
         if not len(where):
             return rows
-        P = self._map_covariances(z[where], np.minimum(seen[where], watch.window) * self._dt, where)
+        seconds = np.minimum(seen[where], watch.window) * self._dt
+        P = self._decoded(Decoders.covariances, z[where], seconds, where)
         with np.errstate(invalid="ignore"):
             surer = np.linalg.slogdet(P)[1] < np.linalg.slogdet(self._covariances(rows)[where])[1]
         taken = surer | lost[where]
@@ -194,20 +196,16 @@ class Tracker:
         if not len(where):
             return rows
         rows = rows.copy()
-        rows[where, self.x] = self._within(self._map_estimates(z[where], age[where] * self._dt, where))
+        rows[where, self.x] = self._within(self._decoded(Decoders.__call__, z[where], age[where] * self._dt, where))
         rows[where, self.P] = P.reshape(len(where), -1)
         rows[lost, self.nis : self.nis + 2] = 1.0
         rows[lost, self.nis + 4] = watch.window
         rows[lost, self.nis + 5 :] = 0.0
         return rows
 
-    def _map_estimates(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        """T_inv's estimates in some rows, at ages in seconds."""
-        return self._decoders(z, age)
-
-    def _map_covariances(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        """Their covariances."""
-        return self._decoders.covariances(z, age)
+    def _decoded(self, of: Any, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
+        """What a method of :class:`Decoders` returns for some rows, at ages in seconds."""
+        return np.asarray(of(self._decoders, z, age))
 
     def _covariances(self, rows: np.ndarray) -> np.ndarray:
         return rows[:, self.P].reshape(len(rows), self.motion.nx, self.motion.nx)

@@ -263,13 +263,7 @@ class _Stacked(Tracker):
         q = [each * self.motion.x_scale**2 for each in q]
         self._Q, self._R = (np.array([np.diag(one) for one in each])[owner] for each in (q, r))
 
-    def _map_estimates(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        return self._by_group(z, age, where, Decoders.__call__)
-
-    def _map_covariances(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        return self._by_group(z, age, where, Decoders.covariances)
-
-    def _by_group(self, z: np.ndarray, age: np.ndarray, where: np.ndarray, of: Any) -> np.ndarray:
+    def _decoded(self, of: Any, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
         owner = self._owner[where]
         parts = {i: of(self._each[i], z[owner == i], age[owner == i]) for i in np.unique(owner)}
         values = np.empty((len(z), *next(iter(parts.values())).shape[1:]))
