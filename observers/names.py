@@ -39,12 +39,8 @@ def load(
 
     Raises
     ------
-    ArtifactError
-        If there is no such name or file, or the file is damaged or foreign. It is a ValueError.
-    ImportError
-        If ``compiled`` is True and Numba is not installed.
-    ValueError
-        If a noise level is out of range, or a monitor is asked for and the file holds no limits.
+    ArtifactError, ImportError, ValueError
+        If there is no such name or file, or the file is damaged or foreign; and as :class:`KKLObserver`.
     """
     return KKLObserver(
         Artifact.read(resolve(name_or_path)),

@@ -91,22 +91,17 @@ def _serves(artifact: Artifact) -> dict[str, Any]:
 def check_output(
     artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], *, first: bool = False
 ) -> np.ndarray | None:
-    """Find what is missing of samples. Shapes: returns (..., ny), or None."""
+    """Return which outputs are missing, (..., ny), or None."""
     if y.shape != (*batch, artifact.ny):
         raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
     if all_finite(y):
         return None
-    if artifact.ny == 1 and not batch:
-        hint = "the first sample must be there" if first else "a missing sample is step(None, u)"
-        raise ValueError(f"y holds NaN, infinity or values beyond 1e15: {_first_of('y', y)}; {hint}")
-    gaps = np.isnan(y)
-    there = np.where(gaps, 0.0, y)
-    if not all_finite(there):
-        found = _first_of("y", there)
-        raise ValueError(f"y holds infinity or values beyond 1e15: {found}; NaN is what says that an output is missing")
     if first:
-        found = _first_of("y", y)
-        raise ValueError(f"y holds NaN: {found}; outputs may be missing later, but the first sample must be whole")
+        _check_finite("y", y, hint="; outputs may be missing later, but the first sample must be whole")
+    if artifact.ny == 1 and not batch:
+        _check_finite("y", y, hint="; a missing sample is step(None, u)")
+    gaps = np.isnan(y)
+    _check_finite("y", np.where(gaps, 0.0, y), hint="; NaN marks a missing output")
     return gaps
 
 
@@ -177,12 +172,8 @@ def intervals(t: np.ndarray, steps: int) -> np.ndarray:
 
 
 def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:
-    """ValueError that names the first entry that is no number, or beyond what is taken for one."""
+    """Raise ValueError, which names the first such entry, if a value is not finite or too large."""
     if not all_finite(values):
-        raise ValueError(f"{name} holds NaN, infinity or values beyond 1e15: {_first_of(name, values)}{hint}")
-
-
-def _first_of(name: str, values: np.ndarray) -> str:
-    """Index and value of the first entry that is no number, or beyond what is taken for one."""
-    at = tuple(np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist())
-    return f"{name}[{', '.join(map(str, at))}] = {values[at]}"
+        at = tuple(np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist())
+        entry = f"{name}[{', '.join(map(str, at))}] = {values[at]}"
+        raise ValueError(f"{name} holds NaN, infinity or values beyond 1e15: {entry}{hint}")

@@ -8,7 +8,7 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.decoder import Decoders
 from observers.supervision import INFLATION, RELINEARISATIONS, Supervision
-from observers.unscented import Points, add, factor, shift, solved, transformed, whitened
+from observers.unscented import add, factor, shift, solved, transformed, whitened
 
 KNOWN = 1e-3  # standard deviation of a known start, in scales of the states
 
@@ -56,7 +56,6 @@ class Tracker:
         q, self.r = motion.variances(measurement_noise, process_noise)
         self.q = q * motion.x_scale**2
         self._Q, self._R = np.diag(self.q), np.diag(self.r)
-        self._points = Points(kappa=max(3.0 - motion.nx, 0.0), beta=2.0)
         shares = artifact.inverse.shares(measurement_noise, process_noise)
         self._log_factors = np.log(motion.factors.at_levels(*shares))
         self.x, self.P = slice(motion.nx), slice(motion.nx, motion.nx + motion.nx**2)
@@ -113,7 +112,7 @@ class Tracker:
             return self.motion.step(self._within(x), u, self._dt, samples)
 
         def predict(x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            mean, moved, across = transformed(x, P, function=move, points=self._points)
+            mean, moved, across = transformed(x, P, move)
             return mean, moved + samples * self._Q, across
 
         x, P = rows[:, self.x], self._covariances(rows)
@@ -156,7 +155,7 @@ class Tracker:
         """Mean and covariance of the outputs to measure, and their covariance with the states."""
         C = self._artifact.C
         if C is None:
-            expected, S, across = transformed(x, P, function=self._output, points=self._points)
+            expected, S, across = transformed(x, P, self._output)
         else:
             expected, across = x @ C.T, P @ C.T
             S = C @ across

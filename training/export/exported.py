@@ -19,7 +19,7 @@ from observers.motion import Motion
 from observers.names import resolve
 from observers.storage import checksum
 from observers.supervision import INFLATION, RELINEARISATIONS, Supervision
-from observers.unscented import Points
+from observers.unscented import weights as sigma_weights
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
 # what distinguishes them would be lost in the last digits of floats.
@@ -145,8 +145,7 @@ def output_expression(artifact: Artifact) -> Expression:
 def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
     """Weights of sigma points, and divergence detection."""
     watch = Supervision.of(motion, dt)
-    points = Points(kappa=max(3.0 - motion.nx, 0.0), beta=2.0)  # as in observers.tracker
-    weights = dict(zip(("middle", "middle_squares", "other"), points.weights(motion.nx), strict=True))
+    weights = dict(zip(("middle", "middle_squares", "other"), sigma_weights(motion.nx), strict=True))
     others = {"trend_gain": watch.trend_gain, "inflation": INFLATION, "relinearisations": RELINEARISATIONS}
     return weights | others | dataclasses.asdict(watch)
 
