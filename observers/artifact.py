@@ -1,7 +1,4 @@
-"""One file that holds a whole observer: filter, maps, scaling, and what they were made for.
-
-:meth:`Artifact.save` writes it, at the end of ``kkl-gym train``; :meth:`Artifact.read` reads it.
-"""
+"""One file that holds a whole observer: filter, maps, scaling, and what they were made for."""
 
 import functools
 import math
@@ -74,13 +71,6 @@ class Artifact:
     environment : mapping of str to object, optional
         Of an observer that was learned from rollouts of an environment: its "id" and its arguments, "kwargs". It fits
         that environment alone. Without it, an observer that was learned from recorded states fits none.
-
-    Raises
-    ------
-    ArtifactError
-        If the parts do not fit together, a parameter is not a finite number, or its range does not hold it.
-    ValueError
-        If the usual measurement noise is invalid, or differs between outputs where the map takes one level for all.
     """
 
     filter: LinearFilter
@@ -255,7 +245,7 @@ class Artifact:
         return apart if self.C is not None else np.where(np.isfinite(apart), apart, 0.0)
 
     def require_forward(self) -> ForwardMap:
-        """Return T, or raise ArtifactError, which says which maps have one."""
+        """Return T, or raise ArtifactError if there is none."""
         if self.forward is None:
             raise ArtifactError(
                 f"this map for {self.system!r} holds no forward map T; take one of the pipeline spinn, which does: "
@@ -278,18 +268,18 @@ class Artifact:
             raise ArtifactError(f"this map for {self.system!r} holds no covariance; kkl-gym train makes one that does")
 
     def require_motion(self) -> Motion:
-        """Return the motion by which the observer tracks, or raise ArtifactError, which says how to make one."""
+        """Return the motion by which the observer tracks, or raise ArtifactError if there is none."""
         if self.motion is None:
             raise ArtifactError(f"this map for {self.system!r} does not track; kkl-gym train makes one that does")
         return self.motion
 
     @property
     def process_noise_max(self) -> float | None:
-        """The highest level of process noise that the map was trained for; None if it is not told the level."""
+        """The highest level of process noise in training; None if the map does not take the level."""
         return self.inverse.process_noise_max if "process_noise" in self.inverse.features else None
 
     def check(self, system: str, parameters: Mapping[str, float], *, dt: float, ny: int, nu: int) -> None:
-        """Raise an error unless the observer was made for this system.
+        """Raise ArtifactError, which names both values, unless the observer was made for this system.
 
         Parameters
         ----------
@@ -301,11 +291,6 @@ class Artifact:
             Sampling interval in seconds.
         ny, nu : int
             Numbers of outputs and inputs. An observer that knows of no input serves any number of them.
-
-        Raises
-        ------
-        ArtifactError
-            If anything differs; the message names both values.
         """
 
         def differ(what: str, here: Any, there: Any) -> None:
@@ -368,8 +353,8 @@ class Artifact:
         Raises
         ------
         ArtifactError
-            If the file is missing, not readable, damaged, foreign, of another format, without checksum or too large, or
-            holds what makes no observer.
+            If the file is missing, not readable, damaged, foreign, of another format, without checksum, too large or
+            holds no observer.
         """
         tensors, described = storage.read(path, key=_KEY, error=ArtifactError, what="an observer")
         with storage.explained(path, ArtifactError):
@@ -419,7 +404,7 @@ def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, An
     return described
 
 
-def _get(kind: type, tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> Any:
+def _get(kind: Any, tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> Any:
     """The part that :func:`_put` took apart; raises KeyError unless all is there that it writes."""
     left = dict(described)
     values: dict[str, Any] = {}

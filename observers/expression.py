@@ -57,12 +57,7 @@ class Expression:
     Parameters
     ----------
     components : sequence
-        The components, nested lists or tuples.
-
-    Raises
-    ------
-    ValueError
-        If a component is no expression, a name is unknown, or there are more than 24 levels or 2,000 parts.
+        The components, nested lists or tuples, of at most 24 levels and 2,000 parts.
     """
 
     components: Sequence[Any]

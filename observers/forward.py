@@ -20,11 +20,6 @@ class ForwardMap:
         Scaling of the states.
     z_offset, z_scale : ndarray, shape (nz,)
         Scaling of the filter's state.
-
-    Raises
-    ------
-    ArtifactError
-        If a shape does not fit the network.
     """
 
     mlp: MLP

@@ -239,7 +239,8 @@ class KKLObserver(RecordEstimates):
         y0, x0 = real_array("y", y0).copy(), None if x0 is None else real_array("x0", x0)  # callers reuse arrays
         check_output(self.artifact, y0, y0.shape[:-1], first=True)
         self._state, self._batch = self._begin(y0, x0), y0.shape[:-1]
-        self._pending = Pending(len(self._state), self._delay, self.artifact.nu)
+        n = len(self._state)
+        self._pending = Pending(np.zeros((n, self._delay, self.artifact.nu)), np.zeros(n, dtype=int))
         return self.decode()
 
     def _begin(self, y0: np.ndarray, x0: np.ndarray | None) -> np.ndarray:

@@ -1,8 +1,7 @@
-"""Files of ours: each appears whole or not at all, holds arrays and JSON alone, and says what is wrong with it.
+"""Files of arrays and JSON, which are written atomically and checked when they are read.
 
-A file of arrays is in the safetensors format; a JSON object that describes them lies in its metadata under a key of its
-kind, ``KEY``. Nothing in it can run. Beside it, under ``KEY-sha256``, lies a checksum: the SHA-256 of the file as it is
-without that entry.
+They are in the safetensors format, with a JSON object in the metadata under the key of their kind, ``KEY``. Nothing in
+them can run. Under ``KEY-sha256`` lies the SHA-256 of the file without that entry.
 """
 
 import hashlib

@@ -28,8 +28,8 @@ class Tracker:
       covariance is no longer positive definite. T_inv's covariance is then that of an age of one window, since what
       misled the filter may have misled z as well.
 
-    An estimate that is off by less than the noise does not show in the NIS, but its innovations are not white: where
-    the mean square of their running mean exceeds its limit, the covariance is multiplied by ten.
+    An error below the noise does not show in the NIS, but makes innovations correlated: where the mean square of their
+    running mean exceeds its limit, the covariance is multiplied by ten.
 
     With a gate, an output whose innovation is larger than so many of its standard deviations is rejected, and counts as
     missing. The gate is open in the first window; and where all that is measured has been rejected for a whole window,

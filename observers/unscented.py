@@ -9,9 +9,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-Gaussian = tuple[np.ndarray, np.ndarray]
-"""Means (n, nx) and covariances (n, nx, nx)."""
-
 _BETA = 2.0
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from kkl_gym.simulate import advance_batch
-from observers.unscented import Gaussian, add, shift, transformed, whitened
-from training.kalman import ExtendedKalmanFilter
+from observers.unscented import add, shift, transformed, whitened
+from training.kalman import ExtendedKalmanFilter, Gaussian
 
 
 class UnscentedKalmanFilter(ExtendedKalmanFilter):
