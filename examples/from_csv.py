@@ -15,7 +15,7 @@ from rich.console import Console
 
 import kkl_gym
 import observers
-from observers.storage import write
+from training.files import write
 from training.identification import identify
 from training.records import read_records
 from training.systems import controller

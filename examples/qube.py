@@ -40,8 +40,8 @@ from scipy.signal import savgol_filter
 from kkl_gym.simulate import simulate
 from observers import Artifact
 from observers.estimator import Running
-from observers.storage import write
 from training.figures import ESTIMATE, RIVAL, TARGET, TRUTH, drawing
+from training.files import write
 from training.identification.motions import Shooting
 from training.identification.shooting import shoot
 from training.identification.windows import windows

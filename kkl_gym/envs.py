@@ -25,7 +25,7 @@ from kkl_gym.sensor import Readings, Sensor
 from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, Components, System
 from observers.checks import integer, mapping, real_array, shown
-from observers.thresholds import SOON
+from observers.machine import SOON
 
 _KEYS = (("a", "d"), ("s", "w"))  # for people who play: low and high end of the first inputs
 _INTEGER, _FLOAT32 = np.dtype(np.int64), np.dtype(np.float32)

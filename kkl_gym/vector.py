@@ -18,7 +18,7 @@ from kkl_gym.sensor import Readings, Sensor
 from kkl_gym.simulate import followed_rows
 from kkl_gym.system import Box, System
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
-from observers.thresholds import MANY_ROWS
+from observers.machine import MANY_ROWS
 
 Infos = dict[str, Any]
 ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for the cache

@@ -7,10 +7,9 @@ from observers.factors import ErrorCovariance, Factors
 from observers.filter import LinearFilter
 from observers.forward import ForwardMap
 from observers.inverse import InverseMap
-from observers.loading import load
 from observers.monitor import Limits, Monitor
 from observers.motion import Equations, Flow, Motion
-from observers.names import shipped
+from observers.names import load, shipped
 from observers.network import MLP
 from observers.observer import KKLObserver
 

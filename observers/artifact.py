@@ -1,14 +1,11 @@
-"""One file that holds a whole observer: filter, maps, scaling, and what they were made for.
-
-:meth:`Artifact.save` writes it, at the end of ``kkl-gym train``; :meth:`Artifact.read` reads it.
-"""
+"""One file that holds a whole observer: filter, maps, scaling, and what they were made for."""
 
 import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -16,12 +13,11 @@ from observers import storage
 from observers.checks import is_finite, noise_levels, shown
 from observers.errors import ArtifactError
 from observers.expression import Expression
-from observers.factors import ErrorCovariance, Factors
 from observers.filter import LinearFilter
 from observers.forward import ForwardMap
 from observers.inverse import InverseMap
 from observers.monitor import Limits
-from observers.motion import Equations, Flow, Motion
+from observers.motion import Motion
 from observers.network import MLP
 
 FORMAT = 1
@@ -58,8 +54,8 @@ class Artifact:
         The system's motion, by its equations or by a learned flow. An observer that has it tracks: a Kalman filter on
         the motion carries the estimate, and T_inv initialises it.
     measurement_noise : float or tuple of float, length ny, default 0.5
-        Standard deviation of the noise that is usual on each sample, of all outputs or each. Observers assume it where
-        they are told nothing else. It is cut at the largest that the maps are told.
+        Standard deviation of the usual noise on each sample, of all outputs or each, which observers assume where none
+        is given. It is cut at the largest in the maps' training.
     parameter_ranges : mapping of str to (float, float), optional
         Low and high end of parameters that are not known exactly: the observer was trained for systems with any
         parameters within.
@@ -70,19 +66,11 @@ class Artifact:
     versions : mapping of str to str, optional
         Versions of the libraries that made it.
     signals : mapping of str to sequence of str, optional
-        Of an observer that was learned from recorded states: names of the columns "measured", y, "inputs", u, and
-        "hidden", x. There are no equations behind it.
+        Of an observer that was learned from recorded states, without equations: names of the columns "measured", y,
+        "inputs", u, and "hidden", x.
     environment : mapping of str to object, optional
         Of an observer that was learned from rollouts of an environment: its "id" and its arguments, "kwargs". It fits
         that environment alone. Without it, an observer that was learned from recorded states fits none.
-
-    Raises
-    ------
-    ArtifactError
-        If the parts do not fit together, a parameter is no finite number, or a range of one does not hold it.
-    ValueError
-        If the usual measurement noise is no number, or not one for each output, or the map cannot be told levels that
-        differ.
     """
 
     filter: LinearFilter
@@ -162,19 +150,12 @@ class Artifact:
             )
 
     def _check_free(self, free: InverseMap) -> None:
-        driven, nz = self.inverse, len(self.filter.A)
+        nz = len(self.filter.A)
         if "z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu:
             raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
-        if (free.mlp.outputs, free.measurement_noise_max) != (driven.mlp.outputs, driven.measurement_noise_max):
-            raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
-        process_noise = [
-            "process_noise" in each.features and (each.process_noise_unit, each.process_noise_max)
-            for each in (free, driven)
-        ]
-        if process_noise[0] != process_noise[1]:
-            raise ArtifactError("the maps of free and of driven motion differ in what they are told of process noise")
-        if (free.error_covariance is None) != (driven.error_covariance is None):
-            raise ArtifactError("of the maps of free and of driven motion one has a covariance and the other has none")
+        own = _conditions(self.inverse)
+        if differing := [name for name, value in _conditions(free).items() if value != own[name]]:
+            raise ArtifactError(f"the maps of free and of driven motion differ in {', '.join(differing)}")
 
     def _check_motion(self, motion: Motion) -> None:
         sizes, expected = (motion.nx, len(motion.least_measurement_noise)), (self.nx, self.ny)
@@ -194,10 +175,9 @@ class Artifact:
             raise ArtifactError(f"signals must name {', '.join(counts)}, got {shown(signals)}")
         for role, count in counts.items():
             names = signals[role]
-            if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-                raise ArtifactError(f"the signals {role} must be names, got {shown(names)}")
-            if len(names) != count:
-                raise ArtifactError(f"the signals {role} must be {count}, got {shown(names)}")
+            of_names = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
+            if not of_names or len(names) != count:
+                raise ArtifactError(f"the signals {role} must be {count} names, got {shown(names)}")
 
     def _check_environment(self, environment: Mapping[str, Any]) -> None:
         whole = isinstance(environment, Mapping) and set(environment) == {"id", "kwargs"}
@@ -265,7 +245,7 @@ class Artifact:
         return apart if self.C is not None else np.where(np.isfinite(apart), apart, 0.0)
 
     def require_forward(self) -> ForwardMap:
-        """Return T, or raise ArtifactError, which says which maps have one."""
+        """Return T, or raise ArtifactError if there is none."""
         if self.forward is None:
             raise ArtifactError(
                 f"this map for {self.system!r} holds no forward map T; take one of the pipeline spinn, which does: "
@@ -288,18 +268,18 @@ class Artifact:
             raise ArtifactError(f"this map for {self.system!r} holds no covariance; kkl-gym train makes one that does")
 
     def require_motion(self) -> Motion:
-        """Return the motion by which the observer tracks, or raise ArtifactError, which says how to make one."""
+        """Return the motion by which the observer tracks, or raise ArtifactError if there is none."""
         if self.motion is None:
             raise ArtifactError(f"this map for {self.system!r} does not track; kkl-gym train makes one that does")
         return self.motion
 
     @property
     def process_noise_max(self) -> float | None:
-        """The highest level of process noise that the map was trained for; None if it is not told the level."""
+        """The highest level of process noise in training; None if the map does not take the level."""
         return self.inverse.process_noise_max if "process_noise" in self.inverse.features else None
 
     def check(self, system: str, parameters: Mapping[str, float], *, dt: float, ny: int, nu: int) -> None:
-        """Raise an error unless the observer was made for this system.
+        """Raise ArtifactError, which names both values, unless the observer was made for this system.
 
         Parameters
         ----------
@@ -311,11 +291,6 @@ class Artifact:
             Sampling interval in seconds.
         ny, nu : int
             Numbers of outputs and inputs. An observer that knows of no input serves any number of them.
-
-        Raises
-        ------
-        ArtifactError
-            If anything differs; the message names both values.
         """
 
         def differ(what: str, here: Any, there: Any) -> None:
@@ -338,10 +313,9 @@ class Artifact:
             differ(f"the parameter {name} =", here, there)
         if not math.isclose(self.filter.dt, dt, rel_tol=1e-9):
             differ("the sampling interval dt =", self.filter.dt, dt)
-        if self.ny != ny:
-            differ("the number of outputs", self.ny, ny)
-        if self.nu not in (0, nu):
-            differ("the number of inputs", self.nu, nu)
+        for what, own, given in (("outputs", self.ny, ny), ("inputs", self.nu or nu, nu)):
+            if own != given:
+                differ(f"the number of {what}", own, given)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the artifact; the file appears whole or not at all.
@@ -379,8 +353,8 @@ class Artifact:
         Raises
         ------
         ArtifactError
-            If the file is missing, not readable, damaged, foreign, of another format, without checksum or too large, or
-            holds what makes no observer.
+            If the file is missing, not readable, damaged, foreign, of another format, without checksum, too large or
+            holds no observer.
         """
         tensors, described = storage.read(path, key=_KEY, error=ArtifactError, what="an observer")
         with storage.explained(path, ArtifactError):
@@ -397,19 +371,15 @@ class Artifact:
         return artifact
 
 
-_PARTS: dict[str, type] = {  # what fields hold that are parts with fields of their own
-    "inverse": InverseMap,
-    "free_inverse": InverseMap,
-    "forward": ForwardMap,
-    "motion": Motion,
-    "equations": Equations,
-    "field": Expression,
-    "flow": Flow,
-    "limits": Limits,
-    "h": Expression,
-    "error_covariance": ErrorCovariance,
-    "factors": Factors,
-}
+def _conditions(inverse: InverseMap) -> dict[str, Any]:
+    """What two maps of one artifact must have in common."""
+    process_noise = inverse.process_noise_unit, inverse.process_noise_max
+    return {
+        "number of outputs": inverse.mlp.outputs,
+        "measurement noise": inverse.measurement_noise_max,
+        "process noise": process_noise if "process_noise" in inverse.features else None,
+        "having a covariance": inverse.error_covariance is not None,
+    }
 
 
 def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, Any]:
@@ -434,7 +404,7 @@ def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, An
     return described
 
 
-def _get(kind: type, tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> Any:
+def _get(kind: Any, tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> Any:
     """The part that :func:`_put` took apart; raises KeyError unless all is there that it writes."""
     left = dict(described)
     values: dict[str, Any] = {}
@@ -446,8 +416,8 @@ def _get(kind: type, tensors: Mapping[str, np.ndarray], prefix: str, described: 
             values[name] = storage.get_mlp(tensors, prefix, left.pop("activation"))
         elif f"{prefix}{name}" in tensors:
             values[name] = tensors[f"{prefix}{name}"]
-        elif name in left and name in _PARTS:
-            values[name] = _get(_PARTS[name], tensors, f"{prefix}{name}.", left.pop(name))
+        elif name in left and (part := next(filter(is_dataclass, (entry.type, *get_args(entry.type))), None)):
+            values[name] = _get(part, tensors, f"{prefix}{name}.", left.pop(name))
         elif name in left:
             value = left.pop(name)
             values[name] = tuple(value) if isinstance(value, list) else value
@@ -456,6 +426,3 @@ def _get(kind: type, tensors: Mapping[str, np.ndarray], prefix: str, described: 
     if left:
         raise ArtifactError(f"unknown metadata keys: {', '.join(f'{prefix}{name}' for name in sorted(left))}")
     return kind(**values)
-
-
-__all__ = ["USUAL_NOISE", "Artifact"]

@@ -83,21 +83,21 @@ def integer(name: str, value: Any, least: int, most: int | None = None) -> int:
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return a bool, or raise ValueError if ``value`` is none: "no" would count as true."""
+    """Return a bool; "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {shown(value)}")
     return bool(value)
 
 
 def choice(name: str, value: Any, options: Collection[str]) -> str:
-    """Return a string that is one of ``options``, or raise ValueError with them if ``value`` is none of them."""
+    """Return a string that is one of ``options``."""
     if not isinstance(value, str) or value not in options:
         raise ValueError(f"{name} must be {' or '.join(repr(option) for option in options)}, got {shown(value)}")
     return value
 
 
 def mapping(name: str, value: Any) -> Mapping[Any, Any]:
-    """Return a mapping, an empty one for None, or raise ValueError if ``value`` is neither."""
+    """Return a mapping, an empty one for None."""
     if value is None:
         return {}
     if not isinstance(value, Mapping):
@@ -112,12 +112,6 @@ def real_array(name: str, values: Any) -> np.ndarray:
             return values
         if values.dtype.kind in "fiu" and values.dtype.itemsize <= 8:
             return values.astype(float)
-    elif type(values) is list:
-        for value in values:
-            if type(value) is not float:
-                break
-        else:  # a step's list, which needs no further look
-            return np.array(values, dtype=float)
     elif isinstance(values, MaskedArray) and is_masked(values):
         raise ValueError(f"{name} holds masked entries: {shown(values)}; give them values")
     try:
@@ -154,6 +148,5 @@ def bool_array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     except Exception as error:  # as in real_array
         raise ValueError(f"{name} must be boolean with shape {shape}, got {shown(values)}") from error
     if array.dtype.kind != "b" or array.shape != shape or (isinstance(values, MaskedArray) and is_masked(values)):
-        masked = ", without masked entries" if isinstance(values, MaskedArray) else ""
-        raise ValueError(f"{name} must be boolean with shape {shape}{masked}, got {shown(values)}")
+        raise ValueError(f"{name} must be boolean with shape {shape}, nothing masked, got {shown(values)}")
     return array

@@ -106,6 +106,3 @@ class Decoder:
         units = np.array([inverse.x_offset, inverse.x_scale], dtype=float)
         ages = np.array([inverse.age_unit, inverse.age_max if self._needs_age else 0.0], dtype=float)
         return first, units, ages, *inverse.mlp.packed(1)
-
-
-__all__ = ["Decoder", "Decoders"]

@@ -8,17 +8,7 @@ State = TypeVar("State")
 
 
 class Estimate(NamedTuple):
-    """Estimates of a batch at one time.
-
-    Parameters
-    ----------
-    x_hat : ndarray, shape (n, nx)
-        The estimated states.
-    covariance : ndarray, shape (n, nx, nx), optional
-        Covariances of their errors, where the estimator has them.
-    score : ndarray, shape (n,), optional
-        How well samples fit estimates, where they are watched: beyond 1 a fault is likely.
-    """
+    """Estimates (n, nx) at one time; covariances of their errors (n, nx, nx) and a monitor's scores (n,), if any."""
 
     x_hat: np.ndarray
     covariance: np.ndarray | None = None
@@ -87,9 +77,5 @@ class Running:
 
     def along(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Return the estimates along records y (steps, n, ny) and inputs u (steps - 1, n, nu); (steps, n, nx)."""
-        found = [self.reset(y[0])]
-        found += [self.step(y[k], None if u is None else u[k - 1]) for k in range(1, len(y))]
-        return np.array(found)
-
-
-__all__ = ["Estimate", "Estimator", "Running"]
+        first = self.reset(y[0])
+        return np.array([first, *(self.step(y[k], None if u is None else u[k - 1]) for k in range(1, len(y)))])

@@ -57,12 +57,7 @@ class Expression:
     Parameters
     ----------
     components : sequence
-        The components, nested lists or tuples.
-
-    Raises
-    ------
-    ValueError
-        If a component is no expression, a name is unknown, or there are more than 24 levels or 2,000 parts.
+        The components, nested lists or tuples, of at most 24 levels and 2,000 parts.
     """
 
     components: Sequence[Any]
@@ -178,6 +173,3 @@ def _count(part: Any, letter: str) -> int:
     if part[0] in ("x", "u"):
         return int(part[1]) + 1 if part[0] == letter else 0
     return max(_count(each, letter) for each in part[1:])
-
-
-__all__ = ["Expression"]

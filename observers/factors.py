@@ -35,12 +35,7 @@ class Factors:
     ages : ndarray, shape (m,)
         Seconds since reset, rising from 0.
     factors : ndarray, shape (2, k, m)
-        The factors without process noise, and at the largest level in training; (1, k, m) are for any level.
-
-    Raises
-    ------
-    ArtifactError
-        If shapes do not fit, levels or ages do not rise from 0, or a factor is not positive.
+        The factors, positive, without process noise, and at the largest level in training; (1, k, m) are for any level.
     """
 
     levels: np.ndarray
@@ -74,17 +69,10 @@ class ErrorCovariance:
 
     Parameters
     ----------
-    levels : ndarray, shape (k,)
-        As for :class:`Factors`.
-    ages : ndarray, shape (m,)
+    levels, ages : ndarray, shapes (k,) and (m,)
         As for :class:`Factors`.
     covariance : ndarray, shape (k, m, nx, nx)
-        Covariances in units of the states.
-
-    Raises
-    ------
-    ArtifactError
-        If shapes do not fit, levels or ages do not rise from 0, or a matrix is not positive definite.
+        Covariances in units of the states, positive definite.
     """
 
     levels: np.ndarray
@@ -143,13 +131,3 @@ def check_positive_definite(covariance: np.ndarray) -> None:
 def standard_deviations(covariance: np.ndarray) -> np.ndarray:
     """Return the standard deviations (..., nx) of covariances (..., nx, nx)."""
     return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-
-
-__all__ = [
-    "COVERAGE",
-    "CovarianceByAge",
-    "ErrorCovariance",
-    "Factors",
-    "check_positive_definite",
-    "standard_deviations",
-]

@@ -20,11 +20,6 @@ class ForwardMap:
         Scaling of the states.
     z_offset, z_scale : ndarray, shape (nz,)
         Scaling of the filter's state.
-
-    Raises
-    ------
-    ArtifactError
-        If a shape does not fit the network.
     """
 
     mlp: MLP
@@ -41,6 +36,3 @@ class ForwardMap:
         """Evaluate T. Shapes: ``x`` (..., nx); returns (..., nz)."""
         z = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
         return self.z_offset + self.z_scale * z
-
-
-__all__ = ["ForwardMap"]

@@ -1,4 +1,4 @@
-"""T_inv: from the filter's state, and what else it is told, to the state estimate."""
+"""T_inv: from the filter's state, levels of noise and age to the state estimate."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
 
 @dataclass(frozen=True)
 class InverseMap:
-    """T_inv: the filter's state, and what else it is told, to the state estimate.
+    """T_inv: from the filter's state, levels of noise and age to the state estimate.
 
     The network's inputs are, in the order of ``features`` (of which "z_y" comes first and the rest may be missing):
 
@@ -30,15 +30,15 @@ class InverseMap:
 
     The output is x_offset + x_scale * mlp(inputs).
 
-    A map for several outputs may be told a level for each: ``noise_gain`` then has a row for each output, whose squares
-    add up, and unit and largest level of the measurement noise are tuples. Other maps are told one level for all.
+    A map for several outputs may take a level for each: ``noise_gain`` then has a row for each output, whose squares
+    add up, and unit and largest level of the measurement noise are tuples. Other maps take one level for all.
 
     Parameters
     ----------
     mlp : MLP
         The network.
     features : tuple of str
-        What it is told, an ordered selection of ``FEATURES``.
+        An ordered selection of ``FEATURES``.
     z_offset : ndarray, shape (size,)
         Mean of the filter's state.
     whiten : ndarray, shape (modes, size)
@@ -61,12 +61,6 @@ class InverseMap:
         Seconds after which the age no longer matters.
     error_covariance : ErrorCovariance, optional
         The covariance of the state's error, where it was calibrated.
-
-    Raises
-    ------
-    ArtifactError
-        If a shape does not fit the network, or it has no outputs, a unit is not positive and
-        finite, or nor is the largest level.
     """
 
     mlp: MLP
@@ -177,6 +171,3 @@ class InverseMap:
         if isinstance(age, float):  # a single step: numpy's own overhead would be felt
             return math.log1p(min(age, self.age_max) / self.age_unit)
         return np.log1p(np.minimum(age, self.age_max) / self.age_unit)
-
-
-__all__ = ["FEATURES", "InverseMap"]

@@ -87,18 +87,14 @@ class KKL(Estimator[np.ndarray]):
 
     def step(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
         """Return rows that have begun after samples (n, ny) and inputs (n, nu)."""
-        new = self._stepped_by(state, y, u, dt)
+        if self._machine is None:
+            new = self._stepped(state, y, u, dt)
+        else:
+            new = state.copy()
+            self._machine(new, y[None], u[None], linear=self._filter(dt))
         if self.monitor is not None:  # outputs that are rejected count too
             residual = self.artifact.residual(np.where(np.isnan(y), new[:, self.y], y), self.decode(new))
             new[:, self.watched] = self.monitor.update(new[:, self.watched], residual, ~np.isnan(y))
-        return new
-
-    def _stepped_by(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
-        """The step by what there is, without the monitor."""
-        if self._machine is None:
-            return self._stepped(state, y, u, dt)
-        new = state.copy()
-        self._machine(new, y[None], u[None], linear=self._filter(dt))
         return new
 
     def _filter(self, dt: float | None) -> LinearFilter:
@@ -119,7 +115,7 @@ class KKL(Estimator[np.ndarray]):
             self._filters[dt] = linear.at(dt)
         return self._filters[dt]
 
-    def _stepped(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
+    def _stepped(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None) -> np.ndarray:
         """The step in NumPy, without the monitor."""
         z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
         linear, tracker, gaps = self._filter(dt), self.tracker, np.isnan(y)
@@ -161,10 +157,9 @@ class KKL(Estimator[np.ndarray]):
         """Return rows predicted under inputs (n, delay, nu), of which so many act in each row, (n,)."""
         for k in range(int(waiting.max(initial=0))):
             rows = waiting > k
+            missing = np.full((int(rows.sum()), self.artifact.ny), np.nan)
             state = state.copy()
-            state[rows] = self._stepped_by(
-                state[rows], np.full((int(rows.sum()), self.artifact.ny), np.nan), u[rows, k]
-            )
+            state[rows] = self.step(state[rows], missing, u[rows, k])
         return state
 
     def decode(self, state: np.ndarray) -> np.ndarray:
@@ -211,15 +206,13 @@ class KKL(Estimator[np.ndarray]):
         for first in range(1, len(y), rows):
             samples, inputs = y[first : first + rows], u[first - 1 : first - 1 + rows]
             record = np.empty((len(samples), *state.shape))
-            if dts is not None:
-                for k, dt in enumerate(dts[first - 1 : first - 1 + rows].tolist()):
-                    record[k] = state = self.step(state, samples[k], inputs[k], dt)
-            elif self._machine is not None:
+            if dts is None and self._machine is not None:
                 state = state.copy()
                 self._machine(state, samples, inputs, record)
             else:
                 for k in range(len(samples)):
-                    record[k] = state = self._stepped(state, samples[k], inputs[k])
+                    dt = None if dts is None else float(dts[first - 1 + k])
+                    record[k] = state = self.step(state, samples[k], inputs[k], dt)
             values = of(record.reshape(len(samples) * len(state), self.width))
             parts.append(values.reshape(len(samples), len(state), *values.shape[1:]))
         return np.concatenate(parts)
@@ -241,6 +234,3 @@ class KKL(Estimator[np.ndarray]):
 def _filled(y: np.ndarray, gaps: np.ndarray, predicted: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Samples with gaps filled by what is predicted, or by the outputs before where that is undefined."""
     return np.where(gaps, np.where(np.isfinite(predicted), predicted, before), y)
-
-
-__all__ = ["KKL"]

@@ -1,17 +1,20 @@
 """Inputs of which the effect has not been measured yet, where outputs are late."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 
+@dataclass(frozen=True)
 class Pending:
     """The inputs of the last samples, (n, delay, nu), and how many there are, (n,); no method changes either."""
 
-    def __init__(self, n: int, delay: int, nu: int) -> None:
-        self.inputs, self.count = np.zeros((n, delay, nu)), np.zeros(n, dtype=int)
+    inputs: np.ndarray
+    count: np.ndarray
 
     def restarted(self, rows: np.ndarray) -> "Pending":
         """Return the inputs without those of some rows."""
-        return self._with(self.inputs, np.where(rows, 0, self.count))
+        return Pending(self.inputs, np.where(rows, 0, self.count))
 
     def after(self, u: np.ndarray, rows: np.ndarray) -> tuple["Pending", np.ndarray, np.ndarray]:
         """Return the inputs after those of the next sample, (n, nu), in some rows.
@@ -23,12 +26,4 @@ class Pending:
         inputs = np.where(due[:, None, None], np.roll(self.inputs, -1, axis=1), self.inputs)
         count, at = self.count + (rows & ~due), np.flatnonzero(rows)
         inputs[at, count[at] - 1] = u[at]
-        return self._with(inputs, count), first, due
-
-    def _with(self, inputs: np.ndarray, count: np.ndarray) -> "Pending":
-        other = Pending(*inputs.shape)
-        other.inputs, other.count = inputs, count
-        return other
-
-
-__all__ = ["Pending"]
+        return Pending(inputs, count), first, due

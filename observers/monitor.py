@@ -34,11 +34,6 @@ class Limits:
         Probability of an alarm in a sound run, within (0, 1).
     duration : float
         Seconds of such a run.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a limit is not finite or out of order, or a number is out of range.
     """
 
     levels: np.ndarray
@@ -65,9 +60,9 @@ class Limits:
         if not all((limit <= _LARGEST).all() for limit in (self.levels, self.mean, self.high)):
             raise ValueError(f"limits and their levels must be finite, and not beyond {_LARGEST:g}")
         for name in ("window", "warm_up", "false_alarms", "duration"):
-            if not is_finite(getattr(self, name)):
-                raise ValueError(f"the limits' {name} must be a finite number, got {shown(getattr(self, name))}")
-            object.__setattr__(self, name, float(getattr(self, name)))
+            if not is_finite(value := getattr(self, name)):
+                raise ValueError(f"the limits' {name} must be a finite number, got {shown(value)}")
+            object.__setattr__(self, name, float(value))
         if not (self.window > 0 and 0 <= self.warm_up < self.duration and 0 < self.false_alarms < 1):
             raise ValueError(
                 "limits need window > 0, 0 <= warm_up < duration and 0 < false_alarms < 1, got "
@@ -156,6 +151,3 @@ class Monitor:
     def _parts(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         ny = len(self._sound)
         return rows[..., :ny], rows[..., ny : 2 * ny], rows[..., 2 * ny :]
-
-
-__all__ = ["Limits", "Monitor"]

@@ -24,12 +24,7 @@ class Equations:
     field : Expression
         f(x) + g(x) u, nx components; in discrete time the next state.
     substeps : int, default 1
-        Runge-Kutta steps of order four in a sample; 0 for a system in discrete time.
-
-    Raises
-    ------
-    ArtifactError
-        If ``substeps`` is not an integer from 0 to 1024.
+        Runge-Kutta steps of order four in a sample, at most 1024; 0 for a system in discrete time.
     """
 
     field: Expression
@@ -73,12 +68,7 @@ class Flow:
     gain : ndarray, shape (nx,)
         Scale of the network's outputs.
     u_scale : ndarray, shape (nu,)
-        Scale of the inputs: v = u / u_scale.
-
-    Raises
-    ------
-    ArtifactError
-        If a shape does not fit, or a scale is not positive.
+        Scale of the inputs, positive: v = u / u_scale.
     """
 
     mlp: MLP
@@ -114,7 +104,7 @@ class Motion:
     flow : Flow, optional
         A learned step, where there are no equations. There is one of the two.
     x_offset, x_scale : ndarray, shape (nx,)
-        Scaling of the states.
+        Scaling of the states; scales are positive.
     low, high : ndarray, shape (nx,)
         Bounds of the states, at which estimates are cut.
     mean : ndarray, shape (nx,)
@@ -133,11 +123,6 @@ class Motion:
         Seconds over which innovations are averaged, and after a start within which T_inv is consulted.
     factors : Factors, optional
         Factors of the filter's covariance, with which regions of 90 % hold 90 % of the errors.
-
-    Raises
-    ------
-    ArtifactError
-        If a shape does not fit, a scale is not positive, bounds do not rise, or a variance is negative.
     """
 
     x_offset: np.ndarray
@@ -197,11 +182,6 @@ class Motion:
         assert self.equations is not None
         return self.equations.field.inputs <= nu
 
-    @property
-    def scaled_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of scaled states, (nx,) each."""
-        return (self.low - self.x_offset) / self.x_scale, (self.high - self.x_offset) / self.x_scale
-
     def step(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
         """Return states so many samples of dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         if self.equations is not None:
@@ -232,6 +212,3 @@ class Motion:
             (level * self.process_noise) ** 2 + self.error**2,
             np.maximum(measurement_noise, self.least_measurement_noise) ** 2,
         )
-
-
-__all__ = ["Equations", "Flow", "Motion"]

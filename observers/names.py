@@ -1,13 +1,57 @@
-"""Names of the maps that ship, and the files behind them."""
+"""Observers by the name of a map that ships, or by file."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 
+from observers.artifact import Artifact
 from observers.checks import shown
 from observers.errors import ArtifactError
+from observers.observer import KKLObserver
+
+
+def load(
+    name_or_path: str | os.PathLike[str],
+    measurement_noise: float | Sequence[float] | None = None,
+    *,
+    process_noise: float | None = None,
+    monitor: bool = False,
+    tracking: bool | None = None,
+    compiled: bool | None = None,
+    gate: float | None = None,
+    delay: int = 0,
+) -> KKLObserver:
+    """Return the observer behind a name.
+
+    Parameters
+    ----------
+    name_or_path : str or PathLike
+        A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
+    measurement_noise, process_noise, monitor, tracking, compiled, gate, delay
+        As for :class:`KKLObserver`.
+
+    Returns
+    -------
+    KKLObserver
+        The observer, which awaits :meth:`KKLObserver.reset`.
+
+    Raises
+    ------
+    ArtifactError, ImportError, ValueError
+        If there is no such name or file, or the file is damaged or foreign; and as :class:`KKLObserver`.
+    """
+    return KKLObserver(
+        Artifact.read(resolve(name_or_path)),
+        measurement_noise,
+        process_noise=process_noise,
+        monitor=monitor,
+        tracking=tracking,
+        compiled=compiled,
+        gate=gate,
+        delay=delay,
+    )
 
 
 def shipped() -> tuple[str, ...]:
@@ -54,6 +98,3 @@ def _plain(name: str) -> str:
 
 def _maps() -> Path:
     return Path(str(files("observers").joinpath("maps")))
-
-
-__all__ = ["matching", "resolve", "shipped", "suggestion"]

@@ -41,11 +41,6 @@ class MLP:
         For each layer.
     activation : {"tanh", "silu", "relu"}
         After every layer but the last.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not chain, a weight is not finite in float32 or the activation is unknown.
     """
 
     weights: Sequence[np.ndarray]
@@ -56,12 +51,12 @@ class MLP:
     def __post_init__(self) -> None:
         choice("the activation", self.activation, ACTIVATIONS)
         for name in ("weights", "biases"):
-            if not isinstance(getattr(self, name), Sequence) or isinstance(getattr(self, name), str | bytes):
-                raise ValueError(f"{name} must be a sequence of arrays, got {shown(getattr(self, name))}")
+            arrays = getattr(self, name)
+            if not isinstance(arrays, Sequence) or isinstance(arrays, str | bytes):
+                raise ValueError(f"{name} must be a sequence of arrays, got {shown(arrays)}")
+            object.__setattr__(self, name, [_layer(name, values) for values in arrays])
         if not self.weights or len(self.weights) != len(self.biases):
             raise ValueError(f"{len(self.weights)} weights and {len(self.biases)} biases do not make a network")
-        for name in ("weights", "biases"):
-            object.__setattr__(self, name, [_layer(name, values) for values in getattr(self, name)])
         width, layers = None, []
         for weight, bias in zip(self.weights, self.biases, strict=True):
             if weight.ndim != 2 or bias.shape != weight.shape[:1]:

@@ -13,8 +13,15 @@ from observers.factors import standard_deviations
 from observers.kkl import KKL
 from observers.late import Pending
 from observers.records import RecordEstimates
-from observers.replacement import check_replacement
-from observers.samples import check_arguments, check_delay, check_gate, check_output, first_state, held_input
+from observers.samples import (
+    check_arguments,
+    check_delay,
+    check_gate,
+    check_output,
+    check_replacement,
+    first_state,
+    held_input,
+)
 
 
 class KKLObserver(RecordEstimates):
@@ -52,7 +59,6 @@ class KKLObserver(RecordEstimates):
         Whether Numba compiles the step (the extra ``fast``). None compiles where Numba is installed, True insists on
         it, False takes NumPy. The first process on a machine compiles for some seconds, later ones read the machine
         code from disk. Numba and NumPy agree to rounding.
-
     gate : float, optional
         Outputs whose innovation is larger than so many of its standard deviations are rejected: they count as missing,
         and :attr:`rejected` counts them. The gate is open in the first window, half a second for the maps that ship;
@@ -176,11 +182,9 @@ class KKLObserver(RecordEstimates):
 
         Raises
         ------
-        ArtifactError
-            If it differs in more than its maps.
         ValueError
-            If the noise level is beyond its range, or there is a monitor, which restarts, and it holds no limits. The
-            observer is then as it was.
+            If the artifact differs in more than its maps, the noise level is beyond its range, or there is a monitor,
+            which restarts, and it holds no limits. The observer is then as it was.
         """
         check_replacement(self.artifact, artifact)
         other = KKLObserver(
@@ -235,7 +239,8 @@ class KKLObserver(RecordEstimates):
         y0, x0 = real_array("y", y0).copy(), None if x0 is None else real_array("x0", x0)  # callers reuse arrays
         check_output(self.artifact, y0, y0.shape[:-1], first=True)
         self._state, self._batch = self._begin(y0, x0), y0.shape[:-1]
-        self._pending = Pending(len(self._state), self._delay, self.artifact.nu)
+        n = len(self._state)
+        self._pending = Pending(np.zeros((n, self._delay, self.artifact.nu)), np.zeros(n, dtype=int))
         return self.decode()
 
     def _begin(self, y0: np.ndarray, x0: np.ndarray | None) -> np.ndarray:
@@ -251,12 +256,8 @@ class KKLObserver(RecordEstimates):
 
         The running mean and mean square of y - h(x_hat) over their limits in sound operation. It is 0 right after
         reset; missing outputs leave it as it was. A biased, frozen or dropped-out sensor raises it, and so do states
-        outside the training. :class:`observers.Limits` gives the rate of false alarms.
-
-        Raises
-        ------
-        RuntimeError
-            Before :meth:`reset`, or without ``monitor=True``.
+        outside the training. :class:`observers.Limits` gives the rate of false alarms. Raises RuntimeError before
+        :meth:`reset`, or without ``monitor=True``.
         """
         if self._kkl.monitor is None or self._state is None:
             raise RuntimeError("score needs an observer made with monitor=True, and reset(y0)")
@@ -266,10 +267,7 @@ class KKLObserver(RecordEstimates):
     def rejected(self) -> np.ndarray:
         """Number of outputs that the gate has rejected since reset, shape (...,).
 
-        Raises
-        ------
-        RuntimeError
-            Before :meth:`reset`, or without a ``gate``.
+        Raises RuntimeError before :meth:`reset`, or without a ``gate``.
         """
         if self._gate is None or self._state is None:
             raise RuntimeError("rejected needs an observer made with a gate, and reset(y0)")
@@ -281,12 +279,8 @@ class KKLObserver(RecordEstimates):
 
         The root mean square of (T(x_hat) - z_y) / :attr:`ForwardMap.z_scale` over the modes. It is large in the
         transient, under sensor faults and inputs, on another plant, and beyond the training; noise adds a little. A
-        fault that keeps z on the image of T does not show. There are no limits: measure what sound runs give.
-
-        Raises
-        ------
-        RuntimeError, ValueError
-            Before :meth:`reset`; if the artifact holds no T.
+        fault that keeps z on the image of T does not show. There are no limits: measure what sound runs give. Raises
+        RuntimeError before :meth:`reset`, and ValueError if the artifact holds no T.
         """
         z, T = self.z, self.artifact.require_forward()
         x_hat = self._kkl.decode(self._begun()).reshape(*self._batch, self.artifact.nx)  # as late as z
@@ -296,19 +290,14 @@ class KKLObserver(RecordEstimates):
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray | None = None) -> None:
         """Forget the past in some rows of the batch and take in their first samples.
 
+        Raises the errors of :meth:`reset`, and RuntimeError before it.
+
         Parameters
         ----------
-        y0 : array_like, shape (number of True in rows, ny)
-            First samples.
+        y0, x0
+            As for :meth:`reset`, a row for each True in ``rows``.
         rows : array_like of bool, shape (...,)
             The rows of the batch.
-        x0 : array_like, shape (number of True in rows, nx), optional
-            Their states, where they are known, as for :meth:`reset`.
-
-        Raises
-        ------
-        ValueError, RuntimeError
-            As :meth:`reset`, and before it.
         """
         state = self._begun()
         rows = bool_array("rows", rows, self._batch)
@@ -408,6 +397,8 @@ class KKLObserver(RecordEstimates):
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Return the current estimate: T_inv(z), the network's half of :meth:`step`, or the tracker's.
 
+        Raises ValueError if ``rows`` does not fit the batch, and RuntimeError before :meth:`reset`.
+
         Parameters
         ----------
         rows : array_like of bool, shape (...,), optional
@@ -417,11 +408,6 @@ class KKLObserver(RecordEstimates):
         -------
         ndarray, shape (..., nx) or (number of True in rows, nx)
             The estimate.
-
-        Raises
-        ------
-        ValueError, RuntimeError
-            If ``rows`` does not fit the batch; before :meth:`reset`.
         """
         state, batch = self._some(rows)
         return self._kkl.decode(state).reshape(*batch, self.artifact.nx)
@@ -430,16 +416,11 @@ class KKLObserver(RecordEstimates):
     def parameters_hat(self) -> np.ndarray:
         """Current estimates of the uncertain parameters :attr:`Artifact.estimated_parameters`, shape (..., number).
 
-        Raises
-        ------
-        RuntimeError
-            Before :meth:`reset`.
-        ValueError
-            If the artifact estimates no parameters.
+        Raises RuntimeError before :meth:`reset`, and ValueError if the artifact estimates no parameters.
         """
         state = self._begun()
-        found = self._kkl.parameters_hat(state)
-        return found.reshape(*self._batch, found.shape[-1])
+        parameters = self._kkl.parameters_hat(state)
+        return parameters.reshape(*self._batch, parameters.shape[-1])
 
     @property
     def covariance(self) -> np.ndarray:
@@ -447,15 +428,8 @@ class KKLObserver(RecordEstimates):
 
         It is calibrated on runs, by level of noise and age; a tracker's also follows its filter: 90 % of the
         errors there have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of the chi-square distribution with nx
-        degrees of freedom. On another plant, under a faulty sensor or far from the training it is too small. Computed
-        when asked for.
-
-        Raises
-        ------
-        RuntimeError
-            Before :meth:`reset`.
-        ArtifactError
-            If the artifact holds no covariance. It is a ValueError.
+        degrees of freedom. On another plant, under a faulty sensor or far from the training it is too small. Raises
+        RuntimeError before :meth:`reset`, and ArtifactError if the artifact holds no covariance.
         """
         return self.decode_covariance()
 
@@ -465,18 +439,7 @@ class KKLObserver(RecordEstimates):
         return standard_deviations(self.decode_covariance())
 
     def decode_covariance(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the covariance of the error of what :meth:`decode` returns.
-
-        Parameters
-        ----------
-        rows : ndarray of bool, shape (...,), optional
-            As for :meth:`decode`.
-
-        Returns
-        -------
-        ndarray, shape (..., nx, nx) or (number of True in rows, nx, nx)
-            As :attr:`covariance`, which also raises the same.
-        """
+        """Return the :attr:`covariance` of some rows, (number of True in rows, nx, nx); see :meth:`decode`."""
         state, batch = self._some(rows)
         self.artifact.require_covariance()
         return self._kkl.covariance(state).reshape(*batch, self.artifact.nx, self.artifact.nx)

@@ -29,7 +29,7 @@ class RecordEstimates:
     ) -> np.ndarray:
         """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
 
-        The observer's own state is left as it was.
+        The observer's own state is left as it was. Raises the errors of :meth:`reset` and :meth:`step`.
 
         Parameters
         ----------
@@ -46,53 +46,22 @@ class RecordEstimates:
         -------
         ndarray, shape (steps, ..., nx)
             Estimates.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`reset` and :meth:`step`.
         """
         return self._along(y, u, x0, of=self._kkl.decode, t=t)
 
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Estimate the system's uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
 
-        Parameters
-        ----------
-        y, u
-            As for :meth:`estimate`.
-
-        Returns
-        -------
-        ndarray, shape (steps, ..., number)
-            Estimates.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`estimate`, and if the artifact estimates no parameters.
+        Arguments and errors are those of :meth:`estimate`. Shapes: returns (steps, ..., number).
         """
         return self._along(y, u, None, of=self._kkl.parameters_hat)
 
     def estimate_covariance(
         self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
     ) -> np.ndarray:
-        """Covariances of the errors of what :meth:`estimate` returns.
+        """Covariances of the errors of what :meth:`estimate` returns: :attr:`covariance` at each sample.
 
-        Parameters
-        ----------
-        y, u, x0
-            As for :meth:`estimate`.
-
-        Returns
-        -------
-        ndarray, shape (steps, ..., nx, nx)
-            What :attr:`covariance` would be at each sample.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`estimate`, and if the artifact holds no covariance.
+        Arguments and errors are those of :meth:`estimate`. Shapes: returns (steps, ..., nx, nx).
         """
         self.artifact.require_covariance()
         return self._along(y, u, x0, of=self._kkl.covariance)
@@ -111,5 +80,5 @@ class RecordEstimates:
         x0 = None if x0 is None else real_array("x0", x0)
         state = self._begin(y[0], x0)
         samples, inputs = (each.reshape(len(each), len(state), each.shape[-1]) for each in (y, u))
-        found = self._kkl.along(state, samples, inputs, of, dts)
-        return found.reshape(*y.shape[:-1], *found.shape[2:])
+        values = self._kkl.along(state, samples, inputs, of, dts)
+        return values.reshape(*y.shape[:-1], *values.shape[2:])

@@ -1,4 +1,4 @@
-"""What an observer takes in, checked at its boundary: samples, inputs, records and starts that are known."""
+"""What an observer takes in, checked at its boundary: arguments, other maps, samples, inputs, records and states."""
 
 import math
 from typing import Any
@@ -7,6 +7,7 @@ import numpy as np
 
 from observers.artifact import Artifact
 from observers.checks import LARGEST, all_finite, flag, integer, is_finite, real_array, shown
+from observers.errors import ArtifactError
 from observers.machine import available
 
 MAX_DELAY = 1000  # samples
@@ -53,25 +54,54 @@ def _check_tracks(artifact: Artifact, tracking: bool | None) -> None:
     artifact.require_motion()
 
 
+def check_replacement(artifact: Artifact, other: Artifact) -> None:
+    """Raise ArtifactError unless an artifact can take the place of another while the filter runs."""
+    if not isinstance(other, Artifact):
+        raise ArtifactError(f"an observer is replaced by an observers.Artifact, got {shown(other)}")
+    there = _serves(other)
+    for what, here in _serves(artifact).items():
+        if here != there[what]:
+            raise ArtifactError(
+                f"the observer in use has {what} {shown(here)}, the other {shown(there[what])}: one that is to replace "
+                "it may differ in its maps alone; make the wrapper anew"
+            )
+    for name in ("A", "B", "dt"):
+        mine, others = (np.asarray(getattr(each.filter, name)) for each in (artifact, other))
+        if mine.shape != others.shape or not np.allclose(mine, others, rtol=1e-9, atol=0.0):
+            raise ArtifactError(
+                f"the filters differ in {name}, so that the state of one means nothing to the other: train with the "
+                "eigenvalues and dt of the observer in use, or make the wrapper anew"
+            )
+
+
+def _serves(artifact: Artifact) -> dict[str, Any]:
+    """What an artifact is for, and what it estimates, by the words of messages."""
+    signals, environment = artifact.signals, artifact.environment
+    return {
+        "environment": environment,
+        "system": artifact.system if environment is None else None,
+        "parameters": dict(artifact.parameters),
+        "signals": None if signals is None else {role: tuple(names) for role, names in signals.items()},
+        "estimated parameters": tuple(artifact.estimated_parameters),
+        "number of states": artifact.nx,
+        "number of inputs": artifact.nu,
+    }
+
+
 def check_output(
     artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], *, first: bool = False
 ) -> np.ndarray | None:
-    """Find what is missing of samples. Shapes: returns (..., ny), or None."""
+    """Return which outputs are missing, (..., ny), or None."""
     if y.shape != (*batch, artifact.ny):
         raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
     if all_finite(y):
         return None
-    if artifact.ny == 1 and not batch:
-        hint = "the first sample must be there" if first else "a missing sample is step(None, u)"
-        raise ValueError(f"y holds NaN, infinity or values beyond 1e15: {_first_of('y', y)}; {hint}")
-    gaps = np.isnan(y)
-    there = np.where(gaps, 0.0, y)
-    if not all_finite(there):
-        found = _first_of("y", there)
-        raise ValueError(f"y holds infinity or values beyond 1e15: {found}; NaN is what says that an output is missing")
     if first:
-        found = _first_of("y", y)
-        raise ValueError(f"y holds NaN: {found}; outputs may be missing later, but the first sample must be whole")
+        _check_finite("y", y, hint="; outputs may be missing later, but the first sample must be whole")
+    if artifact.ny == 1 and not batch:
+        _check_finite("y", y, hint="; a missing sample is step(None, u)")
+    gaps = np.isnan(y)
+    _check_finite("y", np.where(gaps, 0.0, y), hint="; NaN marks a missing output")
     return gaps
 
 
@@ -142,12 +172,8 @@ def intervals(t: np.ndarray, steps: int) -> np.ndarray:
 
 
 def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:
-    """ValueError that names the first entry that is no number, or beyond what is taken for one."""
+    """Raise ValueError, which names the first such entry, if a value is not finite or too large."""
     if not all_finite(values):
-        raise ValueError(f"{name} holds NaN, infinity or values beyond 1e15: {_first_of(name, values)}{hint}")
-
-
-def _first_of(name: str, values: np.ndarray) -> str:
-    """Index and value of the first entry that is no number, or beyond what is taken for one."""
-    at = tuple(np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist())
-    return f"{name}[{', '.join(map(str, at))}] = {values[at]}"
+        at = tuple(np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist())
+        entry = f"{name}[{', '.join(map(str, at))}] = {values[at]}"
+        raise ValueError(f"{name} holds NaN, infinity or values beyond 1e15: {entry}{hint}")

@@ -1,8 +1,7 @@
-"""Files of ours: each appears whole or not at all, holds arrays and JSON alone, and says what is wrong with it.
+"""Files of arrays and JSON, which are written atomically and checked when they are read.
 
-A file of arrays is in the safetensors format; a JSON object that describes them lies in its metadata under a key of its
-kind, ``KEY``. Nothing in it can run. Beside it, under ``KEY-sha256``, lies a checksum: the SHA-256 of the file as it is
-without that entry.
+They are in the safetensors format, with a JSON object in the metadata under the key of their kind, ``KEY``. Nothing in
+them can run. Under ``KEY-sha256`` lies the SHA-256 of the file without that entry.
 """
 
 import hashlib
@@ -10,9 +9,6 @@ import json
 import os
 import re
 import secrets
-import shutil
-import tempfile
-import time
 from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -28,7 +24,6 @@ MOST_BYTES = 256 * 2**20  # of a file; maps of the paper's sizes have one or two
 MOST_HEADER = 2**20  # bytes of its header, which holds the JSON
 DEEPEST = 32  # objects and lists within one another
 UNFINISHED = ".part-"  # what names of temporary files begin with
-ABANDONED = 3600.0  # seconds after which nobody writes to one any more
 
 # All that files hold, as safetensors calls it.
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype(np.float64)}
@@ -73,34 +68,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(folder)
         finally:
             os.close(folder)
-
-
-def require_writable(folder: str | os.PathLike[str]) -> None:
-    """Find out before long work whether its results can be written; nothing is left behind."""
-    path = Path(folder)
-    there = next((one for one in (path, *path.parents) if one.exists()), path)
-    try:
-        tempfile.TemporaryFile(dir=there, prefix=UNFINISHED).close()
-    except OSError as problem:  # which names a file that nobody has asked for
-        raise OSError(problem.errno, problem.strerror, str(folder)) from problem
-
-
-def write(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file, whole or not at all; makes its folder."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-
-
-def clear_unfinished(folder: str | os.PathLike[str]) -> None:
-    """Remove temporary files and folders, left by killed processes, that were last written to an hour ago or more."""
-    for left in Path(folder).glob(f"{UNFINISHED}*"):
-        with suppress(OSError):  # another process may clear away, too, and some are not ours to remove
-            written = [left, *left.rglob("*")]  # a folder's own time says nothing of what is in its files
-            if time.time() - max(path.lstat().st_mtime for path in written) > ABANDONED:
-                if left.is_dir() and not left.is_symlink():
-                    shutil.rmtree(left)
-                else:
-                    left.unlink()
 
 
 def save(
@@ -164,16 +131,6 @@ def read(
         except (ValueError, OverflowError) as problem:  # shapes may be as long, and empty arrays as wide, as they like
             raise error(f"{path} is damaged: its tensor {name}: {problem}") from problem
     return tensors, described
-
-
-def is_kind(path: str | os.PathLike[str], key: str) -> bool:
-    """Whether a file is of a kind, by what its header says; not whether it is whole."""
-    try:
-        header, _ = _parts(_content(path, ValueError))
-    except (ValueError, RecursionError):
-        return False
-    metadata = header.get("__metadata__") if isinstance(header, dict) else None
-    return isinstance(metadata, dict) and key in metadata
 
 
 def checksum(path: str | os.PathLike[str], error: type[Exception]) -> str:

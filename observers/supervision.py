@@ -58,6 +58,3 @@ def _limit(freedom: float, quantile: float) -> float:
     """A quantile of the mean square of so many standard normal numbers, by Wilson and Hilferty's approximation."""
     spread = 2 / (9 * freedom)
     return float((1 - spread + quantile * math.sqrt(spread)) ** 3)
-
-
-__all__ = ["INFLATION", "RELINEARISATIONS", "Supervision"]

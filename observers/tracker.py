@@ -1,13 +1,14 @@
 """The tracker: an unscented Kalman filter that T_inv initialises where it is surer, and again where it diverged."""
 
 import math
+from typing import Any
 
 import numpy as np
 
 from observers.artifact import Artifact
 from observers.decoder import Decoders
 from observers.supervision import INFLATION, RELINEARISATIONS, Supervision
-from observers.unscented import Points, add, factor, shift, solved, transformed, whitened
+from observers.unscented import add, factor, shift, solved, transformed, whitened
 
 KNOWN = 1e-3  # standard deviation of a known start, in scales of the states
 
@@ -27,8 +28,8 @@ class Tracker:
       covariance is no longer positive definite. T_inv's covariance is then that of an age of one window, since what
       misled the filter may have misled z as well.
 
-    An estimate that is off by less than the noise does not show in the NIS, but its innovations are not white: where
-    the mean square of their running mean exceeds its limit, the covariance is multiplied by ten.
+    An error below the noise does not show in the NIS, but makes innovations correlated: where the mean square of their
+    running mean exceeds its limit, the covariance is multiplied by ten.
 
     With a gate, an output whose innovation is larger than so many of its standard deviations is rejected, and counts as
     missing. The gate is open in the first window; and where all that is measured has been rejected for a whole window,
@@ -55,7 +56,6 @@ class Tracker:
         q, self.r = motion.variances(measurement_noise, process_noise)
         self.q = q * motion.x_scale**2
         self._Q, self._R = np.diag(self.q), np.diag(self.r)
-        self._points = Points(kappa=max(3.0 - motion.nx, 0.0), beta=2.0)
         shares = artifact.inverse.shares(measurement_noise, process_noise)
         self._log_factors = np.log(motion.factors.at_levels(*shares))
         self.x, self.P = slice(motion.nx), slice(motion.nx, motion.nx + motion.nx**2)
@@ -112,7 +112,7 @@ class Tracker:
             return self.motion.step(self._within(x), u, self._dt, samples)
 
         def predict(x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            mean, moved, across = transformed(x, P, function=move, points=self._points)
+            mean, moved, across = transformed(x, P, move)
             return mean, moved + samples * self._Q, across
 
         x, P = rows[:, self.x], self._covariances(rows)
@@ -155,7 +155,7 @@ class Tracker:
         """Mean and covariance of the outputs to measure, and their covariance with the states."""
         C = self._artifact.C
         if C is None:
-            expected, S, across = transformed(x, P, function=self._output, points=self._points)
+            expected, S, across = transformed(x, P, self._output)
         else:
             expected, across = x @ C.T, P @ C.T
             S = C @ across
@@ -186,7 +186,8 @@ class Tracker:
         where = np.flatnonzero(lost | (seen < watch.window))
         if not len(where):
             return rows
-        P = self._map_covariances(z[where], np.minimum(seen[where], watch.window) * self._dt, where)
+        seconds = np.minimum(seen[where], watch.window) * self._dt
+        P = self._decoded(Decoders.covariances, z[where], seconds, where)
         with np.errstate(invalid="ignore"):
             surer = np.linalg.slogdet(P)[1] < np.linalg.slogdet(self._covariances(rows)[where])[1]
         taken = surer | lost[where]
@@ -194,20 +195,16 @@ class Tracker:
         if not len(where):
             return rows
         rows = rows.copy()
-        rows[where, self.x] = self._within(self._map_estimates(z[where], age[where] * self._dt, where))
+        rows[where, self.x] = self._within(self._decoded(Decoders.__call__, z[where], age[where] * self._dt, where))
         rows[where, self.P] = P.reshape(len(where), -1)
         rows[lost, self.nis : self.nis + 2] = 1.0
         rows[lost, self.nis + 4] = watch.window
         rows[lost, self.nis + 5 :] = 0.0
         return rows
 
-    def _map_estimates(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        """T_inv's estimates in some rows, at ages in seconds."""
-        return self._decoders(z, age)
-
-    def _map_covariances(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        """Their covariances."""
-        return self._decoders.covariances(z, age)
+    def _decoded(self, of: Any, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
+        """What a method of :class:`Decoders` returns for some rows, at ages in seconds."""
+        return np.asarray(of(self._decoders, z, age))
 
     def _covariances(self, rows: np.ndarray) -> np.ndarray:
         return rows[:, self.P].reshape(len(rows), self.motion.nx, self.motion.nx)
@@ -224,6 +221,3 @@ class Tracker:
 
     def _within(self, x: np.ndarray) -> np.ndarray:
         return np.minimum(np.maximum(x, self.motion.low), self.motion.high)
-
-
-__all__ = ["Tracker"]

@@ -1,58 +1,49 @@
 """Gaussians through functions that are not linear, by sigma points, for a batch of them.
 
 The points are the mean +- sqrt(nx + kappa) times each column of the covariance's Cholesky factor, and the mean itself
-(Wan and van der Merwe, 2000, with alpha = 1). They are drawn anew for outputs that are not linear.
+(Wan and van der Merwe, 2000, with alpha = 1, beta = 2). They are drawn again for outputs that are not linear.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-Gaussian = tuple[np.ndarray, np.ndarray]
-"""Means (n, nx) and covariances (n, nx, nx)."""
+_BETA = 2.0
 
 
-@dataclass(frozen=True)
-class Points:
-    """Which sigma points are drawn."""
-
-    kappa: float
-    beta: float
-
-    def weights(self, nx: int) -> tuple[float, float, float]:
-        """What the mean weighs in means and in covariances, and each other point in both."""
-        middle = self.kappa / (nx + self.kappa)
-        return middle, middle + self.beta, 1 / (2 * (nx + self.kappa))
-
-    def of(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
-        """Those of means (n, nx) and covariances (n, nx, nx): (points, n, nx); NaN where these are none."""
-        columns = math.sqrt(x.shape[-1] + self.kappa) * factor(P).transpose(2, 0, 1)
-        return np.concatenate([x[None], x + columns, x - columns])
-
-    def moments(self, moved: np.ndarray, nx: int) -> Gaussian:
-        """Mean (n, k) of points (points, n, k), and what these differ from it by."""
-        middle, _, other = self.weights(nx)
-        mean = other * moved[1:].sum(0) + middle * moved[0]
-        return mean, moved - mean
-
-    def products(self, a: np.ndarray, b: np.ndarray, nx: int) -> np.ndarray:
-        """Sum over points of outer products of (points, n, k) and (points, n, l), as (n, k, l)."""
-        _, middle, other = self.weights(nx)
-        weighted = other * a
-        weighted[0] *= middle / other
-        products: np.ndarray = weighted.transpose(1, 2, 0) @ b.transpose(1, 0, 2)
-        return products
+def weights(nx: int) -> tuple[float, float, float]:
+    """Weights of the mean in means and in covariances, and of each other point in both."""
+    middle = (_scale(nx) - nx) / _scale(nx)
+    return middle, middle + _BETA, 1 / (2 * _scale(nx))
 
 
 def transformed(
-    x: np.ndarray, P: np.ndarray, *, function: Callable[[np.ndarray], np.ndarray], points: Points
+    x: np.ndarray, P: np.ndarray, function: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a function makes of a batch of Gaussians: means (n, k), covariances (n, k, k) and across (n, nx, k)."""
-    nx, at = x.shape[-1], points.of(x, P)
-    mean, spread = points.moments(function(at), nx)
-    return mean, points.products(spread, spread, nx), points.products(at - x, spread, nx)
+    """Means (n, k), covariances (n, k, k) and those with x (n, nx, k) of a function of Gaussians, (n, nx, nx) each.
+
+    They are NaN where a covariance is not positive definite.
+    """
+    nx = x.shape[-1]
+    middle, middle_squares, other = weights(nx)
+    columns = math.sqrt(_scale(nx)) * factor(P).transpose(2, 0, 1)
+    at = np.concatenate([x[None], x + columns, x - columns])  # (points, n, nx)
+    moved = function(at)
+    mean = other * moved[1:].sum(0) + middle * moved[0]
+    spread = moved - mean
+
+    def products(a: np.ndarray) -> np.ndarray:
+        weighted = other * a
+        weighted[0] *= middle_squares / other
+        return np.asarray(weighted.transpose(1, 2, 0) @ spread.transpose(1, 0, 2))
+
+    return mean, products(spread), products(at - x)
+
+
+def _scale(nx: int) -> float:
+    """Nx + kappa, with kappa = 3 - nx, or 0 where that is negative."""
+    return max(float(nx), 3.0)
 
 
 def whitened(
@@ -93,14 +84,11 @@ def solved(P: np.ndarray, b: np.ndarray) -> np.ndarray:
 def factor(P: np.ndarray) -> np.ndarray:
     """Cholesky factors (n, nx, nx) of covariances; NaN where one is not positive definite or not finite."""
     try:
-        found: np.ndarray = np.linalg.cholesky(P)
+        root: np.ndarray = np.linalg.cholesky(P)
     except np.linalg.LinAlgError:  # which says that there is one, not which
-        found = np.full_like(P, np.nan)
+        root = np.full_like(P, np.nan)
         rows = np.flatnonzero(np.isfinite(P).all((1, 2)))
         if len(P) > 1:
             for half in np.array_split(rows, 2):
-                found[half] = factor(P[half])
-    return found
-
-
-__all__ = ["Gaussian", "Points", "add", "factor", "shift", "solved", "transformed", "whitened"]
+                root[half] = factor(P[half])
+    return root

@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 
 from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import System
-from observers.storage import clear_unfinished, write
+from training.files import clear_unfinished, write
 
 
 def describe(system: System) -> dict[str, Any]:

@@ -9,8 +9,10 @@ import numpy as np
 from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from observers.estimator import Estimate
-from observers.unscented import Gaussian
 from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
+
+Gaussian = tuple[np.ndarray, np.ndarray]
+"""Means (n, nx) and covariances (n, nx, nx)."""
 
 ASIDE = 1e-4  # of X's half-widths, steps of the central differences
 NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in multiples of the system's default

@@ -11,6 +11,7 @@ from kkl_gym.system import System
 from training.maps.coordinates import settling_time
 from training.seeds import Stream, generator
 from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
+from training.trajectories.filtering import filter_states
 from training.trajectories.motions import recording_ages
 
 SMOOTH = 0.85  # least exponent of a smooth T: differences in z fall as distance^0.85 where neighbours come closer
@@ -64,7 +65,7 @@ def smoothness(
             "of any spectrum has forgotten its start; widen the bounds or shrink X"
         )
     for linear, rows in zip(filters, known, strict=True):
-        yield _exponents(system, x=x, z=linear.run(y, no_input, ages), known=rows)
+        yield _exponents(system, x=x, z=filter_states(linear, y, no_input, ages), known=rows)
 
 
 def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, known: np.ndarray) -> np.ndarray:

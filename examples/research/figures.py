@@ -29,7 +29,7 @@ from kkl_gym import SYSTEMS
 from observers import Artifact, load
 from observers.factors import standard_deviations
 from observers.names import resolve
-from observers.storage import replacing, write
+from observers.storage import replacing
 from training.agents.agent import Agent, find
 from training.agents.play import Episodes, play
 from training.agents.seeds import agent_evaluation_seed
@@ -42,6 +42,7 @@ from training.evaluation.errors import unseen_trajectories
 from training.evaluation.faults import FAULTS
 from training.evaluation.metrics import percentage_error
 from training.figures import ALARM, ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
+from training.files import write
 from training.lessons.calibrate import chi_square
 
 if TYPE_CHECKING:

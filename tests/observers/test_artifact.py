@@ -231,10 +231,10 @@ def test_maps_must_fit_the_one_of_driven_motion(make_artifact):
         (artifact, artifact.inverse, "must be of z_y, 5 values"),
         (make_artifact(inputs=False), free, "must be of z_y, 5 values, beside one that knows of inputs"),
         (artifact, lorenz, "must be of z_y"),
-        (artifact, dataclasses.replace(free, measurement_noise_max=2.0), "differ in states, or in noise"),
-        (artifact, plain.free_inverse, "told of process noise"),
-        (artifact, dataclasses.replace(free, process_noise_max=0.3), "told of process noise"),
-        (artifact, with_error_bars(artifact).free_inverse, "one has a covariance"),
+        (artifact, dataclasses.replace(free, measurement_noise_max=2.0), "differ in measurement noise"),
+        (artifact, plain.free_inverse, "differ in process noise"),
+        (artifact, dataclasses.replace(free, process_noise_max=0.3), "differ in process noise"),
+        (artifact, with_error_bars(artifact).free_inverse, "differ in having a covariance"),
     ):
         with pytest.raises(ArtifactError, match=words):
             dataclasses.replace(whole, free_inverse=other)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from observers import LinearFilter
-from observers.thresholds import MANY_ROWS
+from observers.machine import MANY_ROWS
 
 DIAGONAL = -np.diag([0.5, 2.0, 7.0])
 PAIR = np.array([[-1.0, 5.0, 0.0], [-5.0, -1.0, 0.5], [0.0, 0.0, -3.0]])

@@ -79,7 +79,7 @@ def test_what_is_told_of_each_output_must_fit_the_outputs(make_artifact):
             dataclasses.replace(make_artifact().inverse, **{name: (1.0, 2.0)})
     with pytest.raises(ArtifactError, match="noise_gain of 3 outputs does not fit 2"):
         dataclasses.replace(artifact, inverse=make_artifact(outputs=3).inverse)
-    with pytest.raises(ArtifactError, match="differ in states, or in noise"):
+    with pytest.raises(ArtifactError, match="differ in measurement noise"):
         dataclasses.replace(artifact, free_inverse=make_artifact(free_inverse=True).free_inverse)
 
 

@@ -25,6 +25,7 @@ from kkl_gym.simulate import simulate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from observers.names import resolve
 from training.maps.coordinates import stationary_covariance
+from training.trajectories.filtering import filter_states
 
 A, B = np.diag([-1.0, -2.5, -4.0]), np.ones((3, 1))
 M = sylvester(A, B)
@@ -83,7 +84,7 @@ def test_transients_stay_in_the_envelope(poles):
     ages = np.arange(len(x))
     for disturbance in (0.0, 0.3):
         v = disturbance * rng.choice([-1.0, 1.0], (len(x), 40, 1))
-        z = linear.run(system.output(x) + v, np.zeros((1000, 40, 0)), ages)
+        z = filter_states(linear, system.output(x) + v, np.zeros((1000, 40, 0)), ages)
         wrong = np.linalg.norm(z - x @ T.T, axis=-1)
         bound = envelope(linear, 0.01 * ages, start=wrong[0].max(), disturbance=disturbance)
         assert (wrong.max(1) <= bound + 2e-5).all()  # the hold's error of order dt^2

@@ -19,6 +19,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.systems import VanDerPol
 from observers import LinearFilter
 from observers.estimator import Running
+from training.trajectories.filtering import filter_states
 
 
 def run(estimator, y):
@@ -102,7 +103,7 @@ def test_rollout_is_the_filter_sample_by_sample(ny):
     linear = LinearFilter(A, rng.normal(size=(4, ny)), 0.05)
     y = rng.normal(size=(301, 3, ny))
     ages = np.array([0, 1, 2, 7, 8, 150, 300])
-    expected = linear.run(y, np.zeros((300, 3, 0)), ages)
+    expected = filter_states(linear, y, np.zeros((300, 3, 0)), ages)
     parts = (torch.as_tensor(part) for part in (linear.transition, linear.early_y, linear.late_y))
     states = rollout(*parts, z0=torch.as_tensor(expected[0]), y=torch.as_tensor(y.swapaxes(0, 1)), ages=ages)
     np.testing.assert_allclose(states.numpy(), expected, rtol=1e-10, atol=1e-12)

@@ -14,12 +14,12 @@ from rich.table import Table
 import kkl_gym
 from kkl_gym.simulate import check_duration
 from observers import load
-from observers.storage import require_writable
 from training.commands.options import NoiseLevel, OneObserver, OneSystem, OwnPolicy, Seconds, Shown, read_policy, shown
 from training.commands.portraits import Motion, animate
 from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
 from training.figures import ESTIMATE, MEASURED, RIVAL, TRUTH, drawing
+from training.files import require_writable
 from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports

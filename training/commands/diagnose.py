@@ -15,10 +15,10 @@ from kkl_gym import EquationError
 from kkl_gym.loading import load_class
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from observers.storage import require_writable, write
 from training.commands.data import DataOptions, names_in
 from training.commands.options import SYSTEM, NoiseLevels, Parameters, merged
 from training.commands.record import PlayOptions
+from training.files import require_writable, write
 from training.progress import ProgressBars, progress_bars
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from observers.storage import require_writable, write
 from training.commands.coverage import coverage_table, default_levels, judged
 from training.commands.faults import fault_table
 from training.commands.options import (
@@ -37,6 +36,7 @@ from training.evaluation.errors import (
 from training.evaluation.levels import Level, as_cell, beyond, level_for, show_level
 from training.evaluation.metrics import by_state
 from training.evaluation.plants import off_by, parameter_errors, show_parameters, show_ranges
+from training.files import require_writable, write
 from training.progress import ProgressBars, progress_bars
 
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))

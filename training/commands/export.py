@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from observers.storage import replacing, write
+from observers.storage import replacing
 from training.commands.options import NoiseLevel
+from training.files import write
 
 if TYPE_CHECKING:
     from training.export import Exported

@@ -19,7 +19,7 @@ from observers.motion import Motion
 from observers.names import resolve
 from observers.storage import checksum
 from observers.supervision import INFLATION, RELINEARISATIONS, Supervision
-from observers.unscented import Points
+from observers.unscented import weights as sigma_weights
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
 # what distinguishes them would be lost in the last digits of floats.
@@ -147,15 +147,14 @@ def output_expression(artifact: Artifact) -> Expression:
 def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
     """Weights of sigma points, and divergence detection."""
     watch = Supervision.of(motion, dt)
-    points = Points(kappa=max(3.0 - motion.nx, 0.0), beta=2.0)  # as in observers.tracker
-    weights = dict(zip(("middle", "middle_squares", "other"), points.weights(motion.nx), strict=True))
+    weights = dict(zip(("middle", "middle_squares", "other"), sigma_weights(motion.nx), strict=True))
     others = {"trend_gain": watch.trend_gain, "inflation": INFLATION, "relinearisations": RELINEARISATIONS}
     return weights | others | dataclasses.asdict(watch)
 
 
 def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
     """Scaling of the states; bounds, and mean and covariance of where motions start, of scaled states."""
-    low, high = motion.scaled_bounds
+    low, high = ((bound - motion.x_offset) / motion.x_scale for bound in (motion.low, motion.high))
     mean = (motion.mean - motion.x_offset) / motion.x_scale
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}

@@ -13,8 +13,8 @@ from rich.console import Console
 from kkl_gym.system import System
 from observers import Artifact
 from observers.checks import check_dt
-from observers.storage import write
 from training.config import Config, override, settings_of
+from training.files import write
 from training.identification.identify import Identified, Limits, estimate_parameters
 from training.identification.report import write_report
 from training.jobs import claimed_job, describe, refuse_checkpoints

@@ -18,6 +18,7 @@ from training.config import settings_of
 from training.progress import ProgressBars, progress_bars
 from training.sources.simulated import SimulatedSource
 from training.sources.source import Runs, Source, TooFewRunsError
+from training.trajectories.filtering import filter_states
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of measurement noise, in multiples of the largest in training
 AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds at the usual pace
@@ -135,7 +136,8 @@ class _Calibration:
     def with_covariances(self, artifact: Artifact) -> Artifact:
         """The covariance of T_inv's errors by level and age, of each map."""
         linear, seconds, x = artifact.filter, self.ages * self.dt, self.x[self.ages]
-        x_hat = Rows(artifact, self.groups, self.owner).decode(linear.run(self.y, self.u, self.ages), seconds[:, None])
+        z = filter_states(linear, self.y, self.u, self.ages)
+        x_hat = Rows(artifact, self.groups, self.owner).decode(z, seconds[:, None])
         errors, known = self.by_level(x - x_hat), np.isfinite(self.runs.x[self.ages]).all(-1)
         least = np.diag(LEAST_VARIANCE * np.ptp(self.runs.x[self.ages][known], axis=0) ** 2 + np.finfo(float).tiny)
         moved = np.zeros(known.shape, dtype=bool)
@@ -266,13 +268,7 @@ class _Stacked(Tracker):
         q = [each * self.motion.x_scale**2 for each in q]
         self._Q, self._R = (np.array([np.diag(one) for one in each])[owner] for each in (q, r))
 
-    def _map_estimates(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        return self._by_group(z, age, where, Decoders.__call__)
-
-    def _map_covariances(self, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        return self._by_group(z, age, where, Decoders.covariances)
-
-    def _by_group(self, z: np.ndarray, age: np.ndarray, where: np.ndarray, of: Any) -> np.ndarray:
+    def _decoded(self, of: Any, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
         owner = self._owner[where]
         parts = {i: of(self._each[i], z[owner == i], age[owner == i]) for i in np.unique(owner)}
         values = np.empty((len(z), *next(iter(parts.values())).shape[1:]))

@@ -17,7 +17,8 @@ import numpy as np
 from kkl_gym.identity import APPEARANCE, sampling_interval
 from kkl_gym.named import InputReader, Reader, acting, resolved
 from observers.checks import check_dt
-from observers.storage import UNFINISHED, clear_unfinished
+from observers.storage import UNFINISHED
+from training.files import clear_unfinished
 from training.records.record import Record, Signals
 
 if TYPE_CHECKING:

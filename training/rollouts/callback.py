@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from kkl_gym import KKLObservation, KKLVectorObservation
 from observers import Artifact, KKLObserver
 from observers.checks import integer, shown
-from observers.replacement import check_replacement
+from observers.samples import check_replacement
 from training.config import Config, settings_of
 from training.maps.coordinates import settling_time
 from training.records import ROLES, Record, Signals, check_dt, resampled

@@ -7,6 +7,7 @@ import numpy as np
 from observers import LinearFilter
 from training.records import Record
 from training.sources.source import Pairs
+from training.trajectories.filtering import filter_states
 
 
 def windows(records: Sequence[Record], linear: LinearFilter, *, ages: np.ndarray, n: int) -> Pairs:
@@ -65,4 +66,4 @@ def along(linear: LinearFilter, record: Record) -> np.ndarray:
     """The filter's states along a whole record, (n, size)."""
     n = len(record.t)
     u = np.zeros((n, 1, 0)) if not linear.nu or record.u is None else record.u[:, None]
-    return linear.run(record.y[:, None], u, np.arange(n))[:, 0]
+    return filter_states(linear, record.y[:, None], u, np.arange(n))[:, 0]

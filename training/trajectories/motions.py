@@ -14,6 +14,7 @@ import numpy as np
 from kkl_gym.simulate import Step, simulate
 from kkl_gym.system import System
 from observers import LinearFilter
+from training.trajectories.filtering import filter_states
 from training.trajectories.policies import Controller
 
 KINDS = ("zero", "steps", "zero", "sine")
@@ -166,7 +167,7 @@ def record(
         motions = dataclasses.replace(motions, kinds=(), policy=None)
     found, done = list[tuple[np.ndarray, np.ndarray, np.ndarray]](), 0
     for x, u, level in trajectories(system, n=n, steps=steps, dt=linear.dt, rng=rng, motions=motions, report=report):
-        found.append((x[ages], linear.run(system.output(x), u, ages), level))
+        found.append((x[ages], filter_states(linear, system.output(x), u, ages), level))
         done += len(level)
         report(done)
     xs, zs, levels = zip(*found, strict=True)

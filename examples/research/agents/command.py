@@ -14,13 +14,13 @@ from examples.research.resumable import Workers, run_and_report
 from kkl_gym import get_system
 from observers import Artifact
 from observers.names import resolve
-from observers.storage import write
 from training.agents.agent import fingerprint
 from training.agents.information import OBSERVED, observer_of
 from training.agents.tasks import TASKS, Task
 from training.commands.agent_task import TaskOptions
 from training.commands.options import NoiseLevels
 from training.evaluation.levels import Level
+from training.files import write
 from training.progress import ProgressBars
 
 

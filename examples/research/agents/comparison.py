@@ -14,7 +14,7 @@ import kkl_gym
 from examples.research.resumable import Job
 from kkl_gym import get_system
 from kkl_gym.memory import IMAGINED
-from observers.storage import explained, write
+from observers.storage import explained
 from training.agents.agent import fingerprint, rules
 from training.agents.environments import vector
 from training.agents.information import OBSERVED, Information, make, observer_of
@@ -22,6 +22,7 @@ from training.agents.play import play
 from training.agents.seeds import AGENT_EVALUATION_SEED
 from training.agents.tasks import Task, scores, successes
 from training.evaluation.levels import as_cell, as_name
+from training.files import write
 
 if TYPE_CHECKING:
     import pandas as pd

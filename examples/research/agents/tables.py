@@ -10,10 +10,10 @@ import numpy as np
 
 from examples.research.agents.comparison import COLUMNS, IDLE, IN_ENVIRONMENTS, KINDS, ON_SYSTEMS, ComparedAgent
 from examples.research.agents.statistics import interval, middle, normalised
-from observers.storage import write
 from training import markdown
 from training.evaluation.levels import as_cell, as_name
 from training.figures import MEASURED, RIVAL, drawing
+from training.files import write
 
 if TYPE_CHECKING:
     import pandas as pd

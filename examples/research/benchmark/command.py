@@ -10,9 +10,9 @@ from rich.console import Console
 from examples.research.resumable import Workers, check_failures, run_job, run_missing
 from kkl_gym.systems import SYSTEMS, get_system
 from observers.checks import noise_levels
-from observers.storage import clear_unfinished
 from training.commands.options import NoiseLevels
 from training.evaluation.levels import multiple, show_level
+from training.files import clear_unfinished
 from training.progress import LOG, progress_bars
 from training.seeds import Stream, generator
 

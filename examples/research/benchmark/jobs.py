@@ -16,8 +16,9 @@ from examples.research.benchmark.protocol import Protocol, measure, step_time, t
 from examples.research.methods import SHIPPED, Budget, Configuration, Task, get_method
 from examples.research.resumable import Job
 from kkl_gym.systems import get_system
-from observers.storage import explained, write
+from observers.storage import explained
 from training import checkpoints
+from training.files import write
 from training.jobs import describe
 
 FAILED = 200.0  # the largest SMAPE, for a configuration whose training diverges

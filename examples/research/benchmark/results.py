@@ -12,8 +12,9 @@ import pandas as pd
 from examples.research.benchmark.tables import draw, write_table
 from examples.research.methods import ABLATION, METHODS
 from kkl_gym.systems import SYSTEMS
-from observers.storage import explained, write
+from observers.storage import explained
 from training.evaluation.levels import read_level, show_level
+from training.files import write
 
 FILES = ("results.csv", "methods.csv")  # a row for each trajectory, and for each method on each system
 NAMED = 4  # of the methods that are missing, by their names

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from observers.storage import write
 from training.evaluation.levels import read_level, show_level
 from training.figures import save, style
+from training.files import write
 from training.markdown import table
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.storage import require_writable, write
 from training import markdown
 from training.commands.options import NoiseLevel, Observers, OwnPolicy, OwnSystem, read_observers, read_policy
 from training.evaluation.levels import beyond, level_for, show_level
 from training.figures import drawing
+from training.files import require_writable, write
 from training.progress import progress_bars
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from kkl_gym.system import System
 from observers import Artifact
 from training.evaluation.levels import Level
 from training.seeds import Stream, generator
+from training.trajectories.filtering import filter_states
 from training.trajectories.motions import draw_process_noise, under_policy
 from training.trajectories.policies import Controller
 
@@ -91,7 +92,7 @@ def record_settled(
         return np.moveaxis(values, 0, 1).reshape(-1, values.shape[-1])
 
     def filtered(y: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return one_by_one(linear.run(y, u, ages))
+        return one_by_one(filter_states(linear, y, u, ages))
 
     return SettledTrajectories(
         x=one_by_one(x[ages]),

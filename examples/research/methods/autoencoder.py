@@ -18,6 +18,7 @@ from training.maps.forward import on_tensors
 from training.maps.networks import Network, tensor
 from training.spectrum import Spectrum
 from training.trajectories.equations import output_matrix
+from training.trajectories.filtering import filter_states
 
 BATCH = 512
 LEARNING_RATE = 1e-3  # the authors'; at several times that the PDE residual jumps
@@ -114,7 +115,7 @@ class _Problem(nn.Module):
         y = data.y[:, :200].astype(float)
         linear = LinearFilter(middle * self.D, middle * self.F, budget.dt)
         late = data.ages[data.ages >= data.ages[-1] // 2]
-        z = linear.run(y, np.zeros((len(y) - 1, y.shape[1], 0)), late).reshape(-1, linear.size)
+        z = filter_states(linear, y, np.zeros((len(y) - 1, y.shape[1], 0)), late).reshape(-1, linear.size)
         self.z_offset, self.z_scale = tensor(z.mean(0), device), tensor(spread(z), device)
         self._D, self._F = tensor(self.D, device), tensor(self.F, device)
         self._xo, self._xs = tensor(self.x_offset, device), tensor(self.x_scale, device)

@@ -10,6 +10,7 @@ from observers import LinearFilter
 from training.evaluation.levels import Level
 from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
+from training.trajectories.filtering import filter_states
 
 TRAJECTORIES_PER_BATCH = 128
 AGES_PER_BATCH = 32
@@ -71,7 +72,7 @@ class Decoder(nn.Module):
     def __init__(self, network: Network, linear: LinearFilter, data: Data, *, device: torch.device) -> None:
         super().__init__()
         y = data.y[:, :500].astype(float)
-        z = linear.run(y, np.zeros((len(y) - 1, y.shape[1], 0)), data.ages).reshape(-1, linear.size)
+        z = filter_states(linear, y, np.zeros((len(y) - 1, y.shape[1], 0)), data.ages).reshape(-1, linear.size)
         self.z_offset, scale = z.mean(0), spread(z)
         _, singular, directions = np.linalg.svd((z - self.z_offset) / scale, full_matrices=False)
         gain = np.sqrt(len(z)) / np.hypot(singular, SOFT_FLOOR * singular[0])

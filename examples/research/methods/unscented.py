@@ -3,16 +3,16 @@
 import numpy as np
 
 from kkl_gym.simulate import advance_batch
-from observers.unscented import Gaussian, Points, add, shift, transformed, whitened
-from training.kalman import ExtendedKalmanFilter
+from observers.unscented import add, shift, transformed, whitened
+from training.kalman import ExtendedKalmanFilter, Gaussian
 
 
 class UnscentedKalmanFilter(ExtendedKalmanFilter):
     """A batch of unscented Kalman filters (Wan and van der Merwe, 2000).
 
-    Their sigma points are those with alpha = 1, beta = 2 and kappa = 3 - nx, which are usual. Where h is undefined at
-    one, it is taken at their mean. A filter starts again if its corrected mean leaves the system's declared bounds, or
-    if its covariance is no longer positive definite. The rest is as in the base class.
+    Their sigma points are those with alpha = 1, beta = 2 and kappa = 3 - nx, or 0 where that is negative. Where h is
+    undefined at one, it is taken at their mean. A filter starts again if its corrected mean leaves the system's
+    declared bounds, or if its covariance is no longer positive definite. The rest is as in the base class.
     """
 
     @np.errstate(over="ignore", invalid="ignore")
@@ -22,7 +22,7 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
             moved = advance_batch(self._system, flat, np.tile(u, len(points)), np.zeros_like(flat), dt)
             return moved.T.reshape(points.shape)
 
-        mean, covariance, _ = transformed(x, P, function=move, points=self._points)
+        mean, covariance, _ = transformed(x, P, move)
         return mean, covariance + self._Q * dt
 
     @np.errstate(over="ignore", invalid="ignore")
@@ -38,7 +38,7 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         return x, P
 
     def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
-        expected, S, across = transformed(x, P, function=self._output, points=self._points)
+        expected, S, across = transformed(x, P, self._output)
         V, white = whitened(y - expected, S + self._R, across, np.isnan(y))
         return shift(x, V, white), add(P, V, V, -1.0)
 
@@ -47,7 +47,3 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         if not np.isfinite(y).all():
             y = np.where(np.isfinite(y), y, self._system.output(points.mean(0, keepdims=True)))
         return y
-
-    @property
-    def _points(self) -> Points:
-        return Points(kappa=3.0 - self._system.nx, beta=2.0)

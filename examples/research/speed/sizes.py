@@ -13,11 +13,11 @@ from rich.table import Table
 from examples.research.speed.observers import in_turns, observer_tasks
 from kkl_gym import System, get_system
 from observers import Artifact
-from observers.storage import write
 from training.commands.options import NoiseLevel, SystemName
 from training.config import read_changes
 from training.evaluation.levels import level_for
 from training.figures import ESTIMATE, TRUTH, drawing
+from training.files import write
 from training.jobs import locked
 from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars

@@ -13,7 +13,7 @@ from examples.research.speed.observers import in_turns
 from kkl_gym.memory import Memory
 from kkl_gym.simulate import simulate
 from observers import KKLObserver, load
-from observers.thresholds import MANY_ROWS
+from observers.machine import MANY_ROWS
 from training import TorchMemory, TorchObserver
 from training.markdown import table
 

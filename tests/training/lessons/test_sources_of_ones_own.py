@@ -9,6 +9,7 @@ from observers import KKLObserver
 from training import Config, Run, learn_flow, learn_map, train
 from training.maps.coordinates import settling_time
 from training.sources.source import Increments, Pairs, Runs
+from training.trajectories.filtering import filter_states
 
 DT, NOISE = 0.05, 0.1
 PHI = np.array([[np.cos(DT), np.sin(DT)], [-np.sin(DT), np.cos(DT)]])
@@ -43,7 +44,8 @@ class Spring:
     def pairs(self, linear, *, free=False, report):
         ages = np.arange(0, int(settling_time(linear) / DT), 5)
         x = self.motions(300, ages[-1], 0)
-        return Pairs(ages, x[ages], linear.run(x[..., :1], np.zeros((ages[-1], 300, 0)), ages), np.zeros(300))
+        z = filter_states(linear, x[..., :1], np.zeros((ages[-1], 300, 0)), ages)
+        return Pairs(ages, x[ages], z, np.zeros(300))
 
     def runs(self, *, report):
         x = self.motions(200, 400, 1)

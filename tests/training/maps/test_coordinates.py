@@ -12,6 +12,7 @@ from training.maps.coordinates import (
     spread,
     stationary_covariance,
 )
+from training.trajectories.filtering import filter_states
 
 
 def test_coordinates_make_the_signal_white_and_the_noise_diagonal():
@@ -38,7 +39,7 @@ def test_noise_covariance_against_simulation_at_every_age():
     ages = np.array([0, 1, 2, 5, 50])
     n, levels = 50_000, np.array([1.0, 0.3])
     y = np.random.default_rng(0).normal(size=(51, n, 2)) * levels
-    e = linear.run(y, np.zeros((50, n, 0)), ages)
+    e = filter_states(linear, y, np.zeros((50, n, 0)), ages)
     together = np.einsum("j,ajkl->akl", levels**2, noise_covariance(linear, ages))
     for predicted, sample in zip(together, e, strict=True):
         measured = sample.T @ sample / n

@@ -23,6 +23,7 @@ from training.maps.forward import ForwardProblem, along, on_tensors, residual, t
 from training.maps.networks import Network, from_mlp
 from training.spectrum import Spectrum
 from training.trajectories.equations import evaluate, jacobian
+from training.trajectories.filtering import filter_states
 
 
 def test_truncation_leaves_epsilon_of_any_start():
@@ -89,7 +90,7 @@ def test_filter_state_from_T_and_what_is_left_of_its_start():
     system, linear = Autonomous(), Spectrum((-1.0,), ((-0.5, 2.0),)).filter(1, 0.001)
     ages = np.array([0, 1, 100, 1000])
     x = simulate(system, np.random.default_rng(0).uniform(-1, 1, (5, 2)), 1000, 0.001)
-    simulated = linear.run(system.output(x), np.zeros((1000, 5, 0)), ages)
+    simulated = filter_states(linear, system.output(x), np.zeros((1000, 5, 0)), ages)
     T = x[ages] @ sylvester(linear.A, linear.B).T
     found = transients(T, simulated[0], linear=linear, ages=ages)
     assert np.abs(T[1] - simulated[1]).max() > 0.1  # the start is far from T

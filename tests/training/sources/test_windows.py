@@ -4,6 +4,7 @@ import pytest
 from training.records import Record
 from training.sources.windows import windows
 from training.spectrum import Spectrum
+from training.trajectories.filtering import filter_states
 
 DT = 0.05
 RNG = np.random.default_rng(0)
@@ -28,7 +29,7 @@ def test_every_pair_is_that_of_a_filter_that_starts_so_many_samples_before():
             owner, sample = records[int(state >= 1000)], int(state) % 1000
             start, end = sample - age, sample + 1
             y, u = owner.y[start:end, None], owner.u[start:end, None]
-            np.testing.assert_allclose(z, LINEAR.run(y, u, np.array([age]))[0, 0], rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(z, filter_states(LINEAR, y, u, np.array([age]))[0, 0], rtol=1e-9, atol=1e-12)
             seen.add(int(state))
         assert 1003 not in seen
         assert len(seen) == (50 - age) + (30 - age) - (age <= 3)  # every sample that is old enough
