@@ -1,9 +1,11 @@
 """``kkl-gym identify``; its refusals are among the others."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_artifacts import random_artifact
 
 from kkl_gym.simulate import simulate
 from kkl_gym.systems import VanDerPol
@@ -33,3 +35,12 @@ def test_from_files_to_an_observer_and_to_another(tmp_path, capsys):
     main(["identify", "VanDerPol", "--observer", "van_der_pol", "--data", *data, *SIZES.split()])
     adapted = Artifact.read("runs/van_der_pol-adapted/van_der_pol.safetensors")
     assert adapted.parameters["mu"] == pytest.approx(found["value"], rel=1e-3)
+
+
+def test_an_observer_of_a_bias_is_not_adapted():
+    artifact, plant = random_artifact(system="lorenz"), VanDerPol()
+    training = artifact.training | {"pipeline": "input-aware", "eigenvalues": [-1.0], "bias": 1.0}
+    replace(artifact, system=plant.name, parameters=plant.parameters, training=training).save("biased.safetensors")
+    np.savez("y.npz", t=0.01 * np.arange(301), y=np.sin(0.01 * np.arange(301)))
+    with pytest.raises(SystemExit, match="this observer estimates a bias of up to 1.0, which identification does not"):
+        main(["identify", "van_der_pol", "--observer", "biased.safetensors", "--data", "y.npz"])
