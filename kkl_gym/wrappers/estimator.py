@@ -92,7 +92,7 @@ class KKLEstimator:
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
         if flag("known_start", known_start) and artifact.nx > system.nx:
             raise ValueError(
-                "known_start=True: no start is known of the bias that this observer estimates; leave it out"
+                "known_start=True: this observer estimates a bias too, of which no start is known; leave it out"
             )
         space = _filter_space(plant, artifact.filter) if estimate == "z" else _estimate_space(plant, artifact.nx)
         if uncertainty:
