@@ -142,6 +142,8 @@ def make(
         env = task.make(num_envs, lambda env: VectorEstimate(env, kalman_filters(env)), autoreset_mode)
         return Features(env, ["x_hat"], feature=of("x_hat"), width=system.nx)
     observer = observer or observer_of(system)
+    if load(observer).artifact.nx > system.nx:
+        raise ValueError(f"the observer {observer} estimates a bias too, which agents do not know; take one without")
     if information == "x_hat":
         env = task.make(num_envs, partial(KKLVectorObservation, observer=observer), autoreset_mode)
         return Features(env, ["x_hat"], feature=of("x_hat"), width=system.nx)
