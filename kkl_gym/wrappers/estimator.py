@@ -91,9 +91,7 @@ class KKLEstimator:
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer or system.name))
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
         if flag("known_start", known_start) and artifact.nx > system.nx:
-            raise ValueError(
-                "known_start=True: this observer estimates a bias too, of which no start is known; leave it out"
-            )
+            raise ValueError("leave known_start out: this observer estimates a bias too, of which no start is known")
         space = _filter_space(plant, artifact.filter) if estimate == "z" else _estimate_space(plant, artifact.nx)
         if uncertainty:
             low, high = with_deviations(space.low, space.high)
