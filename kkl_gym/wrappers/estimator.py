@@ -91,9 +91,7 @@ class KKLEstimator:
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer or system.name))
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
         if flag("known_start", known_start) and artifact.nx > system.nx:
-            raise ValueError(
-                "known_start=True: no start is known of the bias that this observer estimates; leave it out"
-            )
+            raise ValueError("leave known_start out: this observer estimates a bias too, of which no start is known")
         space = _filter_space(plant, artifact.filter) if estimate == "z" else _estimate_space(plant, artifact.nx)
         if uncertainty:
             low, high = with_deviations(space.low, space.high)
@@ -150,8 +148,7 @@ class KKLEstimator:
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
         """Take in samples (..., ny), NaN where missing, and the inputs (..., nu) that led to them."""
-        missing = y.shape == (1,) and y[0] != y[0]  # of a single observer, which takes None for a whole sample
-        self.observer.advance(None if missing else y, None if u is None else self.known(u), rows)
+        self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """What ``info`` gains. Shapes: ``rows`` (...,)."""

@@ -124,6 +124,8 @@ def estimates(task: Task, information: Information, num_envs: int, observer: str
         return _modes(env, artifact, system)
     first = len(task.measured) if task.measurement_noise else 0  # an observer estimates noisy outputs too
     last = len(task.measured) + artifact.nx
+    if system is not None and artifact.nx > system.nx:
+        raise ValueError(f"the observer {observer} estimates a bias too, which agents do not know; take one without")
     scale = 1.0 if system is None else np.array(system.scale)
     width = artifact.nx if system is not None else last - first
 
