@@ -144,8 +144,9 @@ def later(target):
 
 
 @pytest.mark.parametrize(("make", "call", "words", "good", "bad"), [
-    *((observing, call, "y", y, [*arrays_unlike(y), *huge])
-      for call in (lambda o, v: o.reset(v), lambda o, v: o.step(v, u), lambda o, v: o.advance(v))),
+    (observing, lambda o, v: o.reset(v), "y", y, [*arrays_unlike(y), *huge]),
+    *((observing, call, "y", y, [*arrays_unlike(y)[:-3], "x", *huge])
+      for call in (lambda o, v: o.step(v, u), lambda o, v: o.advance(v))),
     *((observing, call, "u", u, [*arrays_unlike(u), *huge])
       for call in (lambda o, v: o.step(y, v), lambda o, v: o.step(None, v))),
     (observing, lambda o, v: o.estimate(v), "y|record", record, arrays_unlike(record, record[:0], record + math.inf)),
