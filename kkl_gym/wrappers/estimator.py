@@ -212,8 +212,6 @@ def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
 def _estimate_space(plant: Plant, nx: int) -> gym.spaces.Box:
     """Bounds of the estimates: those of the states, and none of what an observer estimates behind them."""
     space, others = plant.state_space, np.full(max(0, nx - plant.system.nx), np.inf, dtype=np.float32)
-    if not len(others):
-        return space
     low, high = np.concatenate([space.low, -others]), np.concatenate([space.high, others])
     return gym.spaces.Box(low, high, dtype=np.float32)
 
