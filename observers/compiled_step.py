@@ -107,9 +107,8 @@ class CompiledStep:
         usual = linear is None or linear is self._linear
         model = self._usual if linear is None or usual else self._at(linear)
         given = rows, y, u, self._nothing if record is None else record
-        (step, addresses, _), few = self._one, self._first
-        if len(rows) > 1:
-            few = np.arange(len(rows))
+        step, addresses, _ = self._one
+        few = self._first if len(rows) == 1 else np.arange(len(rows))
         if len(rows) >= _LANES and self._tracks_equations:
             old = rows[:, self._seen] >= self._window
             few, many = few[~old], few[old]
