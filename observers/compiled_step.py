@@ -1,5 +1,6 @@
 """An observer's step as machine code, where Numba is installed: its numbers, as the kernel orders them."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from observers.decoder import Decoder, Decoders
 from observers.filter import LinearFilter
 from observers.tracker import Tracker
 
+_LANES = 8  # rows that are stepped together
 MOST_OPERATIONS = 400  # of expressions; beyond, such as for a network as f, compiling takes many seconds
 
 
@@ -19,21 +21,13 @@ class CompiledStep:
     """
 
     def __init__(self, artifact: Artifact, decoders: Decoders, tracker: Tracker | None) -> None:
-        from observers import kernel, kernel_functions
-
         nx, ny, nu, linear = artifact.nx, artifact.ny, artifact.nu, artifact.filter
         motion = None if tracker is None else tracker.motion
         equations, flow = (None, None) if motion is None else (motion.equations, motion.flow)
         for expression in (None if equations is None else equations.field, artifact.h):
             if expression is not None and expression.operations > MOST_OPERATIONS:
                 raise ValueError("the expression takes too long to compile")
-        # Machine code is freed with what holds its address.
-        self._move = self._measure = None
-        if equations is not None:
-            self._move = kernel_functions.motion(equations.field, nx, nu, not equations.substeps)
-        if artifact.h is not None:
-            self._measure = kernel_functions.output(artifact.h, nx)
-        self._steps, self._nothing = kernel.steps(nx, ny, nu), np.empty((1, 0, 0))
+        self._nothing = np.empty((1, 0, 0))
         driven, free = _of_map(decoders.driven, nx), _of_map(decoders.free or decoders.driven, nx)
         widest = max(driven[2], free[2], nx + nu)
         states, r, watched, limit = np.zeros((3, nx)), np.ones(ny), [0.0] * 7, 0.0
@@ -53,10 +47,10 @@ class CompiledStep:
             scaling[3, :nu], of_flow = 1.0 / flow.u_scale, flow.linear
             packed, shape = flow.mlp.packed()
             widest = max(widest, *shape[1:])
-        addresses = (0 if pointer is None else pointer.address for pointer in (self._move, self._measure))
-        self._equations, self._linear = equations, linear
-        self._flags = int(tracker is not None), int(artifact.knows_output), len(linear.A)
-        self._pointers = *addresses, int(widest)
+        self._equations, self._linear, self._h, self._sizes = equations, linear, artifact.h, (nx, ny, nu)
+        self._flags, self._widest = (int(tracker is not None), int(artifact.knows_output), len(linear.A)), int(widest)
+        self._seen = linear.size + ny + 1 + nx + nx**2 + 2  # where a row has the number of samples seen
+        self._window, self._tracks_equations = watched[0], tracker is not None and equations is not None
         self._numbers = linear.dt, limit, *watched
         self._model = (
             states,
@@ -67,7 +61,24 @@ class CompiledStep:
             (driven[0], free[0], driven[1], free[1]),
             (scaling, np.array(of_flow, order="C"), packed, shape),
         )
-        self._usual = self._at(linear)
+        self._usual, self._one, self._first = self._at(linear), self._code(1), np.zeros(1, int)
+
+    @functools.cached_property
+    def _many(self) -> tuple[Any, tuple[int, ...], Any]:
+        return self._code(_LANES)
+
+    def _code(self, W: int) -> tuple[Any, tuple[int, ...], Any]:
+        """The kernel for W rows at once, and the motion and the output by their addresses."""
+        from observers import kernel, kernel_functions
+
+        nx, ny, nu = self._sizes
+        move = measure = None
+        if self._equations is not None:
+            move = kernel_functions.motion(self._equations.field, nx, nu, W, not self._equations.substeps)
+        if self._h is not None:
+            measure = kernel_functions.output(self._h, nx, W)
+        held = move, measure  # machine code is freed with the object that has its address
+        return kernel.steps(nx, ny, nu, W), tuple(0 if each is None else each.address for each in held), held
 
     def _at(self, linear: LinearFilter) -> tuple[Any, ...]:
         """All that the kernel takes before rows and samples, at the sampling interval of a filter."""
@@ -76,7 +87,7 @@ class CompiledStep:
         if self._equations is not None:
             substeps = self._equations.steps(samples)
             h = linear.dt / substeps
-        flags, numbers = (*self._flags, substeps, *self._pointers), (h, samples, *self._numbers)
+        flags, numbers = (*self._flags, substeps, self._widest), (h, samples, *self._numbers)
         return flags, numbers, *self._model, _of_filter(linear.transition, linear.drive), *self._networks
 
     def __call__(
@@ -95,7 +106,16 @@ class CompiledStep:
         y, u = np.array(y, order="C"), np.array(u, order="C")  # Numba compiles anew for what is read-only
         usual = linear is None or linear is self._linear
         model = self._usual if linear is None or usual else self._at(linear)
-        self._steps(*model, rows, y, u, self._nothing if record is None else record)
+        given = rows, y, u, self._nothing if record is None else record
+        step, addresses, _ = self._one
+        few = self._first if len(rows) == 1 else np.arange(len(rows))
+        if len(rows) >= _LANES and self._tracks_equations:
+            old = rows[:, self._seen] >= self._window
+            few, many = few[~old], few[old]
+            if len(many):
+                self._many[0](self._many[1], *model, many, *given)
+        if len(few):
+            step(addresses, *model, few, *given)
 
 
 def _of_map(decoder: Decoder, nx: int) -> tuple[Any, tuple[np.ndarray, np.ndarray], int]:

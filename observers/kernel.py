@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
-from observers.kernel_functions import OPTIONS, lanes
+from observers.kernel_functions import OPTIONS, padded
+from observers.lanes import choose, doubles, stack
 from observers.machine import kernel, part
 from observers.network import UNROLLED
 from observers.network_kernel import decode, evaluate
@@ -23,16 +23,6 @@ from observers.supervision import INFLATION, RELINEARISATIONS
 _intrinsic: Any = intrinsic  # whose results take other arguments than the functions that it decorates
 _POINTER = types.CPointer(types.float64)
 _kernel, _part, _inlined = kernel(**OPTIONS), part(**OPTIONS), part(forceinline=True, **OPTIONS)
-
-
-@_intrinsic(prefer_literal=True)
-def stack(typing: Any, count: Any) -> Any:
-    """Memory of a constant number of doubles, which the compiler may keep in registers."""
-
-    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return cgutils.alloca_once(builder, ir.DoubleType(), size=ir.Constant(ir.IntType(64), count.literal_value))
-
-    return (_POINTER(count), code) if isinstance(count, types.IntegerLiteral) else None
 
 
 @_intrinsic
@@ -49,14 +39,19 @@ def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any)
 
 
 @functools.cache
-def steps(nx: int, ny: int, nu: int) -> Any:
-    """The kernel for numbers of states, outputs and inputs."""
-    kappa, points, wide = max(3.0 - nx, 0.0), 2 * nx + 1, lanes(nx)
+def steps(nx: int, ny: int, nu: int, W: int) -> Any:
+    """The kernel for numbers of states, outputs and inputs, and for as many rows at once.
+
+    More than one are rows beyond the first window of a tracker by equations; their matrices hold vectors of a number of
+    each row.
+    """
+    kappa, points, wide, single = max(3.0 - nx, 0.0), 2 * nx + 1, padded(nx, W), W == 1
     far, other = math.sqrt(nx + kappa), 0.5 / (nx + kappa)
     middle, middle_squares = kappa / (nx + kappa), kappa / (nx + kappa) + 2.0
     square, cross, inputs, turns, inflation = nx * nx, nx * ny, max(nu, 1), RELINEARISATIONS, INFLATION
-    of_states, of_outputs, of_innovations, of_network = nx * wide, ny * wide, ny * ny, nx + inputs
+    of_states, of_outputs, of_innovations, of_network = (nx + nu) * wide, ny * wide, ny * ny, nx + inputs
     nis = nx + square  # where it lies in a row of the tracker
+    of_row = nis + 5 + ny
 
     @_inlined
     def factorise(P: Any, L: Any, inverse: Any) -> None:
@@ -69,13 +64,13 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 if i > j:
                     L[i * nx + j] = total * inverse[j]
                 else:
-                    L[i * nx + i] = math.sqrt(total) if total > 0.0 else np.nan
-                    inverse[i] = 1.0 / L[i * nx + i]
+                    inverse[i] = 1.0 / math.sqrt(choose(total, 0.0, total, np.nan))
+                    L[i * nx + i] = total * inverse[i]
 
     @_part
     def smoothed(P: Any, L: Any, inverse: Any, across: Any, V: Any, turned: bool, G: Any) -> None:
         """G = across P^-1 V, or across^T P^-1 V."""
-        b = stack(nx)
+        b = stack(nx, 1)
         factorise(P, L, inverse)
         for k in range(ny):
             for i in range(nx):
@@ -136,7 +131,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
     def flow_step(at: Any, u: Any, flow: Any, scratch: Any) -> None:
         """A learned motion of the sigma points, in place."""
         scaling, linear, packed, shape = flow
-        q = stack(of_network)
+        q = stack(of_network, 1)
         for j in range(nu):
             q[nx + j] = u[j] * scaling[3, j]
         for p in range(points):
@@ -153,10 +148,15 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                 at[i * wide + p] = scaling[0, i] + scaling[1, i] * total
 
     @_inlined
-    def clipped(states: Any, s: float, i: int) -> float:
+    def clipped(states: Any, s: Any, i: int) -> Any:
         """A state cut at its bounds."""
-        s = states[0, i] if s < states[0, i] else s
-        return states[1, i] if s > states[1, i] else s
+        s = choose(states[0, i], s, states[0, i], s)
+        return choose(s, states[1, i], states[1, i], s)
+
+    @_inlined
+    def finite(value: Any) -> Any:
+        """1 where a number is finite, 0 elsewhere."""
+        return choose(value, -np.inf, choose(np.inf, value, 1.0, 0.0), 0.0)
 
     @_inlined
     def within(states: Any, at: Any, count: int) -> None:
@@ -169,14 +169,17 @@ def steps(nx: int, ny: int, nu: int) -> Any:
     def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
         """Mean and covariance a sample later, and the covariance with the state before."""
         states, flow, substeps, address, h, share = model
-        inverse, at = stack(nx), stack(of_states)
+        inverse, at = stack(nx, W), stack(of_states, W)
         spread_out(x, P, L, inverse, at)
         within(states, at, wide)
-        if substeps < 0:
+        if substeps >= 0:
+            for j in range(nu):
+                for p in range(wide):
+                    at[(nx + j) * wide + p] = u[j]
+            call(address, doubles(at), doubles(at), substeps, h)
+        if single:
             for _ in range(-substeps):
                 flow_step(at, u, flow, scratch)
-        else:
-            call(address, at, u, substeps, h)
         moments(at, nx, mean, moved)
         together(L, at, nx, across)
         for i in range(nx):
@@ -200,40 +203,42 @@ def steps(nx: int, ny: int, nu: int) -> Any:
                     for i in range(nx):
                         S[k * ny + j] += C[k, i] * V[i * ny + j]
             return
-        inverse, at, to, near = stack(nx), stack(of_states), stack(of_outputs), stack(of_outputs)
+        inverse, at, to, near = stack(nx, W), stack(of_states, W), stack(of_outputs, W), stack(of_outputs, W)
         spread_out(x, P, L, inverse, at)
-        call(address, at, to, points, 0.0)
+        call(address, doubles(at), doubles(to), points, 0.0)
         within(states, at, points)  # sigma points may lie where h is undefined
-        call(address, at, near, points, 0.0)
+        call(address, doubles(at), doubles(near), points, 0.0)
         for k in range(ny):
             for p in range(points):
                 i = k * wide + p
-                to[i] = to[i] if np.isfinite(to[i]) else near[i] if np.isfinite(near[i]) else to[k * wide]
+                near[i] = choose(finite(near[i]), 0.0, near[i], to[k * wide])
+                to[i] = choose(finite(to[i]), 0.0, to[i], near[i])
         moments(to, ny, y, S)
         together(L, to, ny, V)
 
     @_inlined
     def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
         """Mark outputs whose innovations are beyond the gate, unless it is open."""
-        measured, far, open_ = 0, 0, now[nis + 4] >= window or now[nis + 2] < window
+        closed = choose(window, now[nis + 4], choose(now[nis + 2], window - 0.5, 1.0, 0.0), 0.0)
+        measured, far = 0.0, 0.0
         for k in range(ny):
-            measured += not np.isnan(y[k])
-            if (y[k] - expected[k]) ** 2 > gate * gate * (S[k * ny + k] + r[k]):
-                far += 1
-                if not open_:
-                    y[k] = np.nan
-                    now[nis + 3] += 1.0
-        if measured:
-            now[nis + 4] = now[nis + 4] + 1.0 if far == measured else 0.0
+            innovation = y[k] - expected[k]
+            beyond = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)
+            measured += finite(y[k])
+            far += beyond
+            now[nis + 3] += beyond * closed
+            y[k] = choose(beyond * closed, 0.0, np.nan, y[k])
+        in_a_row = choose(measured, far, 0.0, now[nis + 4] + 1.0)
+        now[nis + 4] = choose(measured, 0.0, in_a_row, now[nis + 4])
 
     @_inlined
     def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
         """White innovations, by which V moves the state: x + V white and P - V V^T are what is known then."""
         for k in range(ny):
-            white[k] = y[k] - expected[k]
+            white[k] = choose(finite(y[k]), 0.0, y[k] - expected[k], 0.0)
         for k in range(ny):
-            root = 0.0 if np.isnan(y[k]) else 1.0 / math.sqrt(S[k * ny + k] + r[k])
-            white[k] = 0.0 if np.isnan(y[k]) else white[k] * root
+            root = finite(y[k]) / math.sqrt(S[k * ny + k] + r[k])
+            white[k] *= root
             for i in range(nx):
                 V[i * ny + k] *= root
             for j in range(k + 1, ny):
@@ -270,18 +275,20 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         """Predict and correct the state of a row's tracker; outputs that are rejected become NaN."""
         window, share, trend_share, square_share, trend_gain, trend_limit, gate = watched
         states = model[0]
-        x, P, start, spread = stack(nx), stack(square), stack(nx), stack(square)
-        mean, moved, across, L, inverse = stack(nx), stack(square), stack(square), stack(square), stack(nx)
-        again, again_moved, again_across = stack(nx), stack(square), stack(square)
-        S, V, G, D, white = stack(of_innovations), stack(cross), stack(cross), stack(cross), stack(ny)
+        start, spread, mean, moved = stack(nx, W), stack(square, W), stack(nx, W), stack(square, W)
+        across, L, inverse = stack(square, W), stack(square, W), stack(nx, W)
+        again, again_moved, again_across = stack(nx, W), stack(square, W), stack(square, W)
+        S, V, G, D = stack(of_innovations, W), stack(cross, W), stack(cross, W), stack(cross, W)
+        white, last = stack(ny, W), 0
+        if single:
+            last = turns if now[nis + 2] < window else 0
         for i in range(nx):
-            x[i] = start[i] = now[i]
+            start[i] = now[i]
         for i in range(square):
-            P[i] = spread[i] = now[nx + i]
-        last = turns if now[nis + 2] < window else 0
+            spread[i] = now[nx + i]
         for turn in range(last + 1):
             predict(start, spread, u, model, scratch, L, again, again_moved, again_across)
-            if turn:  # with the motion linearised about the smoothed start of the step
+            if single and turn:  # with the motion linearised about the smoothed start of the step
                 smoothed(spread, L, inverse, again_across, G, True, D)
                 shift(again, -1.0, D, white)
                 add(again_moved, 1.0, D, D)
@@ -296,12 +303,12 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             if turn == 0 and gate < np.inf:
                 reject(now, y, expected, S, r, gate, window)
             whiten(y, expected, S, r, white, V)
-            if turn < last:
+            if single and turn < last:
                 smoothed(moved, L, inverse, across, V, False, G)
                 for i in range(nx):
-                    start[i] = x[i]
+                    start[i] = now[i]
                 for i in range(square):
-                    spread[i] = P[i]
+                    spread[i] = now[nx + i]
                 shift(start, 1.0, G, white)
                 add(spread, -1.0, G, G)
         shift(mean, 1.0, V, white)
@@ -311,29 +318,30 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             total += mean[i]
             for j in range(nx):
                 total += moved[i * nx + j]
-        if not np.isfinite(total):
-            now[nis] = np.inf
-            return
-        count, squares, raised, grown = 0.0, 0.0, 0.0, 1.0
+        sound = finite(total)
+        count, squares, raised = 0.0, 0.0, 0.0
         for k in range(ny):
-            if not np.isnan(y[k]):
-                count += 1.0
-                squares += white[k] * white[k]
-                now[nis + 5 + k] += trend_share * (white[k] - now[nis + 5 + k])
-                raised += now[nis + 5 + k] * now[nis + 5 + k]
-        if count > 0.0:
-            weight = count / ny
-            now[nis] += share * weight * (squares / count - now[nis])
-            now[nis + 1] += square_share * weight * (trend_gain * raised / count - now[nis + 1])
-            now[nis + 2] += 1.0
-            if now[nis + 1] > trend_limit:  # innovations agree with one another
-                grown, now[nis + 1] = inflation, 1.0
-                for k in range(ny):
-                    now[nis + 5 + k] = 0.0
+            seen, trend = sound * finite(y[k]), now[nis + 5 + k]
+            trend = choose(seen, 0.0, trend + trend_share * (white[k] - trend), trend)
+            count += seen
+            squares += white[k] * white[k]
+            raised += seen * trend * trend
+            now[nis + 5 + k] = trend
+        some = choose(count, 0.0, 1.0, 0.0)
+        weight, each = count / float(ny), 1.0 / choose(count, 0.0, count, 1.0)
+        average = now[nis] + share * weight * (squares * each - now[nis])
+        square_average = now[nis + 1] + square_share * weight * (trend_gain * raised * each - now[nis + 1])
+        # Beyond the limit, innovations agree with one another.
+        grown = choose(square_average, trend_limit, inflation, 1.0)
+        now[nis] = choose(sound, 0.0, average, np.inf)
+        now[nis + 1] = choose(some, 0.0, choose(square_average, trend_limit, 1.0, square_average), now[nis + 1])
+        now[nis + 2] += some
+        for k in range(ny):
+            now[nis + 5 + k] = choose(square_average, trend_limit, 0.0, now[nis + 5 + k])
         for i in range(nx):
-            now[i] = clipped(states, mean[i], i)
+            now[i] = choose(sound, 0.0, clipped(states, mean[i], i), now[i])
         for i in range(square):
-            now[nx + i] = grown * moved[i]
+            now[nx + i] = choose(sound, 0.0, grown * moved[i], now[nx + i])
 
     @_part
     def is_driven(z: Any, nz: int) -> bool:
@@ -353,17 +361,14 @@ def steps(nx: int, ny: int, nu: int) -> Any:
             decode(z[:nz], age, free, scratch, x)
 
     @_part
-    def supervise(now: Any, z: Any, age: float, nz: int, dt: float, watched: Any, limit: float, states: Any, maps: Any,
+    def supervise(now: Any, z: Any, age: float, nz: int, dt: float, window: float, lost: bool, states: Any, maps: Any,
                   scratch: Any, x_hat: Any) -> None:  # fmt: skip
         """Take T_inv's estimate where it is surer within the first window, or where the tracker diverged."""
-        window, lost = watched[0], not now[nis] <= limit
-        if not lost and now[nis + 2] >= window:
-            return
         ages, table = maps[2] if is_driven(z, nz) else maps[3]
         seen, at = min(now[nis + 2], window) * dt, 0
         while at < len(ages) - 2 and seen > ages[at + 1]:
             at += 1
-        P, L, inverse, own = stack(square), stack(square), stack(nx), stack(square)
+        P, L, inverse, own = stack(square, 1), stack(square, 1), stack(nx, 1), stack(square, 1)
         part = 0.0 if len(ages) == 1 else min((seen - ages[at]) / (ages[at + 1] - ages[at]), 1.0)
         upper = min(at + 1, len(ages) - 1)
         for i in range(square):
@@ -393,7 +398,7 @@ def steps(nx: int, ny: int, nu: int) -> Any:
         """Replace what is missing of a sample by h(T_inv(z)), or by the output before where that is undefined."""
         invert(z, age, nz, maps, scratch, x_hat)
         address, C = h
-        at, to = stack(of_states), stack(of_outputs)
+        at, to = stack(of_states, 1), stack(of_outputs, 1)
         for i in range(nx):
             at[i * wide] = x_hat[i]
         if address:
@@ -424,52 +429,68 @@ def steps(nx: int, ny: int, nu: int) -> Any:
 
     @_kernel
     def run(
-        flags: Any, numbers: Any, states: Any, r: Any, C: Any, linear: Any, maps: Any, flow: Any,
-        state: Any, y: Any, u: Any, record: Any
+        addresses: Any, flags: Any, numbers: Any, states: Any, r: Any, C: Any, linear: Any, maps: Any,
+        flow: Any, rows: Any, state: Any, y: Any, u: Any, record: Any
     ) -> None:  # fmt: skip
-        """Samples y (steps, n, ny) and inputs u (steps, n, nu) into rows of the state (n, width).
+        """Samples y (steps, n, ny) and inputs u (steps, n, nu) into some rows of the state (n, width).
 
         A record (steps, n, width) keeps the rows at each sample; (steps, n, 0) keeps none.
         """
-        tracks, knows_output, nz, substeps, address, output_address, widest = flags
+        tracks, knows_output, nz, substeps, widest = flags
         h, samples, dt, limit = numbers[:4]
         watched = numbers[4:]
-        model, of_output = (states, flow, substeps, address, h, samples), (output_address, C)
+        model, of_output = (states, flow, substeps, addresses[0], h, samples), (addresses[1], C)
         size = linear[0].shape[1]
         base, scratch = size + ny + 1, np.empty((5, widest + UNROLLED), np.float32)
-        z, x_hat, filled, expected, held = np.empty(size), np.empty(nx), np.empty(ny), stack(ny), stack(inputs)
-        sample = np.empty(ny)
-        for row in range(len(state)):
-            now = state[row]
-            past, before, tracked = now[:size], now[size : size + ny], now[base:]
+        z, x_hat, filled = np.empty(size), np.empty(nx), np.empty(ny)
+        now, sample, held, expected = stack(of_row, W), stack(ny, W), stack(inputs, W), stack(ny, W)
+        nows, ys, us, expecteds = doubles(now), doubles(sample), doubles(held), doubles(expected)
+        for first in range(0, len(rows), W):
+            count = min(W, len(rows) - first)
             for k in range(len(y)):
-                gap = False
-                for i in range(ny):
-                    sample[i] = y[k, row, i]
-                for j in range(nu):
-                    held[j] = u[k, row, j]
+                for w in range(W):
+                    row = rows[first + min(w, count - 1)]  # lanes that are left over do the last row again
+                    for i in range(ny):
+                        ys[i * W + w] = y[k, row, i]
+                    if tracks:
+                        for j in range(nu):
+                            us[j * W + w] = u[k, row, j]
+                        for i in range(of_row):
+                            nows[i * W + w] = state[row, base + i]
                 if tracks:
-                    track(tracked, sample, held, model, of_output, r, watched, scratch, expected)
-                for i in range(ny):
-                    gap = gap or np.isnan(sample[i])
-                    filled[i] = sample[i]
-                    if np.isnan(sample[i]):
-                        filled[i] = expected[i] if tracks and np.isfinite(expected[i]) else before[i]
-                if gap and knows_output and not tracks:
-                    age = now[base - 1]
-                    fill(sample, past, age * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
-                    follow(past, before, held, filled, linear, z)
-                    fill(sample, z, (age + samples) * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
-                follow(past, before, held, filled, linear, z)
-                for i in range(size):
-                    past[i] = z[i]
-                for i in range(ny):
-                    before[i] = filled[i]
-                now[base - 1] += samples
-                if tracks:
-                    supervise(tracked, past, now[base - 1] * dt, nz, dt, watched, limit, states, maps, scratch, x_hat)
-                for i in range(record.shape[2]):
-                    record[k, row, i] = now[i]
+                    track(now, sample, held, model, of_output, r, watched, scratch, expected)
+                for w in range(count):
+                    row = rows[first + w]
+                    whole, before = state[row], state[row, size : size + ny]
+                    past, tracked, input_ = whole[:size], whole[base:], u[k, row]
+                    gap = False
+                    for i in range(ny):
+                        at = i * W + w
+                        gap = gap or np.isnan(ys[at])
+                        filled[i] = ys[at]
+                        if np.isnan(ys[at]):
+                            filled[i] = expecteds[at] if tracks and np.isfinite(expecteds[at]) else before[i]
+                    if single and gap and knows_output and not tracks:
+                        age = whole[base - 1]
+                        fill(sample, past, age * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
+                        follow(past, before, input_, filled, linear, z)
+                        age += samples
+                        fill(sample, z, age * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
+                    follow(past, before, input_, filled, linear, z)
+                    for i in range(size):
+                        past[i] = z[i]
+                    for i in range(ny):
+                        before[i] = filled[i]
+                    whole[base - 1] += samples
+                    if tracks:
+                        age = whole[base - 1] * dt
+                        for i in range(of_row):
+                            tracked[i] = nows[i * W + w]
+                        lost = not tracked[nis] <= limit
+                        if lost or tracked[nis + 2] < watched[0]:
+                            supervise(tracked, past, age, nz, dt, watched[0], lost, states, maps, scratch, x_hat)
+                    for i in range(record.shape[2]):
+                        record[k, row, i] = whole[i]
 
     return run
 

@@ -15,39 +15,43 @@ _SIGNATURE = types.void(_POINTER, _POINTER, types.int64, types.float64)
 _part = part(**OPTIONS)
 
 
-def lanes(nx: int) -> int:
-    """Sigma points of nx states, and as many more as fill the processor's registers."""
-    return -(-(2 * nx + 1) // 4) * 4
+def padded(nx: int, W: int) -> int:
+    """Sigma points of nx states, and for a single row as many more as fill the processor's registers."""
+    return -(-(2 * nx + 1) // 4) * 4 if W == 1 else 2 * nx + 1
 
 
 @functools.cache
-def motion(expression: Expression, nx: int, nu: int, discrete: bool) -> Any:
-    """The equations' step of all sigma points, (nx, lanes), in place, in so many Runge-Kutta steps of h."""
-    wide, field = lanes(nx), expression.python("field", nx, nu)
-    given = ", ".join([f"x{i}" for i in range(nx)] + [f"u[{j}]" for j in range(nu)])
-    lines = ["def step(s, u, p, h):", *(f"    x{i} = s[{i * wide} + p]" for i in range(nx))]
+def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> Any:
+    """The equations' step of all sigma points of W rows, in place, in so many Runge-Kutta steps of h.
+
+    States and inputs lie in one array (nx + nu, points, W).
+    """
+    wide, field, inputs = padded(nx, W) * W, expression.python("field", nx, nu), [f"u{j}" for j in range(nu)]
+    states = [f"x{i}" for i in range(nx)]
+    given = ", ".join(states + inputs)
+    lines = ["def step(s, p, h):", *(f"    {name} = s[{i * wide} + p]" for i, name in enumerate(states + inputs))]
     for stage, (before, share) in enumerate((("", ""), ("a", "0.5 * h * "), ("b", "0.5 * h * "), ("c", "h * "))):
         moved = [f"x{i} + {share}{before}[{i}]" if before else f"x{i}" for i in range(nx)]
-        lines.append(f"    {'abcd'[stage]} = field({', '.join(moved + [f'u[{j}]' for j in range(nu)])})")
+        lines.append(f"    {'abcd'[stage]} = field({', '.join(moved + inputs)})")
     lines += [
         f"    s[{i * wide} + p] = x{i} + h / 6.0 * (a[{i}] + 2.0 * (b[{i}] + c[{i}]) + d[{i}])" for i in range(nx)
     ]
     if discrete:
-        lines[1 + nx :] = [f"    a = field({given})", *(f"    s[{i * wide} + p] = a[{i}]" for i in range(nx))]
+        lines[1 + nx + nu :] = [f"    a = field({given})", *(f"    s[{i * wide} + p] = a[{i}]" for i in range(nx))]
     step = _function("\n".join(lines), "step", field=field)
 
-    def move(s: Any, u: Any, substeps: int, h: float) -> None:
+    def move(s: Any, _: Any, substeps: int, h: float) -> None:
         for _ in range(substeps):
             for p in range(wide):
-                step(s, u, p, h)
+                step(s, p, h)
 
     return pointer(move, _SIGNATURE, **OPTIONS)
 
 
 @functools.cache
-def output(expression: Expression, nx: int) -> Any:
-    """The outputs, (ny, lanes), of the first sigma points, (nx, lanes)."""
-    wide, ny = lanes(nx), len(expression.components)
+def output(expression: Expression, nx: int, W: int) -> Any:
+    """The outputs (ny, points, W) of the first sigma points (nx, points, W) of W rows."""
+    wide, ny = padded(nx, W) * W, len(expression.components)
     function = expression.python("function", nx, 0)
     given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))
     lines = [
@@ -58,7 +62,7 @@ def output(expression: Expression, nx: int) -> Any:
     at = _function("\n".join(lines), "at", function=function)
 
     def measure(s: Any, out: Any, count: int, h: float) -> None:
-        for p in range(count):
+        for p in range(count * W):
             at(s, out, p)
 
     return pointer(measure, _SIGNATURE, **OPTIONS)
@@ -74,4 +78,4 @@ def _function(source: str, name: str, **names: str) -> Any:
     return _part(namespace[name])
 
 
-__all__ = ["OPTIONS", "lanes", "motion", "output"]
+__all__ = ["OPTIONS", "motion", "output", "padded"]

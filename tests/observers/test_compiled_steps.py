@@ -94,13 +94,16 @@ def test_all_that_may_happen(kind, batch):
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind.get("by") != "flow"], ids=str)
 def test_trackers_agree_to_rounding(kind):
-    """Of a T_inv that is never surer, along a record with gaps."""
+    """Of a T_inv that is never surer, along a record with gaps, and by steps, which take several rows at once."""
     artifact = tracking(**{**kind, "surer": -9.0})
-    y, u, _ = record(artifact, 200, (3,))
+    y, u, _ = record(artifact, 200, (ROWS,))
     y[5::7] = y[3::5, 1, 0] = np.nan
     fast, slow = (KKLObserver(artifact, 0.1, compiled=choice) for choice in (None, False))
     found, expected = ((each.estimate(y, u), each.estimate_covariance(y, u)) for each in (fast, slow))
     assert_alike(found, expected, 1e-9)
+    fast.reset(y[0])
+    steps = [(fast.step(y[k], u[k - 1]), fast.covariance) for k in range(1, len(y))]
+    assert_alike(tuple(map(np.array, zip(*steps, strict=True))), [each[1:] for each in expected], 1e-9)
 
 
 @pytest.mark.parametrize("make", [EQUATIONS, FLOW, static], ids=["equations", "flow", "static"])

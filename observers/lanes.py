@@ -1,0 +1,112 @@
+"""Numbers of several rows at once, as a type of Numba's: code for one row then steps as many. It needs Numba."""
+
+import math
+import operator
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typeconv.castgraph import Conversion
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
+
+_intrinsic: Any = intrinsic  # whose results take other arguments than the functions that it decorates
+_OPERATIONS = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}
+_IN_PLACE = {"add": operator.iadd, "sub": operator.isub, "mul": operator.imul}
+
+
+class Lanes(types.Type):
+    """A vector of doubles, one of each row; numbers become one of equal doubles."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        super().__init__(f"lanes({count})")
+
+    def can_convert_from(self, typing: Any, other: Any) -> Any:
+        return Conversion.safe if isinstance(other, types.Float) else None
+
+    def unify(self, typing: Any, other: Any) -> Any:
+        return self if isinstance(other, types.Float) else None
+
+
+@register_model(Lanes)
+class _Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, ir.VectorType(ir.DoubleType(), kind.count))
+
+
+class _Operation(AbstractTemplate):
+    def generic(self, args: Any, keywords: Any) -> Any:
+        kind = _common(*args)
+        return signature(kind, *(kind for _ in args)) if isinstance(kind, Lanes) else None
+
+
+@lower_cast(types.Float, Lanes)
+def _spread(context: Any, builder: Any, given: Any, kind: Any, value: Any) -> Any:
+    value, vector = context.cast(builder, value, given, types.float64), context.get_value_type(kind)
+    zero = ir.Constant(ir.IntType(32), 0)
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, zero)
+    places = ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
+    return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), places)
+
+
+@lower_builtin(math.sqrt, Lanes)
+def _root(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    kind = arguments[0].type
+    name = f"llvm.sqrt.v{kind.count}f64"
+    return builder.call(builder.module.declare_intrinsic(name, fnty=ir.FunctionType(kind, [kind])), arguments)
+
+
+def _define() -> None:
+    infer_global(math.sqrt)(type("Root", (_Operation,), {}))
+    for name, operation in [*_OPERATIONS.items(), *_IN_PLACE.items()]:
+        infer_global(operation)(type(name, (_Operation,), {}))
+
+        def code(context: Any, builder: Any, signature: Any, arguments: Any, name: str = name) -> Any:
+            return getattr(builder, f"f{name}")(*arguments)
+
+        lower_builtin(operation, Lanes, Lanes)(code)
+
+
+def _common(*kinds: Any) -> Any:
+    """The type of a result: of doubles, or of lanes if there are any."""
+    return next((kind for kind in kinds if isinstance(kind, Lanes)), types.float64)
+
+
+@_intrinsic
+def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
+    """``yes`` where a > b, ``no`` elsewhere and where one is NaN."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", *arguments[:2]), *arguments[2:])
+
+    kind = _common(a, b, yes, no)
+    return kind(kind, kind, kind, kind), code
+
+
+@_intrinsic(prefer_literal=True)
+def stack(typing: Any, count: Any, rows: Any) -> Any:
+    """Memory of a constant number of doubles or of lanes, which the compiler may keep in registers."""
+    kind = Lanes(rows.literal_value) if rows.literal_value > 1 else types.float64
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        size = ir.Constant(ir.IntType(64), count.literal_value)
+        return cgutils.alloca_once(builder, context.get_value_type(kind), size=size)
+
+    return types.CPointer(kind)(count, rows), code
+
+
+@_intrinsic
+def doubles(typing: Any, memory: Any) -> Any:
+    """The same memory as doubles: those of the first lanes, then those of the second."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.DoubleType().as_pointer())
+
+    return types.CPointer(types.float64)(memory), code
+
+
+_define()
+
+__all__ = ["choose", "doubles", "stack"]
