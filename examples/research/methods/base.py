@@ -3,13 +3,12 @@
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-import torch
 from torch import nn
 
 from kkl_gym.system import System
@@ -81,7 +80,6 @@ class Task:
     budget: Budget
     folder: Path
     seed: int = 0
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
     @cached_property
     def data(self) -> Data:
@@ -132,10 +130,6 @@ class Method(ABC, Generic[Trained]):
     def believed(self, system: System) -> System:
         """The system on which it is trained: the true one, unless its model is to be wrong."""
         return system
-
-    def settled(self, configuration: Configuration, trained: Trained) -> Configuration:
-        """The configuration of the full training, after the short one with the least error."""
-        return configuration
 
     @abstractmethod
     def train(self, task: Task, configuration: Configuration) -> Trained:

@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import torch
+
 from examples.research.methods.base import Budget, Configuration, Method, Task, WrongParameters
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
@@ -62,6 +64,11 @@ def within(config: Config, budget: Budget, seed: int) -> Config:
     )
 
 
+def trained(task: Task, config: Config) -> Artifact:
+    """Train by the package's pipeline, on a CPU as all methods."""
+    return train(task.system, config, task.folder, resume=True, device=torch.device("cpu")).artifact
+
+
 class Default(KKLMethod):
     """The package's own: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
 
@@ -77,7 +84,7 @@ class Default(KKLMethod):
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
         config = within(preset(task.system, size="large"), task.budget, task.seed)
-        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
+        return trained(task, config)
 
 
 class WrongDefault(WrongParameters, Default):
@@ -137,7 +144,7 @@ class SPINN(KKLMethod):
         fastest, slowest = configuration["spectrum"]
         changes = {"eigenvalues": spectrum(task.system, fastest, slowest), "pairs": (), "box_factor": 1.0}
         config = within(preset(task.system, "spinn", changes=changes), task.budget, task.seed)
-        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
+        return trained(task, config)
 
 
 class WrongSPINN(WrongParameters, SPINN):
