@@ -1,5 +1,7 @@
 """``python -m examples.research hyperkkl``: HyperKKL's protocol (arXiv 2603.29744) with our default training."""
 
+# ruff: noqa: D102 - what each system defines is documented on System
+
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,7 +48,6 @@ class Driven:
     seen: ClassVar[int] = 0
 
     def h(self, x: Components) -> Components:
-        """The state that is measured."""
         return (x[self.seen],)
 
 
@@ -59,7 +60,6 @@ class Duffing(Driven, System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,))
 
     def f(self, x: Components) -> Components:
-        """Drift."""
         return x[1], -x[0] - x[0] * x[0] * x[0]
 
 
@@ -72,7 +72,6 @@ class VanDerPol(Driven, System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,))
 
     def f(self, x: Components) -> Components:
-        """Drift."""
         return x[1], (1.0 - x[0] * x[0]) * x[1] - x[0]
 
 
@@ -86,7 +85,6 @@ class Rossler(Driven, System):
     seen: ClassVar[int] = 1
 
     def f(self, x: Components) -> Components:
-        """Drift."""
         return -x[1] - x[2], x[0] + 0.1 * x[1], 0.1 + x[2] * (x[0] - 14.0)
 
 
@@ -100,7 +98,6 @@ class Lorenz(Driven, System):
     seen: ClassVar[int] = 1
 
     def f(self, x: Components) -> Components:
-        """Drift."""
         return 10.0 * (x[1] - x[0]), x[0] * (28.0 - x[2]) - x[1], x[0] * x[1] - 8.0 / 3.0 * x[2]
 
 
@@ -114,7 +111,6 @@ class FitzHughNagumo(Driven, System):
     trial: ClassVar[float] = 100.0
 
     def f(self, x: Components) -> Components:
-        """Drift."""
         return x[0] - x[0] * x[0] * x[0] / 3.0 - x[1] + 0.5, 0.08 * (x[0] + 0.7 - 0.8 * x[1])
 
 
@@ -130,7 +126,6 @@ class Traffic(Driven, System):
     seen: ClassVar[int] = 4
 
     def f(self, x: Components) -> Components:
-        """Drift."""
         flow = [each - each * each / 0.25 for each in x]
         inflow = (1.2 / 500, 0.0, 0.3 / 500, 0.0, 0.0)
         before = (0.0, *flow[:-1])
@@ -165,7 +160,7 @@ class HyperKKL:
         if unknown := [name for name in self.systems if name not in SYSTEMS]:
             raise ValueError(f"unknown system {unknown[0]!r}; there are {', '.join(SYSTEMS)}")
         if self.trials < 1:
-            raise ValueError(f"trials = {self.trials} must be positive")
+            raise ValueError(f"trials must be positive, got {self.trials}")
         rows = []
         with progress_bars(console, self.out / LOG) as progress:
             for name in self.systems:

@@ -37,10 +37,8 @@ class Benchmark:
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Names, or classes of yours as script.py:Class or module:Class."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
-    """default, spinn, node, node-noise, gru, lru, transformer, ekf, ukf, ekf-wrong, default-wrong, spinn-wrong,
-    ekf-untuned; or, with the maps that ship, shipped, shipped-spinn, shipped-large; or classes of yours as
-    script.py:Class or module:Class. Those that end in -wrong have a model with parameters 10 % too large; a system must
-    have some."""
+    """default, spinn, node, node-noise, gru, lru, transformer, ekf, ukf; or, with the maps that ship, shipped,
+    shipped-spinn, shipped-large; or classes of yours as script.py:Class or module:Class."""
     measurement_noise: NoiseLevels = None
     """Standard deviations of the noise on each sample of y. 0.1,0.3 is one for each output."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
@@ -87,7 +85,7 @@ class Benchmark:
         """Make the jobs of a budget; raises ValueError if an option is invalid."""
         from examples.research.benchmark import budgets  # torch takes seconds that help need not wait for
         from examples.research.benchmark.jobs import Training
-        from examples.research.methods import METHODS, WrongParameters, get_method
+        from examples.research.methods import METHODS, get_method
 
         methods, levels = tuple(METHODS) if self.methods is None else self.methods, self.measurement_noise
         if not self.systems or not methods or levels == ():
@@ -107,9 +105,6 @@ class Benchmark:
             noise = noise or tuple(dict.fromkeys([0.0, multiple(system, 1.0)]))
             for method in methods:
                 contender = get_method(method)
-                if self.methods is None and isinstance(contender, WrongParameters) and not system.parameters:
-                    continue
-                contender.believed(system)  # raises for some systems, before anything is trained
                 job = Training(
                     system=given,
                     method=method,

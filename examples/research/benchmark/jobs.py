@@ -131,7 +131,7 @@ class Training(Job):
         if not (path.exists() and timing.exists()):
             folder = self.folder / name
             folder.mkdir(parents=True, exist_ok=True)
-            task = Task(method.believed(system), budget, folder, self.seed)
+            task = Task(system, budget, folder, self.seed)
             try:
                 trained = method.train(task, configuration)
             except FloatingPointError:

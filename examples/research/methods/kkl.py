@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from examples.research.methods.base import Budget, Configuration, Method, Task, WrongParameters
+from examples.research.methods.base import Budget, Configuration, Method, Task
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.estimator import Estimator
@@ -87,13 +87,6 @@ class Default(KKLMethod):
         return trained(task, config)
 
 
-class WrongDefault(WrongParameters, Default):
-    """The package's own, trained with every parameter 10 % too large."""
-
-    name: ClassVar[str] = "default-wrong"
-    label: ClassVar[str] = "T_inv alone, model 10 % off"
-
-
 class Shipped(KKLMethod):
     """The maps that ship, trained at a larger budget: ``--methods shipped``."""
 
@@ -145,10 +138,3 @@ class SPINN(KKLMethod):
         changes = {"eigenvalues": spectrum(task.system, fastest, slowest), "pairs": (), "box_factor": 1.0}
         config = within(preset(task.system, "spinn", changes=changes), task.budget, task.seed)
         return trained(task, config)
-
-
-class WrongSPINN(WrongParameters, SPINN):
-    """The paper's, trained with every parameter 10 % too large."""
-
-    name: ClassVar[str] = "spinn-wrong"
-    label: ClassVar[str] = "SPINN, model 10 % off"
