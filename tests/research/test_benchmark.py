@@ -34,7 +34,7 @@ from observers.estimator import Estimate
 
 
 class Constant(Method):
-    """The mean of the training states, whatever y says."""
+    """The mean of the training states, whatever y is."""
 
     name = "constant"
     label = "constant mean"

@@ -28,10 +28,10 @@ REVISION = 9  # rises with every change of the shipped methods: results from bef
 def seconds_spent(folder: Path) -> float:
     """CPU seconds of all stages whose checkpoints are in a folder, interruptions included."""
     spent = 0.0
-    for path in sorted(folder.glob(f"[!.]*{checkpoints.SUFFIX}")):  # not those that somebody writes or has left
-        found = checkpoints.load(path)
+    for path in sorted(folder.glob(f"[!.]*{checkpoints.SUFFIX}")):  # not those that are being written
+        checkpoint = checkpoints.load(path)
         with checkpoints.restoring(path):
-            spent += float(found["seconds"])
+            spent += float(checkpoint["seconds"])
     return spent
 
 

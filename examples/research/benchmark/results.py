@@ -18,7 +18,7 @@ FILES = ("results.csv", "methods.csv")  # a row for each trajectory, and for eac
 
 
 def collect(out: Path, beside: Path | None = None) -> None:
-    """Write one CSV file of all errors and one of all costs, from every job found in the folder."""
+    """Write one CSV file of all errors and one of all costs, of every job in the folder."""
     errors, costs = [], []
     for folder in sorted(path.parent for path in (out / "jobs").glob("*/*/errors.csv")):
         with explained(folder, ValueError):

@@ -13,7 +13,7 @@ from training.kalman import ExtendedKalmanFilter, measurement_covariance
 
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
 # white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
-# linearisation, for there is none in the trajectories.
+# linearisation: the trajectories have no process noise.
 DIFFUSION = (1e-4, 1e-3, 1e-2)
 
 
