@@ -184,7 +184,7 @@ class HyperKKL:
             train(system, folder=self.out / system.name, resume=True, console=progress).artifact.save(path)
         return Artifact.read(path)
 
-    def _measured(self, system: Driven, artifact: "Artifact") -> Iterator[dict[str, Any]]:
+    def _measured(self, system: Any, artifact: "Artifact") -> Iterator[dict[str, Any]]:
         """Mean SMAPE after settling: of the observer, of its T_inv alone, and of a Kalman filter with the equations."""
         from scipy.stats.qmc import LatinHypercube
 
@@ -239,7 +239,7 @@ def page(frame: "pd.DataFrame") -> str:
             for case in cases
         ]
         rows.append([f"{name.replace('_', ' ')}, {kind}", printed, *figures])
-    header = ["", "HyperKKL's best", "no noise", "noise", "beyond, no noise", "beyond, noise"]
+    header = ["SMAPE in %", "HyperKKL's best", "no noise", "noise", "beyond, no noise", "beyond, noise"]
     return "\n".join(table(header, rows)) + "\n"
 
 

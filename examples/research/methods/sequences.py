@@ -67,7 +67,7 @@ class LRUCell(Cell):
 
     def __init__(self, width: int) -> None:
         super().__init__(width)
-        rates = torch.logspace(*map(math.log10, self.decay), width).log()
+        rates = torch.linspace(*map(math.log, self.decay), width)  # type: ignore[call-overload]
         self.log_decay = nn.Parameter(rates.repeat(self.blocks, 1))
         self.angle = nn.Parameter(self.turn * torch.rand(self.blocks, width))
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(self.blocks))
@@ -140,7 +140,7 @@ class TransformerCell(Cell):
         return features.transpose(0, 1), torch.stack(after, 1)
 
     def _by_head(self, part: torch.Tensor) -> torch.Tensor:
-        return part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        return part.reshape(*part.shape[:2], self.heads, -1).transpose(1, 2)
 
 
 class Model(nn.Module):
@@ -153,6 +153,10 @@ class Model(nn.Module):
         for name, size in (("y", ny), ("x", nx)):
             self.register_buffer(f"{name}_offset", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
+        self.y_offset: torch.Tensor
+        self.y_scale: torch.Tensor
+        self.x_offset: torch.Tensor
+        self.x_scale: torch.Tensor
 
     def forward(self, y: torch.Tensor, noise: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Scaled estimates (samples, n, nx) and the state after y (samples, n, ny), 0 where a sample is missing."""
