@@ -46,7 +46,7 @@ def preset(
     name : {"fast", "paper"}
         The preset.
     size : {"default", "large"}
-        Of an input-aware T_inv: large is one that stands alone, for certificates and for use without a model.
+        Of an input-aware T_inv: large is one that stands alone, for use without a model.
     changes : mapping of str to object, optional
         Settings that are to differ, as for :func:`training.config.override`. A spectrum that is not given suits them.
 

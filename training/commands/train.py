@@ -64,8 +64,8 @@ class Train:
     preset: Preset = "fast"
     """fast: about half a minute; it made the shipped maps. paper: the paper's sizes."""
     size: Size = "default"
-    """large: a T_inv that is accurate without tracking, for certificates and for use without a model; about ten minutes
-    (input-aware). Writes NAME-large."""
+    """large: a T_inv that is accurate without tracking, for use without a model; about ten minutes (input-aware).
+    Writes NAME-large."""
     parameters: Parameters = ()
     uncertain: HalfWidths = ()
     """How far a parameter may be from its value, as a part of that: mu=0.1, or 0.1 for all. Some motions in training

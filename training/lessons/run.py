@@ -45,7 +45,7 @@ class Run:
     log: Log | None = None
     losses: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    samples: dict[str, int] = field(default_factory=dict)  # distinct ones, for certificates
+    samples: dict[str, int] = field(default_factory=dict)  # distinct ones of each stage
 
     @classmethod
     @contextmanager
