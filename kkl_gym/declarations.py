@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-_METHODS = ("f", "g", "h", "rate", "step", "draw_starts", "box", "output", "drift", "replace")
+from kkl_gym.equation_errors import METHODS
+
+_METHODS = (*METHODS, "draw_starts", "box", "output", "drift", "replace")
 _SIZES = {"nx": "X", "nu": "u_max", "ny": "h(x)", "parameters": "the fields"}
 
 

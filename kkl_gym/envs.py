@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from kkl_gym.compiled import single_step
-from kkl_gym.equations import complex_motion, components, target_of
+from kkl_gym.equations import complex_motion, components
 from kkl_gym.plant import OfPlant, Plant
 from kkl_gym.rendering import (
     ARRAYS_AND_WINDOWS,
@@ -23,7 +23,7 @@ from kkl_gym.rendering import (
 )
 from kkl_gym.sensor import Readings, Sensor
 from kkl_gym.simulate import advance, followed
-from kkl_gym.system import Box, Components, System
+from kkl_gym.system import Box, Components, System, reward_of
 from observers.checks import integer, mapping, real_array, shown
 from observers.machine import SOON
 
@@ -53,10 +53,12 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     ``sample``, an integer of shape (), counts the sampling intervals since reset. ``escaped``, boolean of shape (),
     says whether the state left its declared bounds.
 
-    **Reward.** 1 / (1 + 4 c) in (0, 1] with c = mean(((x - target) / scale)^2): 1 at the system's target.
+    **Reward.** What the system's ``reward(x, u)`` is at the new state. By default 1 / (1 + 4 c) in (0, 1] with
+    c = mean(((x - target) / scale)^2): 1 at the system's target.
 
-    **Ends.** ``terminated`` with ``info["escaped"]`` where the state leaves its declared bounds; the last state and
-    output inside them are then returned. The registered ids truncate after 5,000 steps.
+    **Ends.** ``terminated`` where the system's ``terminated(x)`` says so, and with ``info["escaped"]`` where the state
+    leaves its declared bounds; the last state and output inside them are then returned. The registered ids truncate
+    after 5,000 steps.
 
     Parameters
     ----------
@@ -227,11 +229,9 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             self._u = u
             if self.render_mode == "human" and not self.drawn_by:
                 self.animate()
-        cost = 0.0
-        for xi, (target, weight) in zip(self._x, self._goal):
-            cost += weight * (xi - target) * (xi - target)
+        reward, ended = self._judged(self._x, u)
         info = self._info(u, escaped)
-        return self._observation(info), 1.0 / (1.0 + 4.0 * cost), escaped, False, info
+        return self._observation(info), float(reward), escaped or bool(ended), False, info
 
     def render(self) -> np.ndarray | None:
         """Draw the phase portrait so far.
@@ -301,7 +301,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return {**self.__dict__, "_canvas": None, "_window": None, "_advance": partial(advance, self.system)}
 
     def _exchanged(self) -> None:
-        self._goal = [*zip(target_of(self.system), self.plant.weights.tolist(), strict=True)]
+        self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
         self._samples = -self._sample  # a system that stays for an episode is not worth to be compiled
 

@@ -14,6 +14,7 @@ from kkl_gym import elementary
 from kkl_gym.tracing import Symbol
 from kkl_gym.user_lines import called_function, line_of, path_of, steps_within
 
+METHODS = ("f", "g", "h", "rate", "step", "reward", "terminated")
 _SERVING = "floats, arrays, tensors and symbols"
 _ALIASES = {
     alias: name
@@ -71,13 +72,13 @@ def label(equations: Equations) -> str:
 
 def signature(equations: Equations, first: str = "") -> str:
     """Name and arguments of equations."""
-    return f"{name_of(equations)}({first}{'x, u' if name_of(equations) == 'step' else 'x'})"
+    return f"{name_of(equations)}({first}{'x, u' if name_of(equations) in ('step', 'reward') else 'x'})"
 
 
 def name_of(equations: Equations) -> str:
     """The name of a method, which may have been assigned from a function of another name."""
     function, kind = getattr(equations, "__func__", None), type(getattr(equations, "__self__", None))
-    names = (name for name in ("f", "g", "h", "rate", "step") if function and getattr(kind, name, None) is function)
+    names = (name for name in METHODS if function and getattr(kind, name, None) is function)
     return next(names, getattr(equations, "__name__", "equations"))
 
 

@@ -54,15 +54,26 @@ def input_matrix(system: Any, x: Any) -> Any:
 
 def rate_at(system: Any, x: Any) -> Any:
     """Call a system's rate, and check what comes back. Shapes: ``x`` of length nx."""
-    value = _called(system.rate, x)
-    if not _fits(value, x[0]):
-        raise returned(system.rate, "one number in 1/s for each state x", _misfit(value, x[0]))
+    return _number_at(system.rate, "one number in 1/s for each state x", x)
+
+
+def check_task(system: Any, x: Any, u: Any) -> list[Any]:
+    """Call a system's reward and terminated, and check what comes back. Shapes: ``x`` and ``u`` of length nx and nu."""
+    ended = _number_at(system.terminated, "a bool or a comparison such as x[0] > 1 for each state x", x)
+    return [_number_at(system.reward, "one number for each state x", x, u), ended]
+
+
+def _number_at(equations: Equations, wanted: str, *args: Any) -> Any:
+    value, like = _called(equations, *args), args[0][0]
+    if not _fits(value, like):
+        raise returned(equations, wanted, _misfit(value, like))
     return value
 
 
 def check_equations(system: Any) -> None:
     """Check what a system's equations return at a few starts, one by one on floats and all at once on arrays."""
     names = ("step", "h", "rate") if system.discrete else ("f", "h", "g", "rate")
+    names += ("reward",) if system.states_task else ()
     for name in names[:2]:
         if _is_default(getattr(system, name)):
             raise EquationError(f"{type(system).__name__} defines no {signature(getattr(system, name), 'self, ')}")
@@ -105,6 +116,8 @@ def _values(system: Any, name: str, x: Any, u: Any) -> list[Any]:
         return [value for row in input_matrix(system, x) for value in row]
     if name == "rate":
         return [rate_at(system, x)]
+    if name == "reward":
+        return check_task(system, x, u)
     inputs = (u,) if name == "step" else ()
     return [*components(getattr(system, name), x, *inputs)]
 

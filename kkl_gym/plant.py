@@ -1,15 +1,16 @@
 """A system sampled under noise: what single and vector environments share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from kkl_gym.equation_errors import held, returned
+from kkl_gym.equations import check_task
 from kkl_gym.sensor import Sensor, sensor_of
 from kkl_gym.simulate import check_interval
-from kkl_gym.system import Box, System
+from kkl_gym.system import Box, Components, System
 from kkl_gym.systems import get_system
 from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
@@ -60,7 +61,6 @@ class Plant:
             self._v_scale = np.append(self._v_scale, np.ones(2 * self.ny))
         self.nv = len(self._v_scale)
         self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)
-        self.weights = 1.0 / (self.system.nx * np.square(self.system.scale))
 
     def draw_noise(
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
@@ -102,6 +102,7 @@ class OfPlant:
     """What single and vector environments say of their plant."""
 
     plant: Plant
+    _reward: Callable[[Components, Components], Any]
 
     @property
     def system(self) -> System:
@@ -123,6 +124,18 @@ class OfPlant:
     def _exchanged(self) -> None:
         """Take over what follows from another system."""
         raise NotImplementedError
+
+    def _judged(self, x: Components, u: Components) -> tuple[Any, Any]:
+        """Rewards of intervals that ended at x under u, and whether episodes end there: of floats or arrays."""
+        system = self.plant.system
+        try:
+            reward, ended = self._reward(x, u), system.terminated(x)
+            if system.states_task and not np.isfinite(reward).all():
+                raise returned(system.reward, "finite numbers", f"{shown(reward)}; {held(x)}")
+        except Exception:
+            check_task(system, x, u)
+            raise
+        return reward, ended
 
     @property
     def dt(self) -> float:

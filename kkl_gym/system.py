@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from kkl_gym.declarations import complete
-from kkl_gym.equations import components, rate_at
+from kkl_gym.equations import components, rate_at, target_of
 from kkl_gym.loading import load_class
 from observers.checks import is_finite, mapping, shown
 
@@ -26,6 +26,8 @@ DT = 0.01  # s, where it suits
 SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)  # rate * dt beyond which DT does not suit, and what then does
 PROCESS_NOISE = 0.05  # in multiples of a system's scale in a second of its pace: where none is given
 NOISE_SHARE = 0.05  # of an output's range: measurement noise where none is given
+# Names in a class whose body states nothing; Python 3.13 adds the last two.
+EMPTY = {"__module__", "__qualname__", "__doc__", "__firstlineno__", "__static_attributes__"}
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,12 @@ class System:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        complete(cls, System)
+        if not vars(cls).keys() <= EMPTY:  # cloudpickle makes a class empty, and fills in what is complete already
+            complete(cls, System)
 
     def __post_init__(self) -> None:
+        if "discrete" not in vars(type(self)):
+            complete(type(self), System)
         own = vars(type(self)).get("__dataclass_fields__", {})
         for name, kind in inspect.get_annotations(type(self)).items():
             if name not in own and "ClassVar" not in str(kind):
@@ -174,15 +179,16 @@ class System:
         levels = tuple(float(f"{NOISE_SHARE * size:.2g}") for size in self.output_range)
         return levels[0] if len(set(levels)) == 1 else levels
 
-    @property
+    @functools.cached_property
     def output_range(self) -> tuple[float, ...]:
         """How far each output, without noise, ranges over a thousand starts; 1 where it does not move. Length ny."""
-        return _output_range(self)
+        size = np.ptp(self.output(_starts(self)), axis=0)
+        return tuple(np.where(size > 0, size, 1.0).tolist())
 
-    @property
+    @functools.cached_property
     def typical_rate(self) -> float:
         """Median rate of f(x) + g(x) u over a thousand starts and the largest input, in 1/s; ValueError if it is 0."""
-        return _typical_rate(self)
+        return typical_rate(self, _starts(self))
 
     def f(self, x: Components) -> Components:
         """Drift f(x): from nx components as many, each of the kind that the components of ``x`` are, or a number.
@@ -249,6 +255,35 @@ class System:
         """Output map h(x): ny components, from components as :meth:`f` takes them. Every subclass defines it."""
         raise NotImplementedError(f"{type(self).__name__} does not define h")
 
+    def reward(self, x: Components, u: Components) -> Any:
+        """Reward of a sampling interval, as environments pay it; default: 1 at :attr:`target`, and less away from it.
+
+        The default is 1 / (1 + 4 c) with c = mean(((x - target) / scale)^2). A system that overrides it, or
+        :meth:`terminated`, states a task of its own, for which ``kkl-gym agent train`` trains.
+
+        Parameters
+        ----------
+        x : sequence of length nx
+            Components of the state at the end of the interval: floats or arrays.
+        u : sequence of length nu
+            Components of the input that acted, in its own units.
+
+        Returns
+        -------
+        float, or of the kind that the components of ``x`` are
+            The reward.
+        """
+        return nearness(goal_of(self), x, u)
+
+    def terminated(self, x: Components) -> Any:
+        """Whether an episode ends at x, from components as :meth:`f` takes them; it also ends beyond ``bounds``."""
+        return False
+
+    @property
+    def states_task(self) -> bool:
+        """Whether the system states a reward or an end of episodes of its own."""
+        return type(self).reward is not System.reward or type(self).terminated is not System.terminated
+
     def output(self, x: np.ndarray) -> np.ndarray:
         """Outputs h(x), without noise, of many states. Shapes: ``x`` (..., nx); returns (..., ny)."""
         return on_states(self.h, x)
@@ -311,6 +346,34 @@ class System:
         return type(self)(**{**known, **parameters})
 
 
+def goal_of(system: System) -> list[tuple[float, float]]:
+    """The target of each state, and the weight of its square in the cost, (nx,)."""
+    return [(t, 1.0 / (system.nx * size * size)) for t, size in zip(target_of(system), system.scale, strict=True)]
+
+
+def nearness(goal: Iterable[tuple[float, float]], x: Components, u: Components) -> Any:
+    """The default reward."""
+    cost = 0.0
+    for xi, (target, weight) in zip(x, goal):
+        cost = cost + weight * ((xi - target) * (xi - target))
+    return 1.0 / (1.0 + 4.0 * cost)
+
+
+def nearness_of_rows(target: np.ndarray, weight: np.ndarray, x: np.ndarray, u: Components) -> np.ndarray:
+    """The default reward of a batch, in few operations. Shapes: ``target`` and ``weight`` (nx,), ``x`` (nx, n)."""
+    deviation = x - target[:, None]
+    deviation *= deviation
+    return 1.0 / (1.0 + 4.0 * (weight @ deviation))
+
+
+def reward_of(system: System, *, rows: bool = False) -> Callable[[Any, Components], Any]:
+    """The reward of a system, of one state or of rows; the default one reads the target here, once."""
+    if type(system).reward is not System.reward:
+        return system.reward
+    goal = goal_of(system)
+    return functools.partial(nearness_of_rows, *np.array(goal).T) if rows else functools.partial(nearness, goal)
+
+
 def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> np.ndarray:
     """Evaluate f or h, which take and give components, on an array of states: (..., nx) to (..., m)."""
     values = components(equations, np.moveaxis(x, -1, 0))
@@ -361,17 +424,6 @@ def typical_rate(system: System, starts: np.ndarray) -> float:
     if not 0 < rate < math.inf:
         raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
     return rate
-
-
-@functools.lru_cache(maxsize=256)
-def _typical_rate(system: System) -> float:
-    return typical_rate(system, _starts(system))
-
-
-@functools.lru_cache(maxsize=256)
-def _output_range(system: System) -> tuple[float, ...]:
-    size = np.ptp(system.output(_starts(system)), axis=0)
-    return tuple(np.where(size > 0, size, 1.0).tolist())
 
 
 def _restored(kind: "type[System] | str", parameters: Mapping[str, float]) -> System:

@@ -1,6 +1,5 @@
 """Many environments at once, simulated as one batch."""
 
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -11,14 +10,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from kkl_gym.compiled import SamplingStep, batch_step
-from kkl_gym.equations import components, target_of
+from kkl_gym.equations import components
 from kkl_gym.plant import NOISE_BLOCK, OfPlant, Plant
 from kkl_gym.rendering import ARRAYS, Canvas, Trails, check_render_mode, render_metadata
 from kkl_gym.sensor import Readings, Sensor
 from kkl_gym.simulate import followed_rows
-from kkl_gym.system import Box, System
+from kkl_gym.system import Box, System, reward_of
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
-from observers.machine import MANY_ROWS
 
 Infos = dict[str, Any]
 ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for the cache
@@ -129,6 +127,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         nx, ny = self.system.nx, self.plant.ny
         self._readings = None if self.sensor is None else Readings(self.sensor, ny, self.plant.dt, num_envs)
         self._u_max = np.array(self.system.u_max, dtype=float)
+        self._bounds = np.array(self.system.bounds, dtype=float).T[..., None]
         self._exchanged()
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
@@ -139,7 +138,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._x = np.full((nx, num_envs), np.nan)  # component first, as everything inside
         self._y = self._held = np.full((ny, num_envs), np.nan)
         self._sample = np.zeros(num_envs, dtype=np.int64)
-        self._terminated, self._truncated = np.zeros((2, num_envs), dtype=bool)
+        self._escaped, self._terminated, self._truncated = np.zeros((3, num_envs), dtype=bool)
         self._ready = False
         self.emitted = b""  # the last observations, as observers around it compare what reaches them
         self._u = np.zeros((self.system.nu, num_envs))  # kept, as the trails are, for rendering
@@ -217,7 +216,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         rewards : ndarray, shape (num_envs,)
             0 in rows that began anew instead, or stay at their end.
         terminated, truncated : ndarray of bool, shape (num_envs,)
-            Whether a row's state left its declared bounds, or its time is over.
+            Whether a row's episode has ended, as :class:`KKLEnv` says, or its time is over.
         info : dict
             Of all rows, with masks of those that reported it.
 
@@ -317,13 +316,10 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._y[:, rows] = self._measure(self._x[:, rows], self._noise(rows)[1], rows, start=True)
         self._u[:, rows] = 0.0
         self._sample[rows] = 0
-        self._terminated[rows] = self._truncated[rows] = False
+        self._escaped[rows] = self._terminated[rows] = self._truncated[rows] = False
 
     def _exchanged(self) -> None:
-        low, high = np.array(self.system.bounds, dtype=float).T.copy()
-        target = np.array(target_of(self.system), dtype=float)
-        judge = _compiled_judge() if self.num_envs >= MANY_ROWS else _judge
-        self._judged = functools.partial(judge, low, high, target, self.plant.weights)
+        self._reward = reward_of(self.system, rows=True)
         self._step: SamplingStep[np.ndarray] | None = None
 
     @property
@@ -338,24 +334,29 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         before = self._x if whole else self._x[:, rows]
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
-        inside, reward = self._judged(x)
-        if not inside.all():  # unless that is but an error of the method
-            x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(~inside))
-            inside, reward = self._judged(x)
-        if inside.all():
-            y = self._measure(x, v, rows, start=False)
-        else:  # the last state and output inside
-            x = np.where(inside, x, before)
-            y = np.where(inside, self._measure(x, v, rows, start=False), self._y[:, rows])
-            reward = self._judged(x)[1]
-        sample = self._sample[rows] + 1
-        truncated = sample >= (self.max_episode_steps or np.inf)
-        if whole:
-            self._x, self._y, self._sample, self._terminated, self._truncated = x, y, sample, ~inside, truncated
+        escaped = self._outside(x)
+        if escaped.any():  # unless that is but an error of the method
+            x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(escaped))
+            escaped = self._outside(x)
+        if escaped.any():  # the last state and output inside
+            x = np.where(escaped, before, x)
+            y = np.where(escaped, self._y[:, rows], self._measure(x, v, rows, start=False))
         else:
-            self._x[:, rows], self._y[:, rows], self._sample[rows] = x, y, sample
-            self._terminated[rows], self._truncated[rows] = ~inside, truncated
-        return reward
+            y = self._measure(x, v, rows, start=False)
+        reward, ended = self._judged(x, u)
+        sample = self._sample[rows] + 1
+        if whole:
+            self._x, self._y, self._sample, self._escaped = x, y, sample, escaped
+        else:
+            self._x[:, rows], self._y[:, rows], self._sample[rows], self._escaped[rows] = x, y, sample, escaped
+        self._terminated[rows] = escaped | ended
+        self._truncated[rows] = sample >= (self.max_episode_steps or np.inf)
+        return np.broadcast_to(reward, len(rows)).astype(float)
+
+    def _outside(self, x: np.ndarray) -> np.ndarray:
+        """Which states (nx, n) lie outside their bounds, or are not finite; (n,)."""
+        low, high = self._bounds
+        return ~((x >= low) & (x <= high)).all(0)
 
     def _inputs(self, actions: np.ndarray) -> np.ndarray:
         values = real_array("actions", actions)
@@ -418,7 +419,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
     def _info(self, rows: np.ndarray) -> Infos:
         info: Infos = {}
-        arrays = {"y": self._y.T, "x": self._x.T, "u": self._u.T, "sample": self._sample, "escaped": self._terminated}
+        arrays = {"y": self._y.T, "x": self._x.T, "u": self._u.T, "sample": self._sample, "escaped": self._escaped}
         for key, values in arrays.items():
             info |= {key: values.copy(), f"_{key}": rows.copy()}
         return info
@@ -426,29 +427,6 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     def _trace(self) -> None:
         if self._trails is not None:
             self._trails.add(self._x.T, self._sample)
-
-
-@np.errstate(over="ignore", invalid="ignore")  # of states that have escaped; a block would take twice as long
-def _judge(
-    low: np.ndarray, high: np.ndarray, target: np.ndarray, weights: np.ndarray, x: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which states (nx, n) are within their bounds, and what reward they earn: (n,) each."""
-    inside, cost = np.ones(x.shape[1], np.bool_), np.zeros(x.shape[1])
-    for i in range(len(x)):
-        deviation = x[i] - target[i]
-        cost += weights[i] * (deviation * deviation)
-        inside &= (low[i] <= x[i]) & (x[i] <= high[i])
-    return inside, 1.0 / (1.0 + 4.0 * cost)
-
-
-@functools.cache
-def _compiled_judge() -> Any:
-    """The same in one pass over the rows, a third of the time, where Numba is installed."""
-    try:
-        import numba
-    except ImportError:
-        return _judge
-    return numba.njit(_judge.__wrapped__)  # type: ignore[attr-defined]
 
 
 def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any] | None, np.ndarray]:
