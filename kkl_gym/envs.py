@@ -122,7 +122,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     ) -> None:
         self.plant = Plant(
             system,
-            dt,
+            dt=dt,
             process_noise=process_noise,
             measurement_noise=measurement_noise,
             observe=observe,
@@ -234,20 +234,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return self._observation(info), float(reward), escaped or bool(ended), False, info
 
     def render(self) -> np.ndarray | None:
-        """Draw the phase portrait so far.
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3), or None
-            An RGB image; None without ``render_mode``, and where it is shown in a window.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            Before :meth:`reset`.
-        ImportError
-            If matplotlib (the extra ``plots``) is not installed, or for a window pygame (the extra ``human``).
-        """
+        """Draw the phase portrait so far: a uint8 image (height, width, 3), or None without one or in a window."""
         return self.draw()
 
     def draw(self, estimates: Collection[Sequence[float]] = ()) -> np.ndarray | None:
@@ -281,11 +268,6 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         """Keys for :func:`gymnasium.utils.play.play`: a and d are the ends of the first input, s and w of the second.
 
         ``play`` wants ``noop=np.zeros(nu, np.float32)`` beside them, the action while no key is pressed.
-
-        Returns
-        -------
-        dict of tuple of int to ndarray, shape (nu,)
-            Actions by the codes of the keys that are pressed together.
         """
         found = {}
         for pressed in itertools.product(*(((), (low,), (high,)) for low, high in _KEYS[: self._nu])):

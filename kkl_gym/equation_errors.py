@@ -1,6 +1,7 @@
 """What went wrong in the equations that a user wrote, in words: system, equation, file and line, argument, way out."""
 
 import inspect
+import re
 import reprlib
 import sys
 from collections.abc import Callable
@@ -12,21 +13,16 @@ import numpy as np
 
 from kkl_gym import elementary
 from kkl_gym.tracing import Symbol
-from kkl_gym.user_lines import called_function, line_of, path_of, steps_within
+from kkl_gym.user_lines import line_of, path_of, steps_within, text_of
 
 METHODS = ("f", "g", "h", "rate", "step", "reward", "terminated")
 _SERVING = "floats, arrays, tensors and symbols"
-_ALIASES = {
-    alias: name
-    for name, aliases in {
-        "maximum": ("max", "fmax", "amax", "Max"),
-        "minimum": ("min", "fmin", "amin", "Min"),
-        "abs": ("fabs", "absolute", "Abs"),
-        "atan2": ("arctan2",),
-        "clip": ("clamp",),
-    }.items()
-    for alias in aliases
-}
+# Functions that fail on some kinds of numbers: what other modules call them, and what kkl_gym.elementary does.
+_FUNCTIONS = {name: name for name in vars(elementary) if not name.startswith("_")} | {
+    "max": "maximum", "fmax": "maximum", "amax": "maximum", "Max": "maximum", "min": "minimum", "fmin": "minimum",
+    "amin": "minimum", "Min": "minimum", "fabs": "abs", "absolute": "abs", "Abs": "abs", "arctan2": "atan2",
+    "clamp": "clip",
+}  # fmt: skip
 
 Equations = Callable[..., Any]
 """A system's f, g, h, rate or step, or another function of the state's components."""
@@ -119,11 +115,11 @@ def _defined(equations: Equations) -> str:
 
 def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     on_floats = isinstance(x[0], Real)
-    name = called_function(step)
-    name = _ALIASES.get(name, name)
+    called = re.findall(r"(?:(?:math|cmath|np|numpy|torch|sympy)\.|(?<![\w.]))(\w+)\(", text_of(step))
+    known = [_FUNCTIONS[name] for name in called if name in _FUNCTIONS]
     # On floats, math.sqrt(-1) fails; abs of the whole state, which is no number, does so for another reason.
-    if name in vars(elementary) and not name.startswith("_") and not (on_floats and isinstance(error, TypeError)):
-        return f": use kkl_gym.elementary.{name}, which serves {_SERVING}"
+    if known and not (on_floats and isinstance(error, TypeError)):
+        return f": use kkl_gym.elementary.{known[0]}, which serves {_SERVING}"
     if "truth value" in str(error) or "Boolean value" in str(error):
         return (
             ", on which `if`, `and`, `or` and `not` cannot decide: use kkl_gym.elementary.where, minimum, maximum "

@@ -24,13 +24,13 @@ class Plant:
     def __init__(
         self,
         system: str | System,
-        dt: float | None,
         *,
-        process_noise: float | None,
-        measurement_noise: float | Sequence[float] | None,
-        observe: str,
-        parameters: Mapping[str, float] | None,
-        start_box: Box | None,
+        dt: float | None = None,
+        process_noise: float | None = None,
+        measurement_noise: float | Sequence[float] | None = None,
+        observe: str = "state",
+        parameters: Mapping[str, float] | None = None,
+        start_box: Box | None = None,
         sensor: Sensor | Mapping[str, Any] | None = None,
     ) -> None:
         self.system = get_system(system, parameters)
@@ -137,25 +137,15 @@ class OfPlant:
             raise
         return reward, ended
 
-    @property
-    def dt(self) -> float:
-        """Sampling interval in seconds."""
-        return self.plant.dt
-
-    @property
-    def process_noise(self) -> float:
-        """Bound of the process noise, in multiples of the system's ``scale`` per second."""
-        return self.plant.process_noise
-
-    @property
-    def measurement_noise(self) -> float | tuple[float, ...]:
-        """Standard deviation of the measurement noise, of all outputs or each."""
-        return self.plant.measurement_noise
-
-    @property
-    def sensor(self) -> Sensor | None:
-        """The sensor, None if it is ideal."""
-        return self.plant.sensor
+    dt = property(lambda self: self.plant.dt, doc="Sampling interval in seconds.")
+    process_noise = property(
+        lambda self: self.plant.process_noise, doc="Bound of the process noise, in multiples of ``scale`` per second."
+    )
+    measurement_noise = property(
+        lambda self: self.plant.measurement_noise,
+        doc="Standard deviation of the measurement noise, of all outputs or each.",
+    )
+    sensor = property(lambda self: self.plant.sensor, doc="The sensor, None if it is ideal.")
 
 
 def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """Many environments at once, simulated as one batch."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,9 +13,9 @@ from kkl_gym.compiled import SamplingStep, batch_step
 from kkl_gym.equations import components
 from kkl_gym.plant import NOISE_BLOCK, OfPlant, Plant
 from kkl_gym.rendering import ARRAYS, Canvas, Trails, check_render_mode, render_metadata
-from kkl_gym.sensor import Readings, Sensor
+from kkl_gym.sensor import Readings
 from kkl_gym.simulate import followed_rows
-from kkl_gym.system import Box, System, reward_of
+from kkl_gym.system import System, reward_of
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
 
 Infos = dict[str, Any]
@@ -41,20 +41,6 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         As for :class:`KKLEnv`.
     num_envs : int
         How many.
-    dt : float, optional
-        Sampling interval in seconds. None takes the system's own, 0.01 s for those that ship.
-    process_noise : float, optional
-        As for :class:`KKLEnv`.
-    measurement_noise : float or sequence of float, length ny, optional
-        As for :class:`KKLEnv`.
-    observe : {"state", "output"}
-        What the agent sees.
-    parameters : mapping of str to float, optional
-        As for :class:`KKLEnv`.
-    start_box : tuple of (float, float), length nx, optional
-        As for :class:`KKLEnv`.
-    sensor : Sensor or mapping of its parameters, optional
-        As for :class:`KKLEnv`.
     render_mode : {None, "rgb_array"}
         Whether :meth:`render` draws.
     max_episode_steps : int, optional
@@ -62,6 +48,9 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         it is left out there.
     autoreset_mode : str or gymnasium.vector.AutoresetMode
         One of Gymnasium's, see above.
+    **options
+        ``dt``, ``process_noise``, ``measurement_noise``, ``observe``, ``parameters``, ``start_box`` and ``sensor``, as
+        for :class:`KKLEnv`.
 
     Raises
     ------
@@ -87,32 +76,17 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         system: str | System,
         num_envs: int = 1,
         *,
-        dt: float | None = None,
-        process_noise: float | None = None,
-        measurement_noise: float | Sequence[float] | None = None,
-        observe: Literal["state", "output"] = "state",
-        parameters: Mapping[str, float] | None = None,
-        start_box: Box | None = None,
-        sensor: Sensor | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        **options: Any,
     ) -> None:
         num_envs = integer("num_envs", num_envs, 1, MOST_ENVS)
         if max_episode_steps == -1:  # as gym.make has it
             max_episode_steps = None
         if max_episode_steps is not None:
             max_episode_steps = integer("max_episode_steps", max_episode_steps, 1)
-        self.plant = Plant(
-            system,
-            dt,
-            process_noise=process_noise,
-            measurement_noise=measurement_noise,
-            observe=observe,
-            parameters=parameters,
-            start_box=start_box,
-            sensor=sensor,
-        )
+        self.plant = Plant(system, **options)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = autoreset_mode_of(autoreset_mode)
@@ -202,23 +176,12 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return self._observation(), self._info(mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
-        """Hold the inputs over one sampling interval.
+        """Hold the inputs over one sampling interval; rewards are 0 in rows that reset instead, or stay at their end.
 
         Parameters
         ----------
         actions : array_like, shape (num_envs, nu)
             Inputs over their bounds; values outside [-1, 1] are clipped.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            Of all rows.
-        rewards : ndarray, shape (num_envs,)
-            0 in rows that began anew instead, or stay at their end.
-        terminated, truncated : ndarray of bool, shape (num_envs,)
-            Whether a row's episode has ended, as :class:`KKLEnv` says, or its time is over.
-        info : dict
-            Of all rows, with masks of those that reported it.
 
         Raises
         ------
