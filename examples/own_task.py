@@ -10,13 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 import tyro
 from rich.console import Console
 
 import kkl_gym
 from kkl_gym.elementary import sin
 from training import preset, train
+from training.agents.learning import learn
+from training.agents.play import play
+from training.agents.seeds import agent_evaluation_seed
+from training.agents.tasks import get_task
 
 
 @dataclass(frozen=True)
@@ -53,3 +56,31 @@ class FlexibleJoint(kkl_gym.System):
     def terminated(self, x):
         """The link hits a stop."""
         return abs(x[2]) > 2.0
+
+
+def main(
+    timesteps: int = 400_000, inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/own_task")
+) -> dict[str, float]:
+    """Train an observer, and an agent each on the estimate and on the measurement; returns their mean returns.
+
+    Args:
+        timesteps: actions that an agent learns from.
+        inverse_steps: batches of the observer's training.
+        trajectories: simulated trajectories that it is trained on.
+        out: the run's folder.
+    """
+    system, path = FlexibleJoint(), out / "flexible_joint.safetensors"
+    config = preset(system, changes={"inverse_steps": inverse_steps, "trajectories": trajectories})
+    train(system, config, out, resume=True, console=Console()).artifact.save(path)
+    task, returns = get_task(__file__), {}
+    for information, observer in (("x_hat", str(path)), ("y", None)):
+        agent = learn(task, information, out / information, timesteps=timesteps, observer=observer)
+        envs = agent.make(100, trusted=task.system)
+        played = play(envs, agent.policy(envs.single_action_space), seed=agent_evaluation_seed(0, 100))
+        returns[information] = float(played.returns.mean())
+        print(f"an agent that sees {information}: a return of {returns[information]:.0f} of at most 2000")
+    return returns
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
