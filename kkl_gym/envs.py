@@ -51,12 +51,12 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     **Info.** Arrays, of the same keys at reset and at steps: ``y`` the noisy output, NaN where the ``sensor`` has no
     sample, ``x`` the true state and ``u`` the physical input that acted, zero at reset; float64, never clipped.
     ``sample``, an integer of shape (), counts the sampling intervals since reset. ``escaped``, boolean of shape (),
-    says whether the state left its declared bounds.
+    is whether the state left its declared bounds.
 
     **Reward.** What the system's ``reward(x, u)`` is at the new state. By default 1 / (1 + 4 c) in (0, 1] with
     c = mean(((x - target) / scale)^2): 1 at the system's target.
 
-    **Ends.** ``terminated`` where the system's ``terminated(x)`` says so, and with ``info["escaped"]`` where the state
+    **Ends.** ``terminated`` where the system's ``terminated(x)`` is true, and with ``info["escaped"]`` where the state
     leaves its declared bounds; the last state and output inside them are then returned. The registered ids truncate
     after 5,000 steps.
 
@@ -163,7 +163,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         seed : int, optional
             Of starts and noise; None goes on with the generator as it is.
         options : dict, optional
-            ``"x0"``, shape (nx,), is the start, which is otherwise uniform in ``start_box``; None is none.
+            ``"x0"``, shape (nx,), is the start, which is otherwise drawn in ``start_box``.
 
         Raises
         ------
@@ -269,17 +269,16 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
 
         ``play`` wants ``noop=np.zeros(nu, np.float32)`` beside them, the action while no key is pressed.
         """
-        found = {}
-        for pressed in itertools.product(*(((), (low,), (high,)) for low, high in _KEYS[: self._nu])):
+        actions = {}
+        for ends in itertools.product(*((("", 0), (low, -1), (high, 1)) for low, high in _KEYS[: self._nu])):
             action = np.zeros(self._nu, np.float32)
-            for i, keys in enumerate(pressed):
-                action[i] = sum(_KEYS[i].index(key) * 2 - 1 for key in keys)
-            found[tuple(ord(key) for keys in pressed for key in keys)] = action
-        del found[()]
-        return found
+            action[: len(ends)] = [end for _, end in ends]
+            actions[tuple(ord(key) for key, _ in ends if key)] = action
+        del actions[()]
+        return actions
 
     def __getstate__(self) -> dict[str, Any]:
-        # What cannot be copied is made anew, when it is asked for or at a reset.
+        # What cannot be copied is made again when it is used, or at a reset.
         return {**self.__dict__, "_canvas": None, "_window": None, "_advance": partial(advance, self.system)}
 
     def _exchanged(self) -> None:
@@ -304,7 +303,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         try:
             y = [float(hi + vi) for hi, vi in zip(self.system.h(self._x), white)]  # type: ignore[arg-type]
         except Exception:
-            components(self.system.h, self._x)  # says what went wrong
+            components(self.system.h, self._x)  # raises an EquationError
             raise
         if self._readings is None:
             return y

@@ -4,7 +4,7 @@ import inspect
 import re
 import reprlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Number, Real
 from types import CodeType, TracebackType
 from typing import Any
@@ -102,6 +102,13 @@ def shown(value: Any) -> str:
     return reprlib.repr(value)
 
 
+def is_sequence(value: Any) -> bool:
+    """Whether a value is a sequence of entries; an array of shape () has no length."""
+    if isinstance(value, np.ndarray) or is_of("torch", "Tensor", value):
+        return bool(value.ndim)
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
 def is_of(library: str, kind: str, value: Any) -> bool:
     """Whether a value is of a library's type, which then has been imported already."""
     module = sys.modules.get(library)
@@ -117,7 +124,7 @@ def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     on_floats = isinstance(x[0], Real)
     called = re.findall(r"(?:(?:math|cmath|np|numpy|torch|sympy)\.|(?<![\w.]))(\w+)\(", text_of(step))
     known = [_FUNCTIONS[name] for name in called if name in _FUNCTIONS]
-    # On floats, math.sqrt(-1) fails; abs of the whole state, which is no number, does so for another reason.
+    # On floats, math.sqrt(-1) fails; abs of the whole state does so for another reason.
     if known and not (on_floats and isinstance(error, TypeError)):
         return f": use kkl_gym.elementary.{known[0]}, which serves {_SERVING}"
     if "truth value" in str(error) or "Boolean value" in str(error):

@@ -65,10 +65,8 @@ class Plant:
     def draw_noise(
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw ``NOISE_BLOCK`` samples, (NOISE_BLOCK, nx) and (NOISE_BLOCK, nv), which :meth:`noise` scales.
-
-        A sensor draws from a generator of its own, so that motions and white noise of a seed are the same without it.
-        """
+        """Draw samples, (NOISE_BLOCK, nx) and (NOISE_BLOCK, nv), which :meth:`noise` scales."""
+        # A sensor draws from a generator of its own, so that motions and noise of a seed are the same without it.
         n, ny = NOISE_BLOCK, self.ny
         w = rng.random((n, len(self._w_range)), out=w)
         if not self._random:
@@ -99,7 +97,7 @@ class Plant:
 
 
 class OfPlant:
-    """What single and vector environments say of their plant."""
+    """The plant of single and vector environments."""
 
     plant: Plant
     _reward: Callable[[Components, Components], Any]
@@ -161,12 +159,9 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
 
 
 def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the output h(x) over the declared bounds of the state.
-
-    Evaluated at random states, and at corners, faces' centres and the centre, which must have an output. For more than
-    six states these are not all, but for each output the two corners to which it rises and falls from the centre. They
-    are exact for outputs that are monotone in each state.
-    """
+    """Bounds of the output h(x) over the declared bounds of the state, exact if it is monotone in each state."""
+    # At random states, and at corners, faces' centres and the centre, which must have an output. For more than six
+    # states only some of these, and for each output the two corners to which it rises and falls from the centre.
     low, high = np.array(system.bounds, dtype=float).T
     rng, nx = np.random.default_rng(0), system.nx
     if 3**nx <= _MOST_POINTS:

@@ -165,7 +165,7 @@ class System:
 
     @property
     def duration(self) -> float:
-        """Seconds for which motions are followed in training and evaluation, where nothing else is said."""
+        """Seconds for which motions are followed in training and evaluation, by default."""
         return 50.0 * self.pace
 
     @property
@@ -204,24 +204,7 @@ class System:
         """The next state of a system in discrete time, one sampling interval after x under the held input u.
 
         A system that defines it needs no f and g, sets ``dt``, and is not integrated. Process noise adds w dt to the
-        next state. f then is the mean derivative over the interval, without input.
-
-        Parameters
-        ----------
-        x : sequence of length nx
-            Components of the state: floats, arrays, tensors or symbols.
-        u : sequence of length nu
-            Components of the input, in its own units.
-
-        Returns
-        -------
-        sequence of length nx
-            Components of the next state.
-
-        Raises
-        ------
-        NotImplementedError
-            If the system is one in continuous time.
+        next state. f then is the mean derivative over the interval, without input. Components are those of :meth:`f`.
         """
         raise NotImplementedError(f"{type(self).__name__} is integrated from f; it defines no step")
 
@@ -231,19 +214,7 @@ class System:
         Override it where not every point of X is a state, as with an angle given by its cosine and sine. What it draws
         must lie within the bounds. Such a system also sets ``process_noise = 0.0``, which would push states off.
 
-        Parameters
-        ----------
-        rng : Generator
-            Of everything random.
-        n : int
-            How many.
-        factor : float, default 1
-            How far starts may lie from the middle, in multiples of X.
-
-        Returns
-        -------
-        ndarray, shape (n, nx)
-            The starts.
+        Returns ``n`` states, (n, nx), which lie within ``factor`` times X.
         """
         return rng.uniform(*self.box(factor), (n, self.nx))
 
@@ -296,18 +267,8 @@ class System:
         """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the default ``dt`` follows.
 
         The default differentiates f numerically, with each state in units of X's half-width, so that it does not depend
-        on the user's units. An estimate of the error then says how many substeps an interval takes. A formula in its
-        place says so itself, as where f jumps: a substep lasts 0.4 / rate at most.
-
-        Parameters
-        ----------
-        x : sequence of length nx
-            Components of the state.
-
-        Returns
-        -------
-        float, or of the kind that the components of ``x`` are
-            The rate in 1/s.
+        on the user's units. An estimate of the error then sets the number of substeps. A formula in
+        its place limits them, as where f jumps: a substep lasts 0.4 / rate at most.
         """
         return slope(self.f, x, self.X)
 
@@ -321,23 +282,7 @@ class System:
         return low, high
 
     def replace(self, parameters: Mapping[str, float]) -> "System":
-        """The same system with some parameters changed.
-
-        Parameters
-        ----------
-        parameters : mapping of str to float
-            New values by name.
-
-        Returns
-        -------
-        System
-            An instance of the same class.
-
-        Raises
-        ------
-        ValueError
-            If a name is unknown or a value is not a finite number.
-        """
+        """The same system with some parameters changed; ValueError on an unknown name and on what is not finite."""
         known = self.parameters
         parameters = mapping("parameters", parameters)
         for name in parameters:
@@ -403,7 +348,7 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
     units = [5e-7 * (high - low) for low, high in X]  # a millionth of the half-widths
     fx, total = field(x), 0.0
     for j, unit in enumerate(units):
-        step = max(unit, 2e-8 * max(map(abs, X[j])))  # more where X lies so far from zero that floats hardly tell it
+        step = max(unit, 2e-8 * max(map(abs, X[j])))  # more where X lies so far from zero that floats hardly resolve it
         moved = field([*x[:j], x[j] + step, *x[j + 1 :]])
         ratios = ((b - a) / other * (unit / step) for a, b, other in zip(fx, moved, units, strict=True))
         total = total + sum(ratio**2 for ratio in ratios)
@@ -419,10 +364,10 @@ def rate_under(system: System, x: Components, u: Components) -> Any:
 
 def typical_rate(system: System, starts: np.ndarray) -> float:
     """Median over some starts of how fast f changes. Shapes: ``starts`` (n, nx)."""
-    rate_at(system, starts.T)  # or say what is wrong with it
+    rate_at(system, starts.T)  # or raise an EquationError
     rate = float(np.median(np.broadcast_to(rate_under(system, starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:
-        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
+        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it with how fast f changes")
     return rate
 
 

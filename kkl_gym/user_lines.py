@@ -41,9 +41,10 @@ def path_of(code: CodeType) -> str:
 
 
 def _steps(error: BaseException) -> list[TracebackType]:
-    steps, step = [], error.__traceback__
+    step, steps = error.__traceback__, list[TracebackType]()
     while step is not None:
-        steps, step = [*steps, step], step.tb_next
+        steps.append(step)
+        step = step.tb_next
     return steps
 
 

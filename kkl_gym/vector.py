@@ -121,11 +121,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
     @property
     def compiled(self) -> bool:
-        """Whether steps run as compiled code (the extra ``fast``); compiles them if no step has done so.
-
-        Where they do not, the logger ``kkl_gym`` has said why at level INFO, and
-        ``kkl_gym.compiled.batch_step(env.system).obstacle`` says it again.
-        """
+        """Whether steps run as compiled code (the extra ``fast``); if not, the logger ``kkl_gym`` reports why."""
         return self._advance.obstacle is None
 
     def reset(
@@ -139,7 +135,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             One for each row, or one number n for n, n + 1, ...; None goes on with the generators as they are.
         options : mapping, optional
             ``"x0"`` is the start, shape (nx,) for all or (num_envs, nx), which is otherwise uniform in ``start_box``.
-            ``"reset_mask"``, boolean of shape (num_envs,), says which rows to reset, otherwise all.
+            ``"reset_mask"``, boolean of shape (num_envs,), marks the rows to reset, otherwise all.
 
         Raises
         ------
@@ -235,7 +231,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return tuple(self._canvas.draw(*row) for row in zip(self._trails.rows, guesses, self._u.T))
 
     def __getstate__(self) -> dict[str, Any]:
-        # What cannot be copied is made anew.
+        # What cannot be copied is made again.
         return {**self.__dict__, "_step": None, "_canvas": None}
 
     @property  # type: ignore[override]
@@ -366,7 +362,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         try:
             y = np.array([hi + vi for hi, vi in zip(self.system.h(x), white, strict=True)])
         except Exception:
-            components(self.system.h, x)  # says what went wrong
+            components(self.system.h, x)  # raises an EquationError
             raise
         return y if self._readings is None else self._readings.read(y, v, rows, start=start)
 

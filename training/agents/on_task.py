@@ -17,7 +17,8 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     """Shows an agent what ``kkl-gym agent train SYSTEM`` shows it, and pays it the same.
 
     The agent sees (x_hat - target) / scale and acts once in a period of the task, while the observer sees every sample.
-    It is paid minus the cost, or what the system's own ``reward`` says. Row i of the task's vector environment behaves as this one does with that row's seed.
+    It is paid minus the cost, or by the system's own ``reward``. Row i of the task's vector environment behaves as this
+    one does with that row's seed.
 
     Noise, starts and length of the episodes are the environment's: make it with the
     ``env_kwargs`` of ``training.agents.tasks.get_task(SYSTEM)``. The files in training/agents/hyperparameters do so for
