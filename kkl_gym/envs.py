@@ -17,7 +17,6 @@ from kkl_gym.rendering import (
     TRAIL,
     Canvas,
     Window,
-    check_render_mode,
     render_metadata,
     samples_a_frame,
 )
@@ -130,8 +129,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             start_box=start_box,
             sensor=sensor,
         )
-        check_render_mode(render_mode, ARRAYS_AND_WINDOWS)
-        self.render_mode, self.metadata = render_mode, render_metadata(self.plant.dt, ARRAYS_AND_WINDOWS)
+        self.render_mode, self.metadata = render_mode, render_metadata(self.plant.dt, ARRAYS_AND_WINDOWS, render_mode)
         self.observe = observe
         self.observation_space, self.action_space = self.plant.observation_space, self.plant.action_space
 

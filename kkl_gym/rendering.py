@@ -17,15 +17,11 @@ DRAWN = 50  # frames a second at most that a window is drawn, whose time is that
 ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 
 
-def render_metadata(dt: float, modes: Collection[str]) -> dict[str, Any]:
-    """Metadata of rendering: the modes, and the frames a second that show a motion as it is."""
-    return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
-
-
-def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
-    """Raise an error unless ``render_mode`` is one that environments offer."""
+def render_metadata(dt: float, modes: Collection[str], render_mode: str | None = None) -> dict[str, Any]:
+    """The modes and the frames a second that show a motion as it is; ValueError if a mode is not among them."""
     if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
         raise ValueError(f"render_mode must be None or one of {[*modes]}, got {shown(render_mode)}")
+    return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
 
 
 class Trails:

@@ -12,13 +12,15 @@ from gymnasium.vector.utils import batch_space
 from kkl_gym.compiled import SamplingStep, batch_step
 from kkl_gym.equations import components
 from kkl_gym.plant import NOISE_BLOCK, OfPlant, Plant
-from kkl_gym.rendering import ARRAYS, Canvas, Trails, check_render_mode, render_metadata
+from kkl_gym.rendering import ARRAYS, Canvas, Trails, render_metadata
 from kkl_gym.sensor import Readings
 from kkl_gym.simulate import followed_rows
 from kkl_gym.system import System, reward_of
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
 
 Infos = dict[str, Any]
+Rows = np.ndarray | slice
+ALL = slice(None)  # rows: an index by it is a view
 ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for the cache
 MOST_ENVS = 1_000_000  # of which 256 samples of noise are kept, some 10 kB each
 
@@ -90,9 +92,8 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = autoreset_mode_of(autoreset_mode)
-        check_render_mode(render_mode, ARRAYS)
         self.render_mode = render_mode
-        self.metadata = {**render_metadata(self.plant.dt, ARRAYS), "autoreset_mode": self.autoreset_mode}
+        self.metadata = render_metadata(self.plant.dt, ARRAYS, render_mode) | {"autoreset_mode": self.autoreset_mode}
         self.single_observation_space = self.plant.observation_space
         self.single_action_space = self.plant.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -191,14 +192,12 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         u = self._inputs(actions)
         self._u = u
         over = self._terminated | self._truncated
+        rows = np.flatnonzero(~over) if over.any() else ALL
+        reward = np.zeros(self.num_envs)
+        if not over.all():
+            reward[rows] = self._move(rows, u[:, rows])
         info: Infos = {}
-        if not over.any():
-            reward = self._move(self._everyone, u)
-        else:
-            rows = np.flatnonzero(~over)
-            reward = np.zeros(self.num_envs)
-            if len(rows):
-                reward[rows] = self._move(rows, u[:, rows])
+        if rows is not ALL:
             u[:, over] = 0.0
             if self.autoreset_mode is AutoresetMode.NEXT_STEP:
                 self._begin(np.flatnonzero(over))
@@ -287,10 +286,9 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             self._step = batch_step(self.system)
         return self._step
 
-    def _move(self, rows: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def _move(self, rows: Rows, u: np.ndarray) -> Any:
         """Advance some rows by a sampling interval; returns their rewards."""
-        whole = len(rows) == self.num_envs
-        before = self._x if whole else self._x[:, rows]
+        before = self._x[:, rows]
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
         escaped = self._outside(x)
@@ -303,14 +301,10 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         else:
             y = self._measure(x, v, rows, start=False)
         reward, ended = self._judged(x, u)
-        sample = self._sample[rows] + 1
-        if whole:
-            self._x, self._y, self._sample, self._escaped = x, y, sample, escaped
-        else:
-            self._x[:, rows], self._y[:, rows], self._sample[rows], self._escaped[rows] = x, y, sample, escaped
-        self._terminated[rows] = escaped | ended
-        self._truncated[rows] = sample >= (self.max_episode_steps or np.inf)
-        return np.broadcast_to(reward, len(rows)).astype(float)
+        self._x[:, rows], self._y[:, rows], self._escaped[rows], self._terminated[rows] = x, y, escaped, escaped | ended
+        self._sample[rows] += 1
+        self._truncated[rows] = self._sample[rows] >= (self.max_episode_steps or np.inf)
+        return reward
 
     def _outside(self, x: np.ndarray) -> np.ndarray:
         """Which states (nx, n) lie outside their bounds, or are not finite; (n,)."""
@@ -326,23 +320,17 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             raise ValueError(f"actions must be numbers; NaN in rows {np.flatnonzero(np.isnan(u).any(0)).tolist()}")
         return u
 
-    def _noise(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _noise(self, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
         """One sample of w, (nx, rows), and of v, (ny, rows)."""
-        whole = len(rows) == self.num_envs
-        used = self._used if whole else self._used[rows]
-        together = whole and (used == used[0]).all()  # most often
-        if (used[0] if together else used.max()) == NOISE_BLOCK:
-            self._draw(rows[used == NOISE_BLOCK])
-            used = np.where(used == NOISE_BLOCK, 0, used)
-        if whole:
-            self._used = used + 1
+        used, drawn = self._used[rows].copy(), self._everyone[rows]
+        if used.max() == NOISE_BLOCK:
+            self._draw(drawn[used == NOISE_BLOCK])
+            used[used == NOISE_BLOCK] = 0
+        self._used[rows] = used + 1
+        if rows is ALL and (used == used[0]).all():  # most often
+            w, v = self.plant.noise(self._w[used[0]].T, self._v[used[0]].T)
         else:
-            self._used[rows] = used + 1
-        if together:
-            drawn = self._w[used[0]].T, self._v[used[0]].T
-        else:
-            drawn = self._w[used, :, rows], self._v[used, :, rows]
-        w, v = self.plant.noise(*drawn)
+            w, v = self.plant.noise(self._w[used, :, drawn], self._v[used, :, drawn])
         return w.T, v.T
 
     def _draw(self, rows: np.ndarray) -> None:
@@ -356,15 +344,15 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             for block, drawn in ((self._w, w), (self._v, v)):
                 block[:, :, at] = drawn[: len(some)].transpose(1, 2, 0)
 
-    def _measure(self, x: np.ndarray, v: np.ndarray, rows: np.ndarray, *, start: bool) -> np.ndarray:
+    def _measure(self, x: np.ndarray, v: np.ndarray, rows: Rows, *, start: bool) -> np.ndarray:
         # As System.output, component first and in a third of its time, which a step would feel.
-        white = v if self._readings is None else np.zeros((self.plant.ny, len(rows)))
+        white = v if self._readings is None else np.zeros((self.plant.ny, x.shape[1]))
         try:
             y = np.array([hi + vi for hi, vi in zip(self.system.h(x), white, strict=True)])
         except Exception:
             components(self.system.h, x)  # raises an EquationError
             raise
-        return y if self._readings is None else self._readings.read(y, v, rows, start=start)
+        return y if self._readings is None else self._readings.read(y, v, self._everyone[rows], start=start)
 
     def _observation(self) -> np.ndarray:
         self._held = self._y if self._readings is None else np.where(np.isnan(self._y), self._held, self._y)
