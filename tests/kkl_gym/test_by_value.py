@@ -1,10 +1,14 @@
 """Systems that a script or a notebook defines reach other processes by value."""
 
 import multiprocessing
+import shutil
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from functools import partial
 
 import cloudpickle
 import gymnasium as gym
+import linear_system
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv
@@ -41,18 +45,15 @@ WEIGHT = 0.5
 def helper(angle):
     return WEIGHT * sin(angle)
 
-class Equations:
+class Mixin:
     def f(self, x):
         return x[1], -x[0]
 
     def h(self, x):
         return (x[0],)
 
-class Mixin(Equations):
-    pass
-
 @dataclass(frozen=True)
-class Parent(Equations, System):
+class Parent(Mixin, System):
     mass: float = 1.0
 
     name = "parent"
@@ -68,7 +69,7 @@ def defined(choices):
     """The class of a choice, as the cell of a notebook or a function in it defines it."""
     base, own = choices["base"], {} if "System" not in choices["base"] else {"own": OWN}
     if base == "System":
-        own["equations"] = "f, h = Equations.f, Equations.h"
+        own["equations"] = "f, h = Mixin.f, Mixin.h"
     parts = [*own.values(), *(choices[part] for part in ("f", "h", "rate", "g", "task", "more"))]
     if choices["decorator"]:
         parts.insert(0, choices["parameters"])
@@ -83,19 +84,15 @@ def defined(choices):
 
 
 def looked_at(system):
-    """What a system does, in plain numbers."""
+    """A motion of a system, and what it declares."""
     env = KKLEnv(system)
-    _, info = env.reset(seed=3)
-    seen = [info["x"].tolist(), info["y"].tolist()]
-    for action in (0.3, -1.0):
-        _, reward, terminated, _, info = env.step(np.array([action]))
-        seen += [info["x"].tolist(), info["y"].tolist(), reward, terminated]
+    env.reset(seed=3)
+    motion = [env.step(np.array([action])) for action in (0.3, -1.0)]
     system = env.system
-    return [seen, system.parameters, repr((system.X, system.scale, system.state_names, system.dt, system.target))]
+    return repr([motion, system.parameters, system.X, system.scale, system.state_names, system.dt, system.target])
 
 
 def received(sent):
-    """What :func:`looked_at` says of a system that came as bytes."""
     return looked_at(cloudpickle.loads(sent))
 
 
@@ -117,34 +114,29 @@ def start(make):
     return make().reset(seed=0)[0].tolist()
 
 
-def in_async(context, make):
-    envs = AsyncVectorEnv([make], context=context)
-    obs = envs.reset(seed=0)[0][0].tolist()
-    envs.close()
-    return obs
+def in_async(make, context):
+    with closing(AsyncVectorEnv([make], context=context)) as envs:
+        return envs.reset(seed=0)[0][0].tolist()
 
 
-def in_subprocess(make):
-    subproc = pytest.importorskip("stable_baselines3.common.vec_env").SubprocVecEnv
-    envs = subproc([make])
-    envs.seed(0)
-    obs = envs.reset()[0].tolist()
-    envs.close()
-    return obs
+def in_subproc(make):
+    vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
+    with closing(vec_env.SubprocVecEnv([make])) as envs:
+        envs.seed(0)
+        return envs.reset()[0].tolist()
 
 
 def in_loky(make):
     joblib = pytest.importorskip("joblib")
-    return joblib.Parallel(n_jobs=2, backend="loky")(joblib.delayed(start)(each) for each in [make] * 2)[0]
+    return joblib.Parallel(n_jobs=2, backend="loky")([joblib.delayed(start)(make)] * 2)[0]
+
+
+SPAWN, FORKSERVER = (partial(in_async, context=name) for name in ("spawn", "forkserver"))
 
 
 @pytest.mark.parametrize("which", [0, 1])
-@pytest.mark.parametrize(
-    "played",
-    [lambda make: in_async("spawn", make), lambda make: in_async("forkserver", make), in_subprocess, in_loky],
-    ids=["spawn", "forkserver", "subproc", "loky"],
-)
-def test_workers_play_what_a_notebook_defines(played, which):
+@pytest.mark.parametrize("played", [SPAWN, FORKSERVER, in_subproc, in_loky])
+def test_workers_play_systems_of_a_notebook(played, which):
     system = springs()[which]
     make = lambda: gym.make(kkl_gym.OWN_ID, system=system() if which else system)  # noqa: E731 - as notebooks do
     assert played(make) == start(make)
@@ -156,3 +148,20 @@ def test_a_class_that_states_nothing_is_looked_at_when_it_is_used():
 
     with pytest.raises(TypeError, match="Empty must set the class variables name, X and bounds; it lacks name"):
         Empty()
+
+
+@pytest.mark.parametrize(("where", "instance"), [("script", True), ("module", False)])
+def test_worker_processes_find_the_class_by_its_name(where, instance, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(linear_system.__file__, tmp_path / "found_from_here.py")
+    name = "found_from_here:Oscillator" if where == "module" else "found_from_here.py:Oscillator"
+    make = partial(gym.make, f"kkl_gym:{kkl_gym.OWN_ID}", system=kkl_gym.get_system(name) if instance else name)
+    assert SPAWN(make) == start(make)
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+def test_a_system_must_be_named(make):
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'system'"):
+        make(kkl_gym.OWN_ID)
+    with pytest.raises(ValueError, match="the system must be the name of one or"):
+        make(kkl_gym.OWN_ID, system=None)

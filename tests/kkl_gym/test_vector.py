@@ -281,16 +281,6 @@ def test_frames_are_those_of_single_environments(saved):
     assert not np.array_equal(*estimated)
 
 
-def test_where_only_z_is_estimated_frames_show_no_estimate(saved):
-    pytest.importorskip("matplotlib")
-    drawn = vector("lorenz", "NextStep", render_mode="rgb_array")
-    with pytest.raises(gym.error.ResetNeeded):
-        drawn.render()
-    env = KKLVectorObservation(drawn, saved(system="lorenz"), estimate="z")
-    env.reset(seed=0)
-    assert np.array_equal(env.render(), env.unwrapped.render())
-
-
 def test_a_repeat_inside_the_observer_is_noticed(saved):
     env = KKLVectorObservation(VectorActionRepeat(vector("lorenz", "Disabled"), 2), saved(system="lorenz"))
     env.reset(seed=0)
