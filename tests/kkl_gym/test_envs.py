@@ -49,12 +49,6 @@ def test_checkers_are_content(name, observe):
     sb3.check_env(env)
 
 
-def test_checkers_are_content_with_rendering():
-    for needed in ("matplotlib", "pygame"):
-        pytest.importorskip(needed)
-    check_env(gym.make("KKLLorenz-v0").unwrapped)
-
-
 @everyone
 @both
 def test_equal_seeds_give_equal_episodes(name, observe):
@@ -239,16 +233,6 @@ def test_step_and_render_before_reset():
     for call in (env.render, lambda: env.step(np.zeros(1))):
         with pytest.raises(gym.error.ResetNeeded):
             call()
-
-
-def test_autonomous_user_system(script):
-    env = KKLEnv(f"{script}:Pendulum")
-    assert env.action_space.shape == (0,)
-    check_env(env, skip_render_check=True)
-    obs, _ = env.reset(seed=0)
-    obs, _, _, _, info = env.step(np.zeros(0, np.float32))
-    assert info["u"].shape == (0,)
-    assert obs in env.observation_space
 
 
 def test_render():

@@ -9,7 +9,7 @@ from pushed_systems import Pendulum, TwoInputs
 
 from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.compiled import batch_step, single_step
-from kkl_gym.elementary import exp, sign, sin, where
+from kkl_gym.elementary import exp, sign, sin
 from kkl_gym.simulate import (
     SubstepsError,
     advance,
@@ -305,20 +305,6 @@ def test_what_an_input_speeds_up_is_followed():
             found = step(np.full((1, 3), x0), np.full((1, 3), u), np.zeros((1, 3)), dt)
             np.testing.assert_allclose(found, expected, rtol=1e-6)
     assert Flushed().typical_rate == pytest.approx(400.02, rel=1e-6)  # from which the default dt follows
-
-
-class Pumped(Flushed):
-    name = "pumped"
-    u_max = (1.0,)
-
-    def g(self, x):
-        return ((where(x[0] > 0, -1.0, 0.0),),)
-
-
-def test_a_pump_that_stops_at_zero_takes_no_more_substeps():
-    for step in (single_step(Pumped()), functools.partial(advance, Pumped())):
-        for dt in (0.01, 1.0):
-            assert step((0.0,), [1.0], [0.0], dt)[0] == 0.0
 
 
 def test_a_compiled_step_may_take_the_steps():
