@@ -133,7 +133,7 @@ sizes: $(VENV)/ready  ## errors of wider and narrower maps against their time, a
 
 # RLlib pins Gymnasium, and Tianshou what tyro needs: each has an environment of its own.
 CLIENTS_zoo := --editable ".[agents]" rl-zoo3 torchrl "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
-CLIENTS_rllib := --editable . "ray[rllib]>=2.40" "torch<2.14" tyro
+CLIENTS_rllib := --editable . "distributed>=2025.1" "ray[rllib]>=2.40" "torch<2.14" tyro
 CLIENTS_tianshou := --editable . "tianshou[eval]>=2" "torch<2.14"
 CLIENTS := zoo rllib tianshou
 

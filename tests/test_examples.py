@@ -65,6 +65,13 @@ def test_own_system(tmp_path):
     assert example("own_system")(inverse_steps=100, trajectories=30, out=tmp_path) < 40.0
 
 
+@pytest.mark.slow
+def test_own_task(tmp_path):
+    found = example("own_task")(timesteps=8192, inverse_steps=100, trajectories=30, out=tmp_path)
+    assert 50 < found["y"] < 2000
+    assert 50 < found["x_hat"] < 2000
+
+
 # What makes each of the commands for a system of one's own a matter of seconds.
 SMALL = {
     "diagnose": "",
