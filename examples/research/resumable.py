@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from examples.research.parallel import Backend, engine
-from training.jobs import check_identity, claimed_job
+from training.files import check_identity, claimed_job
 from training.progress import LOG, ProgressBars, progress_bars
 
 

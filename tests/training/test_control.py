@@ -7,8 +7,7 @@ from kkl_gym import SYSTEMS, get_system
 from training.agents.environments import vector
 from training.agents.play import play
 from training.agents.tasks import TASKS, TOLERANCE, control_task, get_task, scores, successes
-from training.presets import preset
-from training.systems import PROFILES, Profile, controller, profile
+from training.presets import PROFILES, Profile, controller, preset, profile
 from training.trajectories.equations import linearised
 from training.trajectories.policies import linear_quadratic
 

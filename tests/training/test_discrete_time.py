@@ -15,8 +15,8 @@ from kkl_gym.simulate import simulate
 from observers.estimator import Running
 from training import errors, preset, train, unseen_trajectories
 from training.kalman import ExtendedKalmanFilter
-from training.smoothness import smooth_spectrum
-from training.systems import controller
+from training.presets import controller
+from training.spectrum import smooth_spectrum
 
 
 def test_a_step_in_closed_form_is_the_integration():

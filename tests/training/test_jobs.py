@@ -11,13 +11,13 @@ import pytest
 
 from kkl_gym import System, get_system
 from observers.storage import UNFINISHED
-from training.jobs import check_identity, claimed_job, claimed_run, describe
+from training.files import check_identity, claimed_job, claimed_run, describe
 
 HOLDER = """
 import sys
 from pathlib import Path
 
-from training.jobs import claimed_run
+from training.files import claimed_run
 
 with claimed_run(Path(sys.argv[1]), {"width": 8}, resume=False):
     print("claimed", flush=True)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from training.markdown import table
+from training.files import table
 
 
 def test_a_table():

@@ -7,8 +7,7 @@ import pytest
 from linear_system import Oscillator
 
 from kkl_gym import get_system
-from training.smoothness import SMOOTH, intervals, smooth_spectrum, smoothness
-from training.spectrum import Spectrum, evenly_spaced, papers_spectrum
+from training.spectrum import SMOOTH, Spectrum, evenly_spaced, intervals, papers_spectrum, smooth_spectrum, smoothness
 
 
 def judged(system, *spectra, dt=0.05, **options):

@@ -12,9 +12,9 @@ from examples.research.methods.kkl import KKLMethod, within
 from observers import Artifact
 from training.config import Pipeline
 from training.evaluation.levels import multiple
+from training.lessons import train
 from training.presets import Size, preset
 from training.spectrum import papers_spectrum
-from training.train_observer import train
 
 Settings = Mapping[str, Any]
 

@@ -77,21 +77,12 @@ class Run:
     def minimise(
         self, name: str, problem: nn.Module, loss: Loss, steps: int, *, share: float = 1.0, **settings: Any
     ) -> None:
-        """Train a stage's network within its share of the CPU time."""
+        """Train a stage's network within its share of the CPU time, with the configuration's settings or others."""
         config = self.config
-        stage = Stage(
-            name=name,
-            steps=steps,
-            folder=self.folder,
-            fingerprint=self.fingerprint,
-            cpu_seconds=math.inf if config.cpu_seconds is None else config.cpu_seconds * share,
-            **{
-                "learning_rate": config.learning_rate,
-                "seed": config.seed,
-                "optimiser": config.optimiser,
-                **settings,
-            },
-        )
+        seconds = math.inf if config.cpu_seconds is None else config.cpu_seconds * share
+        usual = {key: getattr(config, key) for key in ("learning_rate", "seed", "optimiser")}
+        where: dict[str, Any] = {"folder": self.folder, "fingerprint": self.fingerprint, "cpu_seconds": seconds}
+        stage = Stage(name=name, steps=steps, **{**where, **usual, **settings})
         with self.timed(name):
             self.losses[name] = optimise(stage, problem, loss, self.progress, log=self.log, resume=self.resume)
 
@@ -123,13 +114,14 @@ class Stage:
 
 
 class _Course:
-    """How far a stage has come: batches done, CPU seconds spent, and the error by batch."""
+    """How far a stage has come: batches done, CPU seconds spent, the error by batch, and what a checkpoint holds."""
 
-    def __init__(
-        self, stage: Stage, step: int = 0, seconds: float = 0.0, history: list[tuple[int, float]] | None = None
-    ) -> None:
-        self.stage, self.step, self.history = stage, step, history or []
-        self._spent, self._began = seconds, time.process_time()
+    def __init__(self, stage: Stage, module: nn.Module) -> None:
+        self.stage, self.step, self.history = stage, 0, list[tuple[int, float]]()
+        self._spent, self._began = 0.0, time.process_time()
+        self.generator = torch.Generator(next(module.parameters()).device).manual_seed(stage.seed)
+        self.optimiser = _optimiser(stage, module)
+        self._parts: dict[str, Any] = {"module": module, "optimiser": self.optimiser}
 
     @property
     def seconds(self) -> float:
@@ -149,6 +141,20 @@ class _Course:
     def over(self) -> bool:
         return self.step >= self.stage.steps or self.seconds >= self.stage.cpu_seconds
 
+    def save(self) -> None:
+        state = {name: part.state_dict() for name, part in self._parts.items()}
+        state |= {"generator": self.generator.get_state(), "step": self.step, "seconds": self.seconds}
+        checkpoints.save(self.stage.checkpoint, state | {"history": self.history}, fingerprint=self.stage.fingerprint)
+
+    def restore(self) -> None:
+        state = checkpoints.load(self.stage.checkpoint, fingerprint=self.stage.fingerprint)
+        with checkpoints.restoring(self.stage.checkpoint):
+            for name, part in self._parts.items():
+                part.load_state_dict(state[name])
+            self.generator.set_state(state["generator"])
+            self.history = [(int(step), float(error)) for step, error in state["history"]]
+            self.step, self._spent = operator.index(state["step"]), float(state["seconds"])
+
 
 def optimise(
     stage: Stage, module: nn.Module, loss: Loss, progress: Progress, *, log: Log | None = None, resume: bool
@@ -157,24 +163,22 @@ def optimise(
 
     Every tensor in ``module.state_dict()`` is part of the checkpoint, buffers included.
 
-    On a GPU the batches of a ``capturable`` module replay one CUDA graph, with TF32 matrix products unless
+    On a GPU the gradients of a ``capturable`` module replay one CUDA graph, with TF32 matrix products unless
     NVIDIA_TF32_OVERRIDE=0. Data and initial weights of a seed are those on a CPU; batches are not, as the generators
     differ, so that errors agree but for chance.
     """
-    device = next(module.parameters()).device
-    generator = torch.Generator(device).manual_seed(stage.seed)
-    optimiser = _optimiser(stage, module)
-    parts = {"module": module, "optimiser": optimiser}
-    course = _restore(stage, parts, generator) if resume and stage.checkpoint.exists() else _Course(stage)
+    course = _Course(stage, module)
+    if resume and stage.checkpoint.exists():
+        course.restore()
     task = progress.add_task(stage.name, total=stage.steps, completed=course.step)
-    batch = Step(module, loss, optimiser, generator)
-    captured = device.type == "cuda" and getattr(module, "capturable", False)
-    run, saved_at, over = Captured(batch, generator) if captured else batch, time.monotonic(), course.over
+    batch = Gradients(module, loss, course.generator)
+    captured = course.generator.device.type == "cuda" and getattr(module, "capturable", False)
+    run, saved_at, over = Captured(batch, course.generator) if captured else batch, time.monotonic(), course.over
     while not over:
-        batch.set_learning_rate(course.learning_rate)
+        for group in course.optimiser.param_groups:
+            group["lr"] = course.learning_rate
         run()
-        if not batch.optimises:
-            optimiser.step()
+        course.optimiser.step()
         course.step += 1
         over = course.over
         if course.step % LOG_EVERY and not over:
@@ -190,15 +194,14 @@ def optimise(
         total = round(course.step / course.part)  # that there will be by the time the clock ends it
         progress.update(task, completed=course.step, total=total, description=f"{stage.name} (error {mean:.3g})")
         if over or time.monotonic() - saved_at > checkpoints.SECONDS:
-            _save(course, parts, generator)
+            course.save()
             saved_at = time.monotonic()
     return course.history
 
 
 def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
     if stage.optimiser == "adam":
-        capturable = next(module.parameters()).is_cuda
-        return torch.optim.Adam(module.parameters(), lr=stage.learning_rate, capturable=capturable)
+        return torch.optim.Adam(module.parameters(), lr=stage.learning_rate)
     from pytorch_optimizer import SOAP
 
     return SOAP(module.parameters(), lr=stage.learning_rate, weight_decay=0.0)
@@ -216,55 +219,22 @@ def log_to(folder: Path) -> Iterator[Log | None]:
         yield writer.add_scalar
 
 
-def _save(course: _Course, parts: dict[str, Any], generator: torch.Generator) -> None:
-    state = {name: part.state_dict() for name, part in parts.items()} | {"generator": generator.get_state()}
-    state |= {"step": course.step, "seconds": course.seconds, "history": course.history}
-    checkpoints.save(course.stage.checkpoint, state, fingerprint=course.stage.fingerprint)
+class Gradients:
+    """Draws a batch and puts the clipped gradients of its loss, and the sum of errors, in tensors that stay in place.
 
-
-def _restore(stage: Stage, parts: dict[str, Any], generator: torch.Generator) -> _Course:
-    found = checkpoints.load(stage.checkpoint, fingerprint=stage.fingerprint)
-    with checkpoints.restoring(stage.checkpoint):
-        for name, part in parts.items():
-            part.load_state_dict(found[name])
-        generator.set_state(found["generator"])
-        history = [(int(step), float(error)) for step, error in found["history"]]
-        return _Course(stage, operator.index(found["step"]), float(found["seconds"]), history)
-
-
-class Step:
-    """One batch: draw, loss, gradients, clipping, Adam's step and the sum of errors, in tensors that stay in place.
-
-    SOAP steps after it, because its eigenvectors cannot be part of a CUDA graph.
+    The optimiser steps outside, because the eigenvectors of SOAP cannot be part of a CUDA graph.
     """
 
-    def __init__(
-        self, module: nn.Module, loss: Loss, optimiser: torch.optim.Optimizer, generator: torch.Generator
-    ) -> None:
-        self.module, self.loss, self.optimiser, self.generator = module, loss, optimiser, generator
-        self.optimises = isinstance(optimiser, torch.optim.Adam)
-        device = next(module.parameters()).device
-        self.total, self.terms = torch.zeros((), device=device), dict[str, torch.Tensor]()
-        if self.optimises and device.type == "cuda":  # a graph would keep a number as it was when captured
-            for group in optimiser.param_groups:
-                group["lr"] = torch.as_tensor(group["lr"], dtype=torch.float32, device=device)
-
-    def set_learning_rate(self, rate: float) -> None:
-        """For the batches that follow."""
-        for group in self.optimiser.param_groups:
-            if isinstance(group["lr"], torch.Tensor):
-                group["lr"].fill_(rate)
-            else:
-                group["lr"] = rate
+    def __init__(self, module: nn.Module, loss: Loss, generator: torch.Generator) -> None:
+        self.module, self.loss, self.generator = module, loss, generator
+        self.total, self.terms = torch.zeros((), device=generator.device), dict[str, torch.Tensor]()
 
     def __call__(self) -> None:
         """Run it."""
         terms = self.loss(self.generator)
-        self.optimiser.zero_grad(set_to_none=True)
+        self.module.zero_grad(set_to_none=True)
         terms["loss"].backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
-        if self.optimises:
-            self.optimiser.step()
         self.total += terms.get("error", terms["loss"]).detach()
         self.terms = {name: value.detach() for name, value in terms.items()}
 
@@ -272,7 +242,7 @@ class Step:
 class Captured:
     """A function of tensors that stay in place: its first calls run as they are, the others replay a CUDA graph."""
 
-    WARM_UP = 3  # calls in which the optimiser and torch's libraries allocate what they keep
+    WARM_UP = 3  # calls in which torch's libraries allocate what they keep
 
     def __init__(self, function: Callable[[], None], generator: torch.Generator) -> None:
         self._function, self._generator, self._calls = function, generator, 0

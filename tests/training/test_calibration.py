@@ -10,10 +10,10 @@ from tracking import plain_observer
 
 from observers import MLP, ArtifactError, KKLObserver, Motion
 from training import SimulatedSource, calibrate
+from training.calibration import chi_square, rare, squared_distance
 from training.config import settings_of
 from training.evaluation.coverage import REGIONS, coverage
 from training.evaluation.errors import unseen_trajectories
-from training.lessons.calibrate import chi_square, rare, squared_distance
 from training.maps.coordinates import noise_covariance
 
 DT, DISTURBED = 0.05, 0.5
