@@ -11,7 +11,7 @@ import numpy as np
 
 from kkl_gym.loading import load_function
 from kkl_gym.system import NOISE_SHARE, System
-from training.config import Config, Pipeline, override
+from training.config import Config, Pipeline
 from training.spectrum import FASTEST_MODE, evenly_spaced, papers_spectrum, smooth_spectrum
 from training.trajectories.policies import Controller, checked_policy, linear_quadratic
 
@@ -21,6 +21,14 @@ Size = Literal["default", "large"]
 LARGE: dict[str, Any] = {"width": 128, "trajectories": 4000, "inverse_steps": 18_000}
 PAPER: dict[str, Any] = {
     "width": 512, "depth": 4, "activation": "silu", "optimiser": "adam", "batch": 4096, "learning_rate": 1e-3
+}  # fmt: skip
+SPINN: dict[str, Any] = {
+    **LARGE, "forward_steps": 6000, "inverse_steps": 12_000, "box_factor": 2.0, "noise_free_share": 0.35
+}  # fmt: skip
+PAPER_SPINN: dict[str, Any] = {
+    **PAPER, "trajectories": 500, "samples": 5001,
+    "forward_steps": 200 * 3_000_000 // 4096, "inverse_steps": 200 * 5_000_000 // 4096,
+    "collocation": "box", "scaling": "range", "solved_output_layer": False, "transients": False,
 }  # fmt: skip
 NOISE_RANGE = 2.0  # largest measurement noise that maps are trained for, over the system's default
 # FASTEST_MODE in discrete time, where a step may change everything and the last samples say most.
@@ -181,49 +189,29 @@ def preset(
     for what, value, known in (("pipeline", pipeline, Pipeline), ("preset", name, Preset), ("size", size, Size)):
         if value not in get_args(known):
             raise ValueError(f"there is no {what} {value!r}; there are {', '.join(get_args(known))}")
-    changes = changes or {}
-    given = {key: value for key, value in changes.items() if value is not None}
-    noise = _largest_noise(system)
-    sizes: dict[str, Any] = {"dt": system.dt, "duration": system.duration, "measurement_noise_max": noise}
+    given = {key: value for key, value in (changes or {}).items() if value is not None}
+    own, paper, uncertain = profile(system), name == "paper", given.get("uncertain")
+    chosen = {"dt": system.dt, "duration": system.duration, "measurement_noise_max": _largest_noise(system)}
     if pipeline == "input-aware":
-        spectrum = given.get("eigenvalues") or eigenvalues(system, given.get("dt", system.dt))
-        config = override(Config(pipeline, eigenvalues=spectrum, **sizes), profile(system).settings)
+        chosen |= own.settings
         if size == "large":
-            config = override(config, LARGE | dict(profile(system).large_settings))
-        if any(override(config, changes).uncertain.values()):
-            config = override(config, LARGE | dict(profile(system).uncertain_settings))
-        if name == "paper":
-            config = override(config, {**PAPER, "trajectories": 4000, "inverse_steps": 244_140})
-        return override(config, changes)
-    if name == "paper":
-        config = Config(
-            pipeline,
-            eigenvalues=papers_spectrum(system),
-            **sizes,
-            trajectories=500,
-            samples=5001,
-            **PAPER,
-            forward_steps=200 * 3_000_000 // 4096,
-            inverse_steps=200 * 5_000_000 // 4096,
-            collocation="box",
-            scaling="range",
-            solved_output_layer=False,
-            transients=False,
-        )
-        return override(config, changes)
-    chosen = {
-        **sizes,
-        **LARGE,
-        "forward_steps": 6_000,
-        "inverse_steps": 12_000,
-        "box_factor": 2.0,
-        "noise_free_share": 0.35,
-    }
-    chosen |= {**profile(system).spinn_settings, **given}
-    if "eigenvalues" not in chosen:
-        chosen["eigenvalues"] = smooth_spectrum(system, chosen["dt"], chosen["duration"]).eigenvalues
-    elif "eigenvalues" not in given:
-        chosen["eigenvalues"] = _rounded(chosen["eigenvalues"])
+            chosen |= LARGE | dict(own.large_settings)
+        if isinstance(uncertain, Mapping) and any(uncertain.values()):
+            chosen |= LARGE | dict(own.uncertain_settings)
+        if paper:
+            chosen |= PAPER | {"trajectories": 4000, "inverse_steps": 244_140}
+    else:
+        chosen |= PAPER_SPINN if paper else SPINN | dict(own.spinn_settings)
+    chosen |= given
+    if "eigenvalues" not in given:
+        if pipeline == "input-aware":
+            chosen["eigenvalues"] = eigenvalues(system, chosen["dt"])
+        elif paper:
+            chosen["eigenvalues"] = papers_spectrum(system)
+        elif "eigenvalues" in own.spinn_settings:
+            chosen["eigenvalues"] = _rounded(own.spinn_settings["eigenvalues"])
+        else:
+            chosen["eigenvalues"] = smooth_spectrum(system, chosen["dt"], chosen["duration"]).eigenvalues
     return Config(pipeline, **chosen)
 
 

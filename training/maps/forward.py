@@ -116,29 +116,37 @@ class ForwardProblem(nn.Module):
 
     @torch.no_grad()
     def solve_output_layer(self, rng: np.random.Generator, report: Callable[[int], object] = lambda done: None) -> None:
-        """Put the output layer where it minimises the risk for the features that the other layers have learned.
+        """Put the output layer where it minimises the risk for the features phi that the other layers have learned.
 
-        That is linear least squares, in float64 and on more samples than a batch has; gradients come close to it.
+        In the coordinates of A's eigenvectors, dT/dx f = A T + B h is one linear equation for each component of T: with
+        T_i = w . phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point. Pairs add
+        T_i = z_i. Both are solved in the mean square, in float64 and on more samples than a batch has, by a QR
+        factorisation with a small ridge.
         """
         *hidden, last = self.network.to(device="cpu", dtype=torch.float64)
         assert isinstance(last, nn.Linear)
-        features, device = nn.Sequential(*hidden), self._x.device
+        features, linear, device = nn.Sequential(*hidden), self.linear, self._x.device
         some = torch.as_tensor(rng.permutation(len(self._x))[:SOLVED])
         at = torch.as_tensor(rng.permutation(len(self._points))[:SOLVED])
         x, offset, scale = self._points.cpu()[at].double(), self.equation.x_offset.cpu(), self.equation.x_scale.cpu()
-        f = on_tensors(self.system.f, x) / scale
-        value, derivative = along(features, (x - offset) / scale, f)
-        weights = _output_layer(
-            self.linear,
-            equation=(value.numpy(), derivative.numpy(), on_tensors(self.system.h, x).numpy()),
-            speed=f.norm(dim=-1).numpy(),
-            pairs=(
-                features(self._x.cpu()[some].double()).numpy(),
-                self.z_offset + self.z_scale * self._z.cpu()[some].double().numpy(),
-            ),
-            physics_weight=self.config.physics_weight,
-            report=report,
-        )
+        f, h = on_tensors(self.system.f, x) / scale, on_tensors(self.system.h, x).numpy()
+        value, derivative = (each.numpy() for each in along(features, (x - offset) / scale, f))
+        phi = np.column_stack([value, np.ones(len(at))])
+        phi_along = np.column_stack([derivative, np.zeros(len(at))])
+        pairs = np.column_stack([features(self._x.cpu()[some].double()).numpy(), np.ones(len(some))])
+        z = self.z_offset + self.z_scale * self._z.cpu()[some].double().numpy()
+        poles, V = np.linalg.eig(linear.A)
+        driven, target = (np.linalg.solve(V, each.T).T for each in (h @ linear.B.T, z / np.sqrt(len(some))))
+        solved = np.empty((len(poles), phi.shape[1]), dtype=V.dtype)
+        for i, pole in enumerate(poles):
+            report(i)
+            row = np.sqrt(self.config.physics_weight / len(at)) / (f.norm(dim=-1).numpy() + abs(pole))
+            matrix = np.vstack([(phi_along - pole * phi) * row[:, None], pairs / np.sqrt(len(some))])
+            ridge = RIDGE * np.linalg.norm(matrix) / np.sqrt(phi.shape[1]) * np.eye(phi.shape[1])
+            right = np.concatenate([driven[:, i] * row, target[:, i]])
+            Q, R = qr(np.vstack([matrix, ridge]), mode="economic", overwrite_a=True, check_finite=False)
+            solved[i] = solve_triangular(R, Q[: len(right)].conj().T @ right)
+        weights = np.real(V @ solved)
         weights[:, -1] -= self.z_offset
         weights /= self.z_scale[:, None]
         last.weight.copy_(torch.as_tensor(weights[:, :-1]))
@@ -148,43 +156,6 @@ class ForwardProblem(nn.Module):
     def forward_map(self) -> ForwardMap:
         """The learned map for NumPy."""
         return ForwardMap(self.network.export(), self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
-
-
-def _output_layer(
-    linear: LinearFilter,
-    *,
-    equation: tuple[np.ndarray, np.ndarray, np.ndarray],
-    speed: np.ndarray,
-    pairs: tuple[np.ndarray, np.ndarray],
-    physics_weight: float,
-    report: Callable[[int], object],
-) -> np.ndarray:
-    """Solve for the weights with which fixed features phi make T(x) = W [phi(x), 1].
-
-    In the coordinates of A's eigenvectors, dT/dx f = A T + B h is one linear equation for each component of T: with
-    T_i = w . phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point. Pairs add T_i = z_i.
-    Both are solved in the mean square by a QR factorisation with a small ridge. As in :class:`ForwardProblem`, the
-    equation's rows are divided by the local speed plus the rate of the mode.
-
-    Shapes: ``equation`` (m, features), (m, features) and (m, ny), ``speed`` (m,), ``pairs`` (n, features) and (n, nz);
-    returns (nz, features + 1).
-    """
-    value, derivative, h = equation
-    phi, phi_along = np.column_stack([value, np.ones(len(value))]), np.column_stack([derivative, np.zeros(len(value))])
-    poles, V = np.linalg.eig(linear.A)
-    driven = np.linalg.solve(V, linear.B @ h.T).T
-    known = np.column_stack([pairs[0], np.ones(len(pairs[0]))]) / np.sqrt(len(pairs[0]))
-    target = np.linalg.solve(V, pairs[1].T).T / np.sqrt(len(pairs[0]))
-    solved = np.empty((len(poles), phi.shape[1]), dtype=V.dtype)
-    for i, pole in enumerate(poles):
-        report(i)
-        row = np.sqrt(physics_weight / len(phi)) / (speed + abs(pole))
-        matrix = np.vstack([(phi_along - pole * phi) * row[:, None], known])
-        ridge = RIDGE * np.linalg.norm(matrix) / np.sqrt(phi.shape[1]) * np.eye(phi.shape[1])
-        right = np.concatenate([driven[:, i] * row, target[:, i]])
-        Q, R = qr(np.vstack([matrix, ridge]), mode="economic", overwrite_a=True, check_finite=False)
-        solved[i] = solve_triangular(R, Q[: len(right)].conj().T @ right)
-    return np.real(V @ solved)
 
 
 def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
