@@ -116,25 +116,26 @@ class _Calibration:
             artifact = replace(artifact, motion=replace(artifact.motion, factors=table))
         return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
 
-    def measured(self) -> Iterator[tuple[int, np.ndarray, list[tuple[Any, float, np.ndarray]]]]:
-        """Each level's index, its outputs, and the runs of each level of process noise, with both levels."""
+    def groups(self) -> Iterator[tuple[int, dict[str, Any], np.ndarray, np.ndarray, np.ndarray]]:
+        """Index of a level of measurement noise, both levels of noise, their runs (n,), outputs and inputs."""
         runs, rng = self.runs, np.random.default_rng(0)
         for i, level in enumerate(self.levels):
-            given = noise_levels("measurement_noise", level, self.source.ny)
-            rows = [(given, float(noise), runs.process_noise == noise) for noise in np.unique(runs.process_noise)]
-            yield i, runs.y + level * rng.standard_normal(runs.y.shape), rows
+            y = runs.y + level * rng.standard_normal(runs.y.shape)
+            measurement_noise = noise_levels("measurement_noise", level, self.source.ny)
+            for noise in np.unique(runs.process_noise).tolist():
+                rows = runs.process_noise == noise
+                levels = {"measurement_noise": measurement_noise, "process_noise": noise}
+                yield i, levels, rows, y[:, rows], runs.u[:, rows]
 
     def with_covariances(self, artifact: Artifact) -> Artifact:
         """The covariance of T_inv's errors by level and age, of each map."""
-        runs, seconds, x = self.runs, self.ages * self.dt, self.runs.x[self.ages]
+        seconds, x = self.ages * self.dt, self.runs.x[self.ages]
         errors, known = np.empty((len(LEVELS), *x.shape)), np.isfinite(x).all(-1)
-        for i, y, parts in self.measured():
-            z = filter_states(artifact.filter, y, runs.u, self.ages)
-            for level, noise, rows in parts:
-                T_inv = Decoders(artifact, slice(artifact.nx), measurement_noise=level, process_noise=noise)
-                errors[i][:, rows] = x[:, rows] - T_inv(z[:, rows], seconds[:, None])
+        for i, levels, rows, y, u in self.groups():
+            T_inv, z = Decoders(artifact, slice(artifact.nx), **levels), filter_states(artifact.filter, y, u, self.ages)
+            errors[i][:, rows] = x[:, rows] - T_inv(z, seconds[:, None])
         least = np.diag(LEAST_VARIANCE * np.ptp(x[known], axis=0) ** 2 + np.finfo(float).tiny)
-        acted = np.maximum.accumulate((runs.u != 0).any(-1), axis=0)
+        acted = np.maximum.accumulate((self.runs.u != 0).any(-1), axis=0)
         moved = np.concatenate([np.zeros_like(acted[:1]), acted])[self.ages]
 
         def with_table(inverse: InverseMap, group: np.ndarray) -> InverseMap:
@@ -157,21 +158,19 @@ class _Calibration:
         extremes = np.zeros((3, len(LEVELS), *runs.y.shape[1:]))
         share, first = -np.expm1(-self.dt / (WINDOW * pace)), 1 + round(WARM_UP * pace / self.dt)
         slots = {int(age): i for i, age in enumerate(self.ages)}
-        for i, outputs, parts in self.measured():
-            for level, noise, rows in parts:
-                observer = KKLObserver(artifact, level, process_noise=noise)
-                y, u, x = outputs[:, rows], runs.u[:, rows], runs.x[:, rows]
-                x_hat = np.empty_like(x)
-                for k in range(len(y)):
-                    x_hat[k] = observer.step(y[k], u[k - 1]) if k else observer.reset(y[0])
-                    if artifact.motion is not None and k in slots:
-                        distances[i, slots[k], rows] = squared_distance(x[k] - x_hat[k], observer.covariance)
-                if artifact.knows_output:
-                    residual = artifact.residual(y, x_hat)
-                    mean, square = (lfilter([share], [1, share - 1], r, 0)[first:] for r in (residual, residual**2))
-                    largest, high = np.abs(mean).max(0, initial=0.0), square.max(0, initial=0.0)
-                    extremes[:, i, rows] = largest, square.min(0, initial=np.inf), high
-            report(i + 1)
+        for i, levels, rows, y, u in self.groups():
+            report(i)
+            observer, x = KKLObserver(artifact, **levels), runs.x[:, rows]
+            x_hat = np.empty_like(x)
+            for k in range(len(y)):
+                x_hat[k] = observer.step(y[k], u[k - 1]) if k else observer.reset(y[0])
+                if artifact.motion is not None and k in slots:
+                    distances[i, slots[k], rows] = squared_distance(x[k] - x_hat[k], observer.covariance)
+            if artifact.knows_output:
+                residual = artifact.residual(y, x_hat)
+                mean, square = (lfilter([share], [1, share - 1], r, 0)[first:] for r in (residual, residual**2))
+                largest, high = np.abs(mean).max(0, initial=0.0), square.max(0, initial=0.0)
+                extremes[:, i, rows] = largest, square.min(0, initial=np.inf), high
         return distances, extremes
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:

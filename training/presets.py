@@ -191,7 +191,11 @@ def preset(
             raise ValueError(f"there is no {what} {value!r}; there are {', '.join(get_args(known))}")
     given = {key: value for key, value in (changes or {}).items() if value is not None}
     own, paper, uncertain = profile(system), name == "paper", given.get("uncertain")
-    chosen = {"dt": system.dt, "duration": system.duration, "measurement_noise_max": _largest_noise(system)}
+    chosen: dict[str, Any] = {
+        "dt": system.dt,
+        "duration": system.duration,
+        "measurement_noise_max": _largest_noise(system),
+    }
     if pipeline == "input-aware":
         chosen |= own.settings
         if size == "large":
