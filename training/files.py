@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
-from safetensors import SafetensorError, safe_open
 
 from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import System
@@ -47,17 +46,6 @@ def require_writable(folder: str | os.PathLike[str]) -> None:
         tempfile.TemporaryFile(dir=existing, prefix=UNFINISHED).close()
     except OSError as problem:  # which names the temporary file
         raise OSError(problem.errno, problem.strerror, str(folder)) from problem
-
-
-def is_kind(path: str | os.PathLike[str], key: str) -> bool:
-    """Whether the header of a safetensors file has metadata under a key."""
-    try:
-        if not Path(path).is_file():  # to read a pipe may never end
-            return False
-        with safe_open(path, "numpy") as file:
-            return key in (file.metadata() or {})
-    except (OSError, SafetensorError):
-        return False
 
 
 def clear_unfinished(folder: str | os.PathLike[str]) -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import platform
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,6 @@ from observers import Artifact, Flow, ForwardMap, InverseMap, LinearFilter, Moti
 from observers.checks import noise_levels
 from training.calibration import calibrate
 from training.config import Config
-from training.files import claimed_run
 from training.maps.coordinates import spread
 from training.maps.forward import ForwardProblem, transients, truncation_step
 from training.maps.inverse import ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
@@ -27,7 +25,7 @@ from training.progress import ProgressBars
 from training.run import Run
 from training.seeds import Stream, generator
 from training.sources.simulated import SimulatedSource
-from training.sources.source import OF_MEDIAN, Increments, Pairs, Source, TooFewRunsError
+from training.sources.source import OF_MEDIAN, Pairs, Source, TooFewRunsError
 from training.spectrum import Spectrum, check_continuous
 
 # Of a flow's network.
@@ -107,36 +105,31 @@ def train(
     if config.pipeline == "spinn" and isinstance(source, SimulatedSource):
         check_continuous(source.system)
     identity = {**source.identity(), **dataclasses.asdict(config)}
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch) / "run" if folder is None else folder
-        began = time.process_time()
-        with (
-            claimed_run(folder, identity, resume),
-            Run.begin(config, identity, folder, console=console, device=device, resume=resume) as run,
-        ):
-            maps = learn_map(source, run)
-            motion = _motion(source, run) if config.tracking and config.pipeline != "spinn" else None
-            training = {
-                **dataclasses.asdict(config),
-                **run.samples,
-                "device": run.device.type,
-                "threads": torch.get_num_threads(),
-                "resumed": resume,
-            }
-            versions = {
-                "kkl-gym": kkl_gym.__version__,
-                "python": platform.python_version(),
-                "torch": torch.__version__,
-                "numpy": np.__version__,
-            }
-            artifact = Artifact(**vars(maps), **source.facts(), training=training, versions=versions)
-            with run.timed("calibrating"):
-                try:
-                    artifact = calibrate(artifact, source, motion=motion, console=run.progress)
-                except TooFewRunsError as reason:
-                    run.progress.say(f"the observer has no covariances and does not track: {reason}")
-            training |= source.judged(artifact) | {"cpu_seconds_spent": round(time.process_time() - began, 1)}
-            return Result(dataclasses.replace(artifact, training=training), run.losses, dict(run.seconds))
+    began = time.process_time()
+    with Run.begin(config, folder, identity=identity, console=console, device=device, resume=resume) as run:
+        maps = learn_map(source, run)
+        motion = _motion(source, run) if config.tracking and config.pipeline != "spinn" else None
+        training = {
+            **dataclasses.asdict(config),
+            **run.samples,
+            "device": run.device.type,
+            "threads": torch.get_num_threads(),
+            "resumed": resume,
+        }
+        versions = {
+            "kkl-gym": kkl_gym.__version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        }
+        artifact = Artifact(**vars(maps), **source.facts(), training=training, versions=versions)
+        with run.timed("calibrating"):
+            try:
+                artifact = calibrate(artifact, source, motion=motion, console=run.progress)
+            except TooFewRunsError as reason:
+                run.progress.say(f"the observer has no covariances and does not track: {reason}")
+        training |= source.judged(artifact) | {"cpu_seconds_spent": round(time.process_time() - began, 1)}
+        return Result(dataclasses.replace(artifact, training=training), run.losses, dict(run.seconds))
 
 
 def _motion(source: Source, run: Run) -> Motion | None:
@@ -282,48 +275,34 @@ def learn_flow(source: Source, run: Run) -> Motion:
     ValueError
         If no two samples in a row have all states, or such an observer cannot track.
     """
-    parts = source.tracking()
+    parts, device = source.tracking(), run.device
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
     parts = {"x_offset": learned.x.mean(0), "x_scale": spread(learned.x)} | parts
     offset, scale = parts["x_offset"], parts["x_scale"]  # of a simulated source, in which its process noise is
-    problem = FlowProblem(learned, offset, scale, run.device)
-    steps = run.config.flow_steps
-    run.minimise("flow", problem.network, problem.loss, steps, learning_rate=LEARNING_RATE, optimiser="soap")
-    flow = problem.flow()
-    s = (judged.x - offset) / scale
-    missed = np.abs(flow(s, judged.u) - s - judged.change / scale)
-    least = LEAST_ERROR * np.sqrt(np.mean((learned.change / scale) ** 2, axis=0))
-    error = np.maximum(OF_MEDIAN * np.median(missed, axis=0), least)
-    return Motion(**parts | {"flow": flow, "error": error})
+    u_scale = np.abs(learned.u).max(0, initial=0.0)
+    u_scale = np.where(u_scale > 0, u_scale, 1.0)
+    inputs = np.column_stack([(learned.x - offset) / scale, learned.u / u_scale])
+    change, affine = learned.change / scale, np.column_stack([np.ones(len(inputs)), inputs])
+    linear = np.linalg.lstsq(affine, change, rcond=None)[0].T
+    left = change - affine @ linear.T
+    gain = left.std(0)
+    left /= np.where(gain > 0, gain, 1.0)
+    network = Network(inputs.shape[1], left.shape[1], width=WIDTH, depth=DEPTH, activation="tanh").to(device)
+    weight = 1.0 / ((left**2).mean(-1) + LEAST)
+    samples, targets, weights = (tensor(each, device) for each in (inputs, left, weight))
 
-
-class FlowProblem:
-    """The affine part by least squares, and the batches on which the network is trained."""
-
-    def __init__(self, increments: Increments, offset: np.ndarray, scale: np.ndarray, device: torch.device) -> None:
-        u_scale = np.abs(increments.u).max(0, initial=0.0)
-        self.u_scale = np.where(u_scale > 0, u_scale, 1.0)
-        inputs = np.column_stack([(increments.x - offset) / scale, increments.u / self.u_scale])
-        change, affine = increments.change / scale, np.column_stack([np.ones(len(inputs)), inputs])
-        self.linear = np.linalg.lstsq(affine, change, rcond=None)[0].T
-        left = change - affine @ self.linear.T
-        self.gain = left.std(0)
-        left = left / np.where(self.gain > 0, self.gain, 1.0)
-        self.network = Network(inputs.shape[1], left.shape[1], width=WIDTH, depth=DEPTH, activation="tanh").to(device)
-        self._inputs, self._left = tensor(inputs, device), tensor(left, device)
-        self._weight = tensor(1.0 / ((left**2).mean(-1) + LEAST), device)
-
-    def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, relative to what the affine part leaves of each sample."""
-        rows = torch.randint(len(self._inputs), (BATCH,), generator=generator, device=self._inputs.device)
-        square = (self.network(self._inputs[rows]) - self._left[rows]).square().mean(-1)
-        loss = (self._weight[rows] * square).mean()
+    def loss(generator: torch.Generator) -> dict[str, torch.Tensor]:
+        rows = torch.randint(len(samples), (BATCH,), generator=generator, device=device)
+        square = (network(samples[rows]) - targets[rows]).square().mean(-1)
+        loss = (weights[rows] * square).mean()
         return {"loss": loss, "error": loss.detach().sqrt()}
 
-    def flow(self) -> Flow:
-        """The flow as it is now."""
-        return Flow(self.network.export(), self.linear, self.gain, self.u_scale)
+    run.minimise("flow", network, loss, run.config.flow_steps, learning_rate=LEARNING_RATE, optimiser="soap")
+    flow, s = Flow(network.export(), linear, gain, u_scale), (judged.x - offset) / scale
+    missed = np.abs(flow(s, judged.u) - s - judged.change / scale)
+    error = np.maximum(OF_MEDIAN * np.median(missed, axis=0), LEAST_ERROR * np.sqrt(np.mean(change**2, axis=0)))
+    return Motion(**parts | {"flow": flow, "error": error})
 
 
 __all__ = ["Maps", "Result", "learn_flow", "learn_map", "train"]

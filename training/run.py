@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from torch import nn
 from observers.storage import naming
 from training import checkpoints
 from training.config import Config, Optimiser
+from training.files import claimed_run
 from training.progress import LOG, ProgressBars, progress_bars
 
 LOG_EVERY = 100
@@ -34,7 +35,7 @@ Log = Callable[[str, float, int], object]
 
 @dataclass
 class Run:
-    """A training under way; :func:`Run.alone` makes one for a lesson by itself."""
+    """A training under way; ``with Run.begin(config) as run`` makes one for a lesson by itself."""
 
     config: Config
     folder: Path
@@ -52,27 +53,27 @@ class Run:
     def begin(
         cls,
         config: Config,
-        identity: Mapping[str, Any],
-        folder: Path,
+        folder: Path | None = None,
         *,
+        identity: Mapping[str, Any] | None = None,
         console: Any = None,
         device: torch.device | None = None,
         resume: bool = False,
     ) -> Iterator["Run"]:
-        """Begin in a folder, with a log and TensorBoard's scalars."""
-        fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
-        device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        """Begin in a folder, which is locked, with a log and TensorBoard's scalars; without one nothing is kept."""
+        described = json.dumps(identity or {}, sort_keys=True)
         torch.manual_seed(config.seed)
-        with log_to(folder) as log, progress_bars(console, folder / LOG) as progress:
+        with ExitStack() as stack:
+            log, logged = None, None if folder is None else folder / LOG
+            if folder is None:
+                folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            else:
+                stack.enter_context(claimed_run(folder, identity or {}, resume))
+                log = stack.enter_context(log_to(folder))
+            progress = stack.enter_context(progress_bars(console, logged))
+            device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+            fingerprint = hashlib.sha256(described.encode()).hexdigest()[:16]
             yield cls(config, folder, fingerprint, progress, device, resume, log)
-
-    @classmethod
-    @contextmanager
-    def alone(cls, config: Config, console: Any = None, device: torch.device | None = None) -> Iterator["Run"]:
-        """Run a lesson by itself; nothing is kept."""
-        with tempfile.TemporaryDirectory() as folder, progress_bars(console) as progress:
-            torch.manual_seed(config.seed)
-            yield cls(config, Path(folder), "", progress, device or torch.device("cpu"))
 
     def minimise(
         self, name: str, problem: nn.Module, loss: Loss, steps: int, *, share: float = 1.0, **settings: Any
@@ -94,9 +95,9 @@ class Run:
         self.seconds[name] += time.process_time() - began
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Stage:
-    """One optimisation within a run."""
+    """One optimisation within a run, and how far it has come: batches, CPU seconds, and the error by batch."""
 
     name: str
     steps: int
@@ -106,54 +107,46 @@ class Stage:
     seed: int
     cpu_seconds: float = math.inf
     optimiser: Optimiser = "adam"
+    step: int = 0
+    history: list[tuple[int, float]] = field(default_factory=list)
+    began: float = field(default_factory=lambda: time.process_time())
 
     @property
     def checkpoint(self) -> Path:
-        """The file that keeps how far it has come."""
+        """The file that a resumed stage goes on from."""
         return self.folder / f"{self.name}{checkpoints.SUFFIX}"
-
-
-class _Course:
-    """How far a stage has come: batches done, CPU seconds spent, the error by batch, and what a checkpoint holds."""
-
-    def __init__(self, stage: Stage, module: nn.Module) -> None:
-        self.stage, self.step, self.history = stage, 0, list[tuple[int, float]]()
-        self._spent, self._began = 0.0, time.process_time()
-        self.generator = torch.Generator(next(module.parameters()).device).manual_seed(stage.seed)
-        self.optimiser = _optimiser(stage, module)
-        self._parts: dict[str, Any] = {"module": module, "optimiser": self.optimiser}
 
     @property
     def seconds(self) -> float:
-        return self._spent + time.process_time() - self._began
+        """CPU time spent."""
+        return time.process_time() - self.began
 
     @property
     def part(self) -> float:
-        return max(self.step / self.stage.steps, min(1.0, self.seconds / self.stage.cpu_seconds))
+        """Share of the stage that is done, by steps or by CPU time."""
+        return max(self.step / self.steps, min(1.0, self.seconds / self.cpu_seconds))
 
     @property
-    def learning_rate(self) -> float:
+    def rate(self) -> float:
+        """The learning rate of the next batch."""
         done = self.part
-        warm = min(1.0, (done + 1 / self.stage.steps) / WARM_UP)
-        return self.stage.learning_rate * (warm * 0.5 * (1.0 + math.cos(math.pi * done)))
+        warm = min(1.0, (done + 1 / self.steps) / WARM_UP)
+        return self.learning_rate * (warm * 0.5 * (1.0 + math.cos(math.pi * done)))
 
-    @property
-    def over(self) -> bool:
-        return self.step >= self.stage.steps or self.seconds >= self.stage.cpu_seconds
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Write a checkpoint."""
+        own = {"step": self.step, "seconds": self.seconds, "history": self.history}
+        checkpoints.save(self.checkpoint, {**state, **own}, fingerprint=self.fingerprint)
 
-    def save(self) -> None:
-        state = {name: part.state_dict() for name, part in self._parts.items()}
-        state |= {"generator": self.generator.get_state(), "step": self.step, "seconds": self.seconds}
-        checkpoints.save(self.stage.checkpoint, state | {"history": self.history}, fingerprint=self.stage.fingerprint)
-
-    def restore(self) -> None:
-        state = checkpoints.load(self.stage.checkpoint, fingerprint=self.stage.fingerprint)
-        with checkpoints.restoring(self.stage.checkpoint):
-            for name, part in self._parts.items():
+    def restore(self, parts: Mapping[str, Any], generator: torch.Generator) -> None:
+        """Go on from the checkpoint."""
+        state = checkpoints.load(self.checkpoint, fingerprint=self.fingerprint)
+        with checkpoints.restoring(self.checkpoint):
+            for name, part in parts.items():
                 part.load_state_dict(state[name])
-            self.generator.set_state(state["generator"])
+            generator.set_state(state["generator"])
             self.history = [(int(step), float(error)) for step, error in state["history"]]
-            self.step, self._spent = operator.index(state["step"]), float(state["seconds"])
+            self.step, self.began = operator.index(state["step"]), time.process_time() - float(state["seconds"])
 
 
 def optimise(
@@ -167,36 +160,40 @@ def optimise(
     NVIDIA_TF32_OVERRIDE=0. Data and initial weights of a seed are those on a CPU; batches are not, as the generators
     differ, so that errors agree but for chance.
     """
-    course = _Course(stage, module)
+    generator = torch.Generator(next(module.parameters()).device).manual_seed(stage.seed)
+    optimiser = _optimiser(stage, module)
+    parts: dict[str, Any] = {"module": module, "optimiser": optimiser}
     if resume and stage.checkpoint.exists():
-        course.restore()
-    task = progress.add_task(stage.name, total=stage.steps, completed=course.step)
-    batch = Gradients(module, loss, course.generator)
-    captured = course.generator.device.type == "cuda" and getattr(module, "capturable", False)
-    run, saved_at, over = Captured(batch, course.generator) if captured else batch, time.monotonic(), course.over
+        stage.restore(parts, generator)
+    task = progress.add_task(stage.name, total=stage.steps, completed=stage.step)
+    batch = Gradients(module, loss, generator)
+    captured = generator.device.type == "cuda" and getattr(module, "capturable", False)
+    run, saved_at = Captured(batch, generator) if captured else batch, time.monotonic()
+    over = stage.part >= 1
     while not over:
-        for group in course.optimiser.param_groups:
-            group["lr"] = course.learning_rate
+        for group in optimiser.param_groups:
+            group["lr"] = stage.rate
         run()
-        course.optimiser.step()
-        course.step += 1
-        over = course.over
-        if course.step % LOG_EVERY and not over:
+        optimiser.step()
+        stage.step += 1
+        over = stage.part >= 1
+        if stage.step % LOG_EVERY and not over:
             continue
-        mean = float(batch.total) / ((course.step - 1) % LOG_EVERY + 1)
+        mean = float(batch.total) / ((stage.step - 1) % LOG_EVERY + 1)
         if mean != mean:
-            raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {course.step}")
+            raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {stage.step}")
         batch.total.zero_()
-        course.history.append((course.step, mean))
+        stage.history.append((stage.step, mean))
         if log is not None:
             for name, value in batch.terms.items():
-                log(f"{stage.name}/{name}", float(value), course.step)
-        total = round(course.step / course.part)  # that there will be by the time the clock ends it
-        progress.update(task, completed=course.step, total=total, description=f"{stage.name} (error {mean:.3g})")
+                log(f"{stage.name}/{name}", float(value), stage.step)
+        total = round(stage.step / stage.part)  # that there will be by the time the clock ends it
+        progress.update(task, completed=stage.step, total=total, description=f"{stage.name} (error {mean:.3g})")
         if over or time.monotonic() - saved_at > checkpoints.SECONDS:
-            course.save()
+            state = {name: part.state_dict() for name, part in parts.items()}
+            stage.save({**state, "generator": generator.get_state()})
             saved_at = time.monotonic()
-    return course.history
+    return stage.history
 
 
 def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
