@@ -105,12 +105,6 @@ def test_a_second_calibration_finds_the_same_factors(tracking):
     np.testing.assert_array_equal(again, tracking.motion.factors.factors)
 
 
-def test_estimates_of_t_inv_stay_as_they_are(tracking):
-    y = np.random.default_rng(1).normal(size=(30, 4, 1))
-    alone = dataclasses.replace(tracking, motion=None)
-    np.testing.assert_array_equal(KKLObserver(plain_observer(), 0.3).estimate(y), KKLObserver(alone, 0.3).estimate(y))
-
-
 def ever_above(artifact, system, level, fault=lambda y: y, n=400, duration=20.0):
     """Which new runs raise an alarm."""
     rng = np.random.default_rng(11)

@@ -14,9 +14,7 @@ from rich.console import Console
 from small_runs import CPU, toy
 from unstable_system import Falling
 
-import training.lessons
 from kkl_gym import KKLObservation, get_system
-from kkl_gym.equations import EquationError
 from kkl_gym.simulate import simulate
 from observers import Artifact, KKLObserver
 from training import SimulatedSource, checkpoints, errors, preset, train, unseen_trajectories
@@ -101,17 +99,6 @@ def test_equations_that_no_expression_holds_give_way_to_a_flow(whole):
     assert np.sqrt(np.mean(off**2)) < 3e-4
     assert (motion.error > 0).all()
     assert motion.process_noise * motion.x_scale == pytest.approx(np.array(Table().scale) * 0.05 / np.sqrt(3))
-
-
-def test_equations_that_branch_are_refused():
-    class Branching(Slow):
-        name = "branching"
-
-        def f(self, x):
-            return x[1], -x[0] if x[0] > 0 else -2.0 * x[0]
-
-    with pytest.raises(EquationError, match=r"kkl_gym\.elementary\.where"):
-        trained(Branching())
 
 
 def parts(artifact):
@@ -226,24 +213,6 @@ def test_an_unstable_plant_is_trained_under_a_policy(tmp_path):
     script.write_text(body.format(3.0))
     with pytest.raises(ValueError, match="policy_actions"):
         trained(Falling(), tmp_path / "run", resume=True, **small | {"policy": f"{script}:hold"})
-
-
-def test_the_settings_of_noise_reach_motions_and_batches(monkeypatch):
-    sampler, seen = training.lessons.TrajectorySampler, {}
-
-    def spy(pairs, linear, config, **named):
-        seen.update(named, disturbed=(pairs.process_noise > 0).mean())
-        return sampler(pairs, linear, config, **named)
-
-    monkeypatch.setattr(training.lessons, "TrajectorySampler", spy)
-    small = {"duration": 1.0, "samples": 10, "inverse_steps": 2, "trajectories": 100, "inputs": False}
-    for share in (0.5, 0.0):
-        found, _ = trained(Slow(), process_noise_share=share, **small)
-        assert seen["disturbed"] == pytest.approx(share, abs=0.15 * (share > 0))
-        largest = 0.05 if share else 0.0
-        assert (seen["measurement_noise"], seen["process_noise_max"]) == (0.1, largest)
-        factors = found.artifact.motion.factors.factors
-        assert len(factors) == 1 + bool(share)
 
 
 @pytest.mark.slow

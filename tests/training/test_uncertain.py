@@ -89,11 +89,6 @@ def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate():
     assert 2.7 <= mu.min() < 2.8 < 3.2 < mu.max() <= 3.3
 
 
-def test_under_a_policy_it_sees_the_states_alone(tmp_path):
-    config = toy(VanDerPol(), uncertain={"mu": 0.1}, policy="controller", inverse_steps=2, duration=1.0)
-    assert train(VanDerPol(), config, tmp_path, device=CPU).artifact.nx == 2
-
-
 def test_it_does_not_track_and_says_why():
     said = Console(file=io.StringIO(), width=200)
     config = toy(Spring(), uncertain={"stiffness": 0.3}, duration=1.0, inverse_steps=2, inputs=False)
