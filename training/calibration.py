@@ -185,8 +185,7 @@ class _Calibration:
 
     def factor(self, distances: np.ndarray) -> float:
         """The factor with which regions of 90 % hold 90 % of the errors."""
-        edge = np.quantile(distances, COVERAGE, method="weibull")
-        return float(np.clip(edge / chi_square(COVERAGE, self.artifact.nx), 1e-6, 1e6))
+        return float(np.clip(_excess(distances, self.artifact.nx), 1e-6, 1e6))
 
     def limits(self, extremes: np.ndarray) -> Limits:
         """Limits that a sound motion exceeds with a sixth of the probability, and of an output's share in it, each."""
@@ -239,8 +238,9 @@ def chi_square(shares: Any, degrees: int) -> np.ndarray:
 def _covariance(error: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Mean outer product of errors (n, nx), scaled so that the region of 90 % holds 90 % of them."""
     covariance = error.T @ error / len(error) + least
-    edge = np.quantile(squared_distance(error, covariance), COVERAGE, method="weibull")
-    return np.asarray(covariance * edge / chi_square(COVERAGE, error.shape[1]))
+    return np.asarray(covariance * _excess(squared_distance(error, covariance), error.shape[1]))
 
 
-__all__ = ["calibrate", "chi_square", "squared_distance"]
+def _excess(distances: np.ndarray, degrees: int) -> float:
+    """The 90 % quantile of squared distances over that of the chi-square distribution."""
+    return float(np.quantile(distances, COVERAGE, method="weibull") / chi_square(COVERAGE, degrees))

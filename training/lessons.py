@@ -303,6 +303,3 @@ def learn_flow(source: Source, run: Run) -> Motion:
     missed = np.abs(flow(s, judged.u) - s - judged.change / scale)
     error = np.maximum(OF_MEDIAN * np.median(missed, axis=0), LEAST_ERROR * np.sqrt(np.mean(change**2, axis=0)))
     return Motion(**parts | {"flow": flow, "error": error})
-
-
-__all__ = ["Maps", "Result", "learn_flow", "learn_map", "train"]

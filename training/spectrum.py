@@ -79,12 +79,10 @@ def check_continuous(system: System) -> None:
         )
 
 
-def smoothness(
-    system: System, spectra: Iterable[Spectrum], dt: float, *, box_factor: float = 1.5, seed: int = 0
-) -> Iterator[np.ndarray]:
+def smoothness(system: System, spectra: Iterable[Spectrum], dt: float) -> Iterator[np.ndarray]:
     """For each spectrum, exponents (ny * modes,) of differences in z between neighbouring states of different motions.
 
-    Motions without input are simulated once, half of them from X and half from a larger box, and the filters run beside
+    Motions without input are simulated once, half of them from X and half from 1.5 X, and the filters run beside
     them. Those states count at which a filter has forgotten its start to one part in a million. NaN where too few do.
     """
     check_continuous(system)
@@ -93,8 +91,8 @@ def smoothness(
     filters = [spectrum.filter(system.ny, step) for spectrum in spectra]
     settled = [2.0 * settling_time(linear) for linear in filters]
     steps = int(np.ceil((FOLLOWED / rate + max(settled)) / step))
-    ages, rng = recording_ages(steps, SAMPLES), generator(Stream.TUNING, seed)
-    x0 = np.concatenate([system.draw_starts(rng, MOTIONS // 2, factor) for factor in (1.0, box_factor)])
+    ages, rng = recording_ages(steps, SAMPLES), generator(Stream.TUNING, 0)
+    x0 = np.concatenate([system.draw_starts(rng, MOTIONS // 2, factor) for factor in (1.0, 1.5)])
     x = simulate(system, rng.permutation(x0), steps, step)
     inside = np.isfinite(x).all(-1)
     x = np.where(inside[..., None], x, x[0])  # states beyond the bounds do not count; h and the filter need numbers
