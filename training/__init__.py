@@ -53,7 +53,7 @@ __all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    """What is public, imported when it is asked for: torch takes seconds, and parts of the package need none."""
+    """Import a public name on demand: torch takes seconds, and parts of the package do without."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

@@ -25,7 +25,7 @@ PER_AGE = 6  # samples of each run about each age: at a single one all motions m
 FEWEST = 50  # errors from which a covariance or a quantile is taken
 LEAST_VARIANCE = 1e-6  # added to that of each state, over its range squared
 WINDOW, WARM_UP = 0.5, 5.0  # seconds of the monitor, likewise
-MARGIN = 1.05  # on limits found among finitely many motions
+MARGIN = 1.05  # on limits, which are from finitely many motions
 
 
 def calibrate(
@@ -130,11 +130,11 @@ class _Calibration:
     def with_covariances(self, artifact: Artifact) -> Artifact:
         """The covariance of T_inv's errors by level and age, of each map."""
         seconds, x = self.ages * self.dt, self.runs.x[self.ages]
-        errors, known = np.empty((len(LEVELS), *x.shape)), np.isfinite(x).all(-1)
+        errors, finite = np.empty((len(LEVELS), *x.shape)), np.isfinite(x).all(-1)
         for i, levels, rows, y, u in self.groups():
             T_inv, z = Decoders(artifact, slice(artifact.nx), **levels), filter_states(artifact.filter, y, u, self.ages)
             errors[i][:, rows] = x[:, rows] - T_inv(z, seconds[:, None])
-        least = np.diag(LEAST_VARIANCE * np.ptp(x[known], axis=0) ** 2 + np.finfo(float).tiny)
+        least = np.diag(LEAST_VARIANCE * np.ptp(x[finite], axis=0) ** 2 + np.finfo(float).tiny)
         acted = np.maximum.accumulate((self.runs.u != 0).any(-1), axis=0)
         moved = np.concatenate([np.zeros_like(acted[:1]), acted])[self.ages]
 
@@ -144,11 +144,11 @@ class _Calibration:
             return dataclasses.replace(inverse, error_covariance=covariance)
 
         if artifact.free_inverse is None:
-            return dataclasses.replace(artifact, inverse=with_table(artifact.inverse, known))
+            return dataclasses.replace(artifact, inverse=with_table(artifact.inverse, finite))
         return dataclasses.replace(
             artifact,
-            inverse=with_table(artifact.inverse, known & moved),
-            free_inverse=with_table(artifact.free_inverse, known & ~moved),
+            inverse=with_table(artifact.inverse, finite & moved),
+            free_inverse=with_table(artifact.free_inverse, finite & ~moved),
         )
 
     def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -175,13 +175,13 @@ class _Calibration:
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
         """A function of the values (ages, n, ...) about each knot; where these are too few, that of the next knot."""
-        known = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
-        cells = [np.isin(self.ages, span)[:, None] & known for span in self.spans]
+        finite = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
+        cells = [np.isin(self.ages, span)[:, None] & finite for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
         if not enough:
             raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out")
-        found = {i: find(values[cells[i]]) for i in enough}
-        return np.array([found[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
+        entries = {i: find(values[cells[i]]) for i in enough}
+        return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
     def factor(self, distances: np.ndarray) -> float:
         """The factor with which regions of 90 % hold 90 % of the errors."""

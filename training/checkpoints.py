@@ -17,7 +17,7 @@ SUFFIX = ".checkpoint.pt"
 
 def save(path: Path, state: Mapping[str, Any], *, fingerprint: str) -> None:
     """Write a checkpoint, whole or not at all."""
-    content = io.BytesIO()  # torch itself says of a full disk that it is "unexpected pos"
+    content = io.BytesIO()  # torch reports a full disk as "unexpected pos"
     torch.save({**state, "fingerprint": fingerprint}, content)
     with replacing(path) as temporary:
         temporary.write_bytes(content.getbuffer())

@@ -205,22 +205,21 @@ def checked_changes(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
     """The configuration in an artifact's account of its training, with some settings changed."""
-    known = setting_types()
-    found = {name: value for name, value in training.items() if name in known and value is not None}
-    if not {"pipeline", "eigenvalues"} <= set(found):
-        raise ValueError("the observer does not say how it was trained, so that it cannot be trained again")
-    return Config(**{**_validated(found, "the observer's training"), **changes})
+    settings = {name: training[name] for name in setting_types() if training.get(name) is not None}
+    if not {"pipeline", "eigenvalues"} <= set(settings):
+        raise ValueError("the observer holds no settings of its training, so that it cannot be trained again")
+    return Config(**{**_validated(settings, "the observer's training"), **changes})
 
 
 def _validated(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Settings that came through JSON, each of its type and within its limits."""
-    types, found = setting_types(), {}
+    types, checked = setting_types(), {}
     for name, value in settings.items():
         try:
-            found[name] = TypeAdapter(types[name]).validate_json(json.dumps(value), strict=True)
+            checked[name] = TypeAdapter(types[name]).validate_json(json.dumps(value), strict=True)
         except ValidationError as error:
             raise ValueError(f"{where}: {name} = {value!r}: {error.errors()[0]['msg']}") from None
-    return found
+    return checked
 
 
 def override(config: Config, changes: Mapping[str, Any]) -> Config:

@@ -1,6 +1,6 @@
 """One style for all figures, on a light ground or a dark one, and how figures and moving pictures are written.
 
-Colours are named by what they are for, as places in the cycle of colours: what is drawn in them follows the theme.
+Colours are named for their use, as places in the cycle of colours, so that they follow the theme.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Files and folders of results: what appears whole or not at all, who works in a folder, and on what."""
+"""Results: files that appear whole or not at all, locks of folders, and descriptions of their contents."""
 
 import hashlib
 import json

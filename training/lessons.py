@@ -285,12 +285,12 @@ def learn_flow(source: Source, run: Run) -> Motion:
     inputs = np.column_stack([(learned.x - offset) / scale, learned.u / u_scale])
     change, affine = learned.change / scale, np.column_stack([np.ones(len(inputs)), inputs])
     linear = np.linalg.lstsq(affine, change, rcond=None)[0].T
-    left = change - affine @ linear.T
-    gain = left.std(0)
-    left /= np.where(gain > 0, gain, 1.0)
-    network = Network(inputs.shape[1], left.shape[1], width=WIDTH, depth=DEPTH, activation="tanh").to(device)
-    weight = 1.0 / ((left**2).mean(-1) + LEAST)
-    samples, targets, weights = (tensor(each, device) for each in (inputs, left, weight))
+    rest = change - affine @ linear.T
+    gain = rest.std(0)
+    rest /= np.where(gain > 0, gain, 1.0)
+    network = Network(inputs.shape[1], rest.shape[1], width=WIDTH, depth=DEPTH, activation="tanh").to(device)
+    weight = 1.0 / ((rest**2).mean(-1) + LEAST)
+    samples, targets, weights = (tensor(each, device) for each in (inputs, rest, weight))
 
     def loss(generator: torch.Generator) -> dict[str, torch.Tensor]:
         rows = torch.randint(len(samples), (BATCH,), generator=generator, device=device)

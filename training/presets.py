@@ -1,4 +1,4 @@
-"""What is chosen for a system: its profile, its controller, and the configurations behind the commands' options.
+"""Choices for a system: its profile, its controller, and the configurations behind the commands' options.
 
 docs/guides/own_system.md shows how to add a profile.
 """
@@ -31,16 +31,13 @@ PAPER_SPINN: dict[str, Any] = {
     "collocation": "box", "scaling": "range", "solved_output_layer": False, "transients": False,
 }  # fmt: skip
 NOISE_RANGE = 2.0  # largest measurement noise that maps are trained for, over the system's default
-# FASTEST_MODE in discrete time, where a step may change everything and the last samples say most.
+# FASTEST_MODE in discrete time, where a step may change everything and the last samples matter most.
 FASTEST_OF_STEPS = 3.0
 
 
 @dataclass(frozen=True)
 class Profile:
-    """What is chosen for one system; the defaults serve any.
-
-    docs/guides/own_system.md explains them on an example.
-    """
+    """Choices for one system; the defaults serve any. docs/guides/own_system.md explains them on an example."""
 
     eigenvalues: tuple[float, ...] | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -99,7 +96,7 @@ PROFILES: dict[str, Profile] = {
     ),
     "rossler": Profile(
         eigenvalues=evenly_spaced(13, -0.4, -8.0),
-        # Real modes hardly tell its three parameters apart under noise; slow pairs at frequencies of y do: with
+        # Real modes hardly separate its three parameters under noise; slow pairs at frequencies of y do: with
         # parameters as states and all of them 10 % off, the error of the best decoder falls from 2.3 to 1.9 % by the
         # first two. On validation runs short trainings gained a little by the third, and by a wider network. More
         # batches and twice the trajectories are worth 3 % on plants that are 10 % off.
@@ -122,7 +119,7 @@ PROFILES: dict[str, Profile] = {
 
 
 def profile(system: System) -> Profile:
-    """What is known of a system."""
+    """The choices for a system."""
     return PROFILES.get(system.name, Profile())
 
 

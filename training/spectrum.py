@@ -21,7 +21,7 @@ MOTIONS = 300  # that are followed
 ASKING = 40  # of them whose states look for neighbours, among the states of the others
 SAMPLES = 160  # states along a motion
 FAR = 64  # the nearest neighbour is compared with the one of this rank
-FEWEST_STATES = 1000  # that must be known for a judgement
+FEWEST_STATES = 1000  # from which exponents are taken
 FOLLOWED = 300.0  # length of motions in multiples of 1 / rate
 FINEST = 0.05  # least sampling interval in multiples of 1 / rate; finer ones only cost time
 AT_REST = 1e-6  # part of X's half-width below which the variation of a state no longer counts
@@ -89,34 +89,34 @@ def smoothness(system: System, spectra: Iterable[Spectrum], dt: float) -> Iterat
     rate = system.typical_rate
     step = max(dt, FINEST / rate)
     filters = [spectrum.filter(system.ny, step) for spectrum in spectra]
-    settled = [2.0 * settling_time(linear) for linear in filters]
-    steps = int(np.ceil((FOLLOWED / rate + max(settled)) / step))
+    times = [2.0 * settling_time(linear) for linear in filters]
+    steps = int(np.ceil((FOLLOWED / rate + max(times)) / step))
     ages, rng = recording_ages(steps, SAMPLES), generator(Stream.TUNING, 0)
     x0 = np.concatenate([system.draw_starts(rng, MOTIONS // 2, factor) for factor in (1.0, 1.5)])
     x = simulate(system, rng.permutation(x0), steps, step)
     inside = np.isfinite(x).all(-1)
     x = np.where(inside[..., None], x, x[0])  # states beyond the bounds do not count; h and the filter need numbers
     y, no_input = system.output(x), np.zeros((steps, MOTIONS, 0))
-    x, known = x[ages], [inside[ages] & (ages * step >= time)[:, None] for time in settled]
-    if max(one.sum() for one in known) < FEWEST_STATES:
+    x, settled = x[ages], [inside[ages] & (ages * step >= time)[:, None] for time in times]
+    if max(one.sum() for one in settled) < FEWEST_STATES:
         raise ValueError(
-            f"motions of {system.name} leave bounds = {system.bounds} within {min(settled):.3g} s, before the filter "
+            f"motions of {system.name} leave bounds = {system.bounds} within {min(times):.3g} s, before the filter "
             "of any spectrum has forgotten its start; widen the bounds or shrink X"
         )
-    for linear, rows in zip(filters, known, strict=True):
-        yield _exponents(system, x=x, z=filter_states(linear, y, no_input, ages), known=rows)
+    for linear, rows in zip(filters, settled, strict=True):
+        yield _exponents(system, x=x, z=filter_states(linear, y, no_input, ages), settled=rows)
 
 
-def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Compare the z (ages, motions, size) of the known among states x (ages, motions, nx)."""
-    asking, others = known[:, :ASKING], known[:, ASKING:]  # neighbours are of different motions
+def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, settled: np.ndarray) -> np.ndarray:
+    """Compare the z (ages, motions, size) of neighbours among the settled states of x (ages, motions, nx)."""
+    asking, others = settled[:, :ASKING], settled[:, ASKING:]  # neighbours are of different motions
     low, high = system.box()
     least = AT_REST * (high - low) / 2
-    too_few = known.sum() < FEWEST_STATES or not asking.any() or others.sum() < FAR
-    if too_few or (x[known].std(0) <= least).all():
+    too_few = settled.sum() < FEWEST_STATES or not asking.any() or others.sum() < FAR
+    if too_few or (x[settled].std(0) <= least).all():
         return np.full(z.shape[-1], np.nan)
-    x = x / np.maximum(x[known].std(0), least)
-    z_scale = z[known].std(0)
+    x = x / np.maximum(x[settled].std(0), least)
+    z_scale = z[settled].std(0)
     z = z / np.where(z_scale > 0, z_scale, 1.0)
     distances, rows = scipy.spatial.cKDTree(x[:, ASKING:][others]).query(x[:, :ASKING][asking], k=[1, FAR])
     differences = z[:, ASKING:][others][rows] - z[:, :ASKING][asking][:, None]

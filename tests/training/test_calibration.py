@@ -176,7 +176,7 @@ def test_a_system_is_a_source_too_if_the_observer_says_how_it_was_trained():
     artifact = plain_observer()
     artifact = dataclasses.replace(artifact, training={**artifact.training, "inputs": False, "runs": 100})
     assert calibrate(artifact, Slow(), false_alarms=0.5).limits.false_alarms == 0.5
-    with pytest.raises(ValueError, match="does not say how it was trained"):
+    with pytest.raises(ValueError, match="holds no settings of its training"):
         calibrate(dataclasses.replace(artifact, training={}), Slow())
     with pytest.raises(ValueError, match=r"false_alarms must lie between 0 and 1, got 0\.0"):
         calibrate(artifact, Slow(), false_alarms=0.0)

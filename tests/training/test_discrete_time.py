@@ -10,7 +10,6 @@ from linear_system import Oscillator
 from small_runs import toy
 
 import kkl_gym
-from kkl_gym.equations import EquationError
 from kkl_gym.simulate import simulate
 from observers.estimator import Running
 from training import errors, preset, train, unseen_trajectories
@@ -88,17 +87,3 @@ def test_the_equation_of_continuous_time_is_refused(tmp_path):
         train(Henon(), toy(Henon(), "spinn"), tmp_path)
     with pytest.raises(ValueError, match="input-aware"):
         smooth_spectrum(Henon(), 1.0)
-
-
-@pytest.mark.parametrize(
-    ("body", "message"),
-    [
-        ("return x[0]", r"step\(x, u\) of 'wrong' .* must return 2 components"),
-        ("return x[0], nothing", "NameError"),
-    ],
-)
-def test_steps_that_are_wrong_are_named(tmp_path, body, message):
-    lines = ("from discrete_systems import Henon", "class Wrong(Henon):", "    name = 'wrong'")
-    (tmp_path / "wrong.py").write_text("\n".join((*lines, "    def step(self, x, u):", f"        {body}\n")))
-    with pytest.raises(EquationError, match=message):
-        kkl_gym.KKLEnv(f"{tmp_path / 'wrong.py'}:Wrong")

@@ -33,6 +33,10 @@ def forward_problem(system, device=CPU):
     return ForwardProblem(system, linear, config, pairs=pairs, points=x, device=device)
 
 
+def line_of(folder, **settings):
+    return training.run.Stage(**{"name": "line", "folder": folder, "fingerprint": "same", "seed": 0, **settings})
+
+
 class Clock:
     """CPU time that goes on by a hundredth of a second whenever somebody looks."""
 
@@ -62,15 +66,7 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
                 raise KeyboardInterrupt
             return {"loss": ((module.a - 1.0) ** 2).sum()}
 
-        stage = training.run.Stage(
-            name="line",
-            steps=10**9,
-            learning_rate=0.1,
-            folder=tmp_path,
-            fingerprint="same",
-            seed=0,
-            cpu_seconds=4.0,
-        )
+        stage = line_of(tmp_path, steps=10**9, learning_rate=0.1, cpu_seconds=4.0)
         with progress_bars(None) as progress:
             training.run.optimise(stage, module, loss, progress, resume=True)
         rates.extend(np.abs(np.diff(calls)))
@@ -106,9 +102,7 @@ def test_batches_in_place_are_those_of_a_plain_loop(optimiser, tmp_path):
 
         return loss
 
-    stage = training.run.Stage(
-        name="line", steps=40, learning_rate=0.05, folder=tmp_path, fingerprint="", seed=3, optimiser=optimiser
-    )
+    stage = line_of(tmp_path, steps=40, learning_rate=0.05, seed=3, optimiser=optimiser)
     module, plain = fresh(), fresh()
     with progress_bars(None) as progress:
         history = training.run.optimise(stage, module, loss_of(module), progress, resume=False)
@@ -195,10 +189,7 @@ def test_a_captured_stage_on_a_gpu_is_the_same_as_an_eager_one(optimiser, tmp_pa
     for captured in (True, False):
         monkeypatch.setattr(ForwardProblem, "capturable", captured)
         problem = forward_problem(VanDerPol(), torch.device("cuda"))
-        stage = training.run.Stage(
-            name=f"T{captured}", steps=50, learning_rate=1e-3, folder=tmp_path, fingerprint="", seed=0,
-            optimiser=optimiser,
-        )  # fmt: skip
+        stage = line_of(tmp_path, name=f"T{captured}", steps=50, learning_rate=1e-3, optimiser=optimiser)
         with progress_bars(None) as progress:
             training.run.optimise(stage, problem, problem.loss, progress, resume=False)
         weights.append(problem.network.linear_layers()[0].weight.detach().cpu())
