@@ -15,8 +15,6 @@ from observers.names import suggestion
 
 Pipeline = Literal["input-aware", "spinn"]
 Optimiser = Literal["adam", "soap"]
-Activation = Literal["tanh", "silu"]
-Collocation = Literal["motions", "box"]
 Scaling = Literal["relative", "range"]
 
 Positive = Annotated[float, Field(gt=0)]
@@ -64,7 +62,7 @@ class Config:
     """Neurons in each hidden layer."""
     depth: Count = 3
     """Number of hidden layers."""
-    activation: Activation = "tanh"
+    activation: Literal["tanh", "silu"] = "tanh"
     """Activation of the hidden layers."""
     optimiser: Optimiser = "soap"
     """Optimiser of all networks: adam, or soap, which needs a fraction of the batches."""
@@ -76,7 +74,7 @@ class Config:
     """Batches for the forward map (spinn)."""
     inverse_steps: Count = 1500
     """Batches for each inverse map."""
-    collocation: Collocation = "motions"
+    collocation: Literal["motions", "box"] = "motions"
     """Where the forward map's equation must hold, and x' lies (spinn). box: uniform in X, as in the paper."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
     """Most trajectories start in this multiple of the training box X, the others in X (spinn)."""

@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -64,13 +64,18 @@ class Run:
         described = json.dumps(identity or {}, sort_keys=True)
         torch.manual_seed(config.seed)
         with ExitStack() as stack:
-            log, logged = None, None if folder is None else folder / LOG
+            log: Log | None = None
+            lines = None if folder is None else folder / LOG
             if folder is None:
                 folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             else:
                 stack.enter_context(claimed_run(folder, identity or {}, resume))
-                log = stack.enter_context(log_to(folder))
-            progress = stack.enter_context(progress_bars(console, logged))
+                with suppress(ImportError):  # TensorBoard is an extra
+                    from torch.utils.tensorboard import SummaryWriter
+
+                    stack.enter_context(naming(folder))
+                    log = stack.enter_context(SummaryWriter(folder)).add_scalar
+            progress = stack.enter_context(progress_bars(console, lines))
             device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
             fingerprint = hashlib.sha256(described.encode()).hexdigest()[:16]
             yield cls(config, folder, fingerprint, progress, device, resume, log)
@@ -203,18 +208,6 @@ def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
     from pytorch_optimizer import SOAP
 
     return SOAP(module.parameters(), lr=stage.learning_rate, weight_decay=0.0)
-
-
-@contextmanager
-def log_to(folder: Path) -> Iterator[Log | None]:
-    """TensorBoard scalars in a folder, where TensorBoard is installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        yield None
-        return
-    with naming(folder), SummaryWriter(folder) as writer:
-        yield writer.add_scalar
 
 
 class Gradients:

@@ -57,16 +57,12 @@ class Sampler(Protocol):
 class TrajectorySampler(Sampler):
     """Batches along trajectories: every age since reset, every noise level up to ``measurement_noise_max``.
 
-    With several outputs there is a level for each. In half of the samples these are the same part of their largest
-    ones; in the others they are drawn one by one, some of them zero.
-
     Noise is drawn from the covariance that the filter gives it at each age, and added to noise-free z. The network
     that fits such data in the mean square is the conditional mean of x.
 
-    The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall
-    into ``cells`` of like age and levels, and the loss divides each by its cell's own recent error, so that all
-    improve in proportion. Where parameters differ, motions of the system's own are in cells apart: their errors can be
-    smaller, and in cells with the others they would count for little.
+    The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall into
+    ``cells`` of like age and levels, and the loss divides each by its cell's recent error. Where parameters differ,
+    motions of the system's own, whose errors can be smaller, have cells of their own.
 
     Shapes: ``error`` (size, size), ``silent`` (size, k).
     """
