@@ -97,10 +97,10 @@ class Config:
     free_inverse: bool = True
     """Whether an input-aware map has a second inverse, of z_y alone, until an input acts. Never under a policy."""
     lead_in_input: NotNegative = 0.0
-    """Some free trajectories start where inputs lead in 20 s, constant up to this multiple of their bounds; 0: in 10 s,
-    random within their bounds."""
+    """Some free trajectories start where inputs have led: for 20 s constant ones, up to this multiple of their bounds;
+    0: for 10 s random ones within their bounds."""
     process_noise_share: Share = 0.35
-    """Share of an input-aware map's trajectories with process noise, each of its own level, up to the system's."""
+    """Share of an input-aware map's trajectories with process noise, up to the system's; 0: no level is an input."""
     measurement_noise_max: Levels = 1.0
     """Largest standard deviation of the measurement noise that a map is trained for, of all outputs or of each."""
     noise_free_share: Share = 0.2

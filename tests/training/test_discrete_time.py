@@ -31,11 +31,6 @@ def test_a_step_in_closed_form_is_the_integration():
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-def test_another_interval_is_refused():
-    with pytest.raises(ValueError, match=r"steps of dt = 1\.0 s"):
-        kkl_gym.KKLEnv(Henon(), dt=0.01)
-
-
 def test_the_kalman_filter_follows_a_map_as_it_follows_its_integration():
     y, u = np.random.default_rng(0).normal(size=(60, 2, 1)), np.random.default_rng(1).uniform(-0.5, 0.5, (60, 2, 1))
     found = []

@@ -51,14 +51,7 @@ def test_typical_rate():
         def rate(self, x):
             return 0.0
 
-    class Growing(Oscillator):
-        name = "growing"
-
-        def rate(self, x):
-            return 3.0 + x[0]
-
     assert Oscillator().typical_rate == pytest.approx(np.sqrt(2), rel=1e-6)
-    assert Growing().typical_rate == pytest.approx(3.0, abs=0.1)
     with pytest.raises(ValueError, match=r"still\.rate\(x\) is 0\.0"):
         Still().typical_rate  # noqa: B018
 

@@ -9,7 +9,6 @@ import torch
 from kinked_systems import SYSTEMS as KINKED
 from linear_system import Autonomous, C, F, Oscillator, exact_observer, sylvester
 from quadrature import backward_quadrature
-from random_artifacts import random_artifact
 from small_runs import CPU, toy
 from wrong_systems import Branching, Late
 
@@ -148,20 +147,6 @@ def test_the_residual_is_that_of_the_equation():
     assert np.allclose(residual(wrong, Oscillator(), x), expected, atol=1e-5)
     with pytest.raises(ValueError, match="no forward map"):
         residual(dataclasses.replace(exact, forward=None), Oscillator(), x)
-
-
-def test_the_residual_is_the_same_in_training_and_in_a_certificate():
-    system = get_system("rossler")
-    artifact = random_artifact("rossler", inputs=False, age=False, forward=True)
-    linear, rng = artifact.filter, np.random.default_rng(0)
-    x = rng.uniform(*system.box(), (50, 3))
-    torch.manual_seed(0)
-    pairs = x, rng.normal(size=(50, linear.size))
-    problem = ForwardProblem(system, linear, toy(system, "spinn"), pairs=pairs, points=x, device=CPU)
-    found, speed = problem.equation.residual(problem.network, torch.as_tensor(x, dtype=torch.float32))
-    expected = residual(dataclasses.replace(artifact, forward=problem.forward_map()), system, x)
-    np.testing.assert_allclose(found.detach(), expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
-    np.testing.assert_allclose(speed, np.linalg.norm(system.drift(x) / problem.scale.scale, axis=1), rtol=1e-5)
 
 
 @pytest.mark.parametrize("activation", ["tanh", "silu"])
