@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.special import gammaincinv
 
 from kkl_gym.system import System
@@ -153,6 +152,8 @@ class _Calibration:
 
     def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
         """Squared distances (levels, ages, n) of the estimates' errors; extremes (3, levels, n, ny) of residuals."""
+        from scipy.signal import lfilter  # takes half a second to import
+
         runs, pace = self.runs, self.source.pace
         distances = np.full((len(LEVELS), len(self.ages), runs.x.shape[1]), np.nan)
         extremes = np.zeros((3, len(LEVELS), *runs.y.shape[1:]))

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from training import markdown
+from training import files
 from training.commands.options import NoiseLevel, Observers, OwnPolicy, OwnSystem, read_observers, read_policy
 from training.evaluation.levels import beyond, level_for, show_level
 from training.figures import drawing
@@ -191,7 +191,7 @@ def page(certificates: "Sequence[Certificate]") -> str:
         for one in certificates
     )
     head = f"Measurement noise {'; '.join(noise)}; {certificates[0].samples} samples along the motion of the first.\n\n"
-    return head + "\n".join(markdown.table(["", *(one.observer for one in certificates)], rows)) + "\n"
+    return head + "\n".join(files.table(["", *(one.observer for one in certificates)], rows)) + "\n"
 
 
 def _sections(certificates: "Sequence[Certificate]") -> list[list[list[str]]]:
