@@ -32,6 +32,7 @@ from training.agents.agent import Agent, find
 from training.agents.play import Episodes, play
 from training.agents.seeds import agent_evaluation_seed
 from training.agents.tasks import Task
+from training.calibration import chi_square
 from training.commands import demo
 from training.commands.options import shown
 from training.commands.portraits import animate
@@ -41,7 +42,6 @@ from training.evaluation.faults import FAULTS
 from training.evaluation.metrics import percentage_error
 from training.figures import ALARM, ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
 from training.files import write
-from training.lessons.calibrate import chi_square
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from rich.console import Console
+from training.files import table
 
 from kkl_gym.system import Box, Components, System
 from training.files import write
-from training.markdown import table
 from training.progress import LOG, progress_bars
 
 if TYPE_CHECKING:

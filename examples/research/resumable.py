@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from rich.console import Console
 
 from examples.research.parallel import engine
-from training.jobs import check_identity, claimed_job
+from training.files import check_identity, claimed_job
 from training.progress import LOG, ProgressBars, progress_bars
 
 

@@ -18,8 +18,7 @@ from examples.research.resumable import Job
 from kkl_gym.systems import get_system
 from observers.storage import explained
 from training import checkpoints
-from training.files import write
-from training.jobs import describe
+from training.files import describe, write
 
 FAILED = 200.0  # the largest SMAPE, for a configuration whose training diverges
 REVISION = 9  # rises with every change of the shipped methods: results from before are not reused

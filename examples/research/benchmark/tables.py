@@ -12,8 +12,7 @@ import pandas as pd
 
 from training.evaluation.levels import read_level, show_level
 from training.figures import save, style
-from training.files import write
-from training.markdown import table
+from training.files import table, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

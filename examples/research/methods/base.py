@@ -15,9 +15,9 @@ from kkl_gym.system import System
 from observers import storage
 from observers.estimator import Estimator
 from training.evaluation.levels import Level
-from training.jobs import describe
-from training.lessons.run import Loss, Stage, optimise
+from training.files import describe
 from training.progress import progress_bars
+from training.run import Loss, Stage, optimise
 from training.seeds import Stream, generator
 from training.trajectories.motions import recording_ages, trajectories
 

@@ -14,9 +14,9 @@ from observers.estimator import Estimator
 from observers.names import resolve
 from training.config import Config
 from training.evaluation.levels import Level
+from training.lessons import train
 from training.presets import preset
 from training.spectrum import evenly_spaced
-from training.train_observer import train
 
 # Intervals of the eigenvalues of A in 1/s among which methods with a real spectrum choose; the first is the paper's.
 SPECTRA = ((-3.0, -1.5), (-8.0, -1.0), (-20.0, -2.0))
