@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from training.presets import preset
     from training.rollouts import learn
     from training.rollouts.callback import KKLTrainingCallback
+    from training.sources import Source
     from training.sources.recorded import RecordedSource, recorded_preset
     from training.sources.simulated import SimulatedSource
-    from training.sources.source import Source
     from training.train_observer import Result, train
 
 __all__ = [
@@ -60,7 +60,7 @@ _MODULES = {
     "Result": "train_observer",
     "Run": "lessons.run",
     "SimulatedSource": "sources.simulated",
-    "Source": "sources.source",
+    "Source": "sources",
     "TorchMemory": "export.torch_memory",
     "TorchObserver": "export.torch_observer",
     "adapt": "identification.learning",

@@ -11,8 +11,7 @@ from kkl_gym.system import System
 from training.maps.coordinates import settling_time
 from training.seeds import Stream, generator
 from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
-from training.trajectories.filtering import filter_states
-from training.trajectories.motions import recording_ages
+from training.trajectories.motions import filter_states, recording_ages
 
 SMOOTH = 0.85  # least exponent of a smooth T: differences in z fall as distance^0.85 where neighbours come closer
 MOTIONS = 300  # that are followed

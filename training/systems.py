@@ -12,7 +12,7 @@ import numpy as np
 from kkl_gym.loading import load_function
 from kkl_gym.system import System
 from training.spectrum import evenly_spaced
-from training.trajectories.policies import Controller, checked_policy, linear_quadratic
+from training.trajectories.motions import Controller, checked_policy, linear_quadratic
 
 
 @dataclass(frozen=True)

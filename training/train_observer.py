@@ -24,8 +24,8 @@ from training.lessons.run import Run
 from training.presets import preset
 from training.progress import ProgressBars
 from training.smoothness import check_continuous
+from training.sources import Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
-from training.sources.source import Source, TooFewRunsError
 
 
 @dataclass(frozen=True)

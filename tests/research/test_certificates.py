@@ -25,7 +25,7 @@ from kkl_gym.simulate import simulate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from observers.names import resolve
 from training.maps.coordinates import stationary_covariance
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 A, B = np.diag([-1.0, -2.5, -4.0]), np.ones((3, 1))
 M = sylvester(A, B)

@@ -10,7 +10,7 @@ from training.agents.tasks import TASKS, TOLERANCE, control_task, get_task, scor
 from training.presets import preset
 from training.systems import PROFILES, Profile, controller, profile
 from training.trajectories.equations import linearised
-from training.trajectories.policies import linear_quadratic
+from training.trajectories.motions import linear_quadratic
 
 
 def nothing(obs):

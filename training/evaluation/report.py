@@ -17,8 +17,8 @@ from training.evaluation.levels import Level, show_level
 from training.figures import ESTIMATE, TRUTH, drawing
 from training.lessons.calibrate import chi_square, squared_distance
 from training.maps.forward import residual
+from training.sources import Runs, Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
-from training.sources.source import Runs, Source, TooFewRunsError
 from training.train_observer import Result
 
 RUNS = 100  # simulated motions

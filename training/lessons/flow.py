@@ -8,7 +8,7 @@ from observers import Flow, Motion
 from training.lessons.run import Run
 from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
-from training.sources.source import OF_MEDIAN, Increments, Source
+from training.sources import OF_MEDIAN, Increments, Source
 
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
 LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative

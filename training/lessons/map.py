@@ -14,8 +14,8 @@ from training.maps.forward import ForwardProblem, transients, truncation_step
 from training.maps.inverse import ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
 from training.maps.networks import Network, averaged, on_torch
 from training.seeds import Stream, generator
+from training.sources import Pairs, Source
 from training.sources.simulated import SimulatedSource
-from training.sources.source import Pairs, Source
 from training.spectrum import Spectrum
 
 

@@ -22,7 +22,7 @@ from observers.checks import noise_levels
 from training.evaluation.levels import Level, level_for
 from training.evaluation.metrics import nrmse
 from training.seeds import Stream, generator
-from training.trajectories.policies import Controller
+from training.trajectories.motions import Controller
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from examples.research.certificates.smooth import Smooth
+from examples.research.derivatives import evaluate, jacobian
 from kkl_gym.system import System
-from training.trajectories.equations import evaluate, jacobian
 
 # Least and greatest slope of each activation, rounded outwards; those of x sigmoid(x) are where its second derivative
 # vanishes, at |x| = 2.39936.

@@ -10,9 +10,7 @@ from kkl_gym.system import System
 from observers import Artifact
 from training.evaluation.levels import Level
 from training.seeds import Stream, generator
-from training.trajectories.filtering import filter_states
-from training.trajectories.motions import draw_process_noise, under_policy
-from training.trajectories.policies import Controller
+from training.trajectories.motions import Controller, draw_process_noise, filter_states, under_policy
 
 SETTLED = 1e-4  # part of the filter's start that is left where recording begins
 RECORDED = 30.0  # seconds of each trajectory, at the pace of the shipped systems

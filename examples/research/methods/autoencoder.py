@@ -18,7 +18,7 @@ from training.maps.forward import on_tensors
 from training.maps.networks import Network, tensor
 from training.spectrum import Spectrum
 from training.trajectories.equations import output_matrix
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 BATCH = 512
 LEARNING_RATE = 1e-3  # the authors'; at several times that the PDE residual jumps

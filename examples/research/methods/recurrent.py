@@ -10,7 +10,7 @@ from observers import LinearFilter
 from training.evaluation.levels import Level
 from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 TRAJECTORIES_PER_BATCH = 128
 AGES_PER_BATCH = 32

@@ -8,8 +8,8 @@ from tracking import exact_equations, linear_motion
 from observers import KKLObserver
 from training import Config, Run, learn_flow, learn_map, train
 from training.maps.coordinates import settling_time
-from training.sources.source import Increments, Pairs, Runs
-from training.trajectories.filtering import filter_states
+from training.sources import Increments, Pairs, Runs
+from training.trajectories.motions import filter_states
 
 DT, NOISE = 0.05, 0.1
 PHI = np.array([[np.cos(DT), np.sin(DT)], [-np.sin(DT), np.cos(DT)]])

@@ -13,6 +13,7 @@ from random_artifacts import random_artifact
 from small_runs import CPU
 from wrong_systems import Branching, Late
 
+from examples.research.derivatives import evaluate, jacobian
 from kkl_gym import EquationError, ReverseDuffing, get_system
 from kkl_gym.simulate import simulate
 from kkl_gym.system import on_states
@@ -22,8 +23,7 @@ from training.maps.coordinates import StateScale
 from training.maps.forward import ForwardProblem, along, on_tensors, residual, transients, truncation_step
 from training.maps.networks import Network, from_mlp
 from training.spectrum import Spectrum
-from training.trajectories.equations import evaluate, jacobian
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 
 def test_truncation_leaves_epsilon_of_any_start():

@@ -25,7 +25,7 @@ def test_episodes_are_cut_and_the_oldest_are_forgotten(spy):
     assert records[1].y[0, 0] == 3 * LONGEST == records[0].y[-1, 0]
     np.testing.assert_allclose(records[0].u[:-1, 0], 0.1 * records[0].y[1:, 0])
     gathering.add(0, sample(3 * LONGEST + 3))
-    assert len(gathering.records()[0][-1].t) == 2
+    assert len(gathering.records()[0][-1].t) == 4
 
 
 def test_pieces_have_their_role_for_good(spy):

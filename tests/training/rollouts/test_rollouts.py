@@ -82,10 +82,10 @@ def test_the_same_seed_plays_the_same_until_episodes_or_steps_are_played(drift):
     ("changes", "told"),
     [
         ({"measured": ["far"]}, r"names 'far', but an observation of Drift-v0 is goal\[0\], goal\[1\], place; an"),
-        ({"measured": []}, "which entries of the observation are measured"),
-        ({"measured": ["info[speed]"]}, r"episode 0: info\[speed\] is not there after the reset"),
+        ({"measured": []}, "name the measured entries of the observation"),
+        ({"measured": ["info[speed]"]}, r"episode 0: info\[speed\] is missing after the reset"),
         ({"hidden": ["info[height]"]}, "info has no 'height'"),
-        ({"steps": None}, "say how much to record"),
+        ({"steps": None}, "give the amount to record"),
         ({"seed": -1}, "seed must be"),
     ],
 )
@@ -196,7 +196,7 @@ def test_learns_an_observer_that_fits_the_environment(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"hidden": []}, "say which signals are hidden"),
+        ({"hidden": []}, "name the hidden signals"),
         ({"inverse_stepz": 3}, "inverse_stepz"),
         ({"width": -1}, "width"),
         ({"out": "used"}, "holds the checkpoints of a run"),

@@ -16,7 +16,8 @@ from training import RecordedSource, recorded_preset, train
 from training.lessons.calibrate import chi_square, squared_distance
 from training.maps.networks import Network, averaged
 from training.records import Record, resampled
-from training.sources.recorded import check_plant, linear_output, recorded_errors, signal_rate, split
+from training.rollouts.callback import check_plant
+from training.sources.recorded import linear_output, recorded_errors, signal_rate, split
 
 CPU, NOISE, DT = torch.device("cpu"), 0.1, 0.05
 A = np.array([[np.cos(DT), np.sin(DT)], [-np.sin(DT), np.cos(DT)]])

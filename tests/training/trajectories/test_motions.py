@@ -16,24 +16,19 @@ from training.trajectories.motions import (
     KINDS,
     Motions,
     random_inputs,
-    record,
     recording_ages,
-    trajectories,
 )
 
 
 def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     system, n = ReverseDuffing(), 400
-    (x, u, level), *rest = trajectories(
-        system, n=n, steps=10, dt=0.01, rng=np.random.default_rng(0), motions=Motions(lead_in_share=0.5)
-    )
+    x, u, level, _ = Motions(system, 0.01, 10, lead_in_share=0.5).drawn(n, np.random.default_rng(0))
     low, high = system.box()
     inside = ((x[0] >= low) & (x[0] <= high)).all(-1)
-    assert not rest
     assert not level.any()
     assert u.shape == (10, n, 0)
-    assert inside[200:].all()
-    assert 5 < (~inside[:200]).sum() < 150
+    assert inside[::2].all()
+    assert 5 < (~inside[1::2]).sum() < 150
 
 
 def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
@@ -44,14 +39,8 @@ def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
         return simulate(*arguments, w=w, **named)
 
     monkeypatch.setattr(training.trajectories.motions, "simulate", spy)
-    (x, u, level), *_ = trajectories(
-        system,
-        n=n,
-        steps=50,
-        dt=0.01,
-        rng=np.random.default_rng(0),
-        motions=Motions(kinds=("steps",), process_noise_share=0.25),
-    )
+    motions = Motions(system, 0.01, 50, ("steps",), process_noise_share=0.25)
+    x, u, level, _ = motions.drawn(n, np.random.default_rng(0))
     (w,) = seen
     assert np.array_equal(x, simulate(system, x[0], 50, 0.01, u=u, w=w))
     relative = w / (system.process_noise * np.array(system.scale))
@@ -78,14 +67,12 @@ def test_recording_ages_cover_start_transient_and_end():
 
 def test_most_motions_start_in_a_larger_box_where_one_is_asked_for():
     system = VanDerPol()
-    motions = Motions(box_factor=2.0)
-    rng = np.random.default_rng(0)
-    x = np.concatenate(
-        [part[0] for part, *_ in trajectories(system, n=2000, steps=1, dt=0.01, rng=rng, motions=motions)]
-    )
-    relative = np.abs(x) / np.array(system.X)[:, 1]
+    x, _, _, near = Motions(system, 0.01, 1, box_factor=2.0).drawn(2000, np.random.default_rng(0))
+    relative = np.abs(x[0]) / np.array(system.X)[:, 1]
     assert relative.max() == pytest.approx(2.0, abs=0.02)
     assert (relative <= 1).all(1).mean() == pytest.approx(0.4 + 0.6 / 4, abs=0.04)
+    assert near.mean() == pytest.approx(0.4, abs=0.04)
+    assert (relative[near] <= 1).all()
 
 
 def test_recording_gives_up_on_a_system_that_always_escapes():
@@ -98,7 +85,7 @@ def test_recording_gives_up_on_a_system_that_always_escapes():
 
     linear = LinearFilter(np.diag([-1.0]), np.ones((1, 1)), 0.01)
     with pytest.raises(ValueError, match="stayed within bounds"):
-        record(Runaway(), linear, n=5, steps=200, ages=np.array([0]), rng=np.random.default_rng(0), motions=Motions())
+        Motions(Runaway(), 0.01, 200).beside(linear, np.array([0]), 5, np.random.default_rng(0))
 
 
 @dataclass(frozen=True)
@@ -121,32 +108,25 @@ class Integrator(System):
         return 0.0
 
 
-def together(chunks):
-    """States, inputs and levels of all chunks, trajectories first."""
-    x, u, level = zip(*chunks, strict=True)
-    return np.concatenate(x, 1).swapaxes(0, 1), np.concatenate(u, 1).swapaxes(0, 1), np.concatenate(level)
-
-
 def test_what_escapes_is_replaced_by_its_like(monkeypatch):
     n = 57
     monkeypatch.setattr(training.trajectories.motions, "CHUNK", 24)
-    motions, tried = Motions(kinds=KINDS), []
+    tried = []
 
     def spy(system, x0, *arguments, **named):
         tried.append(len(x0))
         return simulate(system, x0, *arguments, **named)
 
     monkeypatch.setattr(training.trajectories.motions, "simulate", spy)
-    x, u, level = together(
-        trajectories(Integrator(), n=n, steps=200, dt=0.01, rng=np.random.default_rng(0), motions=motions)
-    )
+    x, u, level, _ = Motions(Integrator(), 0.01, 200, KINDS).drawn(n, np.random.default_rng(0))
+    u = u.swapaxes(0, 1)
     assert sum(tried) > 1.2 * n  # so many escaped that the kinds of those that stayed are others
-    assert x.shape == (n, 201, 1)
+    assert x.shape == (201, n, 1)
     assert (np.abs(x) <= 0.6).all()
     assert not level.any()
     different = np.array([len(np.unique(row)) for row in u[..., 0]])
     kinds = np.where((u == 0).all((1, 2)), "zero", np.where(different > 100, "sine", "steps"))
-    expected = [KINDS[row % 4] for chunk in range(0, n, 24) for row in range(min(24, n - chunk))]
+    expected = [KINDS[row % 4] for row in range(n)]
     for kind in ("zero", "steps", "sine"):
         assert (kinds == kind).sum() == expected.count(kind)
 
@@ -154,8 +134,8 @@ def test_what_escapes_is_replaced_by_its_like(monkeypatch):
 def test_parts_of_a_chunk_are_told(monkeypatch):
     monkeypatch.setattr(training.trajectories.motions, "CHUNK", 10)
     linear, told = LinearFilter(np.diag([-1.0, -2.0]), np.ones((2, 1)), 0.01), []
-    rng, ages = np.random.default_rng(0), recording_ages(100, 10)
-    record(Oscillator(), linear, n=15, steps=100, ages=ages, rng=rng, motions=Motions(), report=told.append)
+    motions = Motions(Oscillator(), 0.01, 100)
+    motions.beside(linear, recording_ages(100, 10), 15, np.random.default_rng(0), told.append)
     assert told == [0, 5, 10, 10, 12.5, 15]
 
 

@@ -10,11 +10,11 @@ import pytest
 import sympy
 from linear_system import Oscillator, TwoUnits
 
-from kkl_gym import System
+from kkl_gym import System, get_system
 from kkl_gym.elementary import abs as absolute
 from kkl_gym.elementary import atan2, clip, cos, exp, log, maximum, minimum, sign, sin, sqrt, tan, tanh, where
 from observers import Expression
-from training.trajectories.equations import output_expression
+from training.trajectories.equations import output_expression, output_matrix
 
 
 @dataclass(frozen=True)
@@ -83,3 +83,13 @@ def test_outputs_that_cannot_be_written_down(h, match):
     with pytest.raises(ValueError, match=r"observer of 'odd' cannot hold h\(x\)") as raised:
         output_expression(kind())
     assert re.search(match, str(raised.value))
+
+
+def test_output_matrix_of_linear_and_other_outputs():
+    np.testing.assert_array_equal(output_matrix(get_system("rossler")), [[0.0, 1.0, 0.0]])
+    for h, X in (
+        (lambda self, x: (x[0] * x[0],), ((-1, 1), (-1, 1))),
+        (lambda self, x: (x[0] * x[0],), ((-1e-13, 1e-13), (-1e-13, 1e-13))),
+        (lambda self, x: (x[0] / x[1],), ((1, 2), (1, 2))),
+    ):
+        assert output_matrix(type("Odd", (Oscillator,), {"name": "odd", "h": h, "X": X})()) is None

@@ -1,5 +1,7 @@
 """Motions under a policy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from linear_system import Autonomous
@@ -7,7 +9,7 @@ from unstable_system import Falling
 
 from kkl_gym.simulate import simulate
 from training.systems import controller, named_policy
-from training.trajectories.motions import POLICYS_OWN, Motions, trajectories, under_policy
+from training.trajectories.motions import POLICYS_OWN, Motions, under_policy
 
 SYSTEM = Falling()
 
@@ -50,13 +52,11 @@ def test_a_policy_that_fails_on_the_way_says_where(tmp_path):
 
 
 def test_an_unstable_plant_is_held_by_a_policy_alone():
-    sizes = {"n": 30, "steps": 1000, "dt": SYSTEM.dt}
+    free, rng = Motions(SYSTEM, SYSTEM.dt, 1000, ("steps",), process_noise_share=0.5), np.random.default_rng(0)
     with pytest.raises(ValueError, match="--policy"):
-        list(trajectories(SYSTEM, **{**sizes, "n": 120}, rng=np.random.default_rng(0), motions=Motions(("steps",))))
-    motions = Motions(("steps",), process_noise_share=0.5, policy=controller(SYSTEM))
-    found = list(trajectories(SYSTEM, **sizes, rng=np.random.default_rng(0), motions=motions))
-    assert sum(x.shape[1] for x, _, _ in found) == 30
-    (x, u, level), *_ = found
+        free.drawn(120, rng)
+    x, u, level, _ = replace(free, policy=controller(SYSTEM)).drawn(30, rng)
+    assert x.shape[1] == 30
     np.testing.assert_array_equal((u == exact(x)).all((0, 2)), np.arange(x.shape[1]) % POLICYS_OWN == 0)
     assert level.any()
 
