@@ -1,6 +1,8 @@
 """Checks of well-formed records: units, lengths, signals that do not move, steps of time."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -21,28 +23,31 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
     if not records:
         raise ValueError("there is no record")
     first = records[0]
+    names = {role: getattr(first.signals, role) for role in ROLES.values()}
     for record in records[1:]:
-        for role in ROLES.values():
-            here, there = (", ".join(getattr(each.signals, role)) or "none" for each in (record, first))
-            if here != there:
-                raise ValueError(f"{record.name}: {role} are columns {here}, but {there} in {first.name}")
-        if record.environment != first.environment:
-            here, there = (
-                "no known environment" if env is None else f"{env['id']} with arguments {env['kwargs']}"
-                for env in (record.environment, first.environment)
-            )
-            raise ValueError(
-                f"{record.name} is of {here}, but {first.name} of {there}: one observer serves one of them"
-            )
+        check_alike(record, names, first.environment, first.name)
     if system is None:
         return
-    for role, count in {"measured": system.ny, "inputs": system.nu, "hidden": system.nx}.items():
-        names = getattr(first.signals, role)
-        if len(names) != count and (names or role == "measured"):
+    for role, count in zip(ROLES.values(), (system.ny, system.nu, system.nx)):
+        if len(names[role]) != count and (names[role] or role == "measured"):
             raise ValueError(
-                f"{first.name}: {system.name} has {count} {role}, but the columns are {', '.join(names) or 'none'}; "
-                f"name others by --{role}"
+                f"{first.name}: {system.name} has {count} {role}, but the columns are "
+                f"{', '.join(names[role]) or 'none'}; name others by --{role}"
             )
+
+
+def check_alike(record: Record, names: Mapping[str, Sequence[str]], environment: Any, other: str) -> None:
+    """Raise ValueError unless a record has the signals ``names`` by role and is of an environment, as ``other`` is."""
+    for role, there in names.items():
+        if (here := getattr(record.signals, role)) != tuple(there):
+            here, there = (", ".join(each) or "none" for each in (here, there))
+            raise ValueError(f"{record.name}: {role} are columns {here}, but {there} in {other}")
+    if record.environment != environment:
+        here, there = (
+            "no known environment" if env is None else f"{env['id']} with arguments {env['kwargs']}"
+            for env in (record.environment, environment)
+        )
+        raise ValueError(f"{record.name} is of {here}, but {other} of {there}: one observer serves one of them")
 
 
 def check_motion(records: Sequence[Record], warn: Warn) -> None:
@@ -58,27 +63,26 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
                 f"{records[0].name}: column {column}: {value:g} in all rows and all files: nothing can be learned from "
                 "a signal that never moves"
             )
-        still, wrapped, marked = list[str](), list[str](), list[str]()
+        texts = defaultdict[str, list[str]](list)
         for record, each, width in zip(records, values, ranges):
-            jumps = abs(np.diff(each))
+            where, jumps = f"{record.name}: column {column}", abs(np.diff(each))
             turns = np.flatnonzero((jumps > least) & (jumps < most))
             if any(ranges) and not width:
-                still.append(f"{record.name}: column {column} never moves")
+                texts["still"].append(f"{where} never moves")
             if len(turns) and width < most:
-                wrapped.append(
-                    f"{record.name}: column {column}, row {turns[0] + 2}: a jump by a whole turn, as of an angle that "
-                    f"is wrapped; take cos({column}) and sin({column}), or unwrap it"
+                texts["wrapped"].append(
+                    f"{where}, row {turns[0] + 2}: a jump by a whole turn, as of an angle that is wrapped; take "
+                    f"cos({column}) and sin({column}), or unwrap it"
                 )
             for mark in (np.nanmin(each), np.nanmax(each)):
                 rest = each[~np.isnan(each) & (each != mark)]
                 if len(rest) and abs(rest - mark).min() > FAR_OFF * np.ptp(rest) > 0:
-                    marked.append(
-                        f"{record.name}: column {column}, row {np.flatnonzero(each == mark)[0] + 1}: {mark:g} is far "
-                        f"from all other values, {rest.min():.3g} to {rest.max():.3g}; if it marks missing samples, "
-                        "leave their cells empty"
+                    texts["marked"].append(
+                        f"{where}, row {np.flatnonzero(each == mark)[0] + 1}: {mark:g} is far from all other values, "
+                        f"{rest.min():.3g} to {rest.max():.3g}; if it marks missing samples, leave their cells empty"
                     )
-        for texts in (still, wrapped, marked):
-            _warn_of(texts, warn)
+        for alike in texts.values():
+            _warn_of(alike, warn)
 
 
 def check_units(records: Sequence[Record], system: System | None, warn: Warn) -> None:

@@ -23,6 +23,7 @@ from observers.samples import check_replacement
 from training.config import Config, settings_of
 from training.maps.coordinates import settling_time
 from training.records import Record, Signals, check_dt, resampled
+from training.records.checks import check_alike
 from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 from training.train_observer import train
@@ -170,7 +171,7 @@ class KKLTrainingCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         for row in range(self.training_env.num_envs):
-            self._begin(row, goes_on=True)
+            self._gathering.begin(row, {})  # an episode may be under way
 
     def _on_step(self) -> bool:
         self._add(self.locals["infos"], self.locals["dones"])
@@ -186,16 +187,13 @@ class KKLTrainingCallback(BaseCallback):
                 self._add(infos, dones)
             self._refit_where_possible()
 
-    def _begin(self, row: int, *, goes_on: bool = False) -> None:
-        self._gathering.begin(row, self.training_env.unwrapped.reset_infos[row], goes_on=goes_on)
-
     def _add(self, infos: Sequence[dict[str, Any]], dones: Sequence[bool] | np.ndarray) -> None:
         """Add a step of all environments; after a reset of all there are no ``infos``."""
         for row, done in enumerate(dones):
             if infos:
                 self._gathering.add(row, infos[row])
             if done:
-                self._begin(row)
+                self._gathering.begin(row, self.training_env.unwrapped.reset_infos[row])
 
     def _refit_where_possible(self) -> None:
         self._next = self._gathering.steps + self._every
@@ -283,7 +281,6 @@ class _Piece:
     x: list[np.ndarray] = field(default_factory=list)
     u: list[np.ndarray] = field(default_factory=list)
     sample: int = 0  # the number of the last one
-    goes_on: bool = False  # whether the episode may be further than its first sample
 
 
 class Gathering:
@@ -300,17 +297,19 @@ class Gathering:
         self._made = self.steps = 0
         check_dt(before, self._dt)
         for record in before:
-            check_plant(artifact, record)
+            if record.x is None:
+                raise ValueError(f"{record.name}: no hidden states were recorded; name them (--hidden)")
+            known = {role: here for role, here in names.items() if artifact.nu or role != "inputs"}
+            check_alike(record, known, self._environment, "the observer's rollouts")
             y, x, u = (getattr(resampled(record, self._dt), letter) for letter in "yxu")
             u = u if self._signals.inputs else np.zeros((len(y), 0))
             for begin in range(0, len(y) - 1, LONGEST):
                 rows, steps = slice(begin, begin + LONGEST + 1), slice(begin, min(begin + LONGEST, len(y) - 1))
                 self._pieces.append(_Piece(record.name, False, [*y[rows]], [*x[rows]], [*u[steps]]))
 
-    def begin(self, row: int, info: Mapping[str, Any], *, goes_on: bool = False) -> None:
-        """Take in the first sample of an episode."""
+    def begin(self, row: int, info: Mapping[str, Any]) -> None:
+        """Begin an episode, with its first sample where ``info`` holds it."""
         piece = self._new(row)
-        piece.goes_on = goes_on
         if self._outputs in info:
             piece.y, piece.x = [np.array(info[self._outputs])], [info.get("x", np.full(self._nx, np.nan))]
 
@@ -319,25 +318,22 @@ class Gathering:
         if missing := [key for key in (self._outputs, "u", "x", "sample") if key not in info]:
             raise ValueError(
                 f"info of environment {row} has no {', '.join(map(repr, missing))}: KKLObservation gives the true "
-                f"{', '.join(self._signals.hidden)} as 'x' where the environment inside shows them at each step, and "
-                "observers are refitted there alone; training.agents.SB3VecEnv passes on what its info_keys name, "
-                "('y', 'u', 'x', 'sample')"
+                f"{', '.join(self._signals.hidden)} as 'x' where the environment inside shows them at each step; "
+                "training.agents.SB3VecEnv passes on its info_keys, ('y', 'u', 'x', 'sample')"
             )
         piece, sample = self._open[row], int(info["sample"])
         if piece.y and sample != piece.sample + 1:
-            if not piece.goes_on:
-                raise ValueError(
-                    f"environment {row} showed sample {sample} after {piece.sample}: put wrappers that skip steps, "
-                    "such as ActionRepeat, inside KKLObservation while observers are refitted"
-                )
-            piece = self._new(row)
-        elif len(piece.u) == LONGEST:
+            raise ValueError(
+                f"environment {row} showed sample {sample} after {piece.sample}: put wrappers that skip steps, such as "
+                "ActionRepeat, inside KKLObservation while observers are refitted"
+            )
+        if len(piece.u) == LONGEST:
             piece = self._new(row, piece.y[-1:], piece.x[-1:])
         if piece.y:
             piece.u.append(info["u"])
         piece.y.append(np.array(info[self._outputs]))
         piece.x.append(info["x"])
-        piece.sample, piece.goes_on = sample, False
+        piece.sample = sample
         self.steps += 1
 
     def records(self) -> tuple[list[Record], list[Record]]:
@@ -363,28 +359,9 @@ class Gathering:
         return piece
 
     def _record(self, piece: _Piece) -> Record:
-        return Record(
-            piece.name,
-            self._dt * np.arange(len(piece.y)),
-            np.stack(piece.y),
-            np.stack([*piece.u, piece.u[-1]]) if self._signals.inputs else None,
-            np.stack(piece.x),
-            self._signals,
-            source=self._environment["id"],
-            environment=self._environment,
-        )
-
-
-def check_plant(artifact: Artifact, record: Record) -> None:
-    """Raise ValueError unless a record is of an observer's environment and signals, states among them."""
-    if record.x is None:
-        raise ValueError(f"{record.name}: no hidden states were recorded; name them (--hidden)")
-    for role in ("measured", "hidden", *(["inputs"] if artifact.nu else [])):
-        if (here := getattr(record.signals, role)) != (there := tuple((artifact.signals or {})[role])):
-            raise ValueError(f"{record.name}: {role} are {', '.join(here)}, but the observer's {', '.join(there)}")
-    if record.environment != artifact.environment:
-        ours = shown(artifact.environment)
-        raise ValueError(f"{record.name} is of {shown(record.environment)}, the observer of {ours}")
+        t, y, x = self._dt * np.arange(len(piece.y)), np.stack(piece.y), np.stack(piece.x)
+        u, env = np.stack([*piece.u, piece.u[-1]]) if self._signals.inputs else None, self._environment
+        return Record(piece.name, t, y, u, x, self._signals, env["id"], env)
 
 
 __all__ = ["KKLTrainingCallback", "Refit", "rehearsed"]

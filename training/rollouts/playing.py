@@ -5,6 +5,7 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -165,61 +166,55 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         keys = (key for names in chosen.values() for key in Reader(space, names, source=source).keys)
         self._keys = tuple(dict.fromkeys(keys))
         InputReader(env.action_space, acting(env.action_space), source=source)  # an error now, not after hours
-        self._played, self._steps = deque[Episode](), 0
+        self._played, self._steps = deque[_Steps](), 0
+        self._under_way: _Steps | None = None
         self._to_keep = math.inf if keep is None else integer("keep", keep, 1)
-        self._begin()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment; the episode before counts as far as it got."""
-        self._end()
         observation, info = self.env.reset(seed=seed, options=options)
-        self._keep(observation, info)
+        self._under_way = _Steps([self._copied(observation, info)])
+        self._played.append(self._under_way)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the environment; raises RuntimeError before a reset, or after :meth:`rollouts` without one."""
-        if not self._observations:
+        if self._under_way is None:
             raise RuntimeError("reset the environment before its first step")
-        self._actions.append(copy.deepcopy(action))
-        observation, reward, self._terminated, truncated, info = self.env.step(action)
-        self._keep(observation, info)
-        self._rewards.append(float(reward))
-        return observation, float(reward), self._terminated, truncated, info
+        made = copy.deepcopy(action)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._under_way.seen.append(self._copied(observation, info))
+        self._under_way.done.append((made, float(reward)))
+        self._under_way.terminated, self._steps = bool(terminated), self._steps + 1
+        while self._steps - len(self._played[0].done) >= self._to_keep:
+            self._steps -= len(self._played.popleft().done)
+        return observation, float(reward), terminated, truncated, info
 
     def rollouts(self, *, going_on: bool = False) -> Rollouts:
         """The episodes played; the one under way counts as far as it got, and ends there unless ``going_on``."""
-        if not going_on:
-            self._end()
-        env, episodes = self.env, [*self._played, *([self._episode()] if self._rewards else [])]
+        self._under_way = self._under_way if going_on else None
+        env, episodes = self.env, [self._episode(steps) for steps in self._played if steps.done]
         spaces = env.observation_space, env.action_space
         return Rollouts(self._name, self._identity, sampling_interval(env), *spaces, episodes, self._signals, env.spec)
 
-    def _begin(self) -> None:
-        self._observations, self._actions, self._infos = list[Any](), list[Any](), list[list[Any]]()
-        self._rewards, self._terminated = list[float](), False
+    def _copied(self, observation: Any, info: Mapping[str, Any]) -> Any:
+        """An observation and entries of ``info``: environments may write into the same array at each step."""
+        return copy.deepcopy((observation, [info.get(key) for key in self._keys]))
 
-    def _keep(self, observation: Any, info: Mapping[str, Any]) -> None:
-        # Environments and policies may write into the same array at each step.
-        self._observations.append(copy.deepcopy(observation))
-        self._infos.append([copy.deepcopy(info.get(key)) for key in self._keys])
+    def _episode(self, steps: "_Steps") -> Episode:
+        (observations, infos), (actions, rewards) = zip(*steps.seen), zip(*steps.done)
+        observations, actions = _stacked(self.observation_space, observations), _stacked(self.action_space, actions)
+        signals = {key: _numbers(list(values), key) for key, values in zip(self._keys, zip(*infos))}
+        return Episode(observations, actions, np.array(rewards), steps.terminated, signals)
 
-    def _end(self) -> None:
-        if self._rewards:
-            self._played.append(self._episode())
-            self._steps += len(self._rewards)
-            while self._steps - len(self._played[0].rewards) >= self._to_keep:
-                self._steps -= len(self._played.popleft().rewards)
-        self._begin()
 
-    def _episode(self) -> Episode:
-        """The episode under way, as far as it got."""
-        return Episode(
-            _stacked(self.env.observation_space, self._observations),
-            _stacked(self.env.action_space, self._actions),
-            np.array(self._rewards),
-            bool(self._terminated),
-            {key: _numbers(list(values), key) for key, values in zip(self._keys, zip(*self._infos))},
-        )
+@dataclass
+class _Steps:
+    """Observations with entries of ``info``, and actions with rewards, of an episode."""
+
+    seen: list[Any]
+    done: list[Any] = field(default_factory=list)
+    terminated: bool = False
 
 
 def _numbers(values: list[Any], key: str) -> np.ndarray:
@@ -234,7 +229,7 @@ def _numbers(values: list[Any], key: str) -> np.ndarray:
         raise ValueError(f"info[{key}] holds no number at each step, or not always as many") from None
 
 
-def _stacked(space: gym.Space[Any], values: list[Any]) -> Any:
+def _stacked(space: gym.Space[Any], values: Sequence[Any]) -> Any:
     """Values of a space as arrays, those of a Dict or Tuple in its structure."""
     empty: Any = create_empty_array(space, len(values), fn=np.zeros)
     return concatenate(space, values, empty)

@@ -99,8 +99,13 @@ class RecordedSource:
         self.pace = 1 / signal_rate(self.kept)
 
     def identity(self) -> dict[str, Any]:
-        """Name and fingerprints of the records."""
-        return {"name": self.name, "records": [record.fingerprint for record in self.records]}
+        """The name, and a fingerprint for each file, or for all episodes of a data set together."""
+        each = dict[str, str]()
+        for record in self.records:
+            name = record.source or Path(record.name).name
+            each[name] = each.get(name, "") + record.fingerprint
+        records = {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in each.items()}
+        return {"name": self.name, "records": records}
 
     def facts(self) -> dict[str, Any]:
         """Arguments of :class:`observers.Artifact`."""
@@ -177,7 +182,7 @@ class RecordedSource:
         """Errors on the records held out, relative to the signals' standard deviations."""
         errors = recorded_errors(artifact, self.held_out)
         return {
-            "records": fingerprints(self.records),
+            "records": self.identity()["records"],
             "held_out_errors": {name: error for name, error in errors.items() if math.isfinite(error)},
             "held_out_after": settling_time(artifact.filter),
         }
@@ -295,17 +300,6 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
         [record.part(slice(None, end)) for record, end in zip(records, ends)],
         [record.part(slice(end, None)) for record, end in zip(records, ends)],
     )
-
-
-def fingerprints(records: Sequence[Record]) -> dict[str, str]:
-    """A fingerprint for each file, or for all episodes of a data set together, by its name."""
-    each = dict[str, list[str]]()
-    for record in records:
-        each.setdefault(record.source or Path(record.name).name, []).append(record.fingerprint)
-    return {
-        name: one[0] if len(one) == 1 else hashlib.sha256("".join(one).encode()).hexdigest()[:16]
-        for name, one in each.items()
-    }
 
 
 def signal_rate(records: Sequence[Record]) -> float:

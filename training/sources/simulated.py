@@ -71,10 +71,8 @@ class SimulatedSource:
     def identity(self) -> dict[str, Any]:
         """The system, its equations included, and what else motions depend on."""
         system = self.system
-        identity = describe(system) | {
-            "process_noise": float(system.process_noise),
-            "scale": list(map(float, system.scale)),
-        }
+        noise = {"process_noise": float(system.process_noise), "scale": list(map(float, system.scale))}
+        identity = describe(system) | noise
         if self.ranges:
             identity["nominal_share"] = nominal_share(self.ranges)
         if self.policy:

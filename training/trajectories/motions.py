@@ -112,7 +112,7 @@ class Motions:
             part = partial(lambda before, count, k: report(before + k * count / steps), before, count)
             u = np.zeros((steps, count, 0))
             if self.kinds and not self.policy:
-                kinds = tuple(self.kinds[i % len(self.kinds)] for i in rows)
+                kinds = [self.kinds[i % len(self.kinds)] for i in rows]
                 u = random_inputs(system, count, steps, dt=self.dt, rng=rng, kinds=kinds)
             level = self._levels(count, rng)
             w = draw_process_noise(system, level, n=count, steps=steps, rng=rng) if level.any() else None
@@ -150,13 +150,10 @@ class Motions:
             x0[~near] = system.draw_starts(rng, int((~near).sum()), self.box_factor)
         led = np.floor((rows + 1) * share) > np.floor(rows * share)
         if system.nu and led.any():
-            count, seconds = int(led.sum()), (CONSTANT_LEAD_IN if self.lead_in_input else RANDOM_LEAD_IN) * system.pace
-            steps = round(seconds / self.dt)
-            if self.lead_in_input:
-                held = self.lead_in_input * rng.uniform(-1, 1, (count, system.nu)) * system.u_max
-                u = np.broadcast_to(held, (steps, *held.shape))
-            else:
-                u = random_inputs(system, count, steps, dt=self.dt, rng=rng, kinds=DRIVEN)
+            constant, u_max = self.lead_in_input, np.array(system.u_max)
+            steps = round((CONSTANT_LEAD_IN if constant else RANDOM_LEAD_IN) * system.pace / self.dt)
+            kinds, bounds = (("constant",), constant * u_max) if constant else (DRIVEN, u_max)
+            u = random_inputs(system, int(led.sum()), steps, dt=self.dt, rng=rng, kinds=kinds, bounds=bounds)
             end = simulate(system, x0[led], steps, self.dt, u=u)[-1]
             x0[led] = np.where(np.isfinite(end).all(-1)[:, None], end, x0[led])
         return x0, near
@@ -173,13 +170,11 @@ def filter_states(linear: LinearFilter, y: np.ndarray, u: np.ndarray, ages: np.n
     Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), held after the output of its row; returns (m, n, size).
     """
     z = linear.start(y[0])
-    out = np.empty((len(ages), *z.shape))
-    slot = {int(age): i for i, age in enumerate(ages)}
+    out, slots = np.empty((len(ages), *z.shape)), {int(age): i for i, age in enumerate(ages)}
     for k in range(len(y)):
-        if k > 0:
-            z = linear.advance(z, y[k - 1], u[k - 1], y[k])
-        if k in slot:
-            out[slot[k]] = z
+        z = linear.advance(z, y[k - 1], u[k - 1], y[k]) if k else z
+        if k in slots:
+            out[slots[k]] = z
     return out
 
 
@@ -190,27 +185,26 @@ def random_inputs(
     *,
     dt: float,
     rng: np.random.Generator,
-    kinds: tuple[str, ...] = KINDS,
-    bounds: Sequence[float] | None = None,
+    kinds: Sequence[str] = KINDS,
+    bounds: Sequence[float] | np.ndarray | None = None,
 ) -> np.ndarray:
     """Draw random signals (steps, n, k) within bounds (k,), by default those of the inputs; held between samples."""
     bounds = system.u_max if bounds is None else bounds
-    out = np.zeros((steps, n, len(bounds)))
-    t = np.arange(steps) * dt
-    for row in range(n):
-        kind = kinds[row % len(kinds)]
-        for j, bound in enumerate(bounds):
-            if kind in ("steps", "pulses"):
-                hold = system.pace * np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
-                changes = rng.random(steps) < min(1.0, dt / hold)
-                levels = rng.uniform(-bound, bound, steps + 1)
-                out[:, row, j] = levels[np.cumsum(changes)]
-                if kind == "pulses":
-                    out[rng.integers(steps + 1) :, row, j] = 0.0
-            elif kind == "sine":
-                amplitude, phase = rng.uniform(0, bound), rng.uniform(0, 2 * np.pi)
-                frequency = np.exp(rng.uniform(np.log(0.2), np.log(20.0))) / system.pace
-                out[:, row, j] = amplitude * np.sin(frequency * t + phase)
+    out, t = np.zeros((steps, n, len(bounds))), np.arange(steps) * dt
+    for row, j in np.ndindex(n, len(bounds)):
+        kind, bound = kinds[row % len(kinds)], bounds[j]
+        if kind in ("steps", "pulses"):
+            hold = system.pace * np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
+            changes = rng.random(steps) < min(1.0, dt / hold)
+            out[:, row, j] = rng.uniform(-bound, bound, steps + 1)[np.cumsum(changes)]
+            if kind == "pulses":
+                out[rng.integers(steps + 1) :, row, j] = 0.0
+        elif kind == "sine":
+            amplitude, phase = rng.uniform(0, bound), rng.uniform(0, 2 * np.pi)
+            frequency = np.exp(rng.uniform(np.log(0.2), np.log(20.0))) / system.pace
+            out[:, row, j] = amplitude * np.sin(frequency * t + phase)
+        elif kind == "constant":
+            out[:, row, j] = rng.uniform(-bound, bound)
     return out
 
 
@@ -245,21 +239,17 @@ def under_policy(
     """
     n, u_max = len(x0), np.array(system.u_max)
     signals = partial(random_inputs, system, n, steps, dt=dt, rng=rng, kinds=POLICY_KINDS)
-    error = signals(bounds=system.scale)
     least, largest = np.log(POLICY_ERROR)
-    error *= np.exp(rng.uniform(least, largest, n))[:, None]
-    exploration = signals(bounds=(1.0,) * system.nu)
-    exploration *= EXPLORATION * rng.random(n)[:, None]
+    error = signals(bounds=system.scale) * np.exp(rng.uniform(least, largest, n))[:, None]
+    exploration = signals(bounds=(1.0,) * system.nu) * EXPLORATION * rng.random(n)[:, None]
     error[:, own] = exploration[:, own] = 0.0
     u = np.zeros((steps, n, system.nu))
 
     def act(k: int, x: np.ndarray) -> np.ndarray:
         seen = np.where(np.isfinite(x), x, system.X_centre) + error[k]  # what has escaped may do anything
         action = policy(seen)
-        unknown = ~np.isfinite(action).all(-1)
-        if unknown.any():
-            at = int(unknown.argmax())
-            raise ValueError(f"the policy gives the action {action[at].tolist()} at x = {seen[at].tolist()}")
+        for row in np.flatnonzero(~np.isfinite(action).all(-1)):
+            raise ValueError(f"the policy gives the action {action[row].tolist()} at x = {seen[row].tolist()}")
         u[k] = np.clip(action + exploration[k], -1.0, 1.0) * u_max
         return u[k]
 
@@ -298,10 +288,9 @@ def checked_policy(policy: Controller, system: System, name: str) -> Controller:
         try:
             actions = np.asarray(policy(x), dtype=float)
         except Exception as error:  # whatever a user's function does wrong
-            line = user_line(error)
+            where = f" ({line})" if (line := user_line(error)) else ""
             raise ValueError(
-                f"the policy {name!r} fails on states of shape {x.shape}: {type(error).__name__}: {error}"
-                + (f" ({line})" if line else "")
+                f"the policy {name!r} fails on states of shape {x.shape}: {type(error).__name__}: {error}{where}"
             ) from error
         if actions.shape != (len(x), system.nu):
             raise ValueError(
@@ -312,12 +301,10 @@ def checked_policy(policy: Controller, system: System, name: str) -> Controller:
 
     x = system.draw_starts(np.random.default_rng(0), 20)
     actions = act(x)
-    wrong = ~(np.abs(actions) <= 1.0).all(-1)
-    if wrong.any():
-        at = int(wrong.argmax())
+    for row in np.flatnonzero(~(np.abs(actions) <= 1.0).all(-1)):
         raise ValueError(
             f"the policy {name!r} must give actions in [-1, 1], which stand for inputs up to u_max = {system.u_max}; "
-            f"at x = {x[at].tolist()} it gives {actions[at].tolist()}"
+            f"at x = {x[row].tolist()} it gives {actions[row].tolist()}"
         )
     return act
 

@@ -1,8 +1,5 @@
 """Motions that a source simulates, and the equations that it hands to a tracker."""
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
-
 import numpy as np
 import pytest
 from discrete_systems import Sampled
@@ -16,7 +13,6 @@ from kkl_gym.simulate import simulate
 from training import SimulatedSource
 from training.sources import simulated
 from training.sources.simulated import INTEGRATION_ERROR
-from training.trajectories.motions import Motions
 
 
 class Stiff(VanDerPol):
@@ -80,37 +76,11 @@ def test_motions_for_calibration_are_with_and_without_process_noise():
     np.testing.assert_array_equal(source.runs().x, runs.x)
 
 
-@dataclass(frozen=True)
-class Leaving(Autonomous):
-    name: ClassVar[str] = "leaving"
-    bounds: ClassVar = ((-1.02, 1.02), (-1.02, 1.02))  # which four in five from X stay within, and few from 2X
-
-
-def test_motions_that_leave_the_bounds_are_drawn_anew():
-    motions = Motions(Leaving(), 0.05, 200, levels=(0.0,), box_factor=2.0)
-    x, u, _, near = motions.drawn(50, np.random.default_rng(0))
-    assert x.shape == (201, 50, 2)
-    assert (u.shape, near.shape) == ((200, 50, 0), (50,))
-    assert np.isfinite(x).all()
-    with pytest.raises(ValueError, match=r"stayed within bounds"):
-        replace(motions, levels=(3.0,)).drawn(50, np.random.default_rng(0))
-
-
 def test_a_rate_of_zero_and_many_states_are_no_matter():
-    class Chain(System):
-        """Nine integrators, of which each is fed by the next."""
-
-        name = "chain"
-        X = ((-1, 1),) * 9
-        bounds = ((-1e9, 1e9),) * 9
-        dt = 0.1
-
-        def f(self, x):
-            return [*x[1:], 0.0]
-
-        def h(self, x):
-            return (x[0],)
-
-    source = SimulatedSource(Chain(), toy(Chain(), eigenvalues=(-1.0, -2.0)))
+    """Nine integrators, of which each is fed by the next."""
+    methods = {"f": lambda self, x: [*x[1:], 0.0], "h": lambda self, x: (x[0],)}
+    box = {"X": ((-1, 1),) * 9, "bounds": ((-1e9, 1e9),) * 9}
+    chain = type("Chain", (System,), {"name": "chain", "dt": 0.1, **box, **methods})()
+    source = SimulatedSource(chain, toy(chain, eigenvalues=(-1.0, -2.0)))
     assert source.equations().substeps == 1
     assert source.tracking()["covariance"].shape == (9, 9)

@@ -1,7 +1,6 @@
 """Outputs as data that say what the system says."""
 
 import math
-import re
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -71,18 +70,14 @@ def deep(x):
         (lambda self, x: (math.sin(x[0]),), r"test_output_expression\.py, line \d+.* kkl_gym\.elementary"),
         (lambda self, x: (x[0] if x[0] > 0 else x[1],), r"kkl_gym\.elementary\.where"),
         (lambda self, x: (sympy.sinh(x[0]) if isinstance(x[0], sympy.Basic) else np.sinh(x[0]),), "'sinh' is unknown"),
-        (
-            lambda self, x: (1e-13 * (x[0] if isinstance(x[0], sympy.Basic) else 2 * x[0]),),
-            "not the same on symbols as on arrays",
-        ),
+        (lambda self, x: (1e-13 * (1 + isinstance(x[0], sympy.Basic)) * x[0],), "not the same on symbols as on arrays"),
         (lambda self, x: deep(x), "at most 24 levels"),
     ],
 )
 def test_outputs_that_cannot_be_written_down(h, match):
     kind = type("Odd", (Oscillator,), {"name": "odd", "h": h})
-    with pytest.raises(ValueError, match=r"observer of 'odd' cannot hold h\(x\)") as raised:
+    with pytest.raises(ValueError, match=rf"(?s)observer of 'odd' cannot hold h\(x\).*{match}"):
         output_expression(kind())
-    assert re.search(match, str(raised.value))
 
 
 def test_output_matrix_of_linear_and_other_outputs():
