@@ -21,7 +21,7 @@ FAR_OFF = 10.0  # ranges of all other samples, between these and a value that ma
 def check_signals(records: Sequence[Record], system: System | None = None) -> None:
     """Raise ValueError unless all records have the same columns, and as many of them as a system has signals."""
     if not records:
-        raise ValueError("there is no record")
+        raise ValueError("no records are given")
     first = records[0]
     names = {role: getattr(first.signals, role) for role in ROLES.values()}
     for record in records[1:]:

@@ -56,7 +56,7 @@ def _read(path: Path, wanted: Signals) -> Record:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(
-            f"{path} is no record: its name must end in {', '.join(READERS)}, or be minari:ID of a data set"
+            f"{path} is not a record: its name must end in {', '.join(READERS)}, or be minari:ID of a data set"
         )
     if not path.is_file():  # to read a pipe may never end
         raise ValueError(f"{path} is a folder, a pipe or a device" if path.exists() else f"there is no file {path}")
@@ -144,7 +144,7 @@ def _numbers(values: Any, column: str) -> np.ndarray:
     if len(wrong := np.flatnonzero(numbers.isna() & values.notna())) or numbers.dtype.kind not in "fiu":
         value = values.iloc[wrong[0]] if len(wrong) else values.dtype
         hint = "; write decimals with a point" if "," in str(value) else ""
-        raise ValueError(f"column {column}, row {wrong[:1].sum() + 1}: {shown(value)} is no number{hint}")
+        raise ValueError(f"column {column}, row {wrong[:1].sum() + 1}: {shown(value)} is not a number{hint}")
     return np.asarray(numbers, dtype=float)
 
 
@@ -197,16 +197,18 @@ def _csv(path: Path) -> Columns:
 
     with path.open(encoding="utf-8-sig", newline="") as file:
         header = file.readline()
-    separator = max(SEPARATORS, key=re.sub('"[^"]*"', "", header).count)
-    names = [name.strip() for name in next(csv.reader([header], delimiter=separator, skipinitialspace=True), [])]
-    if not any(names):
-        raise ValueError("its first row must hold the names of the columns")
-    if twice := sorted({name for name in names if name and names.count(name) > 1}):
-        raise ValueError(f"more than one column {', '.join(twice)}")
-    layout: Any = {"sep": separator, "skipinitialspace": True, "na_values": MISSING, "encoding": "utf-8-sig"}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", pd.errors.ParserWarning)  # of rows that are longer than the header
-        frame = pd.read_csv(path, header=None, skiprows=1, names=range(len(names)), index_col=False, **layout)
+        separator = max(SEPARATORS, key=re.sub('"[^"]*"', "", header).count)
+        layout: Any = {"delimiter": separator, "skipinitialspace": True}
+        names = [name.strip() for name in next(csv.reader([header], **layout), [])]
+        if not any(names):
+            raise ValueError("its first row must hold the names of the columns")
+        if twice := sorted({name for name in names if name and names.count(name) > 1}):
+            raise ValueError(f"more than one column {', '.join(twice)}")
+        for row, cells in enumerate(csv.reader(file, **layout), 1):
+            if len(cells) not in (0, len(names)):  # pandas would fill or cut it
+                raise ValueError(f"row {row} has {len(cells)} cells, the header {len(names)}")
+    layout |= {"header": None, "skiprows": 1, "names": range(len(names)), "na_values": MISSING, "encoding": "utf-8-sig"}
+    frame = pd.read_csv(path, **layout)
     return {name: frame[i] for i, name in enumerate(names)}
 
 

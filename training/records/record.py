@@ -77,7 +77,7 @@ class Record:
         for letter, name, column in columns:
             missing, back = np.isnan(column), np.append(False, np.diff(self.t) <= 0)
             for wrong, why in (
-                (abs(column) > MAX_SAMPLE, "{0:g} is no sample"),
+                (abs(column) > MAX_SAMPLE, "{0:g} is not a valid sample"),
                 (missing & missing.all(), "no row holds a number"),
                 (missing & (letter in "tu"), "a number is missing, which may be in outputs and states alone"),
                 (back & (letter == "t"), "time must increase, but {0:g} comes after {1:g}"),

@@ -57,7 +57,7 @@ def learn(
     Returns
     -------
     Artifact
-        The observer, which tracks where what is measured is among the hidden signals or a sum of them;
+        The observer, which tracks where the measured signals are among the hidden ones or sums of them;
         ``training["held_out_errors"]`` are its errors on episodes that were not trained on.
 
     Raises

@@ -94,19 +94,9 @@ class KKLTrainingCallback(BaseCallback):
     Raises
     ------
     ValueError
-        If an argument makes no sense. At the beginning of the training, if an environment has no KKLObservation, an
+        If an argument is invalid. At the beginning of the training, if an environment has no KKLObservation, an
         observer that was not learned from rollouts, or another one than the others, or if a record is of another plant.
         At a step, if ``info`` lacks the hidden signals, or a wrapper skips samples.
-
-    Examples
-    --------
-    >>> import gymnasium as gym
-    >>> from kkl_gym import KKLObservation
-    >>> from stable_baselines3 import PPO
-    >>> from training import KKLTrainingCallback
-    >>> def learn(path):
-    ...     env = KKLObservation(gym.make("Pendulum-v1"), path)
-    ...     return PPO("MlpPolicy", env).learn(50_000, KKLTrainingCallback(every=5000, path="newer.safetensors"))
     """
 
     artifact: Artifact

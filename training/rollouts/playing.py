@@ -75,7 +75,9 @@ def _agent(name: str, path: Path, env: Env) -> Policy:
     libraries = (sb3_contrib, stable_baselines3)
     algorithms = {each.lower(): getattr(library, each) for library in libraries for each in library.__all__}
     if name.lower() not in algorithms:
-        raise ValueError(f"{name!r} is no algorithm of stable-baselines3 or sb3-contrib; name it as in ppo:FILE.zip")
+        raise ValueError(
+            f"{name!r} is not an algorithm of stable-baselines3 or sb3-contrib; name it as in ppo:FILE.zip"
+        )
     if not path.is_file():
         raise ValueError(f"there is no file {path}")
     agent = algorithms[name.lower()].load(path, device="cpu")
@@ -226,7 +228,7 @@ def _numbers(values: list[Any], key: str) -> np.ndarray:
     try:
         return np.array(values, dtype=float)
     except (TypeError, ValueError):
-        raise ValueError(f"info[{key}] holds no number at each step, or not always as many") from None
+        raise ValueError(f"info[{key}] is not a number at each step, or not of one shape") from None
 
 
 def _stacked(space: gym.Space[Any], values: Sequence[Any]) -> Any:

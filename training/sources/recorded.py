@@ -54,11 +54,11 @@ class RecordedSource:
     records : sequence of Record
         Records with hidden states, all of the same signals.
     config : Config
-        What concerns them: dt, samples, windows, held_out, inputs, arbitrary_zero, seed.
+        The settings read are dt, samples, windows, held_out, inputs, arbitrary_zero, seed.
     name : str
         Of the observer.
     held_out : sequence of Record, optional
-        What is not trained on; by default a share of the records.
+        Records that are not trained on; by default a share of ``records``.
     C : ndarray, shape (ny, nx), optional
         The output y = C x, where it is known; by default it is fitted.
     warn : callable, optional
@@ -114,7 +114,7 @@ class RecordedSource:
         facts["environment"] = self.records[0].environment
         try:
             return facts | {"C": linear_output(self.kept, self.C)[0]}
-        except ValueError:  # tracking() says why
+        except ValueError:  # tracking() raises it again, with the reason
             return facts
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
@@ -273,7 +273,7 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
     )
     still = [name for name, level in zip(records[0].signals.measured, levels) if not level]
     if still and "measurement_noise_max" not in given:
-        raise ValueError(f"{', '.join(still)} never changes: leave it out of what is measured")
+        raise ValueError(f"{', '.join(still)} never changes: leave it out of the measured signals")
     defaults = {
         "duration": max(50.0, dt),
         "eigenvalues": tuple(float(f"{value:.6g}") for value in spaced),
@@ -306,11 +306,11 @@ def signal_rate(records: Sequence[Record]) -> float:
     """How fast signals change, in 1/s: rms of the derivative over standard deviation, the median of those that move."""
     rates = list[float]()
     for letter in "yx":
-        found = [(getattr(record, letter), record.t) for record in records if getattr(record, letter) is not None]
-        if found:
-            slopes = np.concatenate([np.diff(values, axis=0) / np.diff(t)[:, None] for values, t in found])
+        signals = [(getattr(record, letter), record.t) for record in records if getattr(record, letter) is not None]
+        if signals:
+            slopes = np.concatenate([np.diff(values, axis=0) / np.diff(t)[:, None] for values, t in signals])
             change = np.sqrt(np.nansum(slopes**2, 0) / np.maximum(np.isfinite(slopes).sum(0), 1))
-            size = np.nanstd(np.concatenate([values for values, _ in found]), 0)
+            size = np.nanstd(np.concatenate([values for values, _ in signals]), 0)
             rates += (change[size > 0] / size[size > 0]).tolist()
     moving = [rate for rate in rates if rate > 0]
     if not moving:
@@ -370,7 +370,7 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
     if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
         raise ValueError(
             f"{', '.join(other)} is no sum of {', '.join(signals.hidden)} without an offset, with which a tracker "
-            "compares its samples: train with what is measured, in the same units, among the hidden signals"
+            "compares its samples: add the measured signals, in the same units, to the hidden ones"
         )
     return C, least
 

@@ -56,7 +56,7 @@ def output_facts(system: System) -> dict[str, Any]:
         return {"C": C}
     try:
         return {"h": output_expression(system)}
-    except ValueError:  # calibration says why
+    except ValueError:  # calibration raises it again, with the reason
         return {}
 
 

@@ -99,7 +99,7 @@ def test_environments_that_are_refused(drift, register):
     for env_id, options, message, names in (
         ("None-v0", {}, "cannot make 'None-v0'", {}),
         ("CartPole-v1", {"height": 2}, r"cannot make 'CartPole-v1'.*height", {}),
-        ("Drift-v0", {"text": True}, r"info\[speed\] holds no number", {}),
+        ("Drift-v0", {"text": True}, r"info\[speed\] is not a number", {}),
         ("Picture-v0", {}, r"is an image.*encoder", {"measured": ["0"], "hidden": ["1"]}),
     ):
         with pytest.raises(ValueError, match=message):
@@ -139,7 +139,7 @@ def test_policies_are_functions_or_agents_of_stable_baselines3(tmp_path, drift):
     assert roll_out(env, policy, measured=["0"], hidden=["1"], episodes=1).episodes[0].actions.shape[0] > 3
     for wrong, env_id, message in (
         (f"ppo:{path}", "Pendulum-v1", "trained on the observation space"),
-        (f"clever:{path}", "CartPole-v1", "'clever' is no algorithm"),
+        (f"clever:{path}", "CartPole-v1", "'clever' is not an algorithm"),
         ("ppo:none.zip", "CartPole-v1", "there is no file"),
         ("clever", "CartPole-v1", "a policy is random"),
         (3, "CartPole-v1", "a policy is random"),

@@ -102,7 +102,10 @@ def test_signals_that_are_not_among_the_hidden_ones_cannot_be_tracked(tmp_path):
 
 def test_without_enough_that_is_held_out_there_are_no_covariances():
     records = [both(seed, n=300) for seed in range(3)]
-    for share, reason in ((0.0, "held_out must be positive, got 0"), (0.03, "the records held out have 24 samples with")):
+    for share, reason in (
+        (0.0, "held_out must be positive, got 0"),
+        (0.03, "the records held out have 24 samples with"),
+    ):
         result, said = trained(records, held_out=share, inverse_steps=20, flow_steps=20)
         assert "does not track: " in said
         assert reason in said
