@@ -289,7 +289,7 @@ class Gathering:
         for record in before:
             if record.x is None:
                 raise ValueError(f"{record.name}: no hidden states were recorded; name them (--hidden)")
-            known = {role: here for role, here in names.items() if artifact.nu or role != "inputs"}
+            known = {role: names[role] for role in ROLES.values() if artifact.nu or role != "inputs"}
             check_alike(record, known, self._environment, "the observer's rollouts")
             y, x, u = (getattr(resampled(record, self._dt), letter) for letter in "yxu")
             u = u if self._signals.inputs else np.zeros((len(y), 0))

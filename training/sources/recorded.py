@@ -85,10 +85,9 @@ class RecordedSource:
         check_signals([*records, *(held_out or ())])
         check_dt(records, config.dt)
         self.records, self.config, self.name, self.C, signals = records, config, name, C, records[0].signals
-        if unknown := {*config.arbitrary_zero} - {*signals.measured}:
-            raise ValueError(
-                f"arbitrary_zero {sorted(unknown)} are not measured; measured are {', '.join(signals.measured)}"
-            )
+        if unknown := [name for name in config.arbitrary_zero if name not in signals.measured]:
+            measured = ", ".join(signals.measured)
+            raise ValueError(f"arbitrary_zero names {', '.join(map(repr, unknown))}; measured are {measured}")
         self.signals, self.nx, self.ny = signals, len(signals.hidden), len(signals.measured)
         self.nu, self.dt, self.process_noise = len(signals.inputs) * config.inputs, config.dt, 0.0
         self.linear = Spectrum(config.eigenvalues, config.pairs).filter(self.ny, config.dt, self.nu)

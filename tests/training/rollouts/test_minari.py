@@ -170,7 +170,7 @@ def test_record_and_train(tmp_path, capsys, monkeypatch):
     said = " ".join(capsys.readouterr().out.split())
     assert "6 episodes of 200 to 200 steps of 0.05 s" in said
     assert "kkl-gym train NAME --data minari:pendulum-v1/random-v0" in said
-    for wrong, message in ((record, "there is a data set"), ([*record, "--env-kwargs", "g"], "")):
+    for wrong, message in ((record, "there is a data set"), ([*record, "--env-kwargs", "g"], None)):
         with pytest.raises(SystemExit, match=message):
             main(wrong)
     train = "train swing --data minari:pendulum-v1/random-v0 --set inverse_steps=9 members=1 width=4 samples=4"
