@@ -207,8 +207,8 @@ def _csv(path: Path) -> Columns:
         for row, cells in enumerate(csv.reader(file, **layout), 1):
             if len(cells) not in (0, len(names)):  # pandas would fill or cut it
                 raise ValueError(f"row {row} has {len(cells)} cells, the header {len(names)}")
-    layout |= {"header": None, "skiprows": 1, "names": range(len(names)), "na_values": MISSING, "encoding": "utf-8-sig"}
-    frame = pd.read_csv(path, **layout)
+    layout |= {"header": None, "skiprows": 1, "names": range(len(names)), "na_values": MISSING}
+    frame = pd.read_csv(path, encoding="utf-8-sig", float_precision="round_trip", **layout)
     return {name: frame[i] for i, name in enumerate(names)}
 
 

@@ -58,8 +58,11 @@ class Spring:
 
     def increments(self, *, report):
         x = self.motions(500, 1, 2)
-        found = Increments(x[0], np.zeros((500, 0)), x[1] - x[0])
-        return found.part(slice(400)), found.part(slice(400, None))
+        parts = (slice(400), slice(400, None))
+        learned, judged = (
+            Increments(x[0, part], np.zeros((len(x[0, part]), 0)), (x[1] - x[0])[part]) for part in parts
+        )
+        return learned, judged
 
     def tracking(self):
         parts = vars(linear_motion())
