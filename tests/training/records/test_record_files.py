@@ -123,7 +123,6 @@ BAD_NPZ = {
     "objects": ({"y": np.array([None] * 200)}, "bad.npz: column y, row 1: 'a pickled object' is not a number"),
     "transposed": ({"y": np.stack([Y, Y])}, "columns must be of one length; t has 200, y1 has 2 rows$"),
     "rows for columns": ({"t": T[None]}, r"no column t; there are t1, t2, [t0-9, ]* \.\.\. \(--time\)$"),
-    "text": ({"y": np.array(["a"] * 200)}, "bad.npz: column y, row 1: 'a' is not a number"),
     "complex": ({"y": 1j * Y}, "bad.npz: column y, row 1: dtype.* is not a number"),
     "missing input": ({"u": np.where(T < 5, T, np.nan)}, "bad.npz: column u, row 101: a number is missing"),
 }

@@ -77,11 +77,11 @@ def test_dt_that_does_not_fit():
 
 
 def test_memory():
-    told = []
-    check_memory([record(T), record(T[:20])], 5.0, told.append)
-    assert told == ["a: column t, row 20: the record ends after 0.38 s, but the filter remembers 5 s"]
+    warnings, records = [], [record(T), record(T[:20])]
+    check_memory(records, 5.0, warnings.append)
+    assert warnings == ["a: column t, row 20: the record ends after 0.38 s, but the filter remembers 5 s"]
     with pytest.raises(ValueError, match="and no other is longer"):
-        check_memory([record(T), record(T[:20])], 50.0, told.append)
+        check_memory(records, 50.0, warnings.append)
 
 
 def test_the_sampling_interval_has_no_digits_by_chance():

@@ -236,16 +236,14 @@ def test_episodes_from_before_must_be_of_the_plant(spied, asked):
 
 
 def test_a_worse_observer_is_not_taken(pendulum, asked):
-    env = vector("Pendulum-v1", pendulum, n=1)
-    old, told = in_use(env)[0], []
+    env, refits = vector("Pendulum-v1", pendulum, n=1), []
+    old = in_use(env)[0]
     far = dataclasses.replace(old.inverse, x_offset=old.inverse.x_offset + 99.0)
     asked.artifact = dataclasses.replace(old, inverse=far)
-    refits = KKLTrainingCallback(600, on_refit=told.append)
-    ppo(env, 100).learn(900, refits)
-    assert not told[0].taken
-    assert told[0].error == told[0].before
-    assert "error still" in str(told[0])
-    assert in_use(env) == [refits.artifact] == [old]
+    ppo(env, 100).learn(900, KKLTrainingCallback(600, on_refit=refits.append))
+    assert (refits[0].taken, refits[0].error, refits[0].artifact) == (False, refits[0].before, old)
+    assert "error still" in str(refits[0])
+    assert in_use(env) == [old]
 
 
 def test_environments_that_are_refused(pendulum, tmp_path):

@@ -1,7 +1,6 @@
 """Observers from records of a plant whose best observer is known: a mass on a spring."""
 
 import io
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from scipy.linalg import solve_discrete_are
 from observers import Artifact, KKLObserver
 from training import RecordedSource, recorded_preset, train
 from training.lessons.calibrate import chi_square, squared_distance
-from training.maps.networks import Network, averaged
 from training.records import Record, resampled
 from training.sources.recorded import linear_output, recorded_errors, signal_rate, split
 
@@ -181,14 +179,6 @@ def test_records_that_no_observer_can_be_learned_from():
         trained([swing(0, n=40)])
 
 
-def test_the_mean_of_networks_is_a_network():
-    torch.manual_seed(0)
-    networks = [Network(3, 2, width=5, depth=2, activation="tanh") for _ in range(3)]
-    inputs = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
-    expected = np.mean([network.export()(inputs) for network in networks], 0)
-    np.testing.assert_allclose(averaged(networks)(inputs), expected, rtol=1e-4, atol=1e-6)
-
-
 def test_what_is_held_out():
     records = [resampled(swing(seed, n=100)) for seed in range(10)]
     kept, held_out = split(records, 0.3, 0)
@@ -210,7 +200,6 @@ def test_the_rate_of_signals_is_their_angular_frequency():
     assert config.eigenvalues[-1] == pytest.approx(-30, rel=1e-2)
     assert config.measurement_noise_max == pytest.approx(0.1 / 2**0.5, rel=1e-2)
     assert recorded_preset([record], {"dt": 0.05, "seed": 3}).eigenvalues[-1] == -10.0
-    assert json.dumps(config.eigenvalues)
 
 
 def test_signals_that_stand_still_in_each_record():

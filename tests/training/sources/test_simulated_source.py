@@ -7,7 +7,7 @@ from linear_system import Autonomous, Oscillator
 from pushed_systems import Pendulum
 from small_runs import toy
 
-from kkl_gym import System, VanDerPol
+from kkl_gym import VanDerPol
 from kkl_gym.elementary import sign
 from kkl_gym.simulate import simulate
 from training import SimulatedSource
@@ -16,8 +16,7 @@ from training.sources.simulated import INTEGRATION_ERROR
 
 
 class Stiff(VanDerPol):
-    name = "stiff"
-    bounds = ((-12, 12), (-200, 200))
+    name, bounds = "stiff", ((-12, 12), (-200, 200))
 
 
 class Rubbing(Autonomous):
@@ -74,13 +73,3 @@ def test_motions_for_calibration_are_with_and_without_process_noise():
     assert (off[quiet] == 0).all()
     assert (off[~quiet] > 0.01).all()
     np.testing.assert_array_equal(source.runs().x, runs.x)
-
-
-def test_a_rate_of_zero_and_many_states_are_no_matter():
-    """Nine integrators, of which each is fed by the next."""
-    methods = {"f": lambda self, x: [*x[1:], 0.0], "h": lambda self, x: (x[0],)}
-    box = {"X": ((-1, 1),) * 9, "bounds": ((-1e9, 1e9),) * 9}
-    chain = type("Chain", (System,), {"name": "chain", "dt": 0.1, **box, **methods})()
-    source = SimulatedSource(chain, toy(chain, eigenvalues=(-1.0, -2.0)))
-    assert source.equations().substeps == 1
-    assert source.tracking()["covariance"].shape == (9, 9)

@@ -74,14 +74,11 @@ def test_what_is_no_policy(tmp_path):
 
 
 def test_a_system_that_no_regulator_holds():
-    class Uncontrolled(Falling):
-        name = "uncontrolled"
-        X = ((-0.3, 0.3), (-0.5, 0.5), (-1, 1))
-        bounds = ((-2, 2), (-5, 5), (-3, 3))
-        G = ((0.0,), (1.0,), (0.0,))
-
-        def f(self, x):
-            return *super().f(x[:2]), x[2]
-
+    sizes = {
+        "X": ((-0.3, 0.3), (-0.5, 0.5), (-1, 1)),
+        "bounds": ((-2, 2), (-5, 5), (-3, 3)),
+        "G": ((0.0,), (1.0,), (0.0,)),
+    }
+    equations = {"name": "uncontrolled", "f": lambda self, x: (*Falling.f(self, x[:2]), x[2])}
     with pytest.raises(ValueError, match="policy of your own"):
-        named_policy(Uncontrolled(), "controller")
+        named_policy(type("Uncontrolled", (Falling,), sizes | equations)(), "controller")
