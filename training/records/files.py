@@ -208,7 +208,7 @@ def _csv(path: Path) -> Columns:
             if len(cells) not in (0, len(names)):  # pandas would fill or cut it
                 raise ValueError(f"row {row} has {len(cells)} cells, the header {len(names)}")
     layout |= {"header": None, "skiprows": 1, "names": range(len(names)), "na_values": MISSING}
-    frame = pd.read_csv(path, encoding="utf-8-sig", float_precision="round_trip", **layout)
+    frame = pd.read_csv(path, encoding="utf-8-sig", **layout)
     return {name: frame[i] for i, name in enumerate(names)}
 
 
