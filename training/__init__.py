@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from training.rollouts import learn as learn
     from training.rollouts.callback import KKLTrainingCallback as KKLTrainingCallback
     from training.run import Run as Run
+    from training.sources import Source as Source
     from training.sources.recorded import RecordedSource as RecordedSource
     from training.sources.recorded import recorded_preset as recorded_preset
     from training.sources.simulated import SimulatedSource as SimulatedSource
-    from training.sources.source import Source as Source
 
 _NAMES = {
     "calibration": "calibrate",
@@ -46,7 +46,7 @@ _NAMES = {
     "run": "Run",
     "sources.recorded": "RecordedSource recorded_preset",
     "sources.simulated": "SimulatedSource",
-    "sources.source": "Source",
+    "sources": "Source",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULES)

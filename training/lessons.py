@@ -24,8 +24,8 @@ from training.presets import preset
 from training.progress import ProgressBars
 from training.run import Run
 from training.seeds import Stream, generator
+from training.sources import OF_MEDIAN, Pairs, Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
-from training.sources.source import OF_MEDIAN, Pairs, Source, TooFewRunsError
 from training.spectrum import Spectrum, check_continuous
 
 # Of a flow's network.

@@ -13,7 +13,7 @@ from kkl_gym.loading import load_function
 from kkl_gym.system import NOISE_SHARE, System
 from training.config import Config, Pipeline
 from training.spectrum import FASTEST_MODE, evenly_spaced, papers_spectrum, smooth_spectrum
-from training.trajectories.policies import Controller, checked_policy, linear_quadratic
+from training.trajectories.motions import Controller, checked_policy, linear_quadratic
 
 Preset = Literal["fast", "paper"]
 Size = Literal["default", "large"]

@@ -11,13 +11,13 @@ from filterpy.kalman import UnscentedKalmanFilter as FilterpyUKF
 from linear_system import Autonomous, C, F, Oscillator, TwoOutputs
 from scipy.linalg import expm
 
+from examples.research.derivatives import jacobian
 from examples.research.methods.unscented import UnscentedKalmanFilter
 from kkl_gym import get_system
 from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance, simulate
 from observers.estimator import Running
 from training.kalman import ExtendedKalmanFilter, unknown_start
-from training.trajectories.equations import jacobian
 
 
 @pytest.fixture(params=[ExtendedKalmanFilter, UnscentedKalmanFilter])

@@ -18,8 +18,8 @@ class DataOptions:
     """The recorded data of a command; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
 
     data: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]", help_behavior_hint="")] = ()
-    """Records: .npz files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named columns;
-    rollouts in a Minari data set, minari:ID or its folder, whose signals are named as in `kkl-gym record`."""
+    """Records: .npz or .mat files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named
+    columns; rollouts in a Minari data set, minari:ID or its folder, whose signals are named as in `kkl-gym record`."""
     time: Annotated[str, tyro.conf.arg(metavar="COLUMN", help_behavior_hint="(default: t or time)")] = ""
     """Column of the time in seconds."""
     measured: Annotated[str, tyro.conf.arg(metavar="COLUMNS", help_behavior_hint=_BY_NAME)] = ""

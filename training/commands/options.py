@@ -15,8 +15,8 @@ from observers import Artifact, shipped
 from observers.names import resolve
 from training.evaluation.levels import Level, read_level
 from training.presets import named_policy
+from training.trajectories.motions import Controller
 from training.trajectories.parameters import EVERY, blind, with_bias
-from training.trajectories.policies import Controller
 
 Pairs = tuple[tuple[str, Any], ...]  # of the words NAME=VALUE behind an option
 Repeated = tuple[Pairs, ...]  # of an option that may be given several times; merged makes one mapping of them

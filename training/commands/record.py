@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium as gym
@@ -72,28 +73,26 @@ class RecordCommand:
     def run(self, console: Console) -> str:
         """Record."""
         from training.records.episodes import dataset_folder, write_dataset
-        from training.rollouts import make, policy_of, roll_out
+        from training.rollouts import play, policy_of
 
-        episodes = self.play.episodes
-        steps = 100_000 if episodes is None and self.play.steps is None else self.play.steps
         name = self.dataset or f"{_word(self.env_id)}/{_word(self.policy)}-v0"
         dataset_folder(name)  # an error now, not at the end
-        with progress_bars(console) as progress, make(self.env_id, dict(self.play.env_kwargs)) as env:
-            policy = _player(self.policy, env) if self.policy.endswith(".safetensors") else policy_of(self.policy, env)
-            with progress.phase(f"playing {self.env_id}", steps or episodes or 1) as report:
-                rollouts = roll_out(
-                    env,
-                    policy,
-                    measured=names_in(self.measured),
-                    hidden=names_in(self.hidden),
-                    episodes=episodes,
-                    steps=steps,
-                    seed=self.seed,
-                    name=name,
-                    report=report,
-                )
+        policy_in = partial(_player if self.policy.endswith(".safetensors") else policy_of, self.policy)
+        with progress_bars(console) as progress:
+            rollouts = play(
+                self.env_id,
+                policy_in,
+                progress,
+                env_kwargs=dict(self.play.env_kwargs),
+                measured=names_in(self.measured),
+                hidden=names_in(self.hidden),
+                episodes=self.play.episodes,
+                steps=self.play.steps,
+                seed=self.seed,
+                name=name,
+            )
             with progress.phase("writing the data set"):
-                folder = write_dataset(rollouts, env.spec, policy=self.policy)
+                folder = write_dataset(rollouts, policy=self.policy)
             lengths = [len(episode.rewards) for episode in rollouts.episodes]
             ended = sum(episode.terminated for episode in rollouts.episodes)
             progress.say(

@@ -13,7 +13,7 @@ from training.diagnosis.finding import Finding, Verdict
 from training.diagnosis.records import Judgement, Observability, observability, of_records
 from training.diagnosis.system import Subject
 from training.evaluation.levels import Level
-from training.trajectories.policies import Controller
+from training.trajectories.motions import Controller
 
 FIRST: dict[str, Callable[[System], Iterator[Finding]]] = {
     "system": system.declaration,

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from training.diagnosis.finding import RESOLUTION, Finding, error, point
-from training.diagnosis.records import AS_GOOD, ASKING, ASKING_SHARE, DETERMINED, Filtered, compare
+from training.diagnosis.records import AS_GOOD, ASKING, ASKING_SHARE, DETERMINED, Samples, compare
 from training.diagnosis.system import Subject
 from training.evaluation.levels import show_level
 from training.kalman import Belief, ExtendedKalmanFilter
 from training.maps.coordinates import noise_covariance, settling_time
 from training.presets import eigenvalues
 from training.records import Record, Signals
+from training.records.record import Windows
 from training.sources.recorded import split
 from training.sources.simulated import unknown_start
 from training.spectrum import Spectrum, smooth_spectrum
@@ -139,8 +140,8 @@ def _torn(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Finding]
         for i, each in enumerate(np.moveaxis(x, 1, 0))
     ]
     window = min(int(np.ceil(settling_time(linear) / subject.dt)), len(x) // 2)
-    rest, held_out = (Filtered(part, linear) for part in split(records, ASKING_SHARE, 0))
-    others, one = rest.samples(window, OTHERS), held_out.samples(window, ASKING)
+    rest, held_out = (Windows(part, linear, system.nx) for part in split(records, ASKING_SHARE, 0))
+    others, one = Samples.of(rest, window, OTHERS), Samples.of(held_out, window, ASKING)
     covariance = noise_covariance(linear, np.array([window]))[0]
     compared = compare(one, others, covariance=covariance, noise=(0.0,), rng=np.random.default_rng(0))
     if compared is None:

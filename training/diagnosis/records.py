@@ -2,24 +2,24 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from scipy.spatial import cKDTree
 
-from observers import LinearFilter
 from observers.checks import integer, noise_levels, shown
 from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
 from training.evaluation.levels import Level, show_level
 from training.maps.coordinates import SETTLED, coordinates, noise_covariance, root, settling_time, spread
 from training.progress import ProgressBars, progress_bars
-from training.records import Record, check_signals, pieces, resampled
-from training.rollouts import Policy, make, policy_of, roll_out
+from training.records import Record, check_signals, resampled
+from training.records.record import Windows
+from training.rollouts import Policy, play, policy_of
 from training.rollouts.playing import RANDOM
 from training.seeds import Stream, generator
-from training.sources.recorded import FEW, recorded_preset, split
-from training.sources.windows import along, restarted, samples_as_old, taken
+from training.sources.recorded import FEW, evenly, recorded_preset, split
 from training.spectrum import Spectrum
 
 STEPS = 10_000  # played in an environment, by default
@@ -187,25 +187,12 @@ def observability(
     ValueError
         If an argument makes no sense, or as :func:`training.diagnosis.of_records`.
     """
-    if episodes is None and steps is None:
-        steps = STEPS
     if not hidden:
-        raise ValueError("say which signals are hidden, as in hidden=[2]")
-    with (
-        progress_bars(console) as progress,
-        make(env_id, env_kwargs) as env,
-        progress.phase(f"playing {env_id}", steps or episodes or 1) as report,
-    ):
-        rollouts = roll_out(
-            env,
-            policy_of(policy, env),
-            measured=list(map(str, measured)),
-            hidden=list(map(str, hidden)),
-            episodes=episodes,
-            steps=steps,
-            seed=seed,
-            report=report,
-        )
+        raise ValueError("name the hidden signals, as in hidden=[2]")
+    with progress_bars(console) as progress:
+        signals: dict[str, Any] = {"measured": list(map(str, measured)), "hidden": list(map(str, hidden))}
+        amount: dict[str, Any] = {"episodes": episodes, "steps": steps, "default_steps": STEPS, "seed": seed}
+        rollouts = play(env_id, partial(policy_of, policy), progress, **signals, **amount, env_kwargs=env_kwargs)
     return of_records(rollouts.records(), measurement_noise=measurement_noise, seed=seed)
 
 
@@ -228,13 +215,13 @@ def of_records(
     linear = spectrum.filter(len(signals.measured), config.dt, len(signals.inputs))
     records = [resampled(record, linear.dt) for record in records]
     noise = _levels(records, measurement_noise)
-    others, asking = (Filtered(pieces(part), linear) for part in split(records, ASKING_SHARE, seed))
+    others, asking = (Windows(part, linear, len(signals.hidden)) for part in split(records, ASKING_SHARE, seed))
     rng = generator(Stream.VALIDATION, seed, 1)
     settled = settling_time(linear) / linear.dt
     last, memory = int(np.ceil(np.log2(settled))), settled / SETTLED  # beyond which it forgets where a window began
     windows, found = [0, *(2**i for i in range(last + 1))], list[Compared]()
     for window in windows:
-        samples = asking.samples(window, ASKING), others.samples(window, OTHERS)
+        samples = Samples.of(asking, window, ASKING), Samples.of(others, window, OTHERS)
         compared = compare(*samples, covariance=noise_covariance(linear, np.array([window]))[0], noise=noise, rng=rng)
         if compared is None:
             break
@@ -291,29 +278,6 @@ def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows
             )
 
 
-class Filtered:
-    """Records with the filter along each."""
-
-    def __init__(self, records: list[Record], linear: LinearFilter) -> None:
-        self._linear, self._records = linear, records
-        self._z = [along(linear, record) for record in records]
-
-    def samples(self, window: int, most: int) -> "Samples":
-        """Filter states after so many steps and the states there, evenly spread over all with one then and before."""
-        owner, sample = samples_as_old(self._records, window)
-        if len(owner):
-            states = [record.x for record in self._records]
-            whole = ~np.isnan(taken(states, owner, sample - window)).any(-1)
-            owner, sample = owner[whole], sample[whole]
-        chosen = np.linspace(0, len(owner) - 1, min(most, len(owner))).round().astype(int)
-        owner, sample = owner[chosen], sample[chosen]
-        if not len(owner):
-            return Samples(*np.zeros((3, 0, 0)))
-        x = taken(states, owner, sample)
-        z = restarted(self._linear, self._records, self._z, owner=owner, sample=sample, age=window)
-        return Samples(z, x, x - taken(states, owner, sample - window))
-
-
 @dataclass(frozen=True)
 class Samples:
     """Filter states (n, size), states (n, nx), and how much these have changed since the filter was switched on."""
@@ -321,6 +285,14 @@ class Samples:
     z: np.ndarray
     x: np.ndarray
     change: np.ndarray
+
+    @classmethod
+    def of(cls, windows: Windows, steps: int, most: int) -> "Samples":
+        """Samples so many steps after a start of the filter, evenly spread over all with a state then and before."""
+        rows = windows.rows(steps)
+        rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
+        rows = evenly(rows, min(most, len(rows)))
+        return cls(windows.restarted(rows, steps), windows.x[rows], windows.x[rows] - windows.x[rows - steps])
 
     def nearest(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which of these (n,) come closest to other filter states (n, size), and how close, in standard deviations."""

@@ -16,8 +16,7 @@ from kkl_gym.system import NOISE_SHARE, Box, System, rate_under
 from training.diagnosis.finding import Finding, Verdict, number, percent, point
 from training.evaluation.levels import Level
 from training.presets import named_policy
-from training.trajectories.motions import DRIVEN, random_inputs, under_policy
-from training.trajectories.policies import Controller
+from training.trajectories.motions import DRIVEN, Controller, random_inputs, under_policy
 
 COMPARED = 100  # points of X, and as many of the bounds, at which the kinds of numbers are compared
 POINTS = 1000  # of X, at which outputs, inputs and time constants are looked at

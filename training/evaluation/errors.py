@@ -13,8 +13,7 @@ from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.seeds import Stream, generator
-from training.trajectories.motions import draw_process_noise, random_inputs, under_policy
-from training.trajectories.policies import Controller
+from training.trajectories.motions import Controller, draw_process_noise, random_inputs, under_policy
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
 

@@ -11,8 +11,8 @@ from observers import Artifact, KKLObserver
 from training.evaluation.levels import Level
 from training.presets import profile
 from training.seeds import Stream, generator
-from training.sources.simulated import sound_motions
-from training.trajectories.policies import Controller
+from training.sources.simulated import SOUND
+from training.trajectories.motions import Controller, Motions
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
@@ -44,9 +44,8 @@ def simulate_faults(
         )
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
     steps = round(duration / dt)
-    x, u, _ = sound_motions(
-        system, n=trajectories, steps=steps, dt=dt, rng=rng, driven=bool(artifact.nu), policy=policy
-    )
+    motions = Motions(system, dt, steps, **SOUND, levels=(system.process_noise,), policy=policy)
+    x, u, *_ = motions.with_inputs(artifact.nu).drawn(trajectories, rng)
     clean = system.output(x)
     y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
     counted = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen it

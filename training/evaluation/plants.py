@@ -7,8 +7,8 @@ from observers import Artifact, KKLObserver
 from observers.checks import is_finite, noise_levels, shown
 from training.evaluation.errors import TRANSIENT, measured, unseen_trajectories
 from training.evaluation.levels import Level
+from training.trajectories.motions import Controller
 from training.trajectories.parameters import blind, with_parameters
-from training.trajectories.policies import Controller
 
 
 def off_by(system: System, share: float) -> System:

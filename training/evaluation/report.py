@@ -18,8 +18,8 @@ from training.evaluation.levels import Level, show_level
 from training.figures import ESTIMATE, TRUTH, drawing
 from training.lessons import Result
 from training.maps.forward import residual
+from training.sources import Runs, Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
-from training.sources.source import Runs, Source, TooFewRunsError
 
 RUNS = 100  # simulated motions
 OTHER_SEED = 2**31  # added to that of the training

@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from examples.research.derivatives import jacobian
 from kkl_gym.simulate import advance, simulate
 from kkl_gym.system import System
 from observers import Artifact, InverseMap, KKLObserver
@@ -13,7 +14,6 @@ from observers.estimator import Running
 from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
-from training.trajectories.equations import jacobian
 
 BATCHES = 10  # of one step each, by filters that take one sample at a time
 FEWER = 10  # times as few samples, where Python takes a single one

@@ -70,7 +70,7 @@ def _records():
         ("train lorenz --size large --pipeline spinn", "--size large is of the pipeline 'input-aware', not 'spinn'"),
         (RECORDED.replace("spring.csv", "cells.csv"), "cells.csv: row 5 has 3 cells, the header 4"),
         (RECORDED.replace("spring.csv", "time.csv"), "time.csv: column time, row 9: time must increase"),
-        (RECORDED.replace("spring.csv", "number.csv"), "number.csv: column position, row 4: 'much' is no number"),
+        (RECORDED.replace("spring.csv", "number.csv"), "number.csv: column position, row 4: 'much' is not a number"),
         ("train lorenz --set forward_steps=5", "pipeline 'input-aware' does not go with forward_steps = 5"),
         ("train lorenz --set transients=false", "transients = False: settings of the pipeline"),
         ("train lorenz --config list.json", "list.json must hold settings by name, got a list"),
