@@ -20,7 +20,7 @@ from training.agents.tasks import TOLERANCE, scores, successes
 from training.commands.agent_task import Measured, TaskOptions
 from training.commands.options import NoiseLevel
 from training.evaluation.levels import show_level
-from training.jobs import locked
+from training.files import locked
 from training.progress import LOG, ProgressBars, progress_bars
 
 TRANSIENT = 20  # steps of an episode whose estimates are not judged

@@ -1,19 +1,17 @@
 """The lesson of calibration: covariances and limits of a monitor, from one pass of motions nothing was trained on."""
 
 import dataclasses
-import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from scipy.special import gammaincinv
 
 from kkl_gym.system import System
-from observers import Artifact, ErrorCovariance, Factors, InverseMap, Limits, Motion
+from observers import Artifact, ErrorCovariance, Factors, InverseMap, KKLObserver, Limits, Motion
 from observers.checks import noise_levels
 from observers.decoder import Decoders
 from observers.factors import COVERAGE
-from observers.tracker import Tracker
 from training.config import settings_of
 from training.progress import ProgressBars, progress_bars
 from training.sources.simulated import SimulatedSource
@@ -26,8 +24,7 @@ PER_AGE = 6  # samples of each run about each age: at a single one all motions m
 FEWEST = 50  # errors from which a covariance or a quantile is taken
 LEAST_VARIANCE = 1e-6  # added to that of each state, over its range squared
 WINDOW, WARM_UP = 0.5, 5.0  # seconds of the monitor, likewise
-REPORTED = 100  # samples from report to report
-MARGIN = 1.05  # on limits found among finitely many motions
+MARGIN = 1.05  # on limits, which are from finitely many motions
 
 
 def calibrate(
@@ -82,44 +79,33 @@ def calibrate(
     with progress_bars(console) as progress:
         with progress.phase("motions for calibration") as report:
             runs = source.runs(report=report)
-        return _Calibration(artifact, motion or artifact.motion, source, runs, false_alarms).calibrated(progress)
+        return _Calibration(artifact, source, runs, false_alarms).calibrated(motion or artifact.motion, progress)
 
 
 class _Calibration:
-    """All levels of noise at once: rows are runs at the first level, the same runs at the second, and so on."""
+    """Tables of an observer's errors, from the same runs at each level of measurement noise."""
 
-    def __init__(
-        self, artifact: Artifact, motion: Motion | None, source: Source, runs: Runs, false_alarms: float
-    ) -> None:
-        self.artifact, self.motion, self.source, self.runs = artifact, motion, source, runs
-        self.false_alarms, self.dt = false_alarms, artifact.filter.dt
+    def __init__(self, artifact: Artifact, source: Source, runs: Runs, false_alarms: float) -> None:
+        self.artifact, self.source, self.runs, self.false_alarms = artifact, source, runs, false_alarms
+        self.dt, self.noisy = artifact.filter.dt, runs.process_noise > 0
         self.knots, self.spans = _knots(len(runs.u), source.pace / self.dt)
         self.ages = np.unique(np.concatenate(self.spans))
         self.informed = "measurement_noise" in artifact.inverse.features
         largest = (artifact.inverse if self.informed else source.config).measurement_noise_max
         self.levels = np.multiply.outer(LEVELS, largest)
-        count, noise = len(LEVELS), np.random.default_rng(0).standard_normal((len(LEVELS), *runs.y.shape))
-        y = runs.y + self.levels.reshape(count, 1, 1, -1) * noise
-        self.x, self.u = (np.tile(values, (1, count, 1)) for values in (runs.x, runs.u))
-        self.y = np.moveaxis(y, 0, 1).reshape(len(y[0]), -1, y.shape[-1])
-        process, kind = np.unique(runs.process_noise, return_inverse=True)
-        levels = [noise_levels("measurement_noise", level, source.ny) for level in self.levels]
-        self.groups = list(itertools.product(levels, process.tolist()))
-        self.owner = np.add.outer(len(process) * np.arange(count), kind.ravel()).ravel()
-        self.noisy = runs.process_noise > 0
 
-    def calibrated(self, progress: ProgressBars) -> Artifact:
-        """The artifact with all tables."""
+    def calibrated(self, motion: Motion | None, progress: ProgressBars) -> Artifact:
+        """The artifact with all tables, and with a motion."""
         replace = dataclasses.replace
         artifact = replace(self.artifact, motion=None, limits=None)
         monitored = artifact.knows_output and self.runs.sound
         if self.informed:
             artifact = self.with_covariances(artifact)
-            if self.motion is not None:  # factors are of P as the filter has it
-                artifact = replace(artifact, motion=replace(self.motion, factors=Factors.ones()))
+            if motion is not None:  # factors are of P as the filter has it
+                artifact = replace(artifact, motion=replace(motion, factors=Factors.ones()))
         if artifact.motion is None and not monitored:
             return artifact
-        with progress.phase("calibrating", len(self.y)) as report:
+        with progress.phase("calibrating", len(LEVELS)) as report:
             distances, extremes = self.followed(artifact, report)
         if artifact.motion is not None:
             groups = (~self.noisy, self.noisy) if self.noisy.any() else (~self.noisy,)
@@ -129,20 +115,27 @@ class _Calibration:
             artifact = replace(artifact, motion=replace(artifact.motion, factors=table))
         return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
 
-    def by_level(self, values: np.ndarray) -> np.ndarray:
-        """Values (m, rows, ...) as (levels, m, n, ...)."""
-        return np.moveaxis(values.reshape(len(values), len(LEVELS), -1, *values.shape[2:]), 1, 0)
+    def groups(self) -> Iterator[tuple[int, dict[str, Any], np.ndarray, np.ndarray, np.ndarray]]:
+        """Index of a level of measurement noise, both levels of noise, their runs (n,), outputs and inputs."""
+        runs, rng = self.runs, np.random.default_rng(0)
+        for i, level in enumerate(self.levels):
+            y = runs.y + level * rng.standard_normal(runs.y.shape)
+            measurement_noise = noise_levels("measurement_noise", level, self.source.ny)
+            for noise in np.unique(runs.process_noise).tolist():
+                rows = runs.process_noise == noise
+                levels = {"measurement_noise": measurement_noise, "process_noise": noise}
+                yield i, levels, rows, y[:, rows], runs.u[:, rows]
 
     def with_covariances(self, artifact: Artifact) -> Artifact:
         """The covariance of T_inv's errors by level and age, of each map."""
-        linear, seconds, x = artifact.filter, self.ages * self.dt, self.x[self.ages]
-        z = filter_states(linear, self.y, self.u, self.ages)
-        x_hat = Rows(artifact, self.groups, self.owner).decode(z, seconds[:, None])
-        errors, known = self.by_level(x - x_hat), np.isfinite(self.runs.x[self.ages]).all(-1)
-        least = np.diag(LEAST_VARIANCE * np.ptp(self.runs.x[self.ages][known], axis=0) ** 2 + np.finfo(float).tiny)
-        moved = np.zeros(known.shape, dtype=bool)
+        seconds, x = self.ages * self.dt, self.runs.x[self.ages]
+        errors, finite = np.empty((len(LEVELS), *x.shape)), np.isfinite(x).all(-1)
+        for i, levels, rows, y, u in self.groups():
+            T_inv, z = Decoders(artifact, slice(artifact.nx), **levels), filter_states(artifact.filter, y, u, self.ages)
+            errors[i][:, rows] = x[:, rows] - T_inv(z, seconds[:, None])
+        least = np.diag(LEAST_VARIANCE * np.ptp(x[finite], axis=0) ** 2 + np.finfo(float).tiny)
         acted = np.maximum.accumulate((self.runs.u != 0).any(-1), axis=0)
-        moved[self.ages > 0] = acted[self.ages[self.ages > 0] - 1]
+        moved = np.concatenate([np.zeros_like(acted[:1]), acted])[self.ages]
 
         def with_table(inverse: InverseMap, group: np.ndarray) -> InverseMap:
             table = [self.by_knot(each, group, lambda e: _covariance(e, least)) for each in errors]
@@ -150,131 +143,60 @@ class _Calibration:
             return dataclasses.replace(inverse, error_covariance=covariance)
 
         if artifact.free_inverse is None:
-            return dataclasses.replace(artifact, inverse=with_table(artifact.inverse, known))
+            return dataclasses.replace(artifact, inverse=with_table(artifact.inverse, finite))
         return dataclasses.replace(
             artifact,
-            inverse=with_table(artifact.inverse, known & moved),
-            free_inverse=with_table(artifact.free_inverse, known & ~moved),
+            inverse=with_table(artifact.inverse, finite & moved),
+            free_inverse=with_table(artifact.free_inverse, finite & ~moved),
         )
 
-    def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Squared distances (levels, ages, n) of a tracker's errors; extremes (levels, n, ny) of residuals' means."""
-        observers, y, pace = Rows(artifact, self.groups, self.owner), self.y, self.source.pace
-        share, first = -np.expm1(-self.dt / (WINDOW * pace)), round(WARM_UP * pace / self.dt)
-        mean, square = np.zeros_like(y[0]), np.zeros_like(y[0])
-        largest, high, low = np.zeros_like(mean), np.zeros_like(mean), np.full_like(mean, np.inf)
-        distances = np.full((len(self.ages), y.shape[1]), np.nan)
+    def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Squared distances (levels, ages, n) of the estimates' errors; extremes (3, levels, n, ny) of residuals."""
+        from scipy.signal import lfilter  # takes half a second to import
+
+        runs, pace = self.runs, self.source.pace
+        distances = np.full((len(LEVELS), len(self.ages), runs.x.shape[1]), np.nan)
+        extremes = np.zeros((3, len(LEVELS), *runs.y.shape[1:]))
+        share, first = -np.expm1(-self.dt / (WINDOW * pace)), 1 + round(WARM_UP * pace / self.dt)
         slots = {int(age): i for i, age in enumerate(self.ages)}
-        for k in range(len(y)):
-            x_hat = observers.reset(y[0]) if k == 0 else observers.step(y[k], self.u[k - 1])
+        for i, levels, rows, y, u in self.groups():
+            report(i)
+            observer, x = KKLObserver(artifact, **levels), runs.x[:, rows]
+            x_hat = np.empty_like(x)
+            for k in range(len(y)):
+                x_hat[k] = observer.step(y[k], u[k - 1]) if k else observer.reset(y[0])
+                if artifact.motion is not None and k in slots:
+                    distances[i, slots[k], rows] = squared_distance(x[k] - x_hat[k], observer.covariance)
             if artifact.knows_output:
-                residual = artifact.residual(y[k], x_hat)
-                mean += share * (residual - mean)
-                square += share * (residual**2 - square)
-                if k > first:
-                    largest, high = np.maximum(largest, np.abs(mean)), np.maximum(high, square)
-                    low = np.minimum(low, square)
-            if artifact.motion is not None and k in slots:
-                distances[slots[k]] = squared_distance(self.x[k] - x_hat, observers.covariance)
-            if k % REPORTED == 0:
-                report(k)
-        return self.by_level(distances), [self.by_level(each[None])[:, 0] for each in (largest, low, high)]
+                residual = artifact.residual(y, x_hat)
+                mean, square = (lfilter([share], [1, share - 1], r, 0)[first:] for r in (residual, residual**2))
+                largest, high = np.abs(mean).max(0, initial=0.0), square.max(0, initial=0.0)
+                extremes[:, i, rows] = largest, square.min(0, initial=np.inf), high
+        return distances, extremes
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
         """A function of the values (ages, n, ...) about each knot; where these are too few, that of the next knot."""
-        known = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
-        cells = [np.isin(self.ages, span)[:, None] & known for span in self.spans]
+        finite = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
+        cells = [np.isin(self.ages, span)[:, None] & finite for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
         if not enough:
             raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out")
-        found = {i: find(values[cells[i]]) for i in enough}
-        return np.array([found[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
+        entries = {i: find(values[cells[i]]) for i in enough}
+        return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
     def factor(self, distances: np.ndarray) -> float:
         """The factor with which regions of 90 % hold 90 % of the errors."""
-        edge = np.quantile(distances, COVERAGE, method="weibull")
-        return float(np.clip(edge / chi_square(COVERAGE, self.artifact.nx), 1e-6, 1e6))
+        return float(np.clip(_excess(distances, self.artifact.nx), 1e-6, 1e6))
 
-    def limits(self, extremes: list[np.ndarray]) -> Limits:
+    def limits(self, extremes: np.ndarray) -> Limits:
         """Limits that a sound motion exceeds with a sixth of the probability, and of an output's share in it, each."""
         share, sound = self.false_alarms / (6 * self.artifact.ny), self.noisy if self.noisy.any() else ~self.noisy
-        largest, low, high = (each[:, sound] for each in extremes)
+        largest, low, high = extremes[:, :, sound]
         mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))
         below = np.array([1 / (MARGIN * rare(1 / np.maximum(each, 1e-300), share)) for each in low])
         below[~self.levels.reshape(len(LEVELS), -1).any(-1)] = 0.0
-        pace, seconds = self.source.pace, len(self.u) * self.dt
+        pace, seconds = self.source.pace, len(self.runs.u) * self.dt
         return Limits(self.levels, mean, below, above, WINDOW * pace, WARM_UP * pace, self.false_alarms, seconds)
-
-
-class Rows:
-    """An observer whose rows belong to groups, each with a level of measurement and of process noise of its own."""
-
-    def __init__(self, artifact: Artifact, groups: Sequence[tuple[Any, float]], owner: np.ndarray) -> None:
-        self._linear, self._nx, self._age, self._owner = artifact.filter, artifact.nx, 0, owner
-        self._decoders = [
-            Decoders(artifact, slice(artifact.nx), measurement_noise=level, process_noise=noise)
-            for level, noise in groups
-        ]
-        self._tracker = None if artifact.motion is None else _Stacked(artifact, groups, self._decoders, owner)
-
-    def reset(self, y: np.ndarray) -> np.ndarray:
-        """Begin. Shapes: ``y`` (n, ny); returns (n, nx)."""
-        self._z, self._y, self._age = self._linear.start(y), y, 0
-        if self._tracker is not None:
-            self._rows = self._tracker.begin(y)
-        return self._estimate()
-
-    def step(self, y: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Take in the next samples, all of them present. Shapes: ``u`` (n, nu); returns (n, nx)."""
-        if self._tracker is not None:
-            self._rows, _ = self._tracker.advance(self._rows, y, u)
-        self._z, self._y, self._age = self._linear.advance(self._z, self._y, u, y), y, self._age + 1
-        return self._estimate()
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """That of the tracker, (n, nx, nx)."""
-        assert self._tracker is not None
-        return self._tracker.covariance(self._rows, np.full(len(self._z), float(self._age)))
-
-    def decode(self, z: np.ndarray, age: Any) -> np.ndarray:
-        """T_inv of filter states (..., n, size) at ages in seconds, (..., n, nx)."""
-        x_hat = np.empty((*z.shape[:-1], self._nx))
-        for i, each in enumerate(self._decoders):
-            mine = self._owner == i
-            x_hat[..., mine, :] = each(z[..., mine, :], age)
-        return x_hat
-
-    def _estimate(self) -> np.ndarray:
-        if self._tracker is None:
-            return self.decode(self._z, self._age * self._linear.dt)
-        self._rows = self._tracker.supervise(self._rows, self._z, np.full(len(self._z), float(self._age)))
-        return self._rows[:, self._tracker.x]
-
-
-class _Stacked(Tracker):
-    """A tracker whose rows have levels of their own."""
-
-    def __init__(
-        self,
-        artifact: Artifact,
-        groups: Sequence[tuple[Any, float]],
-        decoders: Sequence[Decoders],
-        owner: np.ndarray,
-    ) -> None:
-        (level, noise), self._each, self._owner = groups[0], decoders, owner
-        super().__init__(artifact, decoders[0], measurement_noise=level, process_noise=noise)
-        q, r = zip(*(self.motion.variances(*group) for group in groups), strict=True)
-        q = [each * self.motion.x_scale**2 for each in q]
-        self._Q, self._R = (np.array([np.diag(one) for one in each])[owner] for each in (q, r))
-
-    def _decoded(self, of: Any, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        owner = self._owner[where]
-        parts = {i: of(self._each[i], z[owner == i], age[owner == i]) for i in np.unique(owner)}
-        values = np.empty((len(z), *next(iter(parts.values())).shape[1:]))
-        for i, part in parts.items():
-            values[owner == i] = part
-        return values
 
 
 def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -317,8 +239,9 @@ def chi_square(shares: Any, degrees: int) -> np.ndarray:
 def _covariance(error: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Mean outer product of errors (n, nx), scaled so that the region of 90 % holds 90 % of them."""
     covariance = error.T @ error / len(error) + least
-    edge = np.quantile(squared_distance(error, covariance), COVERAGE, method="weibull")
-    return np.asarray(covariance * edge / chi_square(COVERAGE, error.shape[1]))
+    return np.asarray(covariance * _excess(squared_distance(error, covariance), error.shape[1]))
 
 
-__all__ = ["calibrate", "chi_square", "squared_distance"]
+def _excess(distances: np.ndarray, degrees: int) -> float:
+    """The 90 % quantile of squared distances over that of the chi-square distribution."""
+    return float(np.quantile(distances, COVERAGE, method="weibull") / chi_square(COVERAGE, degrees))

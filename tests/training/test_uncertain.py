@@ -13,7 +13,6 @@ from small_runs import CPU, toy
 from kkl_gym import VanDerPol
 from kkl_gym.system import System
 from training import SimulatedSource, errors, train, unseen_trajectories
-from training.config import Config
 from training.evaluation.plants import parameter_errors
 from training.spectrum import Spectrum
 
@@ -89,11 +88,6 @@ def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate():
     assert 2.7 <= mu.min() < 2.8 < 3.2 < mu.max() <= 3.3
 
 
-def test_under_a_policy_it_sees_the_states_alone(tmp_path):
-    config = toy(VanDerPol(), uncertain={"mu": 0.1}, policy="controller", inverse_steps=2, duration=1.0)
-    assert train(VanDerPol(), config, tmp_path, device=CPU).artifact.nx == 2
-
-
 def test_it_does_not_track_and_says_why():
     said = Console(file=io.StringIO(), width=200)
     config = toy(Spring(), uncertain={"stiffness": 0.3}, duration=1.0, inverse_steps=2, inputs=False)
@@ -101,19 +95,6 @@ def test_it_does_not_track_and_says_why():
     assert "does not track: a motion is of one plant, not of a range of stiffness" in said.file.getvalue()
     assert artifact.motion is None
     assert artifact.inverse.error_covariance.nx == 2
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"uncertain": {"mu": 1.0}}, "less than 1"),
-        ({"estimate_parameters": True, "uncertain": {"all": 0.0}}, "needs uncertain parameters"),
-        ({"uncertain": {"mu": 0.1}, "pipeline": "spinn", "forward_steps": 9}, "needs the pipeline 'input-aware'"),
-    ],
-)
-def test_settings_that_make_no_sense(settings, message):
-    with pytest.raises(ValueError, match=message):
-        Config(**{"pipeline": "input-aware", "eigenvalues": (-1.0,), **settings})
 
 
 def test_a_name_that_is_no_parameter_is_refused_before_any_work(tmp_path):

@@ -6,44 +6,39 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from small_runs import CPU, open_loop
+from small_runs import BATCHES, CPU, open_loop
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-import training.evaluation.errors
-import training.lessons.run
-import training.trajectories.motions
+import training.run
 from examples.research.benchmark.jobs import seconds_spent
 from kkl_gym import VanDerPol, get_system
 from observers.storage import UNFINISHED
 from training import checkpoints
-from training.lessons.run import Captured
-from training.maps.coordinates import StateScale
+from training.config import Config
 from training.maps.forward import ForwardProblem
 from training.maps.inverse import ForwardMapSampler, InverseProblem
 from training.maps.networks import Network
 from training.progress import progress_bars
+from training.run import Captured
 from training.spectrum import Spectrum
 
 
-def forward_problem(system, linear, rng, device=CPU):
+def forward_problem(system, device=CPU):
     """An untrained T, with pairs that are none."""
+    rng, linear = np.random.default_rng(0), Spectrum((-1.0, -2.0)).filter(system.ny, 0.01)
     x = rng.uniform(*system.box(), (200, system.nx))
     torch.manual_seed(0)
-    return ForwardProblem(
-        Network(system.nx, linear.size, width=8, depth=2, activation="silu"),
-        system,
-        linear=linear,
-        pairs=(x, rng.normal(size=(200, linear.size))),
-        points=x,
-        scale=StateScale.of(x, "relative"),
-        physics_weight=0.1,
-        batch=64,
-        device=device,
-    )
+    config = Config("spinn", (-1.0,), forward_steps=1, width=8, depth=2, activation="silu", batch=64)
+    pairs = x, rng.normal(size=(200, linear.size))
+    return ForwardProblem(system, linear, config, pairs=pairs, points=x, device=device)
+
+
+def line_of(folder, **settings):
+    return training.run.Stage(**{"name": "line", "folder": folder, "fingerprint": "same", "seed": 0, **settings})
 
 
 class Clock:
-    """CPU time that goes on by a hundredth of a second whenever somebody looks."""
+    """CPU time that goes on by a hundredth of a second at each look."""
 
     def __init__(self):
         self.now = 100.0
@@ -54,34 +49,22 @@ class Clock:
 
 
 def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypatch):
-    monkeypatch.setattr(training.lessons.run.time, "process_time", Clock())
+    monkeypatch.setattr(training.run.time, "process_time", Clock())
     rates = []
 
-    class Line(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.a = torch.nn.Parameter(torch.zeros(1))
-
     def fit(stop_after=None):
-        module, calls = Line(), []
+        module, calls = torch.nn.Linear(1, 1, bias=False), []
+        torch.nn.init.zeros_(module.weight)
 
         def loss(generator):
-            calls.append(float(module.a.detach()))
+            calls.append(module.weight.item())
             if stop_after and len(calls) > stop_after:
                 raise KeyboardInterrupt
-            return {"loss": ((module.a - 1.0) ** 2).sum()}
+            return {"loss": ((module.weight - 1.0) ** 2).sum()}
 
-        stage = training.lessons.run.Stage(
-            name="line",
-            steps=10**9,
-            learning_rate=0.1,
-            folder=tmp_path,
-            fingerprint="same",
-            seed=0,
-            cpu_seconds=4.0,
-        )
+        stage = line_of(tmp_path, steps=10**9, learning_rate=0.1, cpu_seconds=4.0)
         with progress_bars(None) as progress:
-            training.lessons.run.optimise(stage, module, loss, progress, resume=True)
+            training.run.optimise(stage, module, loss, progress, resume=True)
         rates.extend(np.abs(np.diff(calls)))
         return len(calls)
 
@@ -115,16 +98,14 @@ def test_batches_in_place_are_those_of_a_plain_loop(optimiser, tmp_path):
 
         return loss
 
-    stage = training.lessons.run.Stage(
-        name="line", steps=40, learning_rate=0.05, folder=tmp_path, fingerprint="", seed=3, optimiser=optimiser
-    )
+    stage = line_of(tmp_path, steps=40, learning_rate=0.05, seed=3, optimiser=optimiser)
     module, plain = fresh(), fresh()
     with progress_bars(None) as progress:
-        history = training.lessons.run.optimise(stage, module, loss_of(module), progress, resume=False)
+        history = training.run.optimise(stage, module, loss_of(module), progress, resume=False)
     generator, loss, total = torch.Generator().manual_seed(3), loss_of(plain), 0.0
-    steps = training.lessons.run._optimiser(stage, plain)
+    steps = training.run._optimiser(stage, plain)
     for step in range(40):
-        rate = min(1.0, (step / 40 + 1 / 40) / training.lessons.run.WARM_UP) * 0.5 * (1 + np.cos(np.pi * step / 40))
+        rate = min(1.0, (step / 40 + 1 / 40) / training.run.WARM_UP) * 0.5 * (1 + np.cos(np.pi * step / 40))
         steps.param_groups[0]["lr"] = 0.05 * rate
         value = loss(generator)["loss"]
         steps.zero_grad()
@@ -174,9 +155,7 @@ def test_the_first_batches_run_and_the_others_replay_a_graph(monkeypatch):
 
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
 def test_risks_of_t_are_one_graph_for_the_compiler(name):
-    system, rng = get_system(name), np.random.default_rng(0)
-    linear = Spectrum((-1.0, -2.0)).filter(system.ny, 0.01)
-    problem = forward_problem(system, linear, rng)
+    problem = forward_problem(get_system(name))
     batch = problem._x[:64], problem._z[:64], problem._points[:64]
     whole = torch.compile(problem.risk, fullgraph=True, backend="eager")
     torch.testing.assert_close(whole(*batch), problem.risk(*batch))
@@ -184,12 +163,10 @@ def test_risks_of_t_are_one_graph_for_the_compiler(name):
 
 def test_losses_ask_tensors_for_no_numbers_and_have_one_shape():
     """Fake tensors have no values: to read one, or to make a shape of them, raises."""
-    system = VanDerPol()
     sampler, *_ = open_loop(0.5)
-    paper = ForwardMapSampler(
-        lambda x: x.repeat(1, 2), np.eye(4), points=np.random.default_rng(0).normal(size=(100, 2)), batch=64, device=CPU
-    )
-    problems = [forward_problem(system, Spectrum((-1.0, -2.0)).filter(1, 0.01), np.random.default_rng(0))]
+    points = np.random.default_rng(0).normal(size=(100, 2))
+    paper = ForwardMapSampler(lambda x: np.tile(x, 2), np.eye(4), BATCHES, points=points, device=CPU)
+    problems = [forward_problem(VanDerPol())]
     for each in (sampler, paper):
         inputs = each(torch.Generator())[0].shape[1]
         problems.append(InverseProblem(Network(inputs, 2, width=8, depth=1, activation="tanh"), each, CPU))
@@ -207,14 +184,9 @@ def test_a_captured_stage_on_a_gpu_is_the_same_as_an_eager_one(optimiser, tmp_pa
     weights = []
     for captured in (True, False):
         monkeypatch.setattr(ForwardProblem, "capturable", captured)
-        system = VanDerPol()
-        linear = Spectrum((-1.0, -2.0)).filter(1, 0.01)
-        problem = forward_problem(system, linear, np.random.default_rng(0), torch.device("cuda"))
-        stage = training.lessons.run.Stage(
-            name=f"T{captured}", steps=50, learning_rate=1e-3, folder=tmp_path, fingerprint="", seed=0,
-            optimiser=optimiser,
-        )  # fmt: skip
+        problem = forward_problem(VanDerPol(), torch.device("cuda"))
+        stage = line_of(tmp_path, name=f"T{captured}", steps=50, learning_rate=1e-3, optimiser=optimiser)
         with progress_bars(None) as progress:
-            training.lessons.run.optimise(stage, problem, problem.loss, progress, resume=False)
+            training.run.optimise(stage, problem, problem.loss, progress, resume=False)
         weights.append(problem.network.linear_layers()[0].weight.detach().cpu())
     torch.testing.assert_close(*weights, rtol=1e-3, atol=1e-4)

@@ -82,7 +82,7 @@ def test_a_source_of_ones_own_is_enough(known):
 
 def test_lessons_run_by_themselves():
     source = Spring(False)
-    with Run.alone(source.config) as run:
+    with Run.begin(source.config) as run:
         maps, motion = learn_map(source, run), learn_flow(source, run)
     assert maps.filter.dt == DT
     x = np.random.default_rng(0).uniform(-1, 1, (50, 2))
@@ -91,5 +91,5 @@ def test_lessons_run_by_themselves():
 
 def test_the_papers_pipeline_needs_equations_to_simulate():
     source = Spring(True, pipeline="spinn", forward_steps=1)
-    with Run.alone(source.config) as run, pytest.raises(ValueError, match="'spinn' needs the equations of a system"):
+    with Run.begin(source.config) as run, pytest.raises(ValueError, match="'spinn' needs the equations of a system"):
         learn_map(source, run)

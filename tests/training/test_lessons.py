@@ -14,9 +14,7 @@ from rich.console import Console
 from small_runs import CPU, toy
 from unstable_system import Falling
 
-import training.lessons.map
 from kkl_gym import KKLObservation, get_system
-from kkl_gym.equations import EquationError
 from kkl_gym.simulate import simulate
 from observers import Artifact, KKLObserver
 from training import SimulatedSource, checkpoints, errors, preset, train, unseen_trajectories
@@ -101,17 +99,6 @@ def test_equations_that_no_expression_holds_give_way_to_a_flow(whole):
     assert np.sqrt(np.mean(off**2)) < 3e-4
     assert (motion.error > 0).all()
     assert motion.process_noise * motion.x_scale == pytest.approx(np.array(Table().scale) * 0.05 / np.sqrt(3))
-
-
-def test_equations_that_branch_are_refused():
-    class Branching(Slow):
-        name = "branching"
-
-        def f(self, x):
-            return x[1], -x[0] if x[0] > 0 else -2.0 * x[0]
-
-    with pytest.raises(EquationError, match=r"kkl_gym\.elementary\.where"):
-        trained(Branching())
 
 
 def parts(artifact):
@@ -228,26 +215,6 @@ def test_an_unstable_plant_is_trained_under_a_policy(tmp_path):
         trained(Falling(), tmp_path / "run", resume=True, **small | {"policy": f"{script}:hold"})
 
 
-def test_the_settings_of_noise_reach_motions_and_batches(monkeypatch):
-    sampler, seen = training.lessons.map.TrajectorySampler, {}
-
-    def spy(pairs, linear, **named):
-        seen.update(named, disturbed=(pairs.process_noise > 0).mean())
-        return sampler(pairs, linear, **named)
-
-    monkeypatch.setattr(training.lessons.map, "TrajectorySampler", spy)
-    batches = {"noise_free_share": 0.3, "high_noise_emphasis": 3.0}
-    small = {"duration": 1.0, "samples": 10, "inverse_steps": 2, "trajectories": 100, "inputs": False, **batches}
-    for share in (0.5, 0.0):
-        found, _ = trained(Slow(), process_noise_share=share, **small)
-        assert seen["disturbed"] == pytest.approx(share, abs=0.15 * (share > 0))
-        largest = 0.05 if share else 0.0
-        told = {"measurement_noise_max": 0.2, "measurement_noise": 0.1, "process_noise_max": largest, **batches}
-        assert seen.items() >= told.items()
-        factors = found.artifact.motion.factors.factors
-        assert len(factors) == 1 + bool(share)
-
-
 @pytest.mark.slow
 def test_linear_system_gives_the_sylvester_solution(tmp_path):
     system = Oscillator()
@@ -262,7 +229,7 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
     assert relative < 1e-3
 
 
-def test_the_papers_own_way_is_told_neither_noise_nor_age(monkeypatch):
+def test_the_papers_own_way_takes_neither_noise_nor_age(monkeypatch):
     papers = {"pipeline": "spinn", "collocation": "box", "scaling": "range", "transients": False}
     result, _ = trained(Slow(), duration=20.0, inverse_steps=5, forward_steps=5, solved_output_layer=False, **papers)
     artifact = result.artifact
@@ -297,9 +264,8 @@ def test_two_outputs_have_noise_of_their_own(tmp_path):
     np.testing.assert_allclose(read.motion.least_measurement_noise, (0.1, 0.12e-3))
     y, u = np.zeros((10, 3, 2)), np.zeros((9, 3, 1))
     estimates = [KKLObserver(read, levels).estimate(y, u) for levels in (None, (100.0, 0.12), (10.0, 0.2), (0.0, 0.1))]
-    np.testing.assert_array_equal(estimates[0], estimates[1])
-    assert not np.allclose(estimates[0], estimates[2])
-    assert not np.allclose(estimates[0], estimates[3])
+    same = [np.allclose(estimates[0], others, rtol=1e-12) for others in estimates[1:]]
+    assert same == [True, False, False]
     y[1:, 1, 1] = np.nan
     assert np.isfinite(KKLObserver(read).estimate(y, u)).all()
     with pytest.raises(ValueError, match="measurement_noise_max must be one number, or one for each of 1 outputs"):
