@@ -192,8 +192,8 @@ def errors_of_runs(
         system, how = kind(), dict[str, Any](measurement_noise=level, seed=0)
         runs = unseen_trajectories(system, DT, n=trajectories, duration=duration or system.duration, seed=0)
         x_hats = (
-            estimates_of(Artifact.read(resolve(name)), system, runs, **how),
-            estimates_of(None, system, runs, **how),
+            estimates_of(Artifact.read(resolve(name)), system, runs, **how)[0],
+            estimates_of(None, system, runs, **how)[0],
         )
         errors[name] = [percentage_error(runs.x, x_hat) for x_hat in x_hats]
     return errors

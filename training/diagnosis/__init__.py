@@ -1,4 +1,4 @@
-"""Can this be observed, and learned? Checks of a system, of recorded data and of an environment, before a training."""
+"""Whether a system, recorded data or an environment can be observed and learned: diagnosis before a training."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -38,7 +38,7 @@ def check(
     policy: Controller | None = None,
     measurement_noise: Sequence[Level] | None = None,
 ) -> Iterator[Finding]:
-    """Look for what would go wrong with a system in environments, training and evaluation."""
+    """Find what would fail with a system in environments, training and evaluation."""
     for name, look in FIRST.items():
         findings = list(_guarded(name, look, of))
         yield from findings
@@ -69,8 +69,8 @@ def _guarded(name: str, look: Callable[[Any], Iterator[Finding]], at: System | S
 
 
 def _problem(name: str, error: Exception) -> Finding:
-    found, _, advice = str(error).partition("; ")
-    return Finding(name, "problem", found, advice)
+    text, _, advice = str(error).partition("; ")
+    return Finding(name, "problem", text, advice)
 
 
 __all__ = ["Finding", "Judgement", "Observability", "Verdict", "check", "observability", "of_records"]

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from examples.research.certificates.settled import SettledTrajectories
 
 SHOWN = 30_000  # states in the figure
+POINTS = 150  # along each axis, at which the residual is drawn
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,6 @@ def draw(
     from matplotlib.colors import LogNorm
 
     from examples.research.certificates.gains import noise_variance
-    from training.evaluation.report import draw_residual
 
     panels = 1 + (artifact.forward is not None)
     with drawing(path, 5 * panels, 4) as figure:
@@ -236,3 +236,21 @@ def draw(
         if artifact.forward is not None:
             draw_residual(axes[0], artifact, system)
         figure.suptitle(name)
+
+
+def draw_residual(ax: Any, artifact: Artifact, system: System) -> None:
+    """Draw the size of the PDE's residual over the plane of the phase portrait, other states at the centre of X."""
+    from matplotlib.colors import LogNorm
+
+    from training.maps.forward import residual
+
+    first, second = (i % system.nx for i in system.portrait)
+    x = np.tile(np.mean(system.X, axis=1), (POINTS**2, 1))
+    grids = [np.linspace(*system.X[i], POINTS) for i in (first, second)]
+    x[:, first], x[:, second] = (grid.ravel() for grid in np.meshgrid(*grids))
+    size = np.linalg.norm(residual(artifact, system, x), axis=1).reshape(POINTS, POINTS)
+    image = ax.pcolormesh(*grids, size, norm=LogNorm() if size.all() else None, shading="auto")
+    ax.figure.colorbar(image, ax=ax, label="|∂T/∂x f − A T − B h|")
+    ax.set(xlabel=system.state_names[first], ylabel=system.state_names[second])
+    ax.grid(visible=False)
+    ax.set_title("PDE residual over X" if system.nx == 2 else "PDE residual through the centre of X")

@@ -15,8 +15,8 @@ from torch import nn
 from kkl_gym.system import System
 from observers import storage
 from observers.estimator import Estimator
+from training.evaluation.errors import off_by
 from training.evaluation.levels import Level
-from training.evaluation.plants import off_by
 from training.jobs import describe
 from training.lessons.run import Loss, Stage, optimise
 from training.progress import progress_bars

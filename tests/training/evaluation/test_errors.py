@@ -10,8 +10,7 @@ from kkl_gym import VanDerPol, get_system
 from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
 from training import errors, unseen_trajectories
-from training.evaluation.errors import measured
-from training.evaluation.plants import off_by, show_parameters
+from training.evaluation.errors import measured, off_by, show_parameters
 from training.maps.coordinates import stationary_covariance
 
 

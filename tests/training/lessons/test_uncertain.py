@@ -14,7 +14,7 @@ from kkl_gym import VanDerPol
 from kkl_gym.system import System
 from training import SimulatedSource, errors, train, unseen_trajectories
 from training.config import Config
-from training.evaluation.plants import parameter_errors
+from training.evaluation.errors import parameter_errors
 from training.spectrum import Spectrum
 
 
