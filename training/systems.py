@@ -11,6 +11,7 @@ import numpy as np
 
 from kkl_gym.loading import load_function
 from kkl_gym.system import System
+from observers.names import suggestion
 from training.spectrum import evenly_spaced
 from training.trajectories.policies import Controller, checked_policy, linear_quadratic
 
@@ -118,6 +119,10 @@ def controller(system: System) -> Controller:
 
 def named_policy(system: System, name: str) -> Controller:
     """A policy under which motions of a system are simulated."""
+    if ":" not in name and name != "controller":
+        raise ValueError(
+            f"unknown policy {name!r}{suggestion(name, ['controller'])}: it is controller, or script.py:function"
+        )
     if name != "controller":
         return checked_policy(load_function(name), system, name)
     try:

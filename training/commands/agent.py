@@ -1,9 +1,9 @@
 """``kkl-gym agent``: train, evaluate and convert agents."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -16,9 +16,8 @@ from training.agents.agent import Agent, find
 from training.agents.information import Information
 from training.agents.play import Episodes, play
 from training.agents.seeds import agent_evaluation_seed
-from training.agents.tasks import TOLERANCE, scores, successes
-from training.commands.agent_task import Measured, TaskOptions
-from training.commands.options import NoiseLevel
+from training.agents.tasks import TOLERANCE, Task, get_task, scores, successes
+from training.commands.options import EnvironmentArguments, NoiseLevel, merged, names_in, set_threads, words
 from training.evaluation.levels import show_level
 from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
@@ -45,6 +44,66 @@ Trust = Annotated[
         help_behavior_hint="",
     ),
 ]
+
+
+def numbers(kind: type, form: str, count: int | None = None) -> Callable[[str], tuple[Any, ...]]:
+    """A reader of numbers with commas between them."""
+
+    def read(text: str) -> tuple[Any, ...]:
+        try:
+            values = tuple(map(kind, names_in(text)))
+        except ValueError:
+            values = None
+        if values is None or (count and len(values) != count):
+            raise ValueError(f"got {text!r}, not {form}")
+        return values
+
+    return read
+
+
+_INDICES = words(numbers(int, "indices in the flattened observation, as in 0,1"), "INDICES", 1)
+_PAIR = words(numbers(int, "the cosine's entry and the sine's, once for each angle, as in 0,1", 2), "PAIR", 1)
+_STEPS = words(numbers(float, "numbers of steps, as in 1,2"), "STEPS", 1)
+Measured = Annotated[
+    tuple[int, ...],
+    _INDICES,
+    tyro.conf.arg(help_behavior_hint="(default: the positions, of environments known here)"),
+]
+
+
+@dataclass(frozen=True)
+class TaskOptions:
+    """Options of a task; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
+
+    measured: Measured = ()
+    """Entries of the flattened observation that agents may see, with commas between them, as in 0,1. Of systems y is
+    measured."""
+    hidden: Annotated[tuple[int, ...], _INDICES, tyro.conf.arg(help_behavior_hint="(default: all others)")] = ()
+    """Entries that an observer estimates."""
+    env_kwargs: EnvironmentArguments = ()
+    time_constants: Annotated[tuple[float, ...], _STEPS, tyro.conf.arg(help_behavior_hint="(default: 1,2,4,8)")] = ()
+    """Time constants of z's memory and of traces, in actions. Where there is no noise, 1 or 1,2 may be easier to learn
+    with."""
+    frames: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 8)")] = None
+    """Number of stacked observations, each with the action before it."""
+    no_past_actions: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Leave past actions out of z, traces and stacked."""
+    angles: Annotated[
+        tuple[Annotated[tuple[int, ...], _PAIR], ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(help_behavior_hint="(default: none)"),
+    ] = ()
+    """Measured entries that are the cosine and the sine of an angle, once for each angle, as in 0,1. Then z holds how
+    far it has turned."""
+
+    def task(self, name: str, measurement_noise: Any = None) -> Task:
+        """The task of a system or an environment with these options."""
+        options = {name: value for name, value in vars(self).items() if value not in ((), None)}
+        if self.env_kwargs:
+            options["env_kwargs"] = merged("--env-kwargs", self.env_kwargs)
+        if options.pop("no_past_actions"):
+            options["past_actions"] = False
+        return get_task(name, measurement_noise, **options)
 
 
 @dataclass(frozen=True)
@@ -93,16 +152,12 @@ class Train:
 
     def run(self, console: Console) -> None:
         """Train, and play a hundred episodes."""
-        import torch  # which takes seconds to import, as stable-baselines3 does
-
-        from training.agents.learning import learn
+        from training.agents.learning import learn  # which takes seconds to import
         from training.checkpoints import SUFFIX
 
         task = self.options.task(self.name, self.measurement_noise)
         folder = self.out or Path("runs/agents") / f"{task.name}-{self.information}-{self.seed}"
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
-        torch.set_num_threads(self.threads)
+        set_threads(self.threads)
         with locked(folder), progress_bars(console, folder / LOG) as progress:
             if (folder / "agent.safetensors").exists() and not self.resume:
                 raise FileExistsError(f"{folder} holds an agent already; choose another folder with --out")
@@ -184,7 +239,7 @@ class Import:
     """The agent's file."""
     observer: Annotated[str | None, tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: the system's)")] = None
     """The shipped map or .safetensors file that it was trained on."""
-    measured: Measured = ""
+    measured: Measured = ()
     """Entries of the flattened observation that the agent may see, as in 0,1."""
 
     def run(self, console: Console) -> None:

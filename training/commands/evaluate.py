@@ -290,7 +290,9 @@ class Evaluate:
                     case = {"map": of.name, "starts": starts, "driven": driven, "observer": who, "span": span}
                     cells = {"measurement_noise": as_cell(level)}
                     for name, joint, states in zip(names, one.joint, one.states, strict=True):
-                        of_states = {f"{name} {state}": 100 * share for state, share in zip(of.model.state_names, states)}
+                        of_states = {
+                            f"{name} {state}": 100 * share for state, share in zip(of.model.state_names, states)
+                        }
                         cells |= {name: 100 * joint} | of_states
                     low, high = one.limits
                     rows.append(case | cells | {"nees": one.nees, "nees_low": low, "nees_high": high})

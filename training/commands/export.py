@@ -8,11 +8,18 @@ import tyro
 from rich.console import Console
 
 from observers.storage import replacing
-from training.commands.options import NoiseLevel
+from training.commands.options import NoiseLevel, words
 from training.files import write
 
 if TYPE_CHECKING:
     from training.export import Exported
+
+
+def read_format(text: str) -> str:
+    """Read the kind of files, in small letters or capitals."""
+    if text.lower() not in ("onnx", "c"):
+        raise ValueError(f"{text!r} is no format: write onnx or c")
+    return text.lower()
 
 
 @dataclass(frozen=True)
@@ -30,8 +37,8 @@ class ExportCommand:
     observer: Annotated[
         tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP", help="A shipped map, or a .safetensors file.")
     ]
-    format: Literal["onnx", "c"]
-    """What to write."""
+    format: Annotated[str, words(read_format, "{onnx,c}", 1)]
+    """The kind of files."""
     precision: Literal["float", "double"] = "float"
     """Type of the network, of samples and of estimates. The filter and the covariance of maps that track are doubles in
     both: floats are too coarse for them."""

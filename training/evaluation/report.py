@@ -41,7 +41,9 @@ def write_report(path: Path, result: Result, source: Source | System) -> None:
             ax.semilogy(*np.array(history).T, label=name)
         ax.set(xlabel="batch", ylabel="error", title=f"{artifact.system}, {artifact.training['pipeline']}")
         ax.legend()
-        for column in (0, 1) if runs else ():
+        for column in (0, 1):
+            if runs is None:
+                break
             # Of simulated runs the first has no process noise, and the second half has.
             level, run = levels[-column], column * (RUNS // 2) % runs.x.shape[1]
             axes = [figure.add_subplot(grid[1 + i, column]) for i in range(rows)]

@@ -16,9 +16,9 @@ from training.agents.learning import learn
 from training.agents.seeds import AGENT_EVALUATION_SEED, agent_evaluation_seed
 from training.agents.tasks import HIDDEN_VELOCITIES
 from training.cli import main
-from training.commands.agent import Evaluate
-from training.commands.agent_task import TaskOptions
-from training.commands.record import PlayOptions, RecordCommand
+from training.commands.agent import Evaluate, TaskOptions
+from training.commands.options import PlayOptions
+from training.commands.record import RecordCommand
 from training.records import read_records
 
 OWN = f"{linear_system.__file__}:Oscillator"

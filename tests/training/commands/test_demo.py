@@ -46,7 +46,7 @@ def test_an_observer_of_a_bias(capsys):
     main(["demo", "van_der_pol", "--observer", "biased.safetensors", "--out", ".", "--duration", "1"])
     assert "KKLVanDerPol-v0" in capsys.readouterr().out
     assert system_of(artifact, None) == system
-    assert model_of(artifact, None).nx == 3
+    assert model_of(artifact, system).nx == 3
     policy, x = read_policy(artifact, system, None), np.array([[0.3, -0.2, 0.9]])
     np.testing.assert_array_equal(policy(x), policy(x[:, :2]))
     env = gym.make("KKLVanDerPol-v0")

@@ -10,7 +10,8 @@ from kkl_gym import VanDerPol, get_system
 from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
 from training import errors, unseen_trajectories
-from training.evaluation.errors import measured, off_by, show_parameters
+from training.commands.evaluate import show_parameters
+from training.evaluation.errors import measured, off_by
 from training.maps.coordinates import stationary_covariance
 
 

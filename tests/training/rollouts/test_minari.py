@@ -11,7 +11,7 @@ import pytest
 from observers import Artifact
 from observers.storage import UNFINISHED
 from training.cli import main
-from training.commands.record import read_argument
+from training.commands.options import read_argument
 from training.records import Signals, read_records
 from training.records.episodes import is_dataset, read_dataset, write_dataset
 from training.rollouts import make, policy_of, roll_out
@@ -191,4 +191,4 @@ def test_arguments_of_environments():
     assert read_argument("name=plain text") == ("name", "plain text")
     assert read_argument("box=[1, 2]") == ("box", [1, 2])
     with pytest.raises(ValueError, match="NAME=VALUE"):
-        read_argument("9=g")
+        read_argument("g")
