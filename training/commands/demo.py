@@ -13,9 +13,10 @@ from rich.table import Table
 
 import kkl_gym
 from kkl_gym.simulate import check_duration
-from observers import load
+from kkl_gym.system import System
+from observers import Artifact, load
 from training.commands.options import NoiseLevel, OneObserver, OneSystem, OwnPolicy, Seconds, Shown, read_policy, shown
-from training.commands.portraits import Motion, animate
+from training.commands.portraits import animate
 from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
 from training.figures import ESTIMATE, MEASURED, RIVAL, TRUTH, drawing
@@ -66,7 +67,7 @@ class Demo:
                     noise, seed = self.measurement_noise, self.seed
                     episodes.append(play(one, steps, noise, seed=seed, policy=self.policy, report=report))
             console.print(table(episodes))
-            path = self.out / ("estimates.png" if self.system is None else f"estimates-{episodes[0].name}.png")
+            path = self.out / ("estimates.png" if self.system is None else f"estimates-{episodes[0].system.name}.png")
             with progress.phase("drawing"):
                 draw(path, episodes)
             colours = "magenta and blue" if any(one.spinn is not None for one in episodes) else "magenta"
@@ -74,7 +75,7 @@ class Demo:
             if self.gif:
                 moving = path.with_suffix(".gif")
                 with progress.phase("drawing the moving picture"):
-                    animate(moving, [episode.motion for episode in episodes])
+                    animate(moving, episodes)
                 progress.say(f"wrote {moving}: states in black, estimates in magenta, measured outputs below")
         return path
 
@@ -83,9 +84,10 @@ class Demo:
 class Episode:
     """One episode of an environment with an observer; ``spinn`` is the paper's observer's estimate, where it ships."""
 
-    label: str
-    chosen: bool
-    env: kkl_gym.KKLObservation
+    environment: Shown
+    artifact: Artifact
+    dt: float
+    noise: str
     x: np.ndarray
     x_hat: np.ndarray
     spinn: np.ndarray | None
@@ -93,20 +95,9 @@ class Episode:
     seconds: float
 
     @property
-    def name(self) -> str:
-        """The system's."""
-        return self.env.unwrapped.system.name  # type: ignore[attr-defined]
-
-    @property
-    def motion(self) -> Motion:
-        """What a moving picture shows of it."""
-        env: Any = self.env.unwrapped
-        return Motion(env.system, env.dt, self.x, self.x_hat, self.y)
-
-    @property
-    def measurement_noise(self) -> str:
-        """The level as a text."""
-        return show_level(self.env.unwrapped.measurement_noise)  # type: ignore[attr-defined]
+    def system(self) -> System:
+        """The environment's."""
+        return self.environment.system
 
 
 def play(
@@ -119,39 +110,36 @@ def play(
     report: Callable[[int], object] = lambda done: None,
 ) -> Episode:
     """Play one episode with an observer, undriven unless it was trained under a policy."""
-    made = gym.make(
-        environment.env_id, **environment.options, measurement_noise=measurement_noise, max_episode_steps=steps
-    )
-    env = kkl_gym.KKLObservation(made, environment.observer)
-    acting = read_policy(env.observer.artifact, environment.system, policy)
+    options: dict[str, Any] = {"measurement_noise": measurement_noise, "max_episode_steps": steps}
+    env = kkl_gym.KKLObservation(gym.make(environment.env_id, **environment.options, **options), environment.observer)
+    base: Any = env.unwrapped
+    system, level, artifact = environment.system, base.measurement_noise, env.observer.artifact
+    acting = read_policy(artifact, system, policy)
     _, info = env.reset(seed=seed)
-    infos = [info]
-    idle = np.zeros(env.action_space.shape or (), np.float32)
-    seconds = list[float]()
-    for first in range(0, steps, EVERY):
-        for _ in range(first, min(first + EVERY, steps)):
-            action = idle if acting is None else np.asarray(acting(info["x"][None]), dtype=float)[0]
-            started = time.perf_counter()
-            _, _, terminated, _, info = env.step(action)
-            seconds.append(time.perf_counter() - started)
-            infos.append(info)
-            if terminated:
-                break
-        report(len(infos) - 1)
+    infos, seconds = [info], list[float]()
+    action = np.zeros(env.action_space.shape or (), np.float32)
+    for k in range(steps):
+        if acting is not None:
+            action = np.asarray(acting(info["x"][None]), dtype=float)[0]
+        started = time.perf_counter()
+        _, _, terminated, _, info = env.step(action)
+        seconds.append(time.perf_counter() - started)
+        infos.append(info)
         if terminated:
             break
+        if k % EVERY == 0:
+            report(k)
     x, x_hat, y = (np.array([info[key] for info in infos]) for key in ("x", "x_hat", "y"))
-    system, level = environment.system, env.unwrapped.measurement_noise  # type: ignore[attr-defined]
-    x_hat = x_hat[:, : system.nx]  # without a bias behind the states
-    ships = acting is None and type(system) in kkl_gym.SYSTEMS.values()  # SPINN's maps know no inputs
-    paper = f"{system.name}-spinn" if ships else None
+    # SPINN's maps know no inputs.
+    ships = acting is None and type(system) in kkl_gym.SYSTEMS.values()
     return Episode(
-        label=environment.label,
-        chosen=environment.observer is not None,
-        env=env,
+        environment,
+        artifact,
+        dt=base.dt,
+        noise=show_level(level),
         x=x,
-        x_hat=x_hat,
-        spinn=load(paper, level).estimate(y) if paper else None,
+        x_hat=x_hat[:, : system.nx],  # without a bias behind the states
+        spinn=load(f"{system.name}-spinn", level).estimate(y) if ships else None,
         y=y,
         seconds=float(np.median(seconds)),  # the first one compiles, or loads machine code
     )
@@ -159,11 +147,11 @@ def play(
 
 def table(episodes: Sequence[Episode]) -> Table:
     """Errors of the observers, and the time of a step."""
-    noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
+    noise = ", ".join(dict.fromkeys(episode.noise for episode in episodes))
     with_spinn = any(episode.spinn is not None for episode in episodes)
-    found = Table(
+    laid_out = Table(
         "environment",
-        "observer" if episodes[0].chosen else "default",
+        "observer" if episodes[0].environment.observer else "default",
         "late",
         *("SPINN", "late") if with_spinn else (),
         "µs a step",
@@ -176,8 +164,10 @@ def table(episodes: Sequence[Episode]) -> Table:
             for x_hat in estimates
             for skip in (0, len(episode.x) // 5)
         ]
-        found.add_row(episode.label, *(f"{error:.2f}" for error in errors), f"{1e6 * episode.seconds:.0f}")
-    return found
+        laid_out.add_row(
+            episode.environment.label, *(f"{error:.2f}" for error in errors), f"{1e6 * episode.seconds:.0f}"
+        )
+    return laid_out
 
 
 def draw(path: Path, episodes: Sequence[Episode]) -> None:
@@ -186,8 +176,8 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
     with drawing(path, max(6.0, 2.6 * len(episodes)), 1.9 * rows) as figure:
         axes = figure.subplots(rows, len(episodes), squeeze=False)
         for column, episode in enumerate(episodes):
-            system, C = episode.env.unwrapped.system, episode.env.observer.artifact.C  # type: ignore[attr-defined]
-            t = np.arange(len(episode.x)) * episode.env.unwrapped.dt  # type: ignore[attr-defined]
+            system, C = episode.system, episode.artifact.C
+            t = np.arange(len(episode.x)) * episode.dt
             for i in range(rows):
                 ax: Any = axes[i, column]
                 if i >= system.nx:
@@ -197,7 +187,7 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
                     if np.array_equal(row, np.eye(system.nx)[i]):
                         ax.plot(t, measured, color=MEASURED, alpha=0.6, lw=0.6, label="measured")
                 ax.plot(t, episode.x[:, i], color=TRUTH, lw=1.8, label="true")
-                label = "observer" if episode.chosen else "default observer"
+                label = "observer" if episode.environment.observer else "default observer"
                 ax.plot(t, episode.x_hat[:, i], "--", color=ESTIMATE, lw=1.0, label=label)
                 if episode.spinn is not None:
                     ax.plot(t, episode.spinn[:, i], ":", color=RIVAL, label="SPINN")
@@ -210,7 +200,7 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
         lines = [pair for ax in axes.flat for pair in zip(*ax.get_legend_handles_labels(), strict=True)]
         handles = {label: handle for handle, label in lines}
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=len(handles))
-        noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
+        noise = ", ".join(dict.fromkeys(episode.noise for episode in episodes))
         what = "one noisy output" if all(episode.y.shape[1] == 1 for episode in episodes) else "noisy outputs"
         end = "\n" if len(episodes) == 1 else " "  # so that a narrow figure has room
         figure.suptitle(f"Hidden states estimated from {what}{end}(standard deviation {noise} on every sample)")

@@ -1,33 +1,23 @@
 """The moving picture of ``kkl-gym demo``: phase portraits side by side, and below each what its observer sees."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
 
-from kkl_gym.system import System
 from training.figures import ESTIMATE, MEASURED, TRUTH, save_moving, style
+
+if TYPE_CHECKING:
+    from training.commands.demo import Episode
 
 SECONDS = 12.0  # of motion at the pace of the systems that ship, where it plays as fast as the motion
 FRAMES = 144  # at most
 TRAIL = 0.35  # of the samples drawn: older points would hide the new ones
 
 
-@dataclass(frozen=True)
-class Motion:
-    """One episode. Shapes: ``x``, ``x_hat`` (steps + 1, nx), ``y`` (steps + 1, ny)."""
-
-    system: System
-    dt: float
-    x: np.ndarray
-    x_hat: np.ndarray
-    y: np.ndarray
-
-
-def animate(path: Path, motions: Sequence[Motion]) -> None:
+def animate(path: Path, motions: Sequence["Episode"]) -> None:
     """Draw states and estimates as they move, a column for each motion."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -53,7 +43,7 @@ def animate(path: Path, motions: Sequence[Motion]) -> None:
 class Column:
     """A phase portrait of the beginning of a motion, and the measured outputs below it."""
 
-    def __init__(self, motion: Motion, portrait: Any, strip: Any) -> None:
+    def __init__(self, motion: "Episode", portrait: Any, strip: Any) -> None:
         system, shown = motion.system, list(motion.system.portrait)
         self.samples = min(len(motion.x), 1 + round(SECONDS * system.pace / motion.dt))
         self.x, self.x_hat = (states[: self.samples, shown] for states in (motion.x, motion.x_hat))

@@ -143,7 +143,9 @@ def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
     widths = np.broadcast_to(given, (system.ny,))
     for i, (width, size) in enumerate(zip(widths.tolist(), system.output_range, strict=True)):
         if width > MAX_BIAS * size:
-            raise ValueError(f"a bias of up to {width:g} is more than {MAX_BIAS:g} times the range {size:.3g} of y{i + 1}")
+            raise ValueError(
+                f"a bias of up to {width:g} is more than {MAX_BIAS:g} times the range {size:.3g} of y{i + 1}"
+            )
     ranges = {f"y{i + 1}_bias": (-width, width) for i, width in enumerate(widths.tolist()) if width}
 
     def h(self: System, x: Components) -> Components:
