@@ -22,6 +22,7 @@ from training.commands.options import (
     NoiseLevels,
     Parameters,
     PlayOptions,
+    hint,
     merged,
     names_in,
 )
@@ -55,22 +56,20 @@ class Diagnose:
 
     name: Annotated[
         tyro.conf.Positional[str | None],
-        tyro.conf.arg(
+        hint(
             metavar="[NAME]",
             help=f"{SYSTEM} With --measured and --hidden: an environment as gym.make takes it, such as Pendulum-v1.",
-            help_behavior_hint="",
         ),
     ] = None
-    measurement_noise: Annotated[
-        NoiseLevels,
-        tyro.conf.arg(help_behavior_hint="(default: of a system, its own; else 1 % and 10 % of each output's size)"),
-    ] = None
+    measurement_noise: Annotated[NoiseLevels, hint("of a system, its own; else 1 % and 10 % of each output's size")] = (
+        None
+    )
     """Standard deviations of noise on each sample of y, beside 0; one for all outputs or, as in 0.1,0.3, for each."""
-    dt: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
+    dt: Annotated[float | None, hint("the system's")] = None
     """Sampling interval of a system in seconds."""
-    duration: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
+    duration: Annotated[float | None, hint("the system's")] = None
     """Length in seconds of a system's motions that are followed."""
-    policy: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: random)")] = None
+    policy: Annotated[str | None, hint("random")] = None
     """Chooses the inputs: of a system as for `kkl-gym train` ("controller", or a function of yours as
     script.py:function), in an environment as for `kkl-gym record`."""
     parameters: Parameters = ()

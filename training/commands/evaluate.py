@@ -21,6 +21,7 @@ from training.commands.options import (
     OwnSystem,
     Plant,
     Seconds,
+    hint,
     merged,
     model_of,
     read_observers,
@@ -58,7 +59,7 @@ FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median d
 class Motions:
     """The motions, and the plant that moves. The observer keeps its model."""
 
-    trajectories: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 100, with --faults 500)")] = None
+    trajectories: Annotated[int | None, hint("100, with --faults 500")] = None
     """Number of trajectories from each domain."""
     duration: Seconds = None
     """Length of each trajectory in seconds; 50 for the systems that ship."""
@@ -68,7 +69,7 @@ class Motions:
     """Level of the process noise, in multiples of the system's scale per second; the environments' default is 0.05."""
     plant: Plant = ()
     """Parameters of the plant that moves, such as mu=3.3."""
-    plant_error: Annotated[float | None, tyro.conf.arg(metavar="SHARE", help_behavior_hint="(default: none)")] = None
+    plant_error: Annotated[float | None, hint("none", metavar="SHARE")] = None
     """In place of --plant: by what share every parameter of the plant is larger than the observer's; 0.1 is 10 %."""
 
     def plant_of(self, system: System) -> System | None:
@@ -213,58 +214,52 @@ class Evaluate:
         if self.limit:
             estimators["limit"] = partial(noise_limit, of.model)
         frames, smape, nrmse = list[pd.DataFrame](), list[list[str]](), list[list[str]]()
+        inputs, on = bool(of.artifact.nu), f"{of.on}, model {show_parameters(of.system)}" if of.plant else ""
         for starts, driven, trajectories, level in self._cases(f"evaluating {of.name}", of, levels, progress, left_out):
             skip = min(SKIPPED * of.system.pace, of.duration / 2) if driven else None
             for estimator, measure in estimators.items():
                 if estimator == "limit" and starts != "X":  # the variance of other starts is not known
                     continue
                 one = measure(trajectories, measurement_noise=level, seed=self.motions.seed, skip=skip)
-                case = [estimator] * several + [starts] + ["yes" if driven else "no"] * bool(of.artifact.nu)
+                case = [estimator] * several + [starts] + [yes(driven)] * inputs
                 case += [f"{process_noise:g}"] * bool(process_noise) + [show_level(level)]
                 smape.append([*case, spread(one.full), spread(one.late), str(one.escaped)])
                 nrmse.append([*case, *map(percent, np.median(one.nrmse, axis=0))])
-                columns = {
-                    "observer": estimator,
-                    **({"plant": show_parameters(of.plant)} if of.plant else {}),
-                    "starts": starts,
-                    "driven": driven,
-                    "process_noise": process_noise,
-                    "measurement_noise": as_cell(level),
-                    "trajectory": np.arange(len(one.full)),
-                    "smape": one.full,
-                    "smape_late": one.late,
-                }
-                frames.append(pd.DataFrame(columns | by_state(one.nrmse)))
-        if frames:
-            on = f"{of.on}, model {show_parameters(of.system)}" if of.plant else ""
-            ranges = [f"{name} from {low:g} to {high:g}" for name, (low, high) in of.artifact.parameter_ranges.items()]
-            right = ["process\nnoise"] * bool(process_noise) + ["noise\non y"]
-            case = ["observer"] * several + ["starts"] + ["driven"] * bool(of.artifact.nu)
-            smape_title = f"{of.name}: SMAPE in %, median (IQR) of {self._runs(of)}{on}"
-            nrmse_title = f"{of.name}: NRMSE in % after transient, median{on}"
-            progress.console.print(
-                table(smape_title, case, smape, [*right, "all steps", "after transient", "escaped"],
-                      f"trained for {', '.join(ranges)}" if ranges else None),
-                table(nrmse_title, case, nrmse, [*right, *of.model.state_names]),
-            )  # fmt: skip
-            if of.artifact.estimated_parameters:
-                with progress.phase("estimating parameters"):
-                    estimated = self._parameters(of, levels)
-                progress.console.print(estimated)
+                columns: dict[str, Any] = {"observer": estimator} | (
+                    {"plant": show_parameters(of.plant)} if of.plant else {}
+                )
+                columns |= {"starts": starts, "driven": driven, "process_noise": process_noise}
+                columns |= {"measurement_noise": as_cell(level), "trajectory": np.arange(len(one.full))}
+                columns |= {"smape": one.full, "smape_late": one.late, **by_state(one.nrmse)}
+                frames.append(pd.DataFrame(columns))
+        if not frames:
+            return frames
+        left, right = ["observer"] * several + ["starts"] + ["driven"] * inputs, ["noise\non y"]
+        right = ["process\nnoise"] * bool(process_noise) + right
+        ranges = [f"{name} from {low:g} to {high:g}" for name, (low, high) in of.artifact.parameter_ranges.items()]
+        caption = f"trained for {', '.join(ranges)}" if ranges else None
+        title = f"{of.name}: SMAPE in %, median (IQR) of {self._runs(of)}{on}"
+        tables = [table(title, left, smape, [*right, "all steps", "after transient", "escaped"], caption)]
+        title = f"{of.name}: NRMSE in % after transient, median{on}"
+        tables.append(table(title, left, nrmse, [*right, *of.model.state_names]))
+        if of.artifact.estimated_parameters:
+            with progress.phase("estimating parameters"):
+                tables.append(self._parameters(of, levels))
+        progress.console.print(*tables)
         return frames
 
     def _parameters(self, of: Subject, levels: Sequence[Level]) -> Table:
         """A table of errors of estimated parameters, from starts in X."""
-        inputs, rows = bool(of.artifact.nu), []
+        inputs, rows, names = bool(of.artifact.nu), list[list[str]](), of.artifact.estimated_parameters
         motions = of.runs(process_noise=self.motions.process_noise, seed=self.motions.seed) | {"plant": of.plant}
         for driven in (False, True)[: 1 + inputs]:
             for level in levels:
                 motions |= {"trajectories": self._trajectories, "measurement_noise": level, "driven": driven}
                 values = map(percent, parameter_errors(of.artifact, of.system, **motions))
-                rows.append([*["yes" if driven else "no"] * inputs, show_level(level), *values])
+                rows.append([*[yes(driven)] * inputs, show_level(level), *values])
         on = f"plant {show_parameters(of.plant)}" if of.plant else "plants drawn from their ranges"
         title = f"{of.name}: parameters, rms error in % of their values after transient, {on}"
-        return table(title, [], rows, [*["driven"] * inputs, "noise\non y", *of.artifact.estimated_parameters])
+        return table(title, [], rows, [*["driven"] * inputs, "noise\non y", *names])
 
     def _coverage(self, of: Subject, progress: ProgressBars, left_out: list[str]) -> list["pd.DataFrame"]:
         """Print the coverage of error bars; rows of the CSV file."""
@@ -280,7 +275,7 @@ class Evaluate:
         names = [f"{100 * region:g}" for region in REGIONS]
         cases = self._cases(f"judging the error bars of {of.name}", of, levels, progress, left_out)
         for starts, driven, trajectories, level in cases:
-            late = slice(min(settled, len(trajectories.x) - 2), None)
+            late = slice(min(settled, len(trajectories.x) - 1), None)
             spans = {f"first {first * dt:g} s": slice(0, first), f"after {settled * dt:g} s": late}
             how: dict[str, Any] = {"measurement_noise": level, "seed": self.motions.seed, "spans": (*spans.values(),)}
             for who, artifact in {"KKL": of.artifact, "EKF": None}.items():
@@ -318,16 +313,9 @@ class Evaluate:
             left_out.append(reason)
             return []
         with progress.phase(f"breaking the sensor of {of.name}", 1 + len(FAULTS)) as report:
-            runs = simulate_faults(
-                of.artifact,
-                of.model,
-                trajectories=self._trajectories,
-                duration=of.duration,
-                measurement_noise=level,
-                seed=self.motions.seed,
-                policy=of.policy,
-                report=report,
-            )
+            motions: dict[str, Any] = {"trajectories": self._trajectories, "duration": of.duration}
+            motions |= {"seed": self.motions.seed, "policy": of.policy, "measurement_noise": level}
+            runs = simulate_faults(of.artifact, of.model, report=report, **motions)
         runs.insert(0, "observer", of.name)
         return [runs]
 
@@ -404,6 +392,11 @@ def fault_rows(runs: "pd.DataFrame") -> list[list[str]]:
 def show_parameters(system: System) -> str:
     """For titles and tables: ``mu=3.3``, with spaces between several."""
     return " ".join(f"{name}={value:g}" for name, value in system.parameters.items())
+
+
+def yes(driven: bool) -> str:
+    """Whether inputs drive a run, for tables."""
+    return "yes" if driven else "no"
 
 
 def spread(values: np.ndarray) -> str:

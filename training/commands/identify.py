@@ -19,6 +19,7 @@ from training.commands.options import (
     SettingsOptions,
     SystemName,
     Unknowns,
+    hint,
     merged,
     set_threads,
     system_of,
@@ -47,7 +48,7 @@ class Identify:
     Without limits a parameter stays between a tenth of the guess and ten times that. With --observer all by default,
     from the observer's values on."""
     parameters: Parameters = ()
-    observer: Annotated[str | None, tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: none)")] = None
+    observer: Annotated[str | None, hint("none", metavar="MAP")] = None
     """An observer of the plant's model to adapt: a shipped map or a .safetensors file."""
     data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
     """Records of the plant."""

@@ -81,6 +81,11 @@ def read_setting(text: str) -> tuple[str, Any]:
     return name, [value] if listed and not isinstance(value, list) else value
 
 
+def hint(default: str = "", **named: Any) -> Any:
+    """The default of an option in words, if any, and other arguments of :func:`tyro.conf.arg`."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {default})" if default else "", **named)
+
+
 def merged(option: str, repeated: Iterable[Pairs]) -> dict[str, Any]:
     """The values of an option by name; ValueError if one has two."""
     names = [name for pairs in repeated for name, _ in pairs]
@@ -99,78 +104,55 @@ _PARAMETER = words(pair(float, "parameter with its value", "NAME=VALUE, as in mu
 _UNKNOWN = pair(read_unknown, "unknown parameter", "NAME=VALUE, or NAME=VALUE:LOW:HIGH, as in mu=1.5:0.5:6")
 _HALF_WIDTH = pair(float, "uncertainty of a parameter", "NAME=SHARE, as in mu=0.1, or a number for all", EVERY)
 read_argument = pair(read_json, "argument of an environment", "NAME=VALUE, as in g=9.5")
-_BY_NAME = "(default: by the names of the columns)"
-NO_FILE = tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")
+NO_FILE = hint("no file", metavar="FILE")
 SYSTEM = "A shipped system (lorenz, Lorenz or KKLLorenz-v0), or yours: script.py, script.py:Class or module:Class."
 SystemName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SYSTEM", help=SYSTEM)]
-OneSystem = Annotated[
-    tyro.conf.Positional[str | None],
-    tyro.conf.arg(metavar="[SYSTEM]", help=SYSTEM, help_behavior_hint="(default: all four that ship)"),
-]
+OneSystem = Annotated[tyro.conf.Positional[str | None], hint("all four that ship", metavar="[SYSTEM]", help=SYSTEM)]
 OwnSystem = Annotated[
     str | None,
-    tyro.conf.arg(
+    hint(
         metavar="CLASS",
         help="The system of observers that were made for one of your own, as script.py:Class or module:Class.",
-        help_behavior_hint="",
     ),
 ]
 OneObserver = Annotated[
     str | None,
-    tyro.conf.arg(
+    hint(
+        "the newest that ships for it",
         metavar="MAP",
         help="An observer for that system: a shipped map or a .safetensors file.",
-        help_behavior_hint="(default: the newest that ships for it)",
     ),
 ]
-Observers = Annotated[
-    tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
-]
+Observers = Annotated[tyro.conf.Positional[tuple[str, ...]], hint(metavar="[MAP [MAP ...]]")]
 Parameters = Annotated[
     tuple[Annotated[Pairs, _PARAMETER], ...],
     tyro.conf.UseAppendAction,
-    tyro.conf.arg(
-        help="Physical parameters that differ from the system's defaults, as in rho=30.",
-        help_behavior_hint="(default: none)",
-    ),
+    hint("none", help="Physical parameters that differ from the system's defaults, as in rho=30."),
 ]
-Plant = Annotated[
-    tuple[Annotated[Pairs, _PARAMETER], ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(help_behavior_hint="(default: the observer's own)"),
-]
+Plant = Annotated[tuple[Annotated[Pairs, _PARAMETER], ...], tyro.conf.UseAppendAction, hint("the observer's own")]
 Unknowns = Annotated[
-    tuple[Annotated[Pairs, words(_UNKNOWN, "NAME=VALUE[:LOW:HIGH]")], ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(help_behavior_hint=""),
+    tuple[Annotated[Pairs, words(_UNKNOWN, "NAME=VALUE[:LOW:HIGH]")], ...], tyro.conf.UseAppendAction, hint()
 ]
 HalfWidths = Annotated[
-    tuple[Annotated[Pairs, words(_HALF_WIDTH, "NAME=SHARE")], ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(help_behavior_hint="(default: none)"),
+    tuple[Annotated[Pairs, words(_HALF_WIDTH, "NAME=SHARE")], ...], tyro.conf.UseAppendAction, hint("none")
 ]
 EnvironmentArguments = Annotated[
     tuple[Annotated[Pairs, words(read_argument, "NAME=VALUE")], ...],
     tyro.conf.UseAppendAction,
-    tyro.conf.arg(help="Arguments of the environment; values are JSON, or text.", help_behavior_hint="(default: none)"),
+    hint("none", help="Arguments of the environment; values are JSON, or text."),
 ]
 # A level is written as a number for all outputs, or as one for each with commas between them. Defaults are in words.
-NoiseLevel = Annotated[
-    Level | None, words(read_level, "LEVEL", 1), tyro.conf.arg(help_behavior_hint="(default: the system's own)")
-]
+NoiseLevel = Annotated[Level | None, words(read_level, "LEVEL", 1), hint("the system's own")]
 NoiseLevels = Annotated[
-    tuple[Level, ...] | None,
-    words(read_level, "LEVEL [LEVEL ...]"),
-    tyro.conf.arg(help_behavior_hint="(default: 0 and the system's own)"),
+    tuple[Level, ...] | None, words(read_level, "LEVEL [LEVEL ...]"), hint("0 and the system's own")
 ]
-Seconds = Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the system's own)")]
+Seconds = Annotated[float | None, hint("the system's own", metavar="SECONDS")]
 OwnPolicy = Annotated[
     str | None,
-    tyro.conf.arg(
+    hint(
         metavar="FUNCTION",
         help="The policy of observers that were trained under one of your own, as script.py:function or "
         "module:function. Those that were trained under the system's own controller need no option.",
-        help_behavior_hint="",
     ),
 ]
 
@@ -179,7 +161,7 @@ OwnPolicy = Annotated[
 class RunOptions:
     """The folder of a training, and how it runs."""
 
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: runs/NAME)")] = None
+    out: Annotated[Path | None, hint("runs/NAME, of agents runs/agents/NAME-INFORMATION-SEED", metavar="FOLDER")] = None
     """Where all files are written."""
     resume: bool = False
     """Go on from the checkpoints in the folder, if there are any."""
@@ -200,16 +182,16 @@ def set_threads(threads: int) -> None:
 class DataOptions:
     """The recorded data of a command; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
 
-    data: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]", help_behavior_hint="")] = ()
+    data: Annotated[tuple[Path, ...], hint(metavar="FILE [FILE ...]")] = ()
     """Records: .npz files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named columns;
     rollouts in a Minari data set, minari:ID or its folder, whose signals are named as in `kkl-gym record`."""
-    time: Annotated[str, tyro.conf.arg(metavar="COLUMN", help_behavior_hint="(default: t or time)")] = ""
+    time: Annotated[str, hint("t or time", metavar="COLUMN")] = ""
     """Column of the time in seconds."""
-    measured: Annotated[str, tyro.conf.arg(metavar="COLUMNS", help_behavior_hint=_BY_NAME)] = ""
+    measured: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
     """Measured outputs, with commas between them; y, or y1, y2, ... if they are not named."""
-    inputs: Annotated[str, tyro.conf.arg(metavar="COLUMNS", help_behavior_hint=_BY_NAME)] = ""
+    inputs: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
     """Known inputs, each held until the next sample; u, or u1, u2, ... if they are not named."""
-    hidden: Annotated[str, tyro.conf.arg(metavar="COLUMNS", help_behavior_hint=_BY_NAME)] = ""
+    hidden: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
     """Recorded states; x, or x1, x2, ... if they are not named. Of an angle, cos(COLUMN) and sin(COLUMN)."""
 
     def read(self, progress: ProgressBars, system: System | None = None) -> list[Record]:
@@ -228,12 +210,10 @@ class SettingsOptions:
     config: Annotated[Path | None, NO_FILE] = None
     """TOML or JSON file of settings."""
     set: Annotated[
-        tuple[Annotated[Pairs, words(read_setting, "NAME=VALUE")], ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(help_behavior_hint="(default: none)"),
+        tuple[Annotated[Pairs, words(read_setting, "NAME=VALUE")], ...], tyro.conf.UseAppendAction, hint("none")
     ] = ()
     """Single settings, which come before those of the file, as in --set width=64 eigenvalues=-1,-2,-3."""
-    seed: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 0)")] = None
+    seed: Annotated[int | None, hint("0")] = None
     """Seed of everything random."""
 
     def read(self) -> dict[str, Any]:
@@ -247,9 +227,9 @@ class SettingsOptions:
 class PlayOptions:
     """How an environment is made and for how long it is played."""
 
-    episodes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: no limit)")] = None
+    episodes: Annotated[int | None, hint("no limit")] = None
     """Episodes to play."""
-    steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 100,000 if no episodes are given)")] = None
+    steps: Annotated[int | None, hint("100,000 if no episodes are given")] = None
     """Steps to play, at most; to diagnose, 10,000 by default."""
     env_kwargs: EnvironmentArguments = ()
 

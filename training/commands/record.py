@@ -8,13 +8,13 @@ import gymnasium as gym
 import tyro
 from rich.console import Console
 
-from training.commands.options import PlayOptions, names_in
+from training.commands.options import PlayOptions, hint, names_in
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
     from training.rollouts.playing import Policy
 
-_NAMES = tyro.conf.arg(metavar="SIGNALS", help_behavior_hint="")
+_NAMES = hint(metavar="SIGNALS")
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,7 @@ class RecordCommand:
     state`; or an agent of stable-baselines3 as ppo:FILE.zip, whose code loading may run."""
     seed: int = 0
     """Of the environment and of random actions."""
-    dataset: Annotated[
-        str, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from environment and policy)")
-    ] = ""
+    dataset: Annotated[str, hint("from environment and policy", metavar="ID")] = ""
     """Name of the data set, as in pendulum/random-v0."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
 

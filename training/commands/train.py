@@ -21,6 +21,7 @@ from training.commands.options import (
     Parameters,
     RunOptions,
     SettingsOptions,
+    hint,
     merged,
     set_threads,
 )
@@ -59,11 +60,7 @@ class Train:
 
     system: Annotated[
         tyro.conf.Positional[str],
-        tyro.conf.arg(
-            metavar="SYSTEM",
-            help=f"{SYSTEM} With --data, a name of your choice for what was recorded.",
-            help_behavior_hint="",
-        ),
+        hint(metavar="SYSTEM", help=f"{SYSTEM} With --data, a name of your choice for what was recorded."),
     ] = ""
     pipeline: Pipeline = "input-aware"
     """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs, which
@@ -77,9 +74,7 @@ class Train:
     uncertain: HalfWidths = ()
     """How far a parameter may be from its value, as a part of that: mu=0.1, or 0.1 for all. Some motions in training
     then have their own (input-aware), and the observer serves every such plant. It does not track."""
-    policy: Annotated[str | None, tyro.conf.arg(metavar="FUNCTION", help_behavior_hint="(default: random inputs)")] = (
-        None
-    )
+    policy: Annotated[str | None, hint("random inputs", metavar="FUNCTION")] = None
     """Policy of the simulated motions: "controller" for the system's own, or script.py:function, from states
     (n, nx) to actions (n, nu) in [-1, 1]. For plants that no random input would hold within their bounds."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

@@ -28,7 +28,6 @@ QUERY_SHARE = 0.2  # of the records; neighbours come from the others
 MIN_QUERIES = 50  # samples, for a judgement
 MIN_OTHERS = 5  # times the coordinates of z
 NOISE_SHARES = 0.01, 0.1  # of an output's standard deviation, where no level is named
-FALLS = 1.25  # error with half of the samples over that with all, beyond which more records reduce it
 MIN_NEIGHBOURS = 32  # or twice as many as z has coordinates, so that planes rest on enough of them
 ROUNDING = 1e-9  # of z, in a linear regression
 DETERMINED, UNDETERMINED = 0.05, 0.8  # of a signal's standard deviation: largest and least errors of these verdicts
@@ -212,14 +211,13 @@ def of_records(
     others, queries = (Filtered(pieces(part), linear) for part in split(records, QUERY_SHARE, seed))
     rng, settled = generator(Stream.VALIDATION, seed, 1), settling_time(linear) / linear.dt
     windows = (0, *(2**i for i in range(int(np.ceil(np.log2(settled))) + 1)))
-    errors, changes, halves = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    errors, changes = list[np.ndarray](), list[np.ndarray]()
     for window in windows:
         compared = compare(queries, others, window, noise=noise, rng=rng)
         if compared is None:
             break
         errors.append(compared[0])
         changes.append(np.where(window <= settled / SETTLED, compared[1], np.nan))  # the filter forgets later starts
-        halves.append(compared[2])
     if not errors:
         raise ValueError(
             f"{sum(len(record.t) for record in records)} samples in {len(records)} records are too few to judge "
@@ -236,17 +234,9 @@ def of_records(
             f"windows of {windows[len(errors)]} steps and more are left out, as too few samples have so many before "
             "them; record longer episodes, or more"
         )
-    every = np.stack(errors, 1)
-    for name, exact, half in zip(signals.hidden, every[0].T, np.transpose(halves), strict=True):
-        best = int(exact.argmin())
-        if exact[best] > DETERMINED and half[best] > FALLS * exact[best]:
-            warnings.append(
-                f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * half[best]:.2g} % with half of "
-                "them; record more, which reduces it"
-            )
     inputs = signals.inputs if linear.nu else ()
     known = (signals.measured, inputs, signals.hidden, linear.dt, windows[: len(errors)], noise)
-    return Observability(*known, errors=every, changes=np.stack(changes), warnings=tuple(warnings))
+    return Observability(*known, errors=np.stack(errors, 1), changes=np.stack(changes), warnings=tuple(warnings))
 
 
 def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[Level, ...]:
@@ -300,8 +290,8 @@ class Filtered:
 
 def compare(
     queries: Filtered, others: Filtered, window: int, *, noise: Sequence[Level], rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Errors at each level of noise (k, nx), and without any those of changes and with half of the samples, (nx,).
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Errors at each level of noise (k, nx), and without any those of changes (nx,).
 
     The first level is 0. Returns None where there are too few samples.
     """
@@ -321,9 +311,8 @@ def compare(
         else:
             both = (np.hstack([each.x, each.change]) for each in (one, other))
             left, change = np.split(left_by(z, next(both), others_z, next(both)), 2)
-            half = left_by(z, one.x, others_z[::2], other.x[::2])
             errors.append(left)
-    return np.array(errors), change, half
+    return np.array(errors), change
 
 
 def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """A system before any training: its equations, inputs, motions, sampling and outputs."""
 
+import contextlib
 import importlib.util
 from collections.abc import Callable, Iterator
 from functools import cached_property, partial
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from kkl_gym import EquationError
-from kkl_gym.compiled import batch_step, single_step
+from kkl_gym.compiled import SamplingStep, batch_step, single_step
 from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.simulate import SubstepsError, simulate
 from kkl_gym.system import NOISE_SHARE, System, rate_under
@@ -75,10 +76,19 @@ class Subject:
         noise: tuple[Level, ...] = (),
     ) -> None:
         self.system, self.dt, self.duration, self.policy, self.noise = system, dt, duration, policy, noise
-        self.step = batch_step(system)
-        low, high = system.box()
-        self.x, self.half = of_X(system, POINTS), (high - low) / 2
         self.kinds = ("under the policy",) if policy else ("free", "driven") if system.nu else ("free",)
+        low, high = system.box()
+        self.half = (high - low) / 2
+
+    @cached_property
+    def step(self) -> SamplingStep[np.ndarray]:
+        """One sampling interval of a batch, compiled where it can be."""
+        return batch_step(self.system)
+
+    @cached_property
+    def x(self) -> np.ndarray:
+        """Draw points of X."""
+        return of_X(self.system, POINTS)
 
     @cached_property
     def motions(self) -> tuple[np.ndarray, np.ndarray]:
@@ -110,8 +120,9 @@ class Subject:
         return self.motions[0][:, rows], self.motions[1][:, rows]
 
 
-def declaration(system: System) -> Iterator[Finding]:
+def declaration(subject: Subject) -> Iterator[Finding]:
     """States, inputs and parameters."""
+    system = subject.system
     bounds = ", ".join(f"{u_max:g}" for u_max in system.u_max)
     values = ", ".join(f"{name} = {value:g}" for name, value in system.parameters.items())
     text = f"{system.name}: {system.nx} state{'s' * (system.nx > 1)} ({', '.join(system.state_names)}); "
@@ -120,8 +131,9 @@ def declaration(system: System) -> Iterator[Finding]:
     yield Finding("system", "ok", text + (f"; steps of {system.dt:g} s of its own" if system.discrete else ""))
 
 
-def equations(system: System) -> Iterator[Finding]:
+def equations(subject: Subject) -> Iterator[Finding]:
     """The equations on floats, arrays, tensors and symbols: whether they work, agree, and give finite numbers."""
+    system = subject.system
     x = np.concatenate([of_X(system, COMPARED), of_bounds(system, COMPARED)])
     values: dict[str, np.ndarray] = {}
     for kind, evaluated in KINDS.items():
@@ -291,15 +303,16 @@ def sampling(subject: Subject) -> Iterator[Finding]:
 
 def outputs(subject: Subject) -> Iterator[Finding]:
     """How far each output ranges, and how noisy it is."""
-    system, y = subject.system, subject.system.output(subject.x)
+    system, y, moving = subject.system, subject.system.output(subject.x), subject.y
     noise = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
     for i, level in enumerate(noise):
-        name, size = f"y{i + 1}", float(np.ptp(y[:, i]))
+        name, size, along = f"y{i + 1}", float(np.ptp(y[:, i])), ""
         if size <= STILL * np.abs(y[:, i]).max():
             advice = "let h measure something that moves, or leave this output out"
             yield Finding("output", "problem", f"{name} is {y[0, i]:.4g} everywhere in X", advice)
             continue
-        along = f", {number(np.ptp(subject.y[..., i]))} along motions" if subject.y.size else ""
+        if moving.size:
+            along = f", {number(np.ptp(moving[..., i]))} along motions"
         text = f"{name} ranges over {number(size)} in X{along}; noise {number(level)} by default, "
         text += f"{percent(level / size)} of that in X"
         if level > LOUD * size:
@@ -336,12 +349,10 @@ def _way_out(subject: Subject, *, unstable: bool) -> str:
         return way + ", or accept it, as training leaves them out"
     if not system.nu:
         return way
-    try:
-        stays = Subject(system, subject.dt, subject.duration, named_policy(system, "controller")).stay
-    except ValueError:  # there is no such controller, or a motion needs too many substeps
-        stays = np.zeros(1, bool)
-    if stays.mean() > MANY:
-        return f"{way}, or train with --policy controller, under which {stays.sum()} of {len(stays)} stay"
+    with contextlib.suppress(ValueError):  # there is no such controller, or a motion needs too many substeps
+        stay = Subject(system, subject.dt, subject.duration, named_policy(system, "controller")).stay
+        if stay.mean() > MANY:
+            return f"{way}, or train with --policy controller, under which {stay.sum()} of {len(stay)} stay"
     return f"{way}, or train under a policy of yours that holds the system: --policy script.py:function"
 
 

@@ -199,12 +199,7 @@ def errors(
 
 
 def noise_limit(
-    system: System,
-    trajectories: UnseenTrajectories,
-    *,
-    measurement_noise: Level,
-    seed: int,
-    skip: float | None = None,
+    system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int, skip: float | None = None
 ) -> Errors:
     """Errors of an estimator that attains the posterior Cramér-Rao bound, which no unbiased causal one falls below.
 
