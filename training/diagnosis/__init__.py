@@ -36,27 +36,36 @@ def check(
     measurement_noise: Sequence[Level] | None = None,
 ) -> Iterator[Finding]:
     """Find what would fail with a system in environments, training and evaluation."""
-    given = [of.measurement_noise] if measurement_noise is None else measurement_noise
-    noise = tuple(level for one in given if np.any(level := noise_levels("measurement_noise", one, of.ny)))
-    subject = Subject(of, check_dt(dt or of.dt), of.duration if duration is None else duration, policy, noise)
-    failed = False
+    subject, failed = Subject(of, np.nan, np.nan), False
     for name, look in CHECKS.items():
         if name == "compiled":
             if failed:
-                yield Finding(name, "note", "all other checks are left out", "mend this first")
+                yield Finding("equations", "note", "all other checks are left out", "mend this first")
                 return
-            check_interval(of, subject.dt)
-            check_duration(subject.duration, subject.dt)
+            given = [of.measurement_noise] if measurement_noise is None else measurement_noise
+            noise = tuple(level for one in given if np.any(level := noise_levels("measurement_noise", one, of.ny)))
+            interval, seconds = check_dt(of.dt if dt is None else dt), of.duration if duration is None else duration
+            try:
+                check_interval(of, interval)
+            except SubstepsError as error:
+                yield _problem("sampling", error)
+                return
+            check_duration(seconds, interval)
+            subject = Subject(of, interval, seconds, policy, noise)
         try:
             for finding in look(subject):
                 failed |= finding.verdict == "problem"
                 yield finding
         except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-            failed, (text, _, advice) = True, str(error).partition("; ")
+            failed = True
+            yield _problem("sampling" if isinstance(error, SubstepsError) else name, error)
             if isinstance(error, SubstepsError):
-                yield Finding("sampling", "problem", text, advice)
                 return
-            yield Finding(name, "problem", text, advice)
+
+
+def _problem(name: str, error: Exception) -> Finding:
+    text, _, advice = str(error).partition("; ")
+    return Finding(name, "problem", text, advice)
 
 
 __all__ = ["Finding", "Judgement", "Observability", "Verdict", "check", "observability", "of_records"]
