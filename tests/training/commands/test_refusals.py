@@ -38,10 +38,7 @@ def _records():
         (f"diagnose {OSCILLATOR} --parameters rho=1", "no parameter 'rho'"),
         ("diagnose", "name a system, an environment .*, or recorded data"),
         ("diagnose Pendulum-v1", "unknown system 'Pendulum-v1'.*; an environment needs --measured and --hidden"),
-        (
-            "diagnose Pendulum-v1 --measured 0,1 --hidden 2 --dt 0.1",
-            "--dt: of no use for an environment, but for",
-        ),
+        ("diagnose Pendulum-v1 --measured 0,1 --hidden 2 --dt 0.1", "--dt: of no use for an environment, but for"),
         ("diagnose lorenz --steps 3 --env-kwargs g=1", "--steps, --env-kwargs: of no use for a system, but for an env"),
         ("diagnose lorenz --data runs.csv", "NAME .* has no place beside --data; got lorenz"),
         ("train nonsense", "unknown system 'nonsense'"),
@@ -117,12 +114,7 @@ def test_refused(arguments, message, capsys):
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        "evaluate lorenz --csv file/errors.csv",
-        "demo --out file",
-        "diagnose lorenz --json file/found.json",
-    ],
+    "arguments", ["evaluate lorenz --csv file/errors.csv", "demo --out file", "diagnose lorenz --json file/found.json"]
 )
 def test_a_place_that_cannot_be_written_to_is_refused_before_long_work(arguments, tmp_path, monkeypatch):
     def work(self, description, **options):

@@ -254,23 +254,6 @@ def test_motions_that_need_too_many_substeps(monkeypatch):
     assert found.advice == "take a smaller dt"
 
 
-def test_a_state_that_y_does_not_determine_but_the_motion_forgets():
-    forgotten = made(**BLIND | {"f": lambda self, x: (x[1], -x[0], -2.0 * x[2])})
-    assert not problems(forgotten, duration=4.0)
-
-
-def test_the_least_errors_of_states_at_levels_of_noise():
-    """A position and its speed, of uniform starts: against a Kalman filter they are in test_least_errors.py."""
-    found = [
-        one for one in check(Oscillator(), duration=6.0, measurement_noise=[0.1, 0.3]) if one.check == "observability"
-    ]
-    assert [one.found.partition(":")[0] for one in found] == ["x1", "x2"]
-    assert all("without noise (seen 0" in one.found for one in found)
-    assert all(" % at noise 0.1, " in one.found and " % at noise 0.3, in its standard" in one.found for one in found)
-    with pytest.raises(ValueError, match="measurement_noise must"):
-        list(check(Oscillator(), measurement_noise=[float("inf")]))
-
-
 @dataclass(frozen=True)
 class ThroughThird(Lorenz):
     """Seen through x3, which (x1, x2) -> (-x1, -x2) leaves as it is."""

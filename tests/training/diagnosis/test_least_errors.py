@@ -60,12 +60,6 @@ def test_outputs_have_noise_of_their_own_and_one_that_does_not_move_says_nothing
     np.testing.assert_allclose(still[1] / still[1, 0], size / size[0], rtol=1e-4)
 
 
-def test_a_policy_does_not_change_how_well_a_linear_system_is_known(oscillator):
-    """It chooses the inputs, which the observer knows."""
-    driven = of(Oscillator(), 0.3, policy=lambda x: np.tanh(x[:, :1]))
-    np.testing.assert_allclose(driven[1], oscillator[1], rtol=1e-4, atol=1e-12)
-
-
 def test_least_errors_do_not_depend_on_the_units_of_states(oscillator):
     """The oscillator with x2 in thousandths, about another point."""
     other = made(
