@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from training.config import Config
     from training.diagnosis import Observability, observability
-    from training.evaluation.errors import errors, unseen_trajectories
+    from training.evaluation.errors import errors, noise_limit, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
     from training.export.torch_memory import TorchMemory
     from training.export.torch_observer import TorchObserver
@@ -42,6 +42,7 @@ __all__ = [
     "learn",
     "learn_flow",
     "learn_map",
+    "noise_limit",
     "nrmse",
     "observability",
     "preset",
@@ -70,6 +71,7 @@ _MODULES = {
     "learn": "rollouts",
     "learn_flow": "lessons.flow",
     "learn_map": "lessons.map",
+    "noise_limit": "evaluation.errors",
     "nrmse": "evaluation.metrics",
     "observability": "diagnosis",
     "preset": "presets",

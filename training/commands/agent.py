@@ -117,11 +117,11 @@ class Train:
 
     name: Name
     information: Information = "x_hat"
-    """What the agent sees: docs/guides/agents.md explains each."""
+    """The agent's observation: docs/guides/agents.md explains each."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
-    """Standard deviation of the noise on each sample of what is measured."""
+    """Standard deviation of the noise on each sample of the measured signals."""
     timesteps: Annotated[int | None, hint("the hyperparameters'")] = None
     """Actions to learn from, in all environments together."""
     observer: Annotated[str | None, hint("the system's; of environments one is learned", metavar="MAP")] = None
@@ -225,7 +225,7 @@ class Import:
     """The zip of an agent, trained without VecNormalize."""
     name: Name
     information: Information = "x_hat"
-    """What the agent sees."""
+    """The agent's observation."""
     out: Path = Path("agent.safetensors")
     """The agent's file."""
     observer: Annotated[str | None, hint("the system's", metavar="MAP")] = None

@@ -44,7 +44,7 @@ ONLY = {
 
 @dataclass(frozen=True)
 class Diagnose:
-    """Report before any training whether a system can be observed and learned, what is wrong, and what to change.
+    """Report before any training whether a system can be observed and learned, with problems and their remedies.
 
     Three kinds of subject: a system (NAME alone); an environment, which is played for it (NAME with --measured and
     --hidden); recorded data (--data, and no NAME). Takes some ten seconds.

@@ -70,7 +70,7 @@ class Motions:
     plant: Plant = ()
     """Parameters of the plant that moves, such as mu=3.3."""
     plant_error: Annotated[float | None, hint("none", metavar="SHARE")] = None
-    """In place of --plant: by what share every parameter of the plant is larger than the observer's; 0.1 is 10 %."""
+    """In place of --plant: share by which every parameter of the plant is larger than the observer's; 0.1 is 10 %."""
 
     def plant_of(self, system: System) -> System | None:
         """Return the plant; None where it is the system."""
@@ -166,7 +166,7 @@ class Evaluate:
                 for reason in left_out:
                     progress.say(f"{subject.name}, left out: {reason}")
         if not frames:
-            raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: the lines above say why")
+            raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: the lines above give the reasons")
         results = pd.concat(frames, ignore_index=True)
         if self.faults:
             console.print(table("", [Column("observer", overflow="fold"), *FAULTS_HEADER], fault_rows(results)))

@@ -38,7 +38,7 @@ class ExportCommand:
     precision: Literal["float", "double"] = "float"
     """Type of the network, of samples and of estimates. The filter and the covariance of maps that track are doubles in
     both: floats are too coarse for them."""
-    measurement_noise: Annotated[NoiseLevel, hint("what is usual for the map")] = None
+    measurement_noise: Annotated[NoiseLevel, hint("the map's own")] = None
     """For --format c: standard deviation of the noise on each sample that the estimate assumes, or one for each output
     as in 0.1,0.3."""
     process_noise: Annotated[float | None, hint("the system's")] = None
