@@ -36,7 +36,6 @@ from training.agents.seeds import agent_evaluation_seed
 from training.agents.tasks import Task
 from training.commands import demo
 from training.commands.options import shown
-from training.commands.portraits import animate
 from training.evaluation.errors import estimates as estimates_of
 from training.evaluation.errors import unseen_trajectories
 from training.evaluation.faults import FAULTS
@@ -80,7 +79,7 @@ def estimates(duration: float = 15.0) -> Draw:
 def portraits(name: str | None = None, duration: float = 12.0) -> Draw:
     """Phase portraits that move: ``kkl-gym demo --gif --seed 7 --duration 12``, of one system or all."""
     episodes = [demo.play(one, round(duration / one.system.dt), None, seed=SEED) for one in shown(name, None)]
-    return lambda path: animate(path, episodes)
+    return lambda path: demo.animate(path, episodes)
 
 
 def agents() -> tuple[Task, Mapping[str, Episodes]]:

@@ -166,7 +166,7 @@ class Evaluate:
                 for reason in left_out:
                     progress.say(f"{subject.name}, left out: {reason}")
         if not frames:
-            raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: the lines above give the reasons")
+            raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: see the lines above")
         results = pd.concat(frames, ignore_index=True)
         if self.faults:
             console.print(table("", [Column("observer", overflow="fold"), *FAULTS_HEADER], fault_rows(results)))

@@ -12,7 +12,7 @@ from random_artifacts import random_artifact
 
 from kkl_gym import KKLObservation, get_system
 from training.cli import main
-from training.commands import portraits
+from training.commands import demo
 from training.commands.demo import play
 from training.commands.options import model_of, read_policy, shown, system_of
 
@@ -59,7 +59,7 @@ def test_an_observer_of_a_bias(capsys):
 
 
 def test_a_moving_picture(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(portraits, "FRAMES", 4)
+    monkeypatch.setattr(demo, "FRAMES", 4)
     main(["demo", "lorenz", "--gif", "--out", ".", "--duration", "2"])
     assert "wrote estimates-lorenz.gif" in capsys.readouterr().out.replace("\n", "")
     with Image.open(tmp_path / "estimates-lorenz.gif") as gif:
