@@ -221,7 +221,7 @@ class Evaluate:
                 if estimator == "limit" and starts != "X":  # the variance of other starts is not known
                     continue
                 one = measure(trajectories, measurement_noise=level, seed=self.motions.seed, skip=skip)
-                case = [estimator] * several + [starts] + [yes(driven)] * inputs
+                case = [estimator] * several + [starts] + [("no", "yes")[driven]] * inputs
                 case += [f"{process_noise:g}"] * bool(process_noise) + [show_level(level)]
                 smape.append([*case, spread(one.full), spread(one.late), str(one.escaped)])
                 nrmse.append([*case, *map(percent, np.median(one.nrmse, axis=0))])
@@ -256,7 +256,7 @@ class Evaluate:
             for level in levels:
                 motions |= {"trajectories": self._trajectories, "measurement_noise": level, "driven": driven}
                 values = map(percent, parameter_errors(of.artifact, of.system, **motions))
-                rows.append([*[yes(driven)] * inputs, show_level(level), *values])
+                rows.append([*[("no", "yes")[driven]] * inputs, show_level(level), *values])
         on = f"plant {show_parameters(of.plant)}" if of.plant else "plants drawn from their ranges"
         title = f"{of.name}: parameters, rms error in % of their values after transient, {on}"
         return table(title, [], rows, [*["driven"] * inputs, "noise\non y", *names])
@@ -392,11 +392,6 @@ def fault_rows(runs: "pd.DataFrame") -> list[list[str]]:
 def show_parameters(system: System) -> str:
     """For titles and tables: ``mu=3.3``, with spaces between several."""
     return " ".join(f"{name}={value:g}" for name, value in system.parameters.items())
-
-
-def yes(driven: bool) -> str:
-    """Whether inputs drive a run, for tables."""
-    return "yes" if driven else "no"
 
 
 def spread(values: np.ndarray) -> str:

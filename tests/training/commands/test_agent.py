@@ -74,20 +74,6 @@ def test_an_agent_in_any_environment(information, capsys):
         main(["agent", "train", "CartPole-v1", "--information", information])
 
 
-@pytest.mark.parametrize(
-    ("command", "says"),
-    [
-        ("CartPole-v1 --measurement-noise 0.1,0.2", "one number"),
-        ("Acrobot-v1", "say what is measured of Acrobot-v1"),
-        ("lorenz --measured 0", "of the system lorenz y is measured"),
-        ("lorenz --aggregate 2", "no observer to fit again"),
-    ],
-)
-def test_commands_that_make_no_sense(command, says):
-    with pytest.raises(SystemExit, match=says):
-        main(["agent", "train", *command.split()])
-
-
 def test_options_become_a_task(capsys):
     words = [
         "--time-constants",

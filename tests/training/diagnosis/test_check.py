@@ -75,18 +75,6 @@ def test_neither_do_others_have_problems(name, duration):
     assert not problems(get_system(name), duration=duration)
 
 
-def test_a_linear_system_has_its_numbers():
-    subject = Subject(Oscillator(), 0.01, 20.0)
-    found = {name: next(CHECKS[name](subject)).found for name in ("sampling", "inputs", "bounds")}
-    assert (
-        "time constants 1 to 1 s (medians over X), of which the fastest spans 100 samples and a motion 20 of"
-        in found["sampling"]
-    )
-    assert "y changes by 1 % of its standard deviation" in found["sampling"]
-    assert found["inputs"] == "input 1 at its bound 0.5 moves x2 by 0.5 per second"
-    assert found["bounds"] == "all of 100 motions of 20 s from X, free and driven, stay within them"
-
-
 def test_the_command_prints_a_table_of_findings(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "1000")
     options = ["--dt", "0.05", "--duration", "2", "--policy", "controller", "--json", str(tmp_path / "found.json")]

@@ -71,11 +71,6 @@ def test_least_errors_do_not_depend_on_the_units_of_states(oscillator):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-9)
 
 
-def test_equations_that_are_for_numbers_alone_have_least_errors_too(oscillator):
-    of_numpy = made(f=lambda self, x: (x[1], -np.arcsinh(np.sinh(x[0]))), h=lambda self, x: (np.cbrt(x[0] ** 3),))
-    np.testing.assert_allclose(of(of_numpy, 0.3)[0], oscillator[0], rtol=1e-3)
-
-
 def test_motions_that_leave_or_are_short():
     with pytest.raises(ValueError, match=r"only 0 motions from X stayed within the bounds; .* \(--policy\)"):
         of(made(f=lambda self, x: (x[1], 4.0 * x[0])))

@@ -1,24 +1,15 @@
 """Sensor faults, on a small scale."""
 
-import dataclasses
 from pathlib import Path
 
-import linear_system
-import numpy as np
 import pandas as pd
-import pytest
 
-from observers import Limits
 from training import markdown
 from training.cli import main
 from training.commands.evaluate import FAULTS_HEADER, fault_rows
 from training.evaluation.faults import FAULTS
 
 COLUMNS = "observer,system,fault,deadline,trajectory,score,delay"
-LIMITS = Limits(
-    np.array([0.0, 1.0]), np.full((2, 1), 0.5), np.zeros((2, 1)), np.full((2, 1), 2.0), 0.5, 5.0, 0.01, 50.0
-)
-OSCILLATOR = f"{linear_system.__file__}:Oscillator"
 
 
 def test_the_command_and_its_report(tmp_path, capsys):
@@ -47,19 +38,3 @@ def test_the_table_on_the_page_is_that_of_the_file():
     published = pd.read_csv(results / "faults" / "faults.csv")
     assert ",".join(published) == COLUMNS
     assert "\n".join(markdown.table(["", *FAULTS_HEADER], fault_rows(published))) in (results / "faults.md").read_text()
-
-
-def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path, capsys):
-    path = str(tmp_path / "mine.safetensors")
-    dataclasses.replace(make_artifact(system=OSCILLATOR), C=np.array([[1.0, 0.0]]), limits=LIMITS).save(path)
-    with pytest.raises(SystemExit, match="name its class with --system"):
-        main(["evaluate", path, "--faults"])
-    csv = str(tmp_path / "faults.csv")
-    options = ["--faults", "--system", OSCILLATOR, "--trajectories", "4", "--duration", "12", "--csv", csv]
-    with pytest.raises(SystemExit, match=f"nothing is left to evaluate of {path}"):
-        main(["evaluate", path, "--measurement-noise", "1.5", *options])
-    assert f"{path}, left out: measurement noise 1.5 is beyond the map's range, 0 to 1" in capsys.readouterr().out
-    main(["evaluate", path, *options])
-    found = pd.read_csv(csv)
-    assert found.groupby(["observer", "system"]).size().to_dict() == {(path, "oscillator"): 16}
-    assert set(found.deadline) == {2.4}  # a fifth of the duration
