@@ -157,7 +157,7 @@ class Evaluate:
 
         self._check()
         frames: list[pd.DataFrame] = []
-        subjects = list(map(self._subject, *zip(*read_observers(self.observers, self.system), strict=True)))
+        subjects = [self._subject(*of) for of in read_observers(self.observers, self.system)]
         judge = self._faults if self.faults else self._coverage if self.calibration else self._errors
         with progress_bars(console) as progress:
             for subject in subjects:

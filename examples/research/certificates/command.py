@@ -14,7 +14,15 @@ from rich.table import Table
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training import markdown
-from training.commands.options import NoiseLevel, Observers, OwnPolicy, OwnSystem, read_observers, read_policy
+from training.commands.options import (
+    NoiseLevel,
+    Observers,
+    OwnPolicy,
+    OwnSystem,
+    model_of,
+    read_observers,
+    read_policy,
+)
 from training.evaluation.levels import beyond, level_for, show_level
 from training.figures import drawing
 from training.files import require_writable, write
@@ -68,6 +76,7 @@ class Certify:
         observers = read_observers(self.observers, self.system)
         require_writable(self.out)
         for name, (_, artifact, system) in zip(names, observers, strict=True):
+            system = model_of(artifact, system)
             level = level_for(artifact, system, self.measurement_noise)
             if reason := beyond(artifact, level):
                 console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
