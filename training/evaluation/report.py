@@ -41,11 +41,10 @@ def write_report(path: Path, result: Result, source: Source | System) -> None:
             ax.semilogy(*np.array(history).T, label=name)
         ax.set(xlabel="batch", ylabel="error", title=f"{artifact.system}, {artifact.training['pipeline']}")
         ax.legend()
-        for column in (0, 1):
-            if runs is None:
-                break
+        for column, level in enumerate((levels[0], levels[-1]) if runs else ()):
+            assert runs is not None
             # Of simulated runs the first has no process noise, and the second half has.
-            level, run = levels[-column], column * (RUNS // 2) % runs.x.shape[1]
+            run = column * (RUNS // 2) % runs.x.shape[1]
             axes = [figure.add_subplot(grid[1 + i, column]) for i in range(rows)]
             noise = f"measurement noise {show_level(level)}, process noise {runs.process_noise[run]:g}"
             axes[0].set_title("as recorded" if artifact.signals else noise, loc="left")
