@@ -16,9 +16,9 @@ from observers import Artifact, shipped
 from observers.names import resolve
 from training.config import checked_changes, read_changes, setting_types
 from training.evaluation.levels import Level, read_level
+from training.presets import named_policy
 from training.progress import ProgressBars
 from training.records import Record, Signals, read_records
-from training.systems import named_policy
 from training.trajectories.parameters import EVERY, blind, with_bias
 from training.trajectories.policies import Controller
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from training import markdown
+from training import files
 from training.cli import main
 from training.commands.evaluate import FAULTS_HEADER, fault_rows
 from training.evaluation.faults import FAULTS
@@ -37,4 +37,4 @@ def test_the_table_on_the_page_is_that_of_the_file():
     results = Path(__file__).parents[3] / "docs" / "results"
     published = pd.read_csv(results / "faults" / "faults.csv")
     assert ",".join(published) == COLUMNS
-    assert "\n".join(markdown.table(["", *FAULTS_HEADER], fault_rows(published))) in (results / "faults.md").read_text()
+    assert "\n".join(files.table(["", *FAULTS_HEADER], fault_rows(published))) in (results / "faults.md").read_text()
