@@ -73,6 +73,8 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
     if text.endswith(".safetensors"):
         return Path(text)
     names = shipped()
+    if ":" in text or text.endswith(".py"):
+        raise ArtifactError(f"{text} names a system; name its observer's file, such as runs/NAME/NAME.safetensors")
     if (name := matching(text, names)) is None:
         raise ArtifactError(
             f"unknown observer {shown(text)}{suggestion(text, names)}; shipped: {', '.join(names) or 'none'}; "

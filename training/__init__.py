@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from training.diagnosis import Observability as Observability
     from training.diagnosis import observability as observability
     from training.evaluation.errors import errors as errors
+    from training.evaluation.errors import noise_limit as noise_limit
     from training.evaluation.errors import unseen_trajectories as unseen_trajectories
     from training.evaluation.metrics import nrmse as nrmse
     from training.evaluation.metrics import smape as smape
@@ -34,7 +35,7 @@ _NAMES = {
     "calibration": "calibrate",
     "config": "Config",
     "diagnosis": "Observability observability",
-    "evaluation.errors": "errors unseen_trajectories",
+    "evaluation.errors": "errors noise_limit unseen_trajectories",
     "evaluation.metrics": "nrmse smape",
     "export.torch_memory": "TorchMemory",
     "export.torch_observer": "TorchObserver",

@@ -75,6 +75,17 @@ class ExtendedKalmanFilter:
         """Return means and covariances."""
         return Estimate(state.x.copy(), state.P.copy())
 
+    def along(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Covariances (steps + 1, n, nx, nx) with derivatives along motions (steps + 1, n, nx) themselves.
+
+        With the plant's own noise that is the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
+        """
+        state, y, covariances = self.start(x.shape[1]), self._system.output(x), []
+        for k in range(len(x)):
+            state = self.advance(state._replace(x=x[max(k - 1, 0)]), y[k], u[k - 1])  # the first sample has no input
+            covariances.append(state.P)
+        return np.array(covariances)
+
     def _starts(self, n: int) -> Gaussian:
         x0, P0 = self._start
         return np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1))

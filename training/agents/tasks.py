@@ -166,6 +166,11 @@ def get_task(name: str, measurement_noise: Level | None = None, **changes: Any) 
     """Return the task of a system, of a script's class or of any environment id, with changes of its fields."""
     name = matching(name, SYSTEMS) or name
     if name not in SYSTEMS and (name in gym.registry or re.search(r"-v\d+$", name)):
+        if ":" not in name:
+            try:
+                gym.spec(name)
+            except gym.error.Error as error:
+                raise ValueError(f"unknown environment {name!r}: {error}") from error
         known = HIDDEN_VELOCITIES.get(name)
         if known is None and not changes.get("measured"):
             raise ValueError(

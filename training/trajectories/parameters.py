@@ -16,6 +16,7 @@ from training.trajectories.motions import Controller
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
 EVERY = "all"  # in the place of a parameter's name
+MAX_BIAS = 10.0  # of an output's range in X, far more than a network of its scale resolves
 ROOM = 1e6  # half-widths of its range that a parameter may lie from the middle
 
 Ranges = Mapping[str, tuple[float, float]]
@@ -73,6 +74,11 @@ def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
     if len(given) not in (1, system.ny):
         raise ValueError(f"bias must be one number, or one of each of {system.ny} outputs, got {half_widths}")
     widths = np.broadcast_to(given, (system.ny,)).tolist()
+    for i, (width, size) in enumerate(zip(widths, system.output_range, strict=True)):
+        if width > MAX_BIAS * size:
+            raise ValueError(
+                f"a bias of up to {width:g} is more than {MAX_BIAS:g} times the range {size:.3g} of y{i + 1}"
+            )
     biased = [i for i, width in enumerate(widths) if width]
     ranges = {f"y{i + 1}_bias": (-widths[i], widths[i]) for i in biased}
 

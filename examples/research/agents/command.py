@@ -17,7 +17,7 @@ from observers.names import resolve
 from training.agents.agent import fingerprint
 from training.agents.information import OBSERVED, observer_of
 from training.agents.tasks import TASKS, Task
-from training.commands.agent_task import TaskOptions
+from training.commands.agent import TaskOptions
 from training.commands.options import NoiseLevels
 from training.evaluation.levels import Level
 from training.files import write

@@ -10,7 +10,7 @@ import pytest
 from observers import Artifact
 from observers.storage import UNFINISHED
 from training.cli import main
-from training.commands.record import read_argument
+from training.commands.options import read_argument
 from training.records import Signals, read_records
 from training.records.episodes import is_dataset, read_dataset, write_dataset
 from training.rollouts import make, policy_of, roll_out
@@ -175,4 +175,4 @@ def test_arguments_of_environments():
     for text, value in (("g=9.5", 9.5), ("g=plain text", "plain text"), ("g=[1, 2]", [1, 2])):
         assert read_argument(text) == ("g", value)
     with pytest.raises(ValueError, match="NAME=VALUE"):
-        read_argument("9=g")
+        read_argument("g")
