@@ -156,7 +156,7 @@ def learn(
 
         keys = ("y", "u", "x", "sample", CLEAN_Y) if aggregate else ()
         description = f"{task.name} {information} {seed}"
-        with closing(_Learner(name, settings, seed, task, make(), keys)) as learner:
+        with closing(Learner(name, settings, seed, task, make(), keys)) as learner:
             learner.begin(checkpoint, left)
             if privileged is not None and checkpoint.privileged:
                 checkpoint.records = privileged.records
@@ -224,7 +224,7 @@ def _check_actions(algorithm: str, space: gym.Space[Any], env_id: str) -> None:
         raise ValueError(f"{algorithm} cannot learn in {env_id}, whose actions are {space}: take {others}")
 
 
-class _Learner:
+class Learner:
     """An algorithm and its environments, with settings that mean what they mean in rl-zoo3."""
 
     def __init__(
