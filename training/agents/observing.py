@@ -13,19 +13,15 @@ from kkl_gym.wrappers.vector import VectorEnv
 from training.agents.environments import CLEAN, CLEAN_Y, single, vector
 from training.agents.information import FeatureObservation, Information, make
 from training.agents.tasks import Task
-from training.maps.coordinates import SETTLED
 from training.progress import ProgressBars
 from training.records import Record
 from training.rollouts.callback import KKLTrainingCallback
 from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
-from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset, split
-from training.spectrum import evenly_spaced
+from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset
 from training.train_observer import train
 
 OBSERVER = "observer.safetensors"
 HEADROOM = 1.5  # of the noise that a map is trained for over the noise that there is
-# Per step, of filters under noise: more and slower modes, which average over more steps.
-MODES_UNDER_NOISE, SLOWEST_UNDER_NOISE, FASTEST_UNDER_NOISE = 8, 0.05, 1.0
 HELD_OUT = 0.2  # of the episodes
 KEPT = 100_000  # steps that an observer is learned from, the latest
 SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
@@ -106,20 +102,23 @@ def wander(task: Task, steps: int, *, seed: int, progress: ProgressBars) -> list
     return rollouts.records()
 
 
-def learn_observer(task: Task, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars) -> Path:
-    """Learn an observer from an agent's first steps."""
-    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, "tracking": False, **SETTINGS}
+def learn_observer(
+    task: Task,
+    records: Sequence[Record],
+    folder: Path,
+    *,
+    seed: int,
+    progress: ProgressBars,
+    tracking: bool | None = None,
+) -> Path:
+    """Learn an observer from recorded steps; unless ``tracking`` is given, it tracks under noise alone."""
+    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, **SETTINGS}
+    changes["tracking"] = bool(task.measurement_noise) if tracking is None else tracking
     if task.measurement_noise:
         spread = np.std(np.concatenate([record.y for record in records]), 0)
         changes["measurement_noise_max"] = tuple(
             np.maximum(RECORDED_NOISE * spread, HEADROOM * np.asarray(task.measurement_noise))
         )
-        dt = float(np.diff(records[0].t[:2])[0])
-        # The filter has to settle in one episode at least of those that are trained on; a beginner's may be short.
-        longest = max(record.duration for record in split(records, HELD_OUT, seed)[0])
-        fastest = FASTEST_UNDER_NOISE / dt
-        slowest = min(max(SLOWEST_UNDER_NOISE / dt, 1.1 * SETTLED / longest), fastest / 2)
-        changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, -slowest, -fastest))
     source = RecordedSource(records, recorded_preset(records, changes), task.env_id)
     artifact = train(source, console=progress).artifact
     path = folder / OBSERVER

@@ -1,7 +1,7 @@
 """``python -m examples.research kinds``: agents in five kinds of partial observability, at equal CPU time."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import tyro
+from gymnasium.spaces import flatdim
 from rich.console import Console
 
 import kkl_gym
-from examples.research.agents.partly import ENV_ID, KINDS, MEASURED, measured
+from examples.research.agents.partly import ENV_ID, KINDS, MEASURED
 from examples.research.agents.statistics import middle
 from examples.research.resumable import Job, Workers, run_and_report
 from training import markdown
-from training.agents.environments import vector
+from training.agents.environments import single, vector
 from training.agents.information import FeatureObservation, make
 from training.agents.play import play
 from training.agents.seeds import AGENT_EVALUATION_SEED, agent_training_seed
@@ -35,6 +36,8 @@ ALGORITHMS = {"CartPole-v1": "ppo"}  # sac for all others
 FRAMES = 32  # that the linear recurrent unit runs over
 EVALUATIONS, EPISODES, LAST_EPISODES = 15, 20, 100
 OBSERVER_STEPS = 40_000  # random ones, from which an observer is learned
+# An observer tracks where samples are noisy or missing; of late ones it estimates the present state too.
+TRACKED, ALL_ESTIMATED = ("noise", "drop-out"), ("noise", "drop-out", "delay")
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return", "observer_seconds")
 
 
@@ -67,30 +70,51 @@ class TimedAgent(Job):
     def task(self) -> Task:
         """The environment, whose observation is [y, state]."""
         how = {"env_id": self.env_id, **KINDS[self.kind], "hold": self.shown != "x_hat"}
-        return Task(f"examples.research.agents.partly:{ENV_ID}", tuple(measured(self.env_id)), env_kwargs=how)
+        return Task(f"examples.research.agents.partly:{ENV_ID}", tuple(range(self._ny)), env_kwargs=how)
+
+    @property
+    def _ny(self) -> int:
+        return len(MEASURED[self.env_id])
+
+    @property
+    def _noise(self) -> float:
+        return float(KINDS[self.kind].get("noise", 0.0))
+
+    def _states(self, size: int, known: Sequence[int] = ()) -> tuple[int, ...]:
+        """Places of the state in an observation of some size, without those entries of it that are known."""
+        return tuple(place for place in range(self._ny, size) if place - self._ny not in known)
 
     def make(self, rows: int, observer: Path | None = None) -> "VectorEnv":
         """Make environments that show the agent what it is to see."""
         task = self.task
         if self.shown == "state":
-            with closing(vector(task, 1)) as env:
-                size = env.single_observation_space.shape[0]  # type: ignore[index]
-            return make(replace(task, measured=tuple(range(len(task.measured), size))), "y", rows)
+            with closing(single(task)) as one:
+                return make(replace(task, measured=self._states(flatdim(one.observation_space))), "y", rows)
         if self.shown == "lru":
             return make(replace(task, frames=FRAMES), "stacked", rows)
         if self.shown != "x_hat":
             return make(task, self.shown, rows)
-        noise = KINDS[self.kind].get("noise", 0.0)
-        env = vector(task, rows, partial(kkl_gym.KKLVectorObservation, observer=observer, measurement_noise=noise))
-        width = env.single_observation_space.shape[0]  # type: ignore[index]
-        return FeatureObservation(env, lambda at: at["obs"], width)
+        options: dict[str, Any] = {"observer": observer, "measurement_noise": self._noise}
+        env = vector(task, rows, partial(kkl_gym.KKLVectorObservation, **options))
+        first = self._ny if self.kind in ALL_ESTIMATED else 0  # the estimates alone, or after y
+        return FeatureObservation(env, lambda at: at["obs"][:, first:], flatdim(env.single_observation_space) - first)
 
     def learn_observer(self) -> tuple[Path, float]:
-        """Learn an observer from random steps; returns its file and CPU seconds."""
-        from training.agents.observing import learn_from_simulator
+        """Learn an observer from random steps in a simulator; returns its file and CPU seconds."""
+        from training.agents.observing import learn_observer
+        from training.rollouts.playing import WANDERING, policy_of, roll_out
 
         began = time.process_time()
-        path = learn_from_simulator(self.task, OBSERVER_STEPS, self.folder, seed=self.seed)
+        with single(self.task) as env:
+            env.get_wrapper_attr("exact")()
+            known = () if self.kind in ALL_ESTIMATED else MEASURED[self.env_id]
+            hidden = [str(place) for place in self._states(flatdim(env.observation_space), known)]
+            outputs = [str(place) for place in range(self._ny)]
+            policy = policy_of(WANDERING, env)
+            rollouts = roll_out(env, policy, measured=outputs, hidden=hidden, steps=OBSERVER_STEPS, seed=self.seed)
+        task, tracking = replace(self.task, measurement_noise=self._noise), self.kind in TRACKED
+        quiet = ProgressBars(None)
+        path = learn_observer(task, rollouts.records(), self.folder, seed=self.seed, progress=quiet, tracking=tracking)
         return path, time.process_time() - began
 
     def work(self) -> None:
@@ -188,8 +212,8 @@ class Kinds:
         cells = [
             (seed, env_id, kind, shown)
             for seed in range(self.seeds)
-            for env_id in self.environments
             for kind in self.kinds
+            for env_id in self.environments
             for shown in self.information
             # The full state is the same whatever the sensor does.
             if shown != "state" or kind in ("masked", "parameters")

@@ -1,7 +1,7 @@
 """Five kinds of partial observability around any environment: what the sensor shows, and the state beside it."""
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -27,8 +27,7 @@ FACTORS: dict[str, dict[str, float]] = {
 class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     """Shows [y, state]: the entries that a faulty sensor delivers, then the whole observation and varied parameters.
 
-    ``hold`` repeats the last sample in place of a lost one, which is NaN otherwise. While ``exact`` is True there is
-    neither noise nor drop-out, as in the simulator in which an observer is learned.
+    ``hold`` repeats the last sample in place of a lost one, which is NaN otherwise.
     """
 
     def __init__(
@@ -44,13 +43,17 @@ class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         super().__init__(gym.make(env_id))
         if vary and env_id not in FACTORS:
             raise ValueError(f"no parameters of {env_id} are varied; those of {', '.join(FACTORS)} are")
-        self._noise, self._drop_out, self._hold, self.exact = noise, drop_out, hold, False
+        self._noise, self._drop_out, self._hold = noise, drop_out, hold
         self._measured, self._late = list(MEASURED[env_id]), deque[np.ndarray](maxlen=delay + 1)
         self._factors: Mapping[str, float] = FACTORS[env_id] if vary else {}
         self._nominal = {name: getattr(self.env.unwrapped, name) for name in self._factors}
         self._parameters, self._rng = np.ones(len(self._factors)), np.random.default_rng()
         size = len(self._measured) + gym.spaces.flatdim(self.env.observation_space) + len(self._factors)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+    def exact(self) -> None:
+        """Leave noise and drop-out away, as in the simulator in which an observer is learned."""
+        self._noise = self._drop_out = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Start an episode, with new parameters if they vary; its first sample is never late or lost."""
@@ -67,7 +70,7 @@ class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     def step(self, action: Any) -> Any:
         """Step the environment and read the sensor."""
         obs, reward, terminated, truncated, info = self.env.step(action)
-        y, lost = self._sample(obs), self._rng.random() < self._drop_out and not self.exact
+        y, lost = self._sample(obs), self._rng.random() < self._drop_out
         self._late.append(np.full_like(y, np.nan) if lost else y)
         y = self._late[0]
         if self._hold:
@@ -75,8 +78,7 @@ class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         return np.concatenate([y, obs, self._parameters]).astype(np.float32), reward, terminated, truncated, info
 
     def _sample(self, obs: np.ndarray) -> np.ndarray:
-        noise = self._noise * self._rng.standard_normal(len(self._measured))
-        return np.asarray(obs[self._measured] + (0.0 if self.exact else noise))
+        return np.asarray(obs[self._measured] + self._noise * self._rng.standard_normal(len(self._measured)))
 
     def _draw_parameters(self) -> None:
         base: Any = self.env.unwrapped
@@ -85,11 +87,6 @@ class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
             setattr(base, name, self._nominal[name] * factor)
         if hasattr(base, "polemass_length"):  # which the cart derives from its parameters
             base.total_mass, base.polemass_length = base.masspole + base.masscart, base.masspole * base.length
-
-
-def measured(env_id: str) -> Sequence[int]:
-    """Entries of the observation that are the sensor's."""
-    return range(len(MEASURED[env_id]))
 
 
 gym.register(ENV_ID, Partly, disable_env_checker=True)
