@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
@@ -36,8 +35,7 @@ ALGORITHMS = {"CartPole-v1": "ppo"}  # sac for all others
 FRAMES = 32  # that the linear recurrent unit runs over
 EVALUATIONS, EPISODES, LAST_EPISODES = 15, 20, 100
 OBSERVER_STEPS = 40_000  # random ones, from which an observer is learned
-# An observer tracks where samples are noisy or missing; of late ones it estimates the present state too.
-TRACKED, ALL_ESTIMATED = ("noise", "drop-out"), ("noise", "drop-out", "delay")
+FAULTY = ("noise", "delay", "drop-out")  # kinds in which an observer tracks, and the agent sees its estimates alone
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return", "observer_seconds")
 
 
@@ -94,9 +92,14 @@ class TimedAgent(Job):
             return make(replace(task, frames=FRAMES), "stacked", rows)
         if self.shown != "x_hat":
             return make(task, self.shown, rows)
-        options: dict[str, Any] = {"observer": observer, "measurement_noise": self._noise}
-        env = vector(task, rows, partial(kkl_gym.KKLVectorObservation, **options))
-        first = self._ny if self.kind in ALL_ESTIMATED else 0  # the estimates alone, or after y
+
+        def observed(env: "VectorEnv") -> "VectorEnv":
+            out = kkl_gym.KKLVectorObservation(env, observer, measurement_noise=self._noise)
+            out.observer.delay = KINDS[self.kind].get("delay", 0)
+            return out
+
+        env = vector(task, rows, observed)
+        first = self._ny if self.kind in FAULTY else 0
         return FeatureObservation(env, lambda at: at["obs"][:, first:], flatdim(env.single_observation_space) - first)
 
     def learn_observer(self) -> tuple[Path, float]:
@@ -107,12 +110,12 @@ class TimedAgent(Job):
         began = time.process_time()
         with single(self.task) as env:
             env.get_wrapper_attr("exact")()
-            known = () if self.kind in ALL_ESTIMATED else MEASURED[self.env_id]
+            known = () if self.kind in FAULTY else MEASURED[self.env_id]
             hidden = [str(place) for place in self._states(flatdim(env.observation_space), known)]
             outputs = [str(place) for place in range(self._ny)]
             policy = policy_of(WANDERING, env)
             rollouts = roll_out(env, policy, measured=outputs, hidden=hidden, steps=OBSERVER_STEPS, seed=self.seed)
-        task, tracking = replace(self.task, measurement_noise=self._noise), self.kind in TRACKED
+        task, tracking = replace(self.task, measurement_noise=self._noise), self.kind in FAULTY
         quiet = ProgressBars(None)
         path = learn_observer(task, rollouts.records(), self.folder, seed=self.seed, progress=quiet, tracking=tracking)
         return path, time.process_time() - began

@@ -52,8 +52,8 @@ class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
     def exact(self) -> None:
-        """Leave noise and drop-out away, as in the simulator in which an observer is learned."""
-        self._noise = self._drop_out = 0.0
+        """Make the sensor perfect, as in the simulator in which an observer is learned."""
+        self._noise, self._drop_out, self._late = 0.0, 0.0, deque(maxlen=1)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Start an episode, with new parameters if they vary; its first sample is never late or lost."""
