@@ -29,8 +29,8 @@ from training.agents.bridge import SB3VecEnv
 from training.agents.checkpoint import Checkpoint
 from training.agents.cost import Cost
 from training.agents.environments import CLEAN_Y, vector
-from training.agents.information import ESTIMATED, OBSERVED, Information, observer_of
-from training.agents.observing import KKL, OBSERVER, Estimation, Privileged, estimated_entries, wander
+from training.agents.information import ESTIMATED, OBSERVED, Information, make, observer_of
+from training.agents.observing import OBSERVER, Privileged, estimated_entries, learn_observer, refits, wander
 from training.agents.policy import ALGORITHMS, CONTINUOUS, head_of, linear, lstm_in, perceptron
 from training.agents.seeds import agent_training_seed
 from training.agents.tasks import PREFERRED, Task
@@ -91,7 +91,7 @@ def learn(
     observer_steps: int | None = None,
     aggregate: int = 0,
     resume: bool = False,
-    estimation: Estimation = KKL,
+    show: Callable[..., VectorEnv] = make,
     progress: ProgressBars | None = None,
 ) -> Agent:
     """Train one agent, with checkpoints; writes agent.safetensors, curve.csv and maybe observer.safetensors.
@@ -116,7 +116,7 @@ def learn(
         raise ValueError(f"an agent that sees {information!r} has no use for the observer {observer!r}")
     if aggregate and (task.system is not None or information not in ESTIMATED):
         raise ValueError(f"an agent that sees {information!r} of {task.env_id} has no observer to fit again")
-    if task.system is not None and information in OBSERVED and observer is None and estimation is KKL:
+    if task.system is not None and information in OBSERVED and observer is None and show is make:
         observer = observer_of(get_system(task.system))
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
     # Whether an observer is learned on the way.
@@ -136,7 +136,7 @@ def learn(
     if resumes and (folder / FILE).exists():
         return Agent.read(folder / FILE)  # nothing is left to do
     with progress_bars(progress) as bars:
-        fit = partial(estimation.learn, task, folder=folder, seed=seed, progress=bars)
+        fit = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
         privileged = None
         if fits and task.measurement_noise:  # what is right with the truth is not with estimates then
             checkpoint.spent = first
@@ -149,14 +149,14 @@ def learn(
             observer = str(folder / OBSERVER)
         left = steps - rehearsal - checkpoint.spent
 
-        def make() -> VectorEnv:
+        def make_envs() -> VectorEnv:
             if privileged is not None and checkpoint.privileged:
                 return privileged.make()
-            return estimation.show(task, information, rows, observer)
+            return show(task, information, rows, observer=observer)
 
         keys = ("y", "u", "x", "sample", CLEAN_Y) if aggregate else ()
         description = f"{task.name} {information} {seed}"
-        with closing(Learner(name, settings, seed, task, make(), keys)) as learner:
+        with closing(Learner(name, settings, seed, task, make_envs(), keys)) as learner:
             learner.begin(checkpoint, left)
             if privileged is not None and checkpoint.privileged:
                 checkpoint.records = privileged.records
@@ -170,13 +170,13 @@ def learn(
                 fit(privileged.records())
                 checkpoint.privileged = False
                 checkpoint.restarts += 1
-                learner.move(make(), checkpoint.restarts)
+                learner.move(make_envs(), checkpoint.restarts)
             callbacks: list[BaseCallback] = [checkpoint]
             if aggregate:
                 before = [] if privileged is None else privileged.records()  # no random actions
                 checkpoint.records = lambda: before
                 every = max(1, (left - (first - checkpoint.spent)) // (aggregate + 1))
-                callbacks.append(estimation.refits(task, fit, every, rehearsal, folder / OBSERVER, before))
+                callbacks.append(refits(task, every, rehearsal, folder / OBSERVER, before))
             else:
                 checkpoint.records = list
             with bars.phase(description, left) as report:

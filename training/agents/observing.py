@@ -1,17 +1,15 @@
 """An observer for an agent: from the first steps that it makes in an environment, and from later ones."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
 
 from kkl_gym.wrappers.vector import VectorEnv
 from training.agents.environments import CLEAN, CLEAN_Y, single, vector
-from training.agents.information import FeatureObservation, Information, make
+from training.agents.information import FeatureObservation
 from training.agents.tasks import Task
 from training.progress import ProgressBars
 from training.records import Record
@@ -126,32 +124,9 @@ def learn_observer(
     return path
 
 
-def refits(
-    task: Task,
-    learn: Callable[[Sequence[Record]], Path],
-    every: int,
-    rehearsal: int,
-    path: Path,
-    records: Sequence[Record],
-) -> BaseCallback:
-    """Make what fits an observer again to an agent's own steps, beside those of ``records``."""
+def refits(task: Task, every: int, rehearsal: int, path: Path, records: Sequence[Record]) -> KKLTrainingCallback:
+    """A callback that fits an observer again to an agent's own steps and to earlier ``records``."""
     outputs = CLEAN_Y if task.measurement_noise else "y"
     return KKLTrainingCallback(
         every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
     )
-
-
-def _show(task: Task, information: Information, rows: int, observer: str | None) -> VectorEnv:
-    return make(task, information, rows, observer=observer)
-
-
-@dataclass(frozen=True)
-class Estimation:
-    """How estimates are shown to an agent, learned from its steps and learned again; by default, by KKL observers."""
-
-    show: Callable[[Task, Information, int, str | None], VectorEnv] = _show
-    learn: Callable[..., Path] = learn_observer
-    refits: Callable[..., BaseCallback] = refits
-
-
-KKL = Estimation()
