@@ -79,6 +79,8 @@ def test_timed_agents_are_compared_and_not_trained_again(tmp_path):
     files = {path: path.stat().st_mtime_ns for path in tmp_path.glob("jobs/**/curve.csv")}
     research(*common, "state", "lru")
     assert {path: path.stat().st_mtime_ns for path in files} == files
+    with pytest.raises(SystemExit, match="unknown kinds fog; there are masked, noise"):
+        research("kinds", "--kinds", "fog", "--out", str(tmp_path))
     with pytest.raises(SystemExit, match=r"of another comparison: seconds = 0\.3 there, 0\.5 here"):
         research(*common, "state", "--seconds", "0.5")
 

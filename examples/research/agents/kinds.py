@@ -212,6 +212,11 @@ class Kinds:
 
     def run(self, console: Console) -> None:
         """Train the missing agents, then report."""
+        for name, values, known in (("environments", self.environments, MEASURED), ("kinds", self.kinds, KINDS)):
+            if unknown := [value for value in values if value not in known]:
+                raise ValueError(f"unknown {name} {', '.join(unknown)}; there are {', '.join(known)}")
+        if self.seeds < 1 or self.seconds <= 0:
+            raise ValueError(f"seeds and seconds must be positive, got {self.seeds} and {self.seconds}")
         cells = [
             (seed, env_id, kind, shown)
             for seed in range(self.seeds)
