@@ -39,11 +39,11 @@ from training.progress import ProgressBars, progress_bars
 
 RECURRENT = "ppo_lstm"
 # Share of the steps of a training, the first ones, in which there are no estimates yet.
-PRIVILEGED = 0.9  # without noise: estimates come so near to the truth that what is right with the one is with the other
+PRIVILEGED = 0.9  # without noise: estimates are so near to the truth that the same policy is right
 WANDERED = 0.1  # under noise
 REHEARSAL = 0.05  # of the steps, the last ones, in which the agent acts without exploration and learns no more
 FILE = "agent.safetensors"
-_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
+_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # not of the algorithm
 _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # what rl-zoo3 makes a system's task of
 
 
@@ -102,7 +102,7 @@ def learn(
     alone is learned. They count too.
 
     A training that goes on from a checkpoint begins new episodes, so that it makes another agent than one that never
-    stopped; ``Agent.training`` then says how many times it was resumed.
+    stopped; ``Agent.training`` then has the number of times it was resumed.
     """
     with closing(vector(task.without_noise, 1)) as env:
         actions, size = env.single_action_space, gym.spaces.flatdim(env.single_observation_space)
@@ -138,7 +138,7 @@ def learn(
     with progress_bars(progress) as bars:
         fit = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
         privileged = None
-        if fits and task.measurement_noise:  # what is right with the truth is not with estimates then
+        if fits and task.measurement_noise:  # a policy that is right with the truth is not with estimates
             checkpoint.spent = first
             if not resumes:
                 fit(wander(task, first, seed=seed, progress=bars))
@@ -300,7 +300,7 @@ class Learner:
 
 
 class _Until(BaseCallback):
-    """Stops a training once there were so many steps, where an algorithm collects anew, and before the last time."""
+    """Stops a training after so many steps, between two rollouts, and before the last one."""
 
     def __init__(self, steps: int, last: int) -> None:
         super().__init__()

@@ -61,7 +61,7 @@ class Train:
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
-    """Standard deviation of the noise on each sample of what is measured."""
+    """Standard deviation of the noise on each measured sample."""
     timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None
     """Actions to learn from, in all environments together."""
     observer: Annotated[

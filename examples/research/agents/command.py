@@ -30,7 +30,7 @@ class Compare:
 
     Writes OUT/results.csv (a row for each agent), OUT/table.md, OUT/scores.png, and the learning curves as
     OUT/curves.csv and OUT/curves.png. Each agent is a job with a folder of its own. An interrupted run goes on where it
-    stopped, and reports what is there and how much is missing.
+    stopped, and reports on the agents that are done.
     """
 
     names: Annotated[
@@ -52,7 +52,7 @@ class Compare:
     measurement_noise: Annotated[
         NoiseLevels, tyro.conf.arg(help_behavior_hint="(default: the task's own, on Van der Pol also 0.2, on Lorenz 2)")
     ] = None
-    """Standard deviations of the noise on what is measured; each level is a task of its own."""
+    """Standard deviations of the measurement noise; each level is a task of its own."""
     observers: tuple[str, ...] = ()
     """Observers for agents on systems: a .safetensors file for each system of yours, or shipped maps."""
     aggregate: int = 0

@@ -55,7 +55,7 @@ class TimedAgent(Job):
 
     @property
     def name(self) -> str:
-        """Environment, kind, what is shown and seed."""
+        """Environment, kind, information and seed."""
         return f"{self.env_id} {self.kind}/{self.shown}/{self.seed}"
 
     @property
@@ -130,6 +130,10 @@ class TimedAgent(Job):
         settings = hyperparameters(algorithm, Task(self.env_id, tuple(MEASURED[self.env_id])))
         if algorithm == "sac":
             settings["buffer_size"] = 100_000  # more than the steps that there will be
+        budget = _budget(self.seconds, lambda seconds: evaluate(seconds))
+        for name, value in settings.items():
+            if str(value).startswith("lin_"):
+                settings[name] = _falling(float(value.removeprefix("lin_")), budget)
         if self.shown == "lru":
             extractor = {"features_extractor_class": LinearRecurrence, "features_extractor_kwargs": {"frames": FRAMES}}
             settings["policy_kwargs"] |= extractor
@@ -148,9 +152,14 @@ class TimedAgent(Job):
                 at = (model.num_timesteps, round(seconds, 2), round(float(value), 3), round(spent, 1))
                 curve.append((self.env_id, self.kind, self.shown, self.seed, *at))
 
-            learner.learn(10**9, [_budget(self.seconds, evaluate)])
+            learner.learn(10**9, [budget])
         lines = [",".join(map(str, row)) for row in [COLUMNS, *curve]]
         write(self.folder / self.result, "\n".join(lines) + "\n")
+
+
+def _falling(start: float, budget: Any) -> Callable[[float], float]:
+    """A schedule that ends at zero with the CPU time, in place of steps."""
+    return lambda progress: start * float(budget.remaining())
 
 
 def policy_of(model: Any, rows: int) -> Callable[[np.ndarray], Any]:
@@ -164,25 +173,26 @@ def policy_of(model: Any, rows: int) -> Callable[[np.ndarray], Any]:
 
 
 def _budget(seconds: float, evaluate: Callable[[float], None]) -> Any:
-    """A callback that evaluates at equal CPU times and stops at the last."""
+    """A callback that evaluates at equal CPU times and stops at the last; an evaluation's own time does not count."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Budget(BaseCallback):
-        def _on_training_start(self) -> None:
-            self._began, self._evaluations = time.process_time(), 0
+        began = time.process_time()
+        evaluations = 0
 
-        def _on_rollout_end(self) -> None:
-            # Schedules run over CPU time in place of steps.
-            share = (time.process_time() - self._began) / seconds
-            self.model._total_timesteps = max(self.num_timesteps, round(self.num_timesteps / share))
+        def remaining(self) -> float:
+            return max(0.0, 1.0 - (time.process_time() - self.began) / seconds)
+
+        def _on_training_start(self) -> None:
+            self.began = time.process_time()
 
         def _on_step(self) -> bool:
             now = time.process_time()
-            spent = now - self._began
-            if spent >= (self._evaluations + 1) * seconds / EVALUATIONS:
-                self._evaluations += 1
+            spent = now - self.began
+            if spent >= (self.evaluations + 1) * seconds / EVALUATIONS:
+                self.evaluations += 1
                 evaluate(spent)
-                self._began += time.process_time() - now
+                self.began += time.process_time() - now
             return spent < seconds
 
     return Budget()

@@ -78,7 +78,7 @@ def test_an_agent_in_any_environment(information, capsys):
     ("command", "says"),
     [
         ("CartPole-v1 --measurement-noise 0.1,0.2", "one number"),
-        ("Acrobot-v1", "say what is measured of Acrobot-v1"),
+        ("Acrobot-v1", "name the measured entries of Acrobot-v1"),
         ("lorenz --measured 0", "of the system lorenz y is measured"),
         ("lorenz --aggregate 2", "no observer to fit again"),
     ],
