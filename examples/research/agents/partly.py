@@ -89,4 +89,4 @@ class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
             base.total_mass, base.polemass_length = base.masspole + base.masscart, base.masspole * base.length
 
 
-gym.register(ENV_ID, Partly, disable_env_checker=True)
+gym.register(ENV_ID, f"{__name__}:Partly", disable_env_checker=True)

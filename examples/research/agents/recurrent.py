@@ -15,6 +15,8 @@ class LinearRecurrence(BaseFeaturesExtractor):
     it is linear, its weights on all frames make one matrix.
     """
 
+    ages: torch.Tensor
+
     def __init__(self, observation_space: Any, frames: int, units: int = 32) -> None:
         self._width = int(np.prod(observation_space.shape)) // frames
         super().__init__(observation_space, self._width + 2 * units)
