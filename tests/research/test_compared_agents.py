@@ -47,7 +47,7 @@ def test_agents_on_a_system_are_compared_and_not_trained_again(tmp_path):
 
 def test_agents_in_an_environment_are_compared(tmp_path, monkeypatch):
     monkeypatch.setitem(SETTINGS, "inverse_steps", 20)
-    kinds = ["state", "stacked", "x_hat"]
+    kinds = ["state", "x_hat", "stacked"]
     common = ("agents", "CartPole-v1", "--seeds", "1", "--episodes", "2", "--timesteps", "600", "--frames", "4")
     research(*common, "--jobs", "1", "--out", str(tmp_path), "--information", *kinds)
     results, curves = (pd.read_csv(tmp_path / name) for name in ("results.csv", "curves.csv"))
