@@ -148,7 +148,7 @@ class TimedAgent(Job):
 
             def evaluate(seconds: float) -> None:
                 env = few if seconds < self.seconds else many
-                value = play(env, policy_of(model, env.num_envs), seed=AGENT_EVALUATION_SEED).returns.mean()
+                value = play(env, policy_of(model), seed=AGENT_EVALUATION_SEED).returns.mean()
                 at = (model.num_timesteps, round(seconds, 2), round(float(value), 3), round(spent, 1))
                 curve.append((self.env_id, self.kind, self.shown, self.seed, *at))
 
@@ -162,8 +162,8 @@ def _falling(start: float, budget: Any) -> Callable[[float], float]:
     return lambda progress: start * float(budget.remaining())
 
 
-def policy_of(model: Any, rows: int) -> Callable[[np.ndarray], Any]:
-    """The deterministic policy of a model that learns, at the start of episodes."""
+def policy_of(model: Any) -> Callable[[np.ndarray], Any]:
+    """The deterministic policy of a model while it learns."""
     scaling = model.get_vec_normalize_env()
 
     def act(obs: np.ndarray) -> Any:
@@ -189,7 +189,7 @@ def _budget(seconds: float, evaluate: Callable[[float], None]) -> Any:
         def _on_step(self) -> bool:
             now = time.process_time()
             spent = now - self.began
-            if spent >= (self.evaluations + 1) * seconds / EVALUATIONS:
+            if spent >= seconds * ((self.evaluations + 1) / EVALUATIONS):
                 self.evaluations += 1
                 evaluate(spent)
                 self.began += time.process_time() - now
