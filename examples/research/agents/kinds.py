@@ -16,13 +16,12 @@ import kkl_gym
 from examples.research.agents.partly import ENV_ID, KINDS, MEASURED
 from examples.research.agents.statistics import middle
 from examples.research.resumable import Job, Workers, run_and_report
-from training import markdown
+from training import files
 from training.agents.environments import single, vector
 from training.agents.information import FeatureObservation, make
 from training.agents.play import play
 from training.agents.seeds import AGENT_EVALUATION_SEED, agent_training_seed
 from training.agents.tasks import Task
-from training.files import write
 from training.progress import ProgressBars
 
 if TYPE_CHECKING:
@@ -154,7 +153,7 @@ class TimedAgent(Job):
 
             learner.learn(10**9, [budget])
         lines = [",".join(map(str, row)) for row in [COLUMNS, *curve]]
-        write(self.folder / self.result, "\n".join(lines) + "\n")
+        files.write(self.folder / self.result, "\n".join(lines) + "\n")
 
 
 def _falling(start: float, budget: Any) -> Callable[[float], float]:
@@ -247,8 +246,8 @@ class Kinds:
                 import pandas as pd
 
                 rows = pd.concat(map(pd.read_csv, done), ignore_index=True)
-                write(self.out / "kinds.csv", rows.to_csv(index=False))
-                write(self.out / "table.md", "\n".join(table(rows, len(agents) - len(done))) + "\n")
+                files.write(self.out / "kinds.csv", rows.to_csv(index=False))
+                files.write(self.out / "table.md", "\n".join(table(rows, len(agents) - len(done))) + "\n")
                 progress.say(f"wrote kinds.csv and table.md in {self.out}")
 
         run_and_report(agents, self.out, console, workers=self.workers, what="agents", report=report)
@@ -278,11 +277,11 @@ def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
         f"Returns after {rows.seconds.max():.0f} CPU seconds: interquartile means over seeds, [95 % interval], "
         f"number of seeds.{fit}{partial}",
         "",
-        *markdown.table(["", *shown], lines),
+        *files.table(["", *shown], lines),
         "",
         "Thousands of steps in that time:",
         "",
-        *markdown.table(["", *shown], steps),
+        *files.table(["", *shown], steps),
     ]
 
 
