@@ -114,7 +114,7 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 	mkdir -p docs/results/environments
 	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
 	$(BIN)/python -m examples.research agents CartPole-v1 Pendulum-v1 --measurement-noise 0.1 0.2 0.3 \
-		--information state x_hat stacked_x_hat z stacked recurrent --aggregate 4 --seeds 5 --out runs/agents/noise
+		--information state x_hat z stacked recurrent --aggregate 4 --seeds 5 --out runs/agents/noise
 	cp runs/agents/noise/results.csv docs/results/environments/noise.csv
 	$(BIN)/python -m examples.research agents InvertedDoublePendulum-v5 --information state x_hat --seeds 10 \
 		--out runs/agents/double-pendulum

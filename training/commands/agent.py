@@ -121,7 +121,7 @@ class Train:
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
-    """Standard deviation of the noise on each sample of the measured signals."""
+    """Standard deviation of the noise on each measured sample."""
     timesteps: Annotated[int | None, hint("the hyperparameters'")] = None
     """Actions to learn from, in all environments together."""
     observer: Annotated[str | None, hint("the system's; of environments one is learned", metavar="MAP")] = None
