@@ -10,12 +10,10 @@ from typing import Any, get_args
 import numpy as np
 
 from observers import storage
-from observers.checks import is_finite, noise_levels, shown
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError, is_finite, noise_levels, shown
 from observers.expression import Expression
 from observers.filter import LinearFilter
-from observers.forward import ForwardMap
-from observers.inverse import InverseMap
+from observers.inverse import ForwardMap, InverseMap
 from observers.monitor import Limits
 from observers.motion import Motion
 from observers.network import MLP

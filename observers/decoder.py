@@ -68,7 +68,7 @@ class Decoder:
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the estimate."""
         if z.ndim == 1 and self._machine and available():
-            from observers.network_kernel import decode_one
+            from observers.kernel_functions import decode_one
 
             x_hat = np.empty(len(self._inverse.x_offset))
             decode_one(z, float(age), self.network, x_hat)
@@ -92,7 +92,7 @@ class Decoder:
 
     @functools.cached_property
     def network(self) -> tuple[np.ndarray, ...]:
-        """What :func:`observers.network_kernel.decode` takes.
+        """What :func:`observers.kernel_functions.decode` takes.
 
         The coordinates in which the network sees z are a matrix product, as its first layer is: they are one, in
         doubles. (They are differences of filter states that are much alike, of which float32 would leave little.)

@@ -5,8 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from observers.checks import shown
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError, shown
 
 COVERAGE = 0.9  # of the regions that calibration makes true
 _MAX_FACTOR = 1e12

@@ -1,6 +1,7 @@
 """The observer itself, with a state that the caller keeps: linear filter, T_inv, tracker and monitor."""
 
 import functools
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,30 @@ from observers.tracker import Tracker
 _MAX_FILTERS = 64  # at sampling intervals other than the artifact's, which are kept
 _MAX_SAMPLES = 1000  # in one step
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
+
+
+@dataclass(frozen=True)
+class Pending:
+    """The inputs of the last samples, (n, delay, nu), and how many there are, (n,); no method changes either."""
+
+    inputs: np.ndarray
+    count: np.ndarray
+
+    def restarted(self, rows: np.ndarray) -> "Pending":
+        """Return the inputs without those of some rows."""
+        return Pending(self.inputs, np.where(rows, 0, self.count))
+
+    def after(self, u: np.ndarray, rows: np.ndarray) -> tuple["Pending", np.ndarray, np.ndarray]:
+        """Return the inputs after those of the next sample, (n, nu), in some rows.
+
+        Also those that led to the outputs which now arrive, (n, nu), and in which of the rows one does, (n,).
+        """
+        delay = self.inputs.shape[1]
+        due, first = rows & (self.count == delay), self.inputs[:, 0]
+        inputs = np.where(due[:, None, None], np.roll(self.inputs, -1, axis=1), self.inputs)
+        count, at = self.count + (rows & ~due), np.flatnonzero(rows)
+        inputs[at, count[at] - 1] = u[at]
+        return Pending(inputs, count), first, due
 
 
 class KKL(Estimator[np.ndarray]):
@@ -219,8 +244,11 @@ class KKL(Estimator[np.ndarray]):
 
     @functools.cached_property
     def _machine(self) -> CompiledStep | None:
-        """The step as machine code; None without Numba, or where NumPy is chosen or an expression is too long."""
-        if self._choice is False:
+        """A tracker's step as machine code; None without Numba, or where NumPy is chosen or an expression is too long.
+
+        The linear filter alone is a matrix product, which NumPy takes as quickly.
+        """
+        if self._choice is False or self.tracker is None:
             return None
         try:
             return CompiledStep(self.artifact, self.decoders, self.tracker)

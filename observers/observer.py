@@ -10,8 +10,7 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.checks import bool_array, check_dt, noise_level, noise_levels, real_array
 from observers.factors import standard_deviations
-from observers.kkl import KKL
-from observers.late import Pending
+from observers.kkl import KKL, Pending
 from observers.records import RecordEstimates
 from observers.samples import (
     check_arguments,

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.checks import LARGEST, all_finite, flag, integer, is_finite, real_array, shown
-from observers.errors import ArtifactError
+from observers.checks import LARGEST, ArtifactError, all_finite, flag, integer, is_finite, real_array, shown
 from observers.machine import available
 
 MAX_DELAY = 1000  # samples
