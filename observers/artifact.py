@@ -54,6 +54,8 @@ class Artifact:
     measurement_noise : float or tuple of float, length ny, default 0.5
         Standard deviation of the usual noise on each sample, of all outputs or each, which observers assume where none
         is given. It is cut at the largest in the maps' training.
+    u_max : tuple of float, length nu, optional
+        Largest absolute values of the inputs in training. Observers warn once of inputs beyond ten times these.
     parameter_ranges : mapping of str to (float, float), optional
         Low and high end of parameters that are not known exactly: the observer was trained for systems with any
         parameters within.
@@ -82,6 +84,7 @@ class Artifact:
     free_inverse: InverseMap | None = None
     motion: Motion | None = None
     measurement_noise: float | tuple[float, ...] = USUAL_NOISE
+    u_max: tuple[float, ...] | None = None
     parameter_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     estimated_parameters: tuple[str, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
@@ -109,6 +112,8 @@ class Artifact:
             raise ArtifactError(f"a noise_gain of {len(gain)} outputs does not fit {self.ny}")
         usual = noise_levels("measurement_noise", self.measurement_noise, self.ny)
         object.__setattr__(self, "measurement_noise", self.inverse.within(usual))
+        if self.u_max is not None and (len(self.u_max) != self.nu or not all(is_finite(each) for each in self.u_max)):
+            raise ArtifactError(f"u_max must be {self.nu} finite numbers, got {shown(self.u_max)}")
         free, nz = self.free_inverse, len(self.filter.A)
         if free is not None:
             self._check_free(free)

@@ -28,7 +28,11 @@ class CompiledStep:
             if expression is not None and expression.operations > MOST_OPERATIONS:
                 raise ValueError("the expression takes too long to compile")
         maps = [_of_map(each) for each in (decoders.driven, decoders.free or decoders.driven)]
-        scaling, affine, network = np.zeros((4, nx + nu)), np.zeros((nx, 1)), (np.zeros(0, np.float32), np.zeros(1, int))
+        scaling, affine, network = (
+            np.zeros((4, nx + nu)),
+            np.zeros((nx, 1)),
+            (np.zeros(0, np.float32), np.zeros(1, int)),
+        )
         if (flow := motion.flow) is not None:
             scaling[0, :nx], scaling[1, :nx], scaling[2, :nx] = motion.x_offset, motion.x_scale, flow.gain
             scaling[3, :nu], affine, network = 1.0 / flow.u_scale, np.array(flow.linear, order="C"), flow.mlp.packed()
@@ -41,7 +45,10 @@ class CompiledStep:
             *(watch.trend_square_share, watch.trend_gain, watch.trend_limit, tracker.gate),
         )
         self._parts = tuple(of for each in zip(*maps, strict=True) for of in each), (scaling, affine, *network)
-        self._window, self._seen = watch.window, linear.size + ny + 1 + tracker.nis + 2  # where a row has the number of samples seen
+        self._window, self._seen = (
+            watch.window,
+            linear.size + ny + 1 + tracker.nis + 2,
+        )  # where a row has the number of samples seen
         self._usual, self._first = self._at(linear), np.zeros(1, int)
         self._one, self._many = self._code(1), None
 

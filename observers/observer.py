@@ -18,6 +18,7 @@ from observers.samples import (
     check_gate,
     check_output,
     check_replacement,
+    far_input,
     first_state,
     held_input,
 )
@@ -94,7 +95,7 @@ class KKLObserver(RecordEstimates):
         self.artifact, self._monitored = artifact, bool(monitor)
         self._tracking, self._compiled = None if tracking is None else bool(tracking), compiled
         self._kkl: KKL
-        self._warned = False
+        self._warned = frozenset[str]()
         self._state: np.ndarray | None = None  # (n, width), never changed in place
         self._batch: tuple[int, ...] = ()
         self._process_noise = self._level(process_noise)
@@ -363,7 +364,9 @@ class KKLObserver(RecordEstimates):
             raise RuntimeError("call reset(y0) before step(y)")
         if rows is not None:
             rows = bool_array("rows", rows, batch).ravel()
-        u = held_input(self.artifact, u, batch).reshape(len(state), self.artifact.nu)
+        u = held_input(self.artifact, u, batch)
+        self._warn_of_input(u)
+        u = u.reshape(len(state), self.artifact.nu)
         if y is None:
             y = np.full((len(state), self.artifact.ny), np.nan)
             self._warn_of_gaps()
@@ -385,13 +388,23 @@ class KKLObserver(RecordEstimates):
             self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows], dt)
 
     def _warn_of_gaps(self) -> None:
-        if not self.artifact.knows_output and not self._warned:
-            self._warned = True
-            warnings.warn(
+        if not self.artifact.knows_output:
+            self._warn(
                 f"the map for {self.artifact.system!r} holds no output h(x) by which to predict what is missing: it "
-                "holds the last value of a missing output",
-                stacklevel=4,
+                "holds the last value of a missing output"
             )
+
+    def _warn_of_input(self, u: np.ndarray) -> None:
+        """Warn of inputs (..., nu) far beyond those of training."""
+        if (far := far_input(self.artifact, u)) is not None:
+            most = ", ".join(f"{each:g}" for each in self.artifact.u_max or ())
+            self._warn(f"an input of {far:g} is far beyond those in training, at most {most}: estimates may be wrong")
+
+    def _warn(self, text: str) -> None:
+        """Warn once, by the first words."""
+        if text[:12] not in self._warned:
+            self._warned = self._warned | {text[:12]}
+            warnings.warn(text, stacklevel=5)
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Return the current estimate: T_inv(z), the network's half of :meth:`step`, or the tracker's.

@@ -10,6 +10,7 @@ from observers.checks import LARGEST, ArtifactError, all_finite, flag, integer, 
 from observers.machine import available
 
 MAX_DELAY = 1000  # samples
+FAR = 10.0  # in multiples of the largest input in training, from where on one warns
 
 
 def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tracking: bool | None) -> None:
@@ -49,7 +50,9 @@ def check_delay(artifact: Artifact, tracking: bool | None, delay: Any) -> int:
 
 def _check_tracks(artifact: Artifact, tracking: bool | None) -> None:
     if tracking is not None and not tracking:
-        raise ValueError("a gate and a delay need an observer that tracks: leave tracking=False out")
+        raise ValueError(
+            "a gate and a delay need an observer that tracks: leave tracking=False, or a wrapper's estimate='z', out"
+        )
     artifact.require_motion()
 
 
@@ -166,6 +169,16 @@ def intervals(t: np.ndarray, steps: int) -> np.ndarray:
     if t.shape != (steps,) or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
         raise ValueError(f"t must be {steps} times in seconds, which rise, got {shown(t)}")
     return np.diff(t)
+
+
+def far_input(artifact: Artifact, u: np.ndarray) -> float | None:
+    """Return the first of inputs (..., nu) that is far beyond those of training, or None."""
+    if not artifact.u_max:
+        return None
+    if u.ndim == 1:  # fast path for one sample
+        return next((v for v, most in zip(u.tolist(), artifact.u_max, strict=True) if abs(v) > FAR * most), None)
+    far = np.abs(u) > FAR * np.array(artifact.u_max)
+    return float(u[far][0]) if far.any() else None
 
 
 def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:

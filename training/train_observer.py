@@ -141,7 +141,7 @@ def _artifact(maps: Maps, source: Source, run: Run) -> Artifact:
     """The observer, not calibrated yet, with how it was made."""
     return Artifact(
         **vars(maps),
-        **source.facts(),
+        **source.facts() | ({} if maps.filter.nu else {"u_max": None}),
         training={
             **dataclasses.asdict(run.config),
             **run.samples,
