@@ -18,10 +18,10 @@ from kkl_gym.sensor import Readings, Sensor
 from kkl_gym.simulate import followed_rows
 from kkl_gym.system import Box, System
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
-from observers.machine import MANY_ROWS
 
 Infos = dict[str, Any]
 ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for the cache
+MANY_ROWS = 128  # from which on compiling is worth the seconds that it takes
 MOST_ENVS = 1_000_000  # of which 256 samples of noise are kept, some 10 kB each
 
 

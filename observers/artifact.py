@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, get_args
+from typing import Any, NoReturn, get_args
 
 import numpy as np
 
@@ -249,32 +249,30 @@ class Artifact:
 
     def require_forward(self) -> ForwardMap:
         """Return T, or raise ArtifactError if there is none."""
-        if self.forward is None:
-            raise ArtifactError(
-                f"this map for {self.system!r} holds no forward map T; take one of the pipeline spinn, which does: "
-                "for the package's systems those named SYSTEM-spinn ship, others are made by "
-                "kkl-gym train SYSTEM --pipeline spinn"
-            )
-        return self.forward
+        return self.forward or self._lacks(
+            "holds no forward map T; take one of the pipeline spinn, which does: for the package's systems those named "
+            "SYSTEM-spinn ship, others are made by kkl-gym train SYSTEM --pipeline spinn"
+        )
 
     def require_known_start(self) -> None:
         """Raise ArtifactError unless an observer can begin at a known state: by T, or by tracking from there."""
         if self.motion is None and self.forward is None:
-            raise ArtifactError(
-                f"this map for {self.system!r} can begin at no known state: it holds neither a motion nor T; kkl-gym "
-                "train makes one that tracks, and kkl-gym train SYSTEM --pipeline spinn one with T"
+            self._lacks(
+                "can begin at no known state: it holds neither a motion nor T; kkl-gym train makes one that tracks, "
+                "and kkl-gym train SYSTEM --pipeline spinn one with T"
             )
 
     def require_covariance(self) -> None:
         """Raise ArtifactError unless T_inv has a covariance."""
         if self.inverse.error_covariance is None:
-            raise ArtifactError(f"this map for {self.system!r} holds no covariance; kkl-gym train makes one that does")
+            self._lacks("holds no covariance; kkl-gym train makes one that does")
 
     def require_motion(self) -> Motion:
         """Return the motion by which the observer tracks, or raise ArtifactError if there is none."""
-        if self.motion is None:
-            raise ArtifactError(f"this map for {self.system!r} does not track; kkl-gym train makes one that does")
-        return self.motion
+        return self.motion or self._lacks("does not track; kkl-gym train makes one that does")
+
+    def _lacks(self, text: str) -> NoReturn:
+        raise ArtifactError(f"this map for {self.system!r} {text}")
 
     @property
     def process_noise_max(self) -> float | None:

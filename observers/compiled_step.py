@@ -1,7 +1,7 @@
 """A tracker's step as machine code, where Numba is installed: its numbers, as the kernel orders them."""
 
 import functools
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -50,7 +50,7 @@ class CompiledStep:
             linear.size + ny + 1 + tracker.nis + 2,
         )  # where a row has the number of samples seen
         self._usual, self._first = self._at(linear), np.zeros(1, int)
-        self._one, self._many = self._code(1), None
+        self._one, self._many = self._code(1), cast(Any, None)
 
     def _code(self, W: int) -> Any:
         """The kernel for W rows at once, with the addresses of the motion and of the output."""
@@ -112,6 +112,3 @@ def _of_filter(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, n
     diagonal = transition.diagonal()
     places = np.array(np.nonzero(transition - np.diag(diagonal)))
     return np.vstack([diagonal, drive]), places, transition[*places]
-
-
-__all__ = ["CompiledStep"]

@@ -32,10 +32,8 @@ class Decoders:
             return np.asarray(of(driven, z, age))
         nz = free.size  # behind it lies z_u, exactly 0 until an input acts
         moved = z[..., nz:].any(-1)
-        if moved.all():
-            return np.asarray(of(driven, z, age))
-        if not moved.any():
-            return np.asarray(of(free, z[..., :nz], age))
+        if moved.all() or not moved.any():
+            return np.asarray(of(driven, z, age) if moved.all() else of(free, z[..., :nz], age))
         ages = np.broadcast_to(age, moved.shape)
         of_driven, of_free = of(driven, z[moved], ages[moved]), of(free, z[~moved][:, :nz], ages[~moved])
         out = np.empty((*moved.shape, *of_driven.shape[1:]))

@@ -458,6 +458,3 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                         record[k, row, i] = whole[i]
 
     return run
-
-
-__all__ = ["steps"]

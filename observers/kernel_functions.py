@@ -187,6 +187,3 @@ def _function(source: str, name: str, **names: str) -> Any:
         namespace[inner] = _part(namespace[inner])
     exec(source, namespace)
     return _part(namespace[name])
-
-
-__all__ = ["OPTIONS", "decode", "decode_one", "evaluate", "motion", "output", "padded"]

@@ -7,10 +7,6 @@ from contextlib import suppress
 from functools import cache
 from typing import Any, TypeVar
 
-# From when on compiling is worth the seconds that it takes.
-MANY_ROWS = 128  # of a batch
-SOON = 1000  # single samples, after which a simulation will go on for long enough
-
 logger = logging.getLogger("observers")
 
 _F = TypeVar("_F", bound=Callable[..., Any])

@@ -92,10 +92,9 @@ class KKLObserver(RecordEstimates):
     ) -> None:
         check_arguments(artifact, monitor, compiled, tracking)
         self._gate, self._delay = check_gate(artifact, tracking, gate), check_delay(artifact, tracking, delay)
-        self.artifact, self._monitored = artifact, bool(monitor)
-        self._tracking, self._compiled = None if tracking is None else bool(tracking), compiled
+        self.artifact, self._warned = artifact, frozenset[str]()
+        self._options: dict[str, Any] = {"monitor": monitor, "tracking": tracking, "compiled": compiled}
         self._kkl: KKL
-        self._warned = frozenset[str]()
         self._state: np.ndarray | None = None  # (n, width), never changed in place
         self._batch: tuple[int, ...] = ()
         self._process_noise = self._level(process_noise)
@@ -133,7 +132,7 @@ class KKLObserver(RecordEstimates):
 
     @gate.setter
     def gate(self, gate: float | None) -> None:
-        self._gate = check_gate(self.artifact, self._tracking, gate)
+        self._gate = check_gate(self.artifact, self._options["tracking"], gate)
         self._set_levels(self._measurement_noise, self._process_noise)
 
     @property
@@ -143,7 +142,7 @@ class KKLObserver(RecordEstimates):
 
     @delay.setter
     def delay(self, delay: int) -> None:
-        self._delay, self._state = check_delay(self.artifact, self._tracking, delay), None
+        self._delay, self._state = check_delay(self.artifact, self._options["tracking"], delay), None
 
     def _level(self, process_noise: float | None) -> float:
         if process_noise is None:
@@ -157,15 +156,8 @@ class KKLObserver(RecordEstimates):
 
     def _set_levels(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
         """Take maps, tracker and monitor for levels of noise; the monitor starts again."""
-        kkl = KKL(
-            self.artifact,
-            measurement_noise=measurement_noise,
-            process_noise=process_noise,
-            tracking=self.artifact.motion is not None and self._tracking is not False,
-            monitored=self._monitored,
-            compiled=self._compiled,
-            gate=self._gate,
-        )
+        levels: dict[str, Any] = {"measurement_noise": measurement_noise, "process_noise": process_noise}
+        kkl = KKL(self.artifact, gate=self._gate, **levels, **self._options)
         if self._state is not None and kkl.monitor is not None:
             self._state = np.hstack([self._state[:, : kkl.watched.start], kkl.monitor.start(len(self._state))])
         self._kkl, self._measurement_noise, self._process_noise = kkl, measurement_noise, process_noise
@@ -187,16 +179,8 @@ class KKLObserver(RecordEstimates):
             which restarts, and it holds no limits. The observer is then as it was.
         """
         check_replacement(self.artifact, artifact)
-        other = KKLObserver(
-            artifact,
-            self._measurement_noise,
-            process_noise=self._process_noise,
-            monitor=self._monitored,
-            tracking=self._tracking,
-            compiled=self._compiled,
-            gate=self._gate,
-            delay=self._delay,
-        )
+        how: dict[str, Any] = {**self._options, "gate": self._gate, "delay": self._delay}
+        other = KKLObserver(artifact, self._measurement_noise, process_noise=self._process_noise, **how)
         if self._state is not None:
             other._state, other._batch = other._kkl.take_over(self._kkl, self._state), self._batch
             other._pending = self._pending

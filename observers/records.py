@@ -21,12 +21,7 @@ class RecordEstimates:
     _begin: Any
 
     def estimate(
-        self,
-        y: np.ndarray,
-        u: np.ndarray | None = None,
-        *,
-        x0: np.ndarray | None = None,
-        t: np.ndarray | None = None,
+        self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None, t: np.ndarray | None = None
     ) -> np.ndarray:
         """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
 

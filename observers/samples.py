@@ -111,19 +111,15 @@ def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...])
     if u is None:
         return np.zeros((*batch, nu))
     u = real_array("u", u)
-    if nu == 0:
-        if u.shape[:-1] != batch:
-            raise ValueError(f"u must have a row of inputs for each of the batch, {batch}, got shape {u.shape}")
-        if u.any():
-            raise ValueError(
-                f"this map for {artifact.system} knows no inputs, but u = {u}; take one that does, "
-                "or pass u=None to ignore the input"
-            )
-        return np.zeros((*batch, 0))
-    if u.shape != (*batch, nu):
+    if u.shape[:-1] != batch or (nu and u.shape != (*batch, nu)):
         raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
+    if nu == 0 and u.any():
+        raise ValueError(
+            f"this map for {artifact.system} knows no inputs, but u = {u}; take one that does, "
+            "or pass u=None to ignore the input"
+        )
     _check_finite("u", u)
-    return u
+    return u[..., :nu]
 
 
 def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:

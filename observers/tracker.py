@@ -64,20 +64,17 @@ def _limit(freedom: float, quantile: float) -> float:
 class Tracker:
     """An unscented Kalman filter on the system's equations, or on a learned flow, for a batch of rows.
 
-    The filter starts at the mean and covariance of the states at which motions start, corrected by the first sample.
-    Within the first window each step is taken three times: once a sample has corrected a prediction, it also says more
-    of where the step began, and the motion is linearised anew over what is left of that uncertainty (Kullberg, Skog and
-    Hendeby, 2023).
+    It starts at the mean and covariance of the states at which motions start, corrected by the first sample. Within the
+    first window each step is taken three times, with the motion linearised about where the sample puts the start of
+    the step (Kullberg, Skog and Hendeby, 2023).
 
     The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's
+    within the first window where T_inv's covariance has the smaller determinant, and where the filter diverged: the
+    mean square of its innovations over the window (NIS) exceeds its limit, or its covariance is no longer positive
+    definite. T_inv's covariance is then that of an age of one window, since what misled the filter may have misled z.
 
-    - within the first window where T_inv's covariance has the smaller determinant, and
-    - where the filter diverged: the mean square of its innovations over the window (NIS) exceeds its limit, or its
-      covariance is no longer positive definite. T_inv's covariance is then that of an age of one window, since what
-      misled the filter may have misled z as well.
-
-    An error below the noise does not show in the NIS, but makes innovations correlated: where the mean square of their
-    running mean exceeds its limit, the covariance is multiplied by ten.
+    An error below the noise makes innovations correlated: where the mean square of their running mean exceeds its
+    limit, the covariance is multiplied by ten.
 
     With a gate, an output whose innovation is larger than so many of its standard deviations is rejected, and counts as
     missing. The gate is open in the first window; and for an output that has been rejected for a whole window, or of a
