@@ -90,9 +90,9 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         lines += [
             "## Component-wise SMAPE in % after the first 20 %, no noise",
             "",
-            "Median for starts in X / 1.5X \\ X / 2X \\ X. In brackets what the notebooks released with the paper "
-            "print for 1.5X \\ X, from other networks, budgets and data. They contradict a heatmap in the same "
-            "notebooks: docs/results/benchmark.md says how, and what they rest on.",
+            "Median for starts in X / 1.5X \\ X / 2X \\ X. In brackets the printed values of the notebooks "
+            "released with the paper for 1.5X \\ X, from other networks, budgets and data. They contradict a "
+            "heatmap in the same notebooks: see docs/results/benchmark.md.",
             "",
             *_by_method(methods, partial(_beside_printed, component["median"])),
         ]
