@@ -128,14 +128,13 @@ class Speed:
         """Time `estimate` along whole records: of one observer, an hour at 100 Hz by default, and of many."""
         steps, n = 72 * self.steps, self.num_envs
         title = Column("records", no_wrap=True)
-        table = Table(
-            title, *(f"µs a sample, {rows} rows of {count:,}" for rows, count in ((1, steps), (n, steps // n)))
-        )
-        for one in (one for one in environments if one.observed):
+        sizes = {1: steps, n: steps // n}
+        table = Table(title, *(f"µs a sample, {rows} of {count:,} samples" for rows, count in sizes.items()))
+        for one in filter(lambda one: one.observed, environments):
             artifact = Artifact.read(resolve(one.observer or one.system.name))
             medians: list[dict[str, float]] = []
-            for rows in (1, n):
-                tasks = record_tasks(artifact, one.system, rows=rows, steps=steps // rows)
+            for rows, count in sizes.items():
+                tasks = record_tasks(artifact, one.system, rows=rows, steps=count)
                 report = progress.bar(f"timing records of {rows}", len(tasks) * 4)
                 seconds = in_turns(tasks, 3, report)
                 medians.append({name: 1e6 * float(np.median(times)) for name, times in seconds.items()})
