@@ -62,8 +62,8 @@ class KKLObserver(RecordEstimates):
     gate : float, optional
         Outputs whose innovation is larger than so many of its standard deviations are rejected: they count as missing,
         and :attr:`rejected` counts them. The gate is open in the first window, half a second for the maps that ship;
-        and where all that is measured has been rejected for a whole window, or the tracker diverged, until an output
-        fits again. It needs a map that tracks.
+        and for an output that was beyond it for a whole window, or where the tracker diverged, until that output fits
+        again: a jump that stays is accepted. It needs a map that tracks.
     delay : int, default 0
         Samples by which outputs are late. ``step(y, u)`` then takes the output of so many samples ago and the input
         held since the sample before, and the estimate is predicted by the motion to now. It needs a map that tracks.

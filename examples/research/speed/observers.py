@@ -90,7 +90,8 @@ def record_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -
     Both run on the equations of the observer's tracker. The first run, in which dynamax compiles, is not to be counted.
     """
     rng, motion = np.random.default_rng(0), artifact.motion
-    starts = rng.uniform(*np.transpose(system.X), (rows, system.nx))
+    low, high = np.transpose(system.X)
+    starts = rng.uniform(low, high, (rows, system.nx))
     y = system.output(simulate(system, starts, steps, artifact.filter.dt))
     y = np.nan_to_num(y) + np.asarray(artifact.measurement_noise) * rng.standard_normal(y.shape)
     observer = KKLObserver(artifact)
@@ -115,10 +116,12 @@ def _dynamax(artifact: Artifact) -> Callable[[np.ndarray], np.ndarray]:
 
     jax.config.update("jax_enable_x64", True)
     jnp, motion, space = jax.numpy, artifact.require_motion(), dict[str, Any]()
-    for name, expression in (("f", motion.equations and motion.equations.field), ("h", artifact.h)):
-        if expression is not None:
-            exec(expression.python(name, artifact.nx, artifact.nu), {"np": jnp}, space)
-    u, substeps = [0.0] * artifact.nu, motion.equations.substeps if motion.equations else 1
+    equations = motion.equations
+    assert equations is not None
+    exec(equations.field.python("f", artifact.nx, artifact.nu), {"np": jnp}, space)
+    if artifact.h is not None:
+        exec(artifact.h.python("h", artifact.nx, 0), {"np": jnp}, space)
+    u, substeps = [0.0] * artifact.nu, equations.substeps
     h = artifact.filter.dt / substeps
 
     def f(x: Any) -> Any:
