@@ -119,7 +119,7 @@ def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...])
             "or pass u=None to ignore the input"
         )
     _check_finite("u", u)
-    return u[..., :nu]
+    return u if nu else u[..., :0]
 
 
 def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
@@ -172,7 +172,10 @@ def far_input(artifact: Artifact, u: np.ndarray) -> float | None:
     if not artifact.u_max:
         return None
     if u.ndim == 1:  # fast path for one sample
-        return next((v for v, most in zip(u.tolist(), artifact.u_max, strict=True) if abs(v) > FAR * most), None)
+        for value, most in zip(u.tolist(), artifact.u_max):
+            if abs(value) > FAR * most:
+                return float(value)
+        return None
     far = np.abs(u) > FAR * np.array(artifact.u_max)
     return float(u[far][0]) if far.any() else None
 

@@ -30,7 +30,7 @@ def test_speed_of_a_shipped_system(observer, wrapped, observers, capsys):
     assert (ratios["Pendulum-v1"], ratios["CartPole-v1, 4 rows"]) == (1.0, 1.0)
     lines = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if "│" in line]
     rows = [sum(len(cells) == columns for cells in lines) for columns in (3, 5, 6)]
-    assert rows == [2 + len(wrapped) + 2, 3 + len(wrapped), 6 * observers]
+    assert rows == [3 + len(wrapped), 3 + len(wrapped), 6 * observers]
     with pytest.raises(ValueError, match="turns must be positive"):
         Speed(turns=0).run(Console())
 
