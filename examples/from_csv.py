@@ -17,8 +17,8 @@ import kkl_gym
 import observers
 from training.files import write
 from training.identification import identify
+from training.presets import controller
 from training.records import read_records
-from training.systems import controller
 
 MU = 3.3  # of the plant; the model's first guess is GUESS
 GUESS, LIMITS = 2.0, (0.2, 20.0)

@@ -41,15 +41,14 @@ from kkl_gym.simulate import simulate
 from observers import Artifact
 from observers.estimator import Running
 from training.figures import ESTIMATE, RIVAL, TARGET, TRUTH, drawing
-from training.files import write
+from training.files import table, write
 from training.identification.motions import Shooting
 from training.identification.shooting import shoot
 from training.identification.windows import windows
 from training.kalman import ExtendedKalmanFilter
-from training.markdown import table
+from training.lessons import train
 from training.records import Record, Signals, read_records, resampled
 from training.sources.recorded import RecordedSource, estimates, recorded_preset
-from training.train_observer import train
 
 SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))
 MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # what these signals are multiplied with in the mirror
