@@ -7,8 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from observers.artifact import Artifact
-from observers.checks import shown
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError, shown
 from observers.observer import KKLObserver
 
 

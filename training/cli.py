@@ -6,6 +6,7 @@ command is called.
 
 import _thread
 import io
+import logging
 import os
 import re
 import signal
@@ -59,6 +60,13 @@ EXTRAS = {
 }
 
 
+class _Notes(logging.Handler):
+    """Puts notes of the library, such as that it compiles, on stderr as it is then: a progress bar redirects it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(record.getMessage(), file=sys.stderr)
+
+
 def main(
     arguments: list[str] | None = None,
     *,
@@ -71,6 +79,9 @@ def main(
     if arguments[:1] == ["--version"]:
         print(f"kkl-gym {version('kkl-gym')}")
         return
+    notes = logging.getLogger("observers")
+    notes.setLevel(logging.INFO)
+    notes.handlers = [_Notes()]
     with _noticing_interruptions() as interrupted:
         try:
             from rich.console import Console

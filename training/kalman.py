@@ -69,7 +69,8 @@ class ExtendedKalmanFilter:
             held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
             moved, spread = self._predicted(x, P, held, self._dt if dt is None else dt)
             x, P = np.where(begun[:, None], moved, x), np.where(begun[:, None, None], spread, P)
-        return Belief(*self._corrected(x, P, y), np.ones(len(y), dtype=bool))
+        begun = begun | np.isfinite(y).any(-1)  # a sample that is missing begins no row
+        return Belief(*self._corrected(x, P, np.where(begun[:, None], y, np.nan)), begun)
 
     def estimate(self, state: Belief) -> Estimate:
         """Return means and covariances."""

@@ -122,7 +122,8 @@ def train(
             "torch": torch.__version__,
             "numpy": np.__version__,
         }
-        artifact = Artifact(**vars(maps), **source.facts(), training=training, versions=versions)
+        facts = source.facts() | ({} if maps.filter.nu else {"u_max": None})
+        artifact = Artifact(**vars(maps), **facts, training=training, versions=versions)
         with run.timed("calibrating"):
             try:
                 artifact = calibrate(artifact, source, motion=motion, console=run.progress)

@@ -1,6 +1,5 @@
 """What single and vector wrappers share: an observer fitted to a plant, and what it shows."""
 
-import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -65,9 +64,9 @@ class KKLEstimator:
         self._known_start = flag("known_start", known_start)
         self._monitor = flag("monitor", monitor)
         self.estimate, self.space, self._blind = estimate, space, blind
-        self.observer = KKLObserver(
-            self.asked(artifact), measurement_noise, process_noise=process_noise, monitor=monitor, compiled=compiled
-        )
+        tracks = estimate == "x" or self._monitor or self._known_start
+        how: dict[str, Any] = {"process_noise": process_noise, "monitor": monitor, "compiled": compiled}
+        self.observer = KKLObserver(self.asked(artifact), measurement_noise, tracking=None if tracks else False, **how)
 
     @classmethod
     def of_plant(
@@ -123,9 +122,7 @@ class KKLEstimator:
             raise ValueError(f"uncertainty=True is about x_hat: it needs estimate='x', got {self.estimate!r}")
         if self._uncertainty:
             artifact.require_covariance()
-        if self.estimate == "x" or self._monitor or self._known_start:
-            return artifact
-        return dataclasses.replace(artifact, motion=None)
+        return artifact
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
         """The input as far as the map knows it. Shapes: ``u`` (..., nu); returns (..., nu), or None."""

@@ -59,9 +59,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     array of shape (), above 1 where the samples do not fit the estimates (a faulty sensor, states that the map was not
     made for).
 
-    With ``estimate="z"`` the network is not evaluated, and nothing tracks (the map of :attr:`observer` holds no
-    motion), unless there is a monitor or the start is known. There is then no ``x_hat``, and :meth:`render` shows no
-    estimate.
+    With ``estimate="z"`` the network is not evaluated, and nothing tracks, unless there is a monitor or the start is
+    known. There is then no ``x_hat``, and :meth:`render` shows no estimate.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
     ``training.learn``). That one sees the signals of the observation that its file names, and the actions. The

@@ -16,8 +16,8 @@ from pushed_systems import Pendulum, TwoInputs
 from kkl_gym import SYSTEMS, EquationError, KKLEnv, KKLVectorEnv, System, get_system
 from kkl_gym.compiled import batch_step, single_step
 from kkl_gym.elementary import clip, exp, log, maximum, minimum, sign, sin, sqrt, tan, tanh, where
+from kkl_gym.envs import SOON
 from kkl_gym.simulate import advance, advance_batch
-from observers.machine import SOON
 
 DT = 0.01
 GRAVITY = 9.81

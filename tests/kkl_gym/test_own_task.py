@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from kkl_gym import ActionRepeat, EquationError, KKLEnv, KKLVectorEnv, System
 from kkl_gym.elementary import where
-from observers.machine import MANY_ROWS
+from kkl_gym.vector import MANY_ROWS
 
 
 class Cart(System):

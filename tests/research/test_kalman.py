@@ -178,6 +178,13 @@ def test_samples_count_where_h_is_undefined_at_some_sigma_points(filters):
     assert np.abs(x_hat - x[-1]).max() < 0.05
 
 
+def test_a_sample_that_is_missing_begins_no_row(filters):
+    ekf = running(filters, Oscillator(), 0.02, Q=np.eye(2), R=np.eye(1)).estimator
+    state = ekf.advance(ekf.start(2), np.array([[np.nan], [0.3]]))
+    assert state.begun.tolist() == [False, True]
+    np.testing.assert_array_equal(state.x[0], ekf.start(1).x[0])
+
+
 def test_missing_outputs_correct_nothing(filters):
     """With NaN in place of the second output it is the filter of the first alone, and with none it only predicts."""
     start, Q, dt = (np.array([0.2, -0.1]), np.array([[1.0, 0.3], [0.3, 0.5]])), np.diag([0.01, 0.02]), 0.02

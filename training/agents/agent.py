@@ -14,8 +14,7 @@ import numpy as np
 from kkl_gym import SYSTEMS, get_system
 from kkl_gym.wrappers.vector import VectorEnv
 from observers import MLP, storage
-from observers.checks import choice, shown
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError, choice, shown
 from observers.names import matching, resolve
 from training.agents.information import ESTIMATED, INFORMATION, Information, make
 from training.agents.tasks import Task

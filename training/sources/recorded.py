@@ -110,11 +110,17 @@ class RecordedSource:
         """Arguments of :class:`observers.Artifact`."""
         signals = {role: getattr(self.signals, role) for role in ROLES.values()} | ({} if self.nu else {"inputs": ()})
         facts = {"system": self.name, "parameters": {}, "measurement_noise": 0.0, "signals": signals}
+        facts["u_max"] = self._largest_inputs()
         facts["environment"] = self.records[0].environment
         try:
             return facts | {"C": linear_output(self.kept, self.C)[0]}
         except ValueError:  # tracking() raises it again, with the reason
             return facts
+
+    def _largest_inputs(self) -> tuple[float, ...] | None:
+        """Largest absolute values of the inputs in all records, None without inputs."""
+        inputs = [np.abs(each.u[:-1]).max(0, initial=0.0) for each in self.records if self.nu and each.u is not None]
+        return tuple(np.max(inputs, 0).tolist()) if inputs else None
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
         """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""

@@ -86,6 +86,7 @@ class SimulatedSource:
             "system": self.name,
             "parameters": self.system.parameters,
             "measurement_noise": system.measurement_noise,
+            "u_max": tuple(map(float, system.u_max)),
             "parameter_ranges": self.ranges,
             "estimated_parameters": self.estimated,
             **output_facts(system),

@@ -67,7 +67,7 @@ def _records():
         ("evaluate lorenz --plant-error 0.1 --plant rho=30", "give --plant or --plant-error, not both"),
         ("evaluate lorenz --plant rho=x", "'rho=x' is no parameter with its value: write NAME=VALUE, as in mu=3.3"),
         ("agent train CartPole-v1 --measurement-noise 0.1,0.2", "one number"),
-        ("agent train Acrobot-v1", "say what is measured of Acrobot-v1"),
+        ("agent train Acrobot-v1", "name the measured entries of Acrobot-v1"),
         ("agent train lorenz --measured 0", "of the system lorenz y is measured"),
         ("agent train lorenz --aggregate 2", "no observer to fit again"),
         ("agent train lorenz --threads 0", "threads must be at least 1"),
