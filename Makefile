@@ -7,7 +7,7 @@ SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 LARGE := $(SYSTEMS:%=%-large)
 
 .PHONY: demo install test test-coverage guard test-slow test-research test-long test-browser lint format maps results figures benchmark ablation \
-	certificates agents environments speed sizes clients docs clean help
+	faults agents environments speed sizes clients docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -90,13 +90,8 @@ ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumabl
 	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md) docs/results/ablation
 	$(MAKE) figures
 
-CERTIFIED := $(LARGE) $(SYSTEMS:%=%-spinn)
-
-certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
-	$(BIN)/python -m examples.research certify $(CERTIFIED)
+faults: $(VENV)/ready  ## the faults in docs/results
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --faults --csv docs/results/faults/faults.csv
-	mkdir -p docs/results/certificates
-	cp runs/certificates/table.md $(CERTIFIED:%=runs/certificates/%.json) docs/results/certificates
 	$(MAKE) figures
 
 # The one on y is what `kkl-gym agent train van_der_pol --information y` makes, for the picture of two agents side by side.
@@ -138,7 +133,7 @@ sizes: $(VENV)/ready  ## errors of wider and narrower maps against their time, a
 
 # RLlib pins Gymnasium, and Tianshou what tyro needs: each has an environment of its own.
 CLIENTS_zoo := --editable ".[agents]" rl-zoo3 torchrl "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
-CLIENTS_rllib := --editable . "ray[rllib]>=2.40" "torch<2.14" tyro
+CLIENTS_rllib := --editable . "distributed>=2025.1" "ray[rllib]>=2.40" "torch<2.14" tyro
 CLIENTS_tianshou := --editable . "tianshou[eval]>=2" "torch<2.14"
 CLIENTS := zoo rllib tianshou
 

@@ -1,4 +1,4 @@
-"""A shipped observer adapted to a plant that is not its model, from outputs alone, checked against what is known.
+"""A shipped observer adapted to a plant that is not its model, from outputs alone, checked against the true plant.
 
 Every parameter of the plant is 10 % larger than the observer's model has it. The records hold t and y, nothing else::
 
@@ -58,7 +58,7 @@ def main(
     inverse_steps: int | None = None,
     trajectories: int | None = None,
 ) -> Compared:
-    """Simulate records of a plant that is not an observer's model, adapt the observer, and say what that brings.
+    """Simulate records of a plant that is not an observer's model, adapt the observer, and print its errors.
 
     Args:
         system: reverse_duffing, van_der_pol, rossler or lorenz.

@@ -1,4 +1,4 @@
-"""An observer for an environment of others: its rollouts, what is hidden in them, and the observer around it.
+"""An observer for an environment of others: its rollouts, their hidden signals, and the observer around it.
 
 The policies are simple ones. An agent of yours does as well: ``kkl-gym record ENV_ID --policy ppo:agent.zip``.
 """
@@ -50,7 +50,7 @@ def balance_both(obs: np.ndarray) -> np.ndarray:
     return np.float32([np.clip(-GAINS @ [obs[0], *angles, *obs[5:8]], -1, 1)])
 
 
-# What is measured, what is hidden, and who acts.
+# The measured signals, the hidden ones, and the policy that acts.
 CASES: dict[str, tuple[list[int], list[int], Callable]] = {
     "Pendulum-v1": ([0, 1], [2], swing_up),
     "CartPole-v1": ([0, 2], [1, 3], balance),
@@ -120,7 +120,7 @@ def main(
         held_out: steps of other episodes, in which the policy does not explore.
         batches: of the training, for each network.
         members: networks that are trained and averaged.
-        noise: standard deviation of the noise on what is measured. With noise the observer estimates all signals, and
+        noise: standard deviation of the measurement noise. With noise the observer estimates all signals, and
             tracks. The controller then acts on its estimates, on those of T_inv alone, and on the truth.
         seed: of everything random.
     """
@@ -142,7 +142,7 @@ def main(
         )
         env = KKLObservation(gym.make(env_id), Path(folder) / f"{env_id}.safetensors")
     obs, _ = env.reset(seed=seed)
-    print(f"{env_id}: the agent sees {obs.size} numbers, what is measured and {len(hidden)} estimates")
+    print(f"{env_id}: the agent sees {obs.size} numbers, the measurements and {len(hidden)} estimates")
     unseen = make(env_id)
     names = {"measured": list(map(str, measured)), "hidden": list(map(str, hidden))}
     found = {}

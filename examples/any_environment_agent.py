@@ -30,7 +30,7 @@ def wrapped(path: Path) -> gym.Env:
     return KKLObservation(gym.make(ENV_ID), path)
 
 
-def told() -> gym.Env:
+def with_hidden() -> gym.Env:
     """The environment with the truth where estimates will be."""
     env = gym.make(ENV_ID)
     space = gym.spaces.Box(env.observation_space.low[ORDER], env.observation_space.high[ORDER])
@@ -44,7 +44,7 @@ def beginner(make: Callable[[], gym.Env], seed: int) -> PPO:
 
 
 def own_episodes(agent: PPO, env: gym.Env, episodes: int, seed: int) -> list[tuple[np.ndarray, ...]]:
-    """Outputs, inputs and hidden signals of an agent's episodes, as info says them."""
+    """Outputs, inputs and hidden signals of an agent's episodes, as info gives them."""
     played = []
     for episode in range(episodes):
         obs, info = env.reset(seed=seed + episode)
@@ -104,7 +104,7 @@ def main(
         observers = {"first ": first, "newest ": refits.artifact}
         found["refitted"] = report("refitted", refitted, observers, path, seed)
 
-        agent = beginner(told, seed).learn(timesteps - every)
+        agent = beginner(with_hidden, seed).learn(timesteps - every)
         path = Path(folder, "agent", f"{ENV_ID}.safetensors")
         after = learn(policy=lambda obs: agent.predict(obs[ORDER])[0], out=path.parent)
         agent.set_env(make_vec_env(partial(wrapped, path), 4, seed=seed))

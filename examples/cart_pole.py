@@ -5,7 +5,7 @@ The same from the command line::
     kkl-gym train examples/cart_pole.py:CartPole --policy controller
     kkl-gym evaluate runs/cart_pole/cart_pole.safetensors --system examples/cart_pole.py:CartPole
 
-docs/guides/your_system.md says more about such plants.
+See docs/guides/your_system.md for such plants.
 """
 
 from dataclasses import dataclass

@@ -4,7 +4,7 @@ The same from the command line::
 
     kkl-gym train examples/circle_pendulum.py:CirclePendulum
 
-docs/guides/your_system.md says more about such plants.
+See docs/guides/your_system.md for such plants.
 """
 
 from dataclasses import dataclass

@@ -17,8 +17,8 @@ import kkl_gym
 import observers
 from training.files import write
 from training.identification import identify
+from training.presets import controller
 from training.records import read_records
-from training.systems import controller
 
 MU = 3.3  # of the plant; the model's first guess is GUESS
 GUESS, LIMITS = 2.0, (0.2, 20.0)
@@ -64,7 +64,7 @@ def main(
     """Record, identify, control; returns mu as found, and the costs with x_hat and with the true state.
 
     Args:
-        runs: files that are written; of five or more, one is left out of the fit, for a look at what is predicted.
+        runs: number of files to write; of five or more, one is left out of the fit, to test predictions.
         seconds: length of each.
         inverse_steps: batches of the observer's training.
         trajectories: simulated trajectories of the plant found, to train on.
@@ -96,7 +96,7 @@ def main(
         console=Console(),
     )
 
-    act = controller(learned.identified.system)  # made for the model found: nobody knows the plant
+    act = controller(learned.identified.system)  # designed for the identified model, since the plant is unknown
     observer = observers.load(str(out / "van_der_pol.safetensors"), NOISE)
 
     def on_estimate(x: np.ndarray, info: dict[str, np.ndarray]) -> np.ndarray:

@@ -61,7 +61,7 @@ def main(
     out: Path | None = None,
     inverse_steps: int | None = None,
 ) -> Found:
-    """Simulate records of a plant, identify it from its outputs, and say how far off everything is.
+    """Simulate records of a plant, identify it from its outputs, and print all errors.
 
     Args:
         system: reverse_duffing, van_der_pol, rossler or lorenz.

@@ -45,7 +45,7 @@ class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
         return obs, info | {"y": self._last}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
-        """As the environment's, with what the sensor says in place of the output."""
+        """As the environment's, with the sensor's reading in place of the output."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         y = self._noisy(info["y"])
         self._last = {"none": y, "bias": y + self._bias, "drop-out": 0.0 * y, "freeze": self._last}[self.fault]
@@ -119,7 +119,7 @@ class Live:
         return self.artists
 
     def press(self, key: str | None) -> None:
-        """Do what a key is for; ``KEYS`` says what that is."""
+        """Act on a key; ``KEYS`` lists them."""
         if key == " ":
             self.paused = not self.paused
         elif key == "n":
@@ -183,7 +183,7 @@ class Live:
         figure.text(0.02, 0.05, KEYS, size="small")
 
     def _set_noise(self, level: float) -> None:
-        observer = self.env.observer  # whose map may be told less noise of some outputs than of others
+        observer = self.env.observer  # its map may assume less noise on some outputs than on others
         self.sensor.level = observer.measurement_noise = observer.artifact.inverse.within(float(level))
 
     def _set_input(self, share: float) -> None:

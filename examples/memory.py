@@ -1,4 +1,4 @@
-"""A memory around an environment of others: SAC swings a pendulum up whose rate nobody measures."""
+"""A memory around an environment of others: SAC swings a pendulum up whose rate is not measured."""
 
 import gymnasium as gym
 import numpy as np
@@ -19,7 +19,7 @@ class Positions(gym.ObservationWrapper):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
-        """What is measured."""
+        """The measured signals."""
         return (observation[:2] + self.noise * self.np_random.normal(size=2)).astype(np.float32)
 
 
@@ -28,7 +28,7 @@ def main(steps: int = 10_000, noise: float = 0.0, episodes: int = 20, seed: int 
 
     Args:
         steps: environment steps that each agent learns from, in half a minute.
-        noise: standard deviation of what is added to each measurement.
+        noise: standard deviation of the noise added to each measurement.
         episodes: evaluation episodes, which training has not seen.
         seed: of everything random.
     """

@@ -1,6 +1,6 @@
 """Three plants in physical units: minutes and seconds, kelvin and mol/l, volts and amperes.
 
-Nothing is said of scales, sampling or noise: the defaults follow from the equations and the training box::
+Scales, sampling and noise are left to their defaults, which follow from the equations and the training box::
 
     kkl-gym diagnose examples/physical_units.py:StirredTank
     kkl-gym train examples/physical_units.py:StirredTank

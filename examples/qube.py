@@ -1,6 +1,6 @@
 """Real hardware: the pendulum of a Quanser Qube Servo 2, estimated from the angle of its arm alone.
 
-The first observer is told no equation: it is fitted to eight recorded runs, and four others say how good it is. Beside
+The first observer gets no equation: it is fitted to eight recorded runs and tested on four others. Beside
 it stand an extended Kalman filter, with the device's published model and with one that is fitted to the same eight
 runs, and the finite differences that a control engineer would begin with::
 
@@ -11,14 +11,14 @@ time (s): the twelve free runs that come with Buisson-Fenet, Bahr, Morgenthaler,
 numerical KKL observers" (2023), repository Centre-automatique-et-systemes/learn_observe_KKL, MIT licence.
 docs/results/qube.md has the results.
 
-What is said of the device beforehand, beside the records: left and right are alike, and the arm has no angle of its
+Given about the device, beside the records: left and right are alike, and the arm has no angle of its
 own. Each run is therefore learned from twice, once mirrored, with the signs of both angles changed; and the map sees
 how the arm's angle changes, not where it is.
 
 Eight runs hold few of the swings that a pendulum can do. A second observer therefore learns from motions of the
 device's equations as well, with the parameters that were fitted to the same eight runs, released from anywhere.
 
-When the arm sticks, its angle says no more, and the pendulum swings on. What knows how is its equation. So the second
+When the arm sticks, its angle carries no information, and the pendulum swings on by its equation. So the second
 observer starts a Kalman filter as well, whose arm can stick, and takes it back where the two disagree.
 
 The recorded velocities are no measurements. They follow from the recorded angles exactly, sample by sample, as
@@ -41,15 +41,14 @@ from kkl_gym.simulate import simulate
 from observers import Artifact
 from observers.estimator import Running
 from training.figures import ESTIMATE, RIVAL, TARGET, TRUTH, drawing
-from training.files import write
+from training.files import table, write
 from training.identification.motions import Shooting
 from training.identification.shooting import shoot
 from training.identification.windows import windows
 from training.kalman import ExtendedKalmanFilter
-from training.markdown import table
+from training.lessons import train
 from training.records import Record, Signals, read_records, resampled
 from training.sources.recorded import RecordedSource, estimates, recorded_preset
-from training.train_observer import train
 
 SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))
 MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # what these signals are multiplied with in the mirror
@@ -74,7 +73,7 @@ SETTINGS = {
     "members": 4,
 }
 
-# First guesses of what is fitted. The mass is not: without an input, all forces may be larger by one factor.
+# First guesses of the fitted parameters. The mass is given: without an input, all forces may be larger by one factor.
 GUESSES = {
     "arm_length": 0.085,
     "arm_inertia": 5.72e-5,
@@ -100,7 +99,7 @@ ENCODER = 2 * np.pi / 2048  # rad, a step of either angle
 # Of the filter that is guided, chosen on the training runs: samples of a motion that its model is fitted to; s at which
 # the observer starts it, how sure it is then, and how far apart, on the unit circle, the two may be.
 LONGER, STARTED, SURE, APART = 250, 0.3, (0.002, 0.3, 1.0, 4.0, 1.0), 0.5
-PUSHED = 1.0  # 0.1 mN m, standard deviation of the torque on the arm that nobody knows
+PUSHED = 1.0  # 0.1 mN m, standard deviation of the unknown torque on the arm
 
 
 def main(
@@ -286,7 +285,7 @@ def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
 
 
 def differences(record: Record) -> np.ndarray:
-    """The arm's velocity as the device computes it. Of the pendulum, differences of theta say nothing."""
+    """The arm's velocity as the device computes it. Differences of theta do not contain the pendulum's rate."""
     nothing = np.full(len(record.t), np.nan)
     return np.stack([nothing, nothing, nothing, recorded_velocity(record.y[:, 0])], -1)
 
@@ -313,7 +312,7 @@ def draw(
     """Draw the first seconds of the runs, each in a column: one recorded signal, and errors of two."""
     names, shown, smooth = ("sin(alpha)", "alpha_dot"), slice(0, round(SHOWN / DT)), np.ones(AVERAGED) / AVERAGED
     of = [SIGNALS.hidden.index(name) for name in names]
-    drawn = {name: x_hat for name, x_hat in estimators.items() if name != DIFFERENCES}  # they say nothing of alpha
+    drawn = {name: x_hat for name, x_hat in estimators.items() if name != DIFFERENCES}  # they do not estimate alpha
     with drawing(path, 2.6 * len(records), 6.5) as figure:
         axes = figure.subplots(1 + len(names), len(records), squeeze=False, sharex=True, sharey="row")
         for column, (record, title) in enumerate(zip(records, titles, strict=True)):

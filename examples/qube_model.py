@@ -8,7 +8,7 @@ import numpy as np
 import kkl_gym
 from kkl_gym.elementary import cos, sin, tanh
 
-KEPT = 0.1  # s until a torque that nobody knows is another
+KEPT = 0.1  # s, correlation time of the unknown torque
 
 
 @dataclass(frozen=True)

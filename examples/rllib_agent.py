@@ -67,7 +67,7 @@ def main(
     """Train for a while; returns the actions taken and the mean episode reward of the last ones.
 
     Args:
-        algorithm: what is trained.
+        algorithm: the algorithm to train.
         env_id: one of the package's environments.
         observer: a shipped map's name, or a .safetensors file that every runner can read.
         steps: actions to learn from, in all environments together.

@@ -1,7 +1,7 @@
 """The Silverbox, the standard benchmark of nonlinear identification: an electronic Duffing oscillator, measured.
 
 The data are not part of this project: nonlinearbenchmark.org has them, as SNLS80mV.csv with columns V1 (input) and V2
-(output), 131,072 samples at 610.35 Hz. docs/results/silverbox.md says what is assumed and what comes out::
+(output), 131,072 samples at 610.35 Hz. See docs/results/silverbox.md for assumptions and results::
 
     python examples/silverbox.py SNLS80mV.csv
 """
@@ -31,7 +31,7 @@ SAMPLES = 131_072
 FREE = 50  # first samples of each test, from which its start may be found, and which do not count
 TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)  # three quarters and one of the multisine records
 ARROW, ARROW_INSIDE = (100, 40_575), (100, 32_100)  # up to there it stays within the outputs of the training part
-RECORDS, LENGTH = 8, 2_048  # taken from the training part; one is left out, for a look at what is predicted
+RECORDS, LENGTH = 8, 2_048  # taken from the training part; one is left out, to test predictions
 LIMITS = {
     "damping": (6.0, 600.0),
     "stiffness": (3e4, 3e6),

@@ -1,10 +1,8 @@
 """Sampling intervals as machine code, where Numba is installed and a system's equations can be written as a program.
 
-The equations are run once on symbols (:mod:`kkl_gym.tracing`); the program that comes out is put into the Runge–Kutta
-step that Python and NumPy take, and compiled, which takes a second for each system and set of parameters. Machine code
-adds and multiplies as Python does, in the same order: a single state's step is the same with it and without, to the
-last bit, in a tenth of the time. Equations with powers, which compilers round in their own way, are compiled for
-batches alone. These go through it many rows at a time, one in each lane of the processor's vectors.
+The equations run once on symbols (:mod:`kkl_gym.tracing`); the program is put into the Runge–Kutta step of Python and
+NumPy, and compiled in a second. A single state's step is Python's to the last bit, in a tenth of the time; equations
+with powers, which compilers round in their own way, are compiled for batches alone.
 """
 
 import functools
@@ -44,14 +42,14 @@ _TRIALS = 200  # states of each kind at which machine code is compared
 _MAX_TRIAL_SUBSTEPS = 64  # of a single state that is compared: Python would take long for more
 _LANES = 32  # rows that make a step together: a few of the processor's vectors
 _KEPT = 64  # kernels
-_kept: dict[Any, Any] = {}  # kernels, or what is in the way of one, by what they were made of
+_kept: dict[Any, Any] = {}  # kernels, or the obstacle to one, by their programs
 
 logger = logging.getLogger("kkl_gym")
 
 
 @dataclass(frozen=True)
 class SamplingStep(Generic[Values]):
-    """One sampling interval, called as ``step(x, u, w, dt)``, and what is in the way of machine code, if it is not."""
+    """One sampling interval, called as ``step(x, u, w, dt)``, and the obstacle to machine code, if it is Python."""
 
     advance: Advance[Values]
     obstacle: str | None = None
@@ -74,18 +72,13 @@ class Motion:
 def single_step(system: System) -> SamplingStep[Components]:
     """One sampling interval of a single state: compiled if Numba is there and takes the equations, else in Python.
 
-    Numbers that the equations read besides are as they were when this was called. The logger ``kkl_gym`` says at level
-    INFO, once for each system, if they are not compiled and why.
+    Numbers that the equations read besides are as they were at this call.
     """
     return _shared(system, single_kernel, _single, advance, f"single steps of {system.name} stay in Python")
 
 
 def batch_step(system: System) -> SamplingStep[np.ndarray]:
-    """One sampling interval of a batch: compiled if Numba is there and takes the equations, else NumPy.
-
-    The two agree to rounding. Otherwise as :func:`single_step`; :mod:`kkl_gym.elementary` has functions that serve
-    both. Systems in discrete time are not integrated, and make their steps in NumPy.
-    """
+    """As :func:`single_step` for a batch; machine code and NumPy agree to rounding."""
     return _shared(system, batch_kernel, _batch, advance_batch, f"{system.name} goes on with NumPy, not compiled")
 
 
@@ -94,15 +87,14 @@ def _shared(
     compile_kernel: Callable[[System, Motion], Any],
     around: Callable[[System, Any], Advance[Values]],
     otherwise: Callable[..., Values],
-    said: str,
+    without: str,
 ) -> SamplingStep[Values]:
     """The step of a system around a kernel that is compiled once for all systems of the same programs."""
     plain = functools.partial(otherwise, system)
     if system.discrete:
         return SamplingStep(plain, f"{system.name} makes its step itself")
-    motion: Any
     try:
-        motion = _motion(system)
+        motion: Any = _motion(system)
     except Exception as error:  # whatever comes out of a user's equations on symbols
         motion = _reason(error)
     of = compile_kernel, type(system), motion
@@ -111,19 +103,18 @@ def _shared(
             _kept.pop(next(iter(_kept)), None)
         try:
             _kept[of] = motion if isinstance(motion, str) else compile_kernel(system, motion)
-        except Exception as error:  # Python takes the equations as they are, and says what is wrong on numbers, too
+        except Exception as error:  # Python takes the equations as they are, and raises for what is wrong on numbers
             _kept[of] = _reason(error)
         if isinstance(_kept[of], str):
-            logger.info("%s: %s", said, _kept[of])
-    found = _kept[of]
-    return SamplingStep(plain, found) if isinstance(found, str) else SamplingStep(around(system, found))
+            logger.info("%s: %s", without, _kept[of])
+    kernel = _kept[of]
+    return SamplingStep(plain, kernel) if isinstance(kernel, str) else SamplingStep(around(system, kernel))
 
 
 def _reason(error: Exception) -> str:
-    """What went wrong, in one line: Numba writes a page, in colours, of which a line says what it cannot take."""
-    lines = re.sub(r"\x1b\[\d*m", "", str(error)).splitlines()
-    said = [line for line in lines if line.strip() and not line.startswith("Failed in ")]
-    return f"{type(error).__name__}: {said[0] if said else ''}"
+    """What went wrong, in one line: Numba writes a page, in colours, of which a line names what it cannot take."""
+    line = re.search(r"^(?!Failed in ).*\S.*", re.sub(r"\x1b\[\d*m", "", str(error)), re.MULTILINE)
+    return f"{type(error).__name__}: {line[0] if line else ''}"
 
 
 def _motion(system: System) -> Motion:
@@ -151,7 +142,7 @@ def _motion(system: System) -> Motion:
 
 
 def single_kernel(system: System, motion: Motion) -> Any:
-    """The compiled step of a single state, NaN where substeps of one length do not do."""
+    """The compiled step of a single state, NaN where substeps of one length err too much."""
     import numba
 
     if not (motion.field.exact and motion.push.exact):
@@ -198,7 +189,7 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
     def step(x: Components, u: Components, w: Components, dt: float) -> Components:
         try:
             end: Components = kernel(*x, *u, *w, dt)
-        except Exception:  # Python says better what is wrong with the equations
+        except Exception:  # Python names the equation that failed
             return advance(system, x, u, w, dt)
         return end if end[0] == end[0] else advance(system, x, u, w, dt)
 
@@ -206,13 +197,11 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
 
 
 def batch_kernel(system: System, motion: Motion) -> Any:
-    """The compiled step of a batch: substeps of one length for each row, in groups of rows that need as many.
-
-    Components and lanes are written out, and lie in one array at distances that the compiler knows. That is what lets
-    it use the processor's vectors.
-    """
+    """The compiled step of a batch: substeps of one length for each row, in groups of rows that need as many."""
     import numba
 
+    # Components and lanes are written out, and lie in one array at distances that the compiler knows, which lets it
+    # use the processor's vectors.
     nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
     lanes = [f"s[{i * _LANES} + j]" for i in range(size + nx + 3)]
     states, d, (substeps, length, error) = lanes[:size], lanes[size:-3], lanes[-3:]
@@ -269,7 +258,7 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         kernel(*at, found)
         expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan  # what escapes may be either
         if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
-            raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
+            raise ValueError(f"{system.name}: the equations return something else for symbols than for numbers")
     return kernel
 
 

@@ -3,21 +3,19 @@
 import dataclasses
 import inspect
 import math
-from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 
-_METHODS = ("f", "g", "h", "rate", "step", "draw_starts", "box", "output", "drift", "replace")
+from kkl_gym.equation_errors import METHODS, is_sequence
+
+_METHODS = (*METHODS, "draw_starts", "box", "output", "drift", "replace")
 _SIZES = {"nx": "X", "nu": "u_max", "ny": "h(x)", "parameters": "the fields"}
 
 
 def complete(cls: Any, base: Any) -> None:
-    """Check the class variables of a system, and fill in those that follow from others.
-
-    Numbers may be of any real type and be held by lists or arrays; they become tuples of Python's numbers.
-    """
+    """Check the class variables of a system, write their numbers as tuples, and fill in those that follow."""
     _check_names(cls, base)
     _read_box(cls)
     nx = len(cls.X)
@@ -26,18 +24,20 @@ def complete(cls: Any, base: Any) -> None:
     if cls.discrete and cls.dt is base.dt:
         raise TypeError(f"{cls.__name__} defines step and must set dt, the sampling interval in seconds")
     _check_inputs(cls, base)
-    if "X" in vars(cls):  # what is not said anew belongs to the parent's box
+    if "X" in vars(cls):  # what is not set again belongs to the parent's box
         defaults = {
             "scale": tuple((high - low) / 2 for low, high in cls.X),
             "state_names": tuple(f"x{i + 1}" for i in range(nx)),
             "X_centre": tuple((low + high) / 2 for low, high in cls.X),
         }
         for name, default in defaults.items():
-            if _is_empty(vars(cls).get(name, ())):
+            if not _size(vars(cls).get(name, ())):
                 setattr(cls, name, default)
     _read(cls, "scale", f"{nx} positive numbers, one for each state", (nx,), above=0.0)
     _read(cls, "X_centre", f"{nx} finite numbers, one for each state", (nx,))
-    _check_portrait(cls)
+    portrait = cls.portrait
+    if not _is_row(portrait, 2, Integral) or any(isinstance(i, bool) or not -nx <= i < nx for i in portrait):
+        raise _wrong(cls, "portrait", f"two indices of its {nx} states, as in (0, {nx - 1})")
     if not _is_row(cls.state_names, nx, str):
         raise _wrong(cls, "state_names", f"a tuple of {nx} texts, one for each state")
     level = "a number, not below zero"
@@ -67,7 +67,7 @@ def _check_names(cls: Any, base: Any) -> None:
     makers = [each for each in cls.__mro__ if "__init__" in vars(each) and each not in (base, object)]
     if any("__dataclass_fields__" not in vars(each) for each in makers):
         raise TypeError(
-            f"{cls.__name__} defines __init__, and would be made anew without what that sets: write its parameters as "
+            f"{cls.__name__} defines __init__, and would be copied without what that sets: write its parameters as "
             "annotated fields under @dataclass(frozen=True), and what follows from them as properties"
         )
     for name in (field.name for field in dataclasses.fields(cls)):  # its own come with the decorator, later
@@ -103,17 +103,11 @@ def _read_box(cls: Any) -> None:
 
 def _check_inputs(cls: Any, base: Any) -> None:
     nx, nu = len(cls.X), len(cls.u_max)
-    if nu == 0 and ("g" in vars(cls) or not _is_empty(vars(cls).get("G", ()))):
+    if nu == 0 and ("g" in vars(cls) or _size(vars(cls).get("G", ()))):
         given = "g(x)" if "g" in vars(cls) else f"G = {cls.G!r}"
         raise TypeError(f"{cls.__name__}: {given} needs u_max, the bound of each input; without it there are no inputs")
     if nu and cls.g is base.g and not cls.discrete:
         _read(cls, "G", f"{nx} rows of {nu} numbers, for {nx} states and {nu} inputs, or override g(x)", (nx, nu))
-
-
-def _check_portrait(cls: Any) -> None:
-    nx = len(cls.X)
-    if not _is_row(cls.portrait, 2, Integral) or any(isinstance(i, bool) or not -nx <= i < nx for i in cls.portrait):
-        raise _wrong(cls, "portrait", f"two indices of its {nx} states, as in (0, {nx - 1})")
 
 
 def _read(
@@ -152,16 +146,12 @@ def _numbers(value: Any, shape: tuple[int | None, ...]) -> Any:
 
 def _is_row(value: Any, length: int | None, kind: Any = object) -> bool:
     """Whether a value is a sequence of this length, None being any, and of entries of this kind."""
-    if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
-        return False
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        return False
-    return length in (None, len(value)) and all(isinstance(entry, kind) for entry in value)
+    return is_sequence(value) and length in (None, len(value)) and all(isinstance(entry, kind) for entry in value)
 
 
-def _is_empty(value: Any) -> bool:
-    """Whether there is no number in a tuple or in its rows."""
-    return isinstance(value, tuple | list) and all(_is_empty(entry) for entry in value)
+def _size(value: Any) -> int:
+    """How many entries there are in a value or in its rows."""
+    return np.array(value, dtype=object).size
 
 
 def _wrong(cls: Any, name: str, wanted: str, value: Any = None) -> TypeError:

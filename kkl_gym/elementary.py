@@ -122,7 +122,7 @@ def clip(x: Any, low: Any, high: Any) -> Any:
 
 
 def where(condition: Any, a: Any, b: Any) -> Any:
-    """where(condition, a, b), a where the condition holds, else b: what ``if`` cannot say to arrays and symbols.
+    """where(condition, a, b), a where the condition holds, else b: in place of ``if``, for arrays and symbols, too.
 
     Parameters
     ----------

@@ -10,20 +10,19 @@ import gymnasium as gym
 import numpy as np
 
 from kkl_gym.compiled import single_step
-from kkl_gym.equations import complex_motion, components, target_of
+from kkl_gym.equations import complex_motion, components
 from kkl_gym.plant import OfPlant, Plant
 from kkl_gym.rendering import (
     ARRAYS_AND_WINDOWS,
     TRAIL,
     Canvas,
     Window,
-    check_render_mode,
     render_metadata,
     samples_a_frame,
 )
 from kkl_gym.sensor import Readings, Sensor
 from kkl_gym.simulate import advance, followed
-from kkl_gym.system import Box, Components, System
+from kkl_gym.system import Box, Components, System, reward_of
 from observers.checks import integer, mapping, real_array, shown
 from observers.machine import SOON
 
@@ -51,12 +50,14 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     **Info.** Arrays, of the same keys at reset and at steps: ``y`` the noisy output, NaN where the ``sensor`` has no
     sample, ``x`` the true state and ``u`` the physical input that acted, zero at reset; float64, never clipped.
     ``sample``, an integer of shape (), counts the sampling intervals since reset. ``escaped``, boolean of shape (),
-    says whether the state left its declared bounds.
+    is whether the state left its declared bounds.
 
-    **Reward.** 1 / (1 + 4 c) in (0, 1] with c = mean(((x - target) / scale)^2): 1 at the system's target.
+    **Reward.** What the system's ``reward(x, u)`` is at the new state. By default 1 / (1 + 4 c) in (0, 1] with
+    c = mean(((x - target) / scale)^2): 1 at the system's target.
 
-    **Ends.** ``terminated`` with ``info["escaped"]`` where the state leaves its declared bounds; the last state and
-    output inside them are then returned. The registered ids truncate after 5,000 steps.
+    **Ends.** ``terminated`` where the system's ``terminated(x)`` is true, and with ``info["escaped"]`` where the state
+    leaves its declared bounds; the last state and output inside them are then returned. The registered ids truncate
+    after 5,000 steps.
 
     Parameters
     ----------
@@ -120,7 +121,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     ) -> None:
         self.plant = Plant(
             system,
-            dt,
+            dt=dt,
             process_noise=process_noise,
             measurement_noise=measurement_noise,
             observe=observe,
@@ -128,8 +129,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             start_box=start_box,
             sensor=sensor,
         )
-        check_render_mode(render_mode, ARRAYS_AND_WINDOWS)
-        self.render_mode, self.metadata = render_mode, render_metadata(self.plant.dt, ARRAYS_AND_WINDOWS)
+        self.render_mode, self.metadata = render_mode, render_metadata(self.plant.dt, ARRAYS_AND_WINDOWS, render_mode)
         self.observe = observe
         self.observation_space, self.action_space = self.plant.observation_space, self.plant.action_space
 
@@ -161,7 +161,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         seed : int, optional
             Of starts and noise; None goes on with the generator as it is.
         options : dict, optional
-            ``"x0"``, shape (nx,), is the start, which is otherwise uniform in ``start_box``; None is none.
+            ``"x0"``, shape (nx,), is the start, which is otherwise drawn in ``start_box``.
 
         Raises
         ------
@@ -227,27 +227,12 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             self._u = u
             if self.render_mode == "human" and not self.drawn_by:
                 self.animate()
-        cost = 0.0
-        for xi, (target, weight) in zip(self._x, self._goal):
-            cost += weight * (xi - target) * (xi - target)
+        reward, ended = self._judged(self._x, u)
         info = self._info(u, escaped)
-        return self._observation(info), 1.0 / (1.0 + 4.0 * cost), escaped, False, info
+        return self._observation(info), float(reward), escaped or bool(ended), False, info
 
     def render(self) -> np.ndarray | None:
-        """Draw the phase portrait so far.
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3), or None
-            An RGB image; None without ``render_mode``, and where it is shown in a window.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            Before :meth:`reset`.
-        ImportError
-            If matplotlib (the extra ``plots``) is not installed, or for a window pygame (the extra ``human``).
-        """
+        """Draw the phase portrait so far: a uint8 image (height, width, 3), or None without one or in a window."""
         return self.draw()
 
     def draw(self, estimates: Collection[Sequence[float]] = ()) -> np.ndarray | None:
@@ -281,27 +266,21 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         """Keys for :func:`gymnasium.utils.play.play`: a and d are the ends of the first input, s and w of the second.
 
         ``play`` wants ``noop=np.zeros(nu, np.float32)`` beside them, the action while no key is pressed.
-
-        Returns
-        -------
-        dict of tuple of int to ndarray, shape (nu,)
-            Actions by the codes of the keys that are pressed together.
         """
-        found = {}
-        for pressed in itertools.product(*(((), (low,), (high,)) for low, high in _KEYS[: self._nu])):
+        actions = {}
+        for ends in itertools.product(*((("", 0), (low, -1), (high, 1)) for low, high in _KEYS[: self._nu])):
             action = np.zeros(self._nu, np.float32)
-            for i, keys in enumerate(pressed):
-                action[i] = sum(_KEYS[i].index(key) * 2 - 1 for key in keys)
-            found[tuple(ord(key) for keys in pressed for key in keys)] = action
-        del found[()]
-        return found
+            action[: len(ends)] = [end for _, end in ends]
+            actions[tuple(ord(key) for key, _ in ends if key)] = action
+        del actions[()]
+        return actions
 
     def __getstate__(self) -> dict[str, Any]:
-        # What cannot be copied is made anew, when it is asked for or at a reset.
+        # What cannot be copied is made again when it is used, or at a reset.
         return {**self.__dict__, "_canvas": None, "_window": None, "_advance": partial(advance, self.system)}
 
     def _exchanged(self) -> None:
-        self._goal = [*zip(target_of(self.system), self.plant.weights.tolist(), strict=True)]
+        self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
         self._samples = -self._sample  # a system that stays for an episode is not worth to be compiled
 
@@ -322,7 +301,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         try:
             y = [float(hi + vi) for hi, vi in zip(self.system.h(self._x), white)]  # type: ignore[arg-type]
         except Exception:
-            components(self.system.h, self._x)  # says what went wrong
+            components(self.system.h, self._x)  # raises an EquationError
             raise
         if self._readings is None:
             return y

@@ -1,9 +1,10 @@
 """What went wrong in the equations that a user wrote, in words: system, equation, file and line, argument, way out."""
 
 import inspect
+import re
 import reprlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Number, Real
 from types import CodeType, TracebackType
 from typing import Any
@@ -12,20 +13,16 @@ import numpy as np
 
 from kkl_gym import elementary
 from kkl_gym.tracing import Symbol
-from kkl_gym.user_lines import called_function, line_of, path_of, steps_within
+from kkl_gym.user_lines import line_of, path_of, steps_within, text_of
 
+METHODS = ("f", "g", "h", "rate", "step", "reward", "terminated")
 _SERVING = "floats, arrays, tensors and symbols"
-_ALIASES = {
-    alias: name
-    for name, aliases in {
-        "maximum": ("max", "fmax", "amax", "Max"),
-        "minimum": ("min", "fmin", "amin", "Min"),
-        "abs": ("fabs", "absolute", "Abs"),
-        "atan2": ("arctan2",),
-        "clip": ("clamp",),
-    }.items()
-    for alias in aliases
-}
+# Functions that fail on some kinds of numbers: what other modules call them, and what kkl_gym.elementary does.
+_FUNCTIONS = {name: name for name in vars(elementary) if not name.startswith("_")} | {
+    "max": "maximum", "fmax": "maximum", "amax": "maximum", "Max": "maximum", "min": "minimum", "fmin": "minimum",
+    "amin": "minimum", "Min": "minimum", "fabs": "abs", "absolute": "abs", "Abs": "abs", "arctan2": "atan2",
+    "clamp": "clip",
+}  # fmt: skip
 
 Equations = Callable[..., Any]
 """A system's f, g, h, rate or step, or another function of the state's components."""
@@ -71,13 +68,13 @@ def label(equations: Equations) -> str:
 
 def signature(equations: Equations, first: str = "") -> str:
     """Name and arguments of equations."""
-    return f"{name_of(equations)}({first}{'x, u' if name_of(equations) == 'step' else 'x'})"
+    return f"{name_of(equations)}({first}{'x, u' if name_of(equations) in ('step', 'reward') else 'x'})"
 
 
 def name_of(equations: Equations) -> str:
     """The name of a method, which may have been assigned from a function of another name."""
     function, kind = getattr(equations, "__func__", None), type(getattr(equations, "__self__", None))
-    names = (name for name in ("f", "g", "h", "rate", "step") if function and getattr(kind, name, None) is function)
+    names = (name for name in METHODS if function and getattr(kind, name, None) is function)
     return next(names, getattr(equations, "__name__", "equations"))
 
 
@@ -105,6 +102,13 @@ def shown(value: Any) -> str:
     return reprlib.repr(value)
 
 
+def is_sequence(value: Any) -> bool:
+    """Whether a value is a sequence of entries; an array of shape () has no length."""
+    if isinstance(value, np.ndarray) or is_of("torch", "Tensor", value):
+        return bool(value.ndim)
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
 def is_of(library: str, kind: str, value: Any) -> bool:
     """Whether a value is of a library's type, which then has been imported already."""
     module = sys.modules.get(library)
@@ -118,11 +122,11 @@ def _defined(equations: Equations) -> str:
 
 def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     on_floats = isinstance(x[0], Real)
-    name = called_function(step)
-    name = _ALIASES.get(name, name)
-    # On floats, math.sqrt(-1) fails; abs of the whole state, which is no number, does so for another reason.
-    if name in vars(elementary) and not name.startswith("_") and not (on_floats and isinstance(error, TypeError)):
-        return f": use kkl_gym.elementary.{name}, which serves {_SERVING}"
+    called = re.findall(r"(?:(?:math|cmath|np|numpy|torch|sympy)\.|(?<![\w.]))(\w+)\(", text_of(step))
+    known = [_FUNCTIONS[name] for name in called if name in _FUNCTIONS]
+    # On floats, math.sqrt(-1) fails; abs of the whole state does so for another reason.
+    if known and not (on_floats and isinstance(error, TypeError)):
+        return f": use kkl_gym.elementary.{known[0]}, which serves {_SERVING}"
     if "truth value" in str(error) or "Boolean value" in str(error):
         return (
             ", on which `if`, `and`, `or` and `not` cannot decide: use kkl_gym.elementary.where, minimum, maximum "

@@ -1,12 +1,6 @@
-"""Equations that a user wrote, called with a look at what they return.
-
-They are evaluated in many places, on floats, arrays, tensors and symbols. Where time does not matter they are called
-through :func:`components`, :func:`input_matrix` and :func:`rate_at`. Where it does, a loop catches what is raised and
-asks :func:`blame`.
-"""
+"""Equations that a user wrote, called with a check of what they return; fast loops call :func:`blame` on errors."""
 
 import math
-from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
@@ -19,6 +13,7 @@ from kkl_gym.equation_errors import (
     failed,
     held,
     is_of,
+    is_sequence,
     name_of,
     returned,
     shown,
@@ -45,7 +40,7 @@ def input_matrix(system: Any, x: Any) -> Any:
     """Call a system's g, and check what comes back. Shapes: ``x`` of length nx; returns (nx, nu)."""
     rows, nx, nu = _called(system.g, x), len(x), system.nu
     wanted = f"{nx} rows, one for each state, of {nu} components, one for each input"
-    if not _is_sequence(rows) or len(rows) != nx:
+    if not is_sequence(rows) or len(rows) != nx:
         raise returned(system.g, wanted, shown(rows))
     for row in rows:
         _check_components(system.g, row, nu, like=x[0], wanted=wanted)
@@ -54,15 +49,26 @@ def input_matrix(system: Any, x: Any) -> Any:
 
 def rate_at(system: Any, x: Any) -> Any:
     """Call a system's rate, and check what comes back. Shapes: ``x`` of length nx."""
-    value = _called(system.rate, x)
-    if not _fits(value, x[0]):
-        raise returned(system.rate, "one number in 1/s for each state x", _misfit(value, x[0]))
+    return _number_at(system.rate, "one number in 1/s for each state x", x)
+
+
+def check_task(system: Any, x: Any, u: Any) -> list[Any]:
+    """Call a system's reward and terminated, and check what comes back. Shapes: ``x`` and ``u`` of length nx and nu."""
+    ended = _number_at(system.terminated, "a bool or a comparison such as x[0] > 1 for each state x", x)
+    return [_number_at(system.reward, "one number for each state x", x, u), ended]
+
+
+def _number_at(equations: Equations, wanted: str, *args: Any) -> Any:
+    value, like = _called(equations, *args), args[0][0]
+    if not _fits(value, like):
+        raise returned(equations, wanted, _misfit(value, like))
     return value
 
 
 def check_equations(system: Any) -> None:
     """Check what a system's equations return at a few starts, one by one on floats and all at once on arrays."""
-    names = ("step", "h", "rate") if system.discrete else ("f", "h", "g", "rate")
+    names = ["step", "h", "rate"] if system.discrete else ["f", "h", "g", "rate"]
+    names += ["reward"] if system.states_task else []
     for name in names[:2]:
         if _is_default(getattr(system, name)):
             raise EquationError(f"{type(system).__name__} defines no {signature(getattr(system, name), 'self, ')}")
@@ -95,7 +101,7 @@ def check_equations(system: Any) -> None:
     try:
         target_of(system)
     except EquationError as error:
-        if not isinstance(error.__cause__, ValueError):  # there is none at these parameters, as environments will say
+        if not isinstance(error.__cause__, ValueError):  # no target at these parameters: environments raise
             raise
 
 
@@ -105,6 +111,8 @@ def _values(system: Any, name: str, x: Any, u: Any) -> list[Any]:
         return [value for row in input_matrix(system, x) for value in row]
     if name == "rate":
         return [rate_at(system, x)]
+    if name == "reward":
+        return check_task(system, x, u)
     inputs = (u,) if name == "step" else ()
     return [*components(getattr(system, name), x, *inputs)]
 
@@ -133,7 +141,7 @@ def target_of(system: Any) -> Any:
         raise _unfinished(found, error) from error
     if callable(target):
         raise EquationError(f"{found} is a method: write @property above its def")
-    if not _is_sequence(target) or len(target) != nx or not all(_fits(t, 0.0) and math.isfinite(t) for t in target):
+    if not is_sequence(target) or len(target) != nx or not all(_fits(t, 0.0) and math.isfinite(t) for t in target):
         raise EquationError(f"{found} must be {nx} finite numbers, one for each state, got {shown(target)}")
     return target
 
@@ -170,7 +178,7 @@ def complex_motion(system: Any, x: Any) -> EquationError:
 def _called(equations: Equations, *args: Any) -> Any:
     try:
         return equations(*args)
-    except NotImplementedError:  # says by itself what is missing
+    except NotImplementedError:  # its message names what is missing
         raise
     except Exception as error:  # whatever a user's code raises
         raise failed(error, equations, *args) from error
@@ -181,20 +189,13 @@ def _is_default(equations: Equations) -> bool:
 
 
 def _check_components(equations: Any, values: Any, n: int | None, *, like: Any, wanted: str) -> None:
-    if not _is_sequence(values):
+    if not is_sequence(values):
         raise returned(equations, wanted, shown(values))
     if len(values) != n if n is not None else len(values) == 0:
         raise returned(equations, wanted, f"{len(values)} of them: {shown(values)}")
     for i, value in enumerate(values):
         if not _fits(value, like):
             raise returned(equations, wanted, f"{shown(values)}, of which [{i}] is {_misfit(value, like)}")
-
-
-def _is_sequence(values: Any) -> bool:
-    # An array of shape () has no length.
-    return (isinstance(values, Sequence) and not isinstance(values, str | bytes)) or (
-        (isinstance(values, np.ndarray) or is_of("torch", "Tensor", values)) and values.ndim > 0
-    )
 
 
 def _fits(value: Any, like: Any) -> bool:
@@ -223,7 +224,7 @@ def _misfit(value: Any, like: Any) -> str:
     if isinstance(value, complex | np.complexfloating) or "complex" in str(dtype):
         return f"{shown(value)}, which is complex: {_POWERS}"
     if is_of("sympy", "Basic", value):
-        return f"{value}, which is no number: use kkl_gym.elementary.where({value}, 1.0, 0.0)"
+        return f"{value}, not a number: use kkl_gym.elementary.where({value}, 1.0, 0.0)"
     if dtype is not None and np.shape(like) != np.shape(value):
         return f"of shape {tuple(np.shape(value))}, where the components of x have shape {tuple(np.shape(like))}"
     return f"{shown(value)}, of type {type(value).__name__}" + (

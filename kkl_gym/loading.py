@@ -35,12 +35,12 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
 
 def load_function(name: str) -> Callable[..., Any]:
     """Find a function by where it is written."""
-    where, _, function_name = name.rpartition(":")
+    where, _, called = name.rpartition(":")
     failure = f"cannot load the function {name!r}"
-    found = getattr(_imported(where, failure), function_name, None)
-    if not callable(found):
-        raise ValueError(f"{failure}: {where} defines no function {function_name}")
-    return found
+    function = getattr(_imported(where, failure), called, None)
+    if not callable(function):
+        raise ValueError(f"{failure}: {where} defines no function {called}")
+    return function
 
 
 def _is_own(value: Any, base: type, module: str) -> bool:

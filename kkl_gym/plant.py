@@ -1,15 +1,16 @@
 """A system sampled under noise: what single and vector environments share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from kkl_gym.equation_errors import held, returned
+from kkl_gym.equations import check_task
 from kkl_gym.sensor import Sensor, sensor_of
 from kkl_gym.simulate import check_interval
-from kkl_gym.system import Box, System
+from kkl_gym.system import Box, Components, System
 from kkl_gym.systems import get_system
 from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
@@ -23,13 +24,13 @@ class Plant:
     def __init__(
         self,
         system: str | System,
-        dt: float | None,
         *,
-        process_noise: float | None,
-        measurement_noise: float | Sequence[float] | None,
-        observe: str,
-        parameters: Mapping[str, float] | None,
-        start_box: Box | None,
+        dt: float | None = None,
+        process_noise: float | None = None,
+        measurement_noise: float | Sequence[float] | None = None,
+        observe: str = "state",
+        parameters: Mapping[str, float] | None = None,
+        start_box: Box | None = None,
         sensor: Sensor | Mapping[str, Any] | None = None,
     ) -> None:
         self.system = get_system(system, parameters)
@@ -60,15 +61,12 @@ class Plant:
             self._v_scale = np.append(self._v_scale, np.ones(2 * self.ny))
         self.nv = len(self._v_scale)
         self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)
-        self.weights = 1.0 / (self.system.nx * np.square(self.system.scale))
 
     def draw_noise(
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw ``NOISE_BLOCK`` samples, (NOISE_BLOCK, nx) and (NOISE_BLOCK, nv), which :meth:`noise` scales.
-
-        A sensor draws from a generator of its own, so that motions and white noise of a seed are the same without it.
-        """
+        """Draw samples, (NOISE_BLOCK, nx) and (NOISE_BLOCK, nv), which :meth:`noise` scales."""
+        # A sensor draws from a generator of its own, so that motions and noise of a seed are the same without it.
         n, ny = NOISE_BLOCK, self.ny
         w = rng.random((n, len(self._w_range)), out=w)
         if not self._random:
@@ -99,9 +97,10 @@ class Plant:
 
 
 class OfPlant:
-    """What single and vector environments say of their plant."""
+    """The plant of single and vector environments."""
 
     plant: Plant
+    _reward: Callable[[Components, Components], Any]
 
     @property
     def system(self) -> System:
@@ -124,25 +123,27 @@ class OfPlant:
         """Take over what follows from another system."""
         raise NotImplementedError
 
-    @property
-    def dt(self) -> float:
-        """Sampling interval in seconds."""
-        return self.plant.dt
+    def _judged(self, x: Components, u: Components) -> tuple[Any, Any]:
+        """Rewards of intervals that ended at x under u, and whether episodes end there: of floats or arrays."""
+        system = self.plant.system
+        try:
+            reward, ended = self._reward(x, u), system.terminated(x)
+            if system.states_task and not np.isfinite(reward).all():
+                raise returned(system.reward, "finite numbers", f"{shown(reward)}; {held(x)}")
+        except Exception:
+            check_task(system, x, u)
+            raise
+        return reward, ended
 
-    @property
-    def process_noise(self) -> float:
-        """Bound of the process noise, in multiples of the system's ``scale`` per second."""
-        return self.plant.process_noise
-
-    @property
-    def measurement_noise(self) -> float | tuple[float, ...]:
-        """Standard deviation of the measurement noise, of all outputs or each."""
-        return self.plant.measurement_noise
-
-    @property
-    def sensor(self) -> Sensor | None:
-        """The sensor, None if it is ideal."""
-        return self.plant.sensor
+    dt = property(lambda self: self.plant.dt, doc="Sampling interval in seconds.")
+    process_noise = property(
+        lambda self: self.plant.process_noise, doc="Bound of the process noise, in multiples of ``scale`` per second."
+    )
+    measurement_noise = property(
+        lambda self: self.plant.measurement_noise,
+        doc="Standard deviation of the measurement noise, of all outputs or each.",
+    )
+    sensor = property(lambda self: self.plant.sensor, doc="The sensor, None if it is ideal.")
 
 
 def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]:
@@ -158,12 +159,9 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
 
 
 def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the output h(x) over the declared bounds of the state.
-
-    Evaluated at random states, and at corners, faces' centres and the centre, which must have an output. For more than
-    six states these are not all, but for each output the two corners to which it rises and falls from the centre. They
-    are exact for outputs that are monotone in each state.
-    """
+    """Bounds of the output h(x) over the declared bounds of the state, exact if it is monotone in each state."""
+    # At random states, and at corners, faces' centres and the centre, which must have an output. For more than six
+    # states only some of these, and for each output the two corners to which it rises and falls from the centre.
     low, high = np.array(system.bounds, dtype=float).T
     rng, nx = np.random.default_rng(0), system.nx
     if 3**nx <= _MOST_POINTS:

@@ -17,15 +17,11 @@ DRAWN = 50  # frames a second at most that a window is drawn, whose time is that
 ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 
 
-def render_metadata(dt: float, modes: Collection[str]) -> dict[str, Any]:
-    """What environments say of their rendering: the modes, and the frames a second that show a motion as it is."""
-    return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
-
-
-def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
-    """Raise an error unless ``render_mode`` is one that environments offer."""
+def render_metadata(dt: float, modes: Collection[str], render_mode: str | None = None) -> dict[str, Any]:
+    """The modes and the frames a second that show a motion as it is; ValueError if a mode is not among them."""
     if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
         raise ValueError(f"render_mode must be None or one of {[*modes]}, got {shown(render_mode)}")
+    return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
 
 
 class Trails:
@@ -43,10 +39,7 @@ class Trails:
 
 
 class Canvas:
-    """A phase portrait of two of a system's states: target, true trail, estimates, and the input as a bar.
-
-    What does not move is drawn once and kept as an image, so that a frame takes milliseconds.
-    """
+    """A phase portrait of two of a system's states: target, true trail, estimates, and the input as a bar."""
 
     def __init__(
         self, system: System, estimates: bool = False, box: Box | None = None, *, title: str | None = None
@@ -80,6 +73,7 @@ class Canvas:
         for bar_ax in below:
             bar_ax.set(xlim=(-1, 1), xticks=[-1, 0, 1], yticks=[], xlabel="u / u_max")
             self._bars = bar_ax.barh(range(system.nu), np.zeros(system.nu), color="C0", animated=True)
+        # What does not move is drawn once and kept as an image, so that a frame takes milliseconds.
         self._canvas.draw()  # type: ignore[no-untyped-call]
         self._still = self._canvas.copy_from_bbox(figure.bbox)  # type: ignore[no-untyped-call]
 

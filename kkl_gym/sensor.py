@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym.equation_errors import is_sequence
 from observers.checks import integer, is_finite, noise_level, shown
 
 MAX_SAMPLES = 10_000  # of a delay, which are kept for each environment, and from one sample to the next
@@ -85,7 +86,7 @@ class Sensor:
         if np.any(self.coloured_noise) and self.time_constant is None:
             raise ValueError(f"coloured_noise = {self.coloured_noise} needs a time_constant in seconds")
         if self.saturation is not None:
-            if not _is_sequence(self.saturation) or len(self.saturation) != 2:
+            if not is_sequence(self.saturation) or len(self.saturation) != 2:
                 raise ValueError(f"the sensor's saturation must be (low, high), got {shown(self.saturation)}")
             ends = tuple(_each(f"the sensor's saturation[{i}]", end, _finite) for i, end in enumerate(self.saturation))
             if len({len(end) for end in ends if isinstance(end, tuple)}) < 2 and not np.all(np.less(ends[0], ends[1])):
@@ -176,12 +177,8 @@ class Readings:
         return self._kept[(age - of["delay"]) % length, self._outputs, rows]
 
 
-def _is_sequence(value: Any) -> bool:
-    return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
-
-
 def _each(name: str, value: Any, check: Callable[[str, Any], float]) -> float | tuple[float, ...]:
-    if _is_sequence(value):
+    if is_sequence(value):
         return tuple(check(f"{name}[{i}]", one) for i, one in enumerate(value))
     return check(name, value)
 

@@ -1,8 +1,7 @@
 """Simulation of sampling intervals by a sixth-order Runge–Kutta method, in 1, 2, 4, ... substeps of one length.
 
-An estimate of the error says how many, or the system's own ``rate(x)``. The same method, and the same substeps, twice:
-written out for single states on Python floats (:func:`advance`), and on whole arrays for batches
-(:func:`advance_batch`). They agree to rounding, 1e-13 of the state in each step.
+An estimate of the error sets their number, or the system's own ``rate(x)``. Single states on Python floats
+(:func:`advance`) and batches on arrays (:func:`advance_batch`) agree to rounding, 1e-13 of the state in each step.
 """
 
 import functools
@@ -64,13 +63,10 @@ class SubstepsError(ValueError):
 
 @functools.cache
 def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, float, int, Components], tuple[Any, float]]:
-    """The Runge–Kutta steps of ``STAGES`` and ``WEIGHTS`` for ``nx`` components, written out and compiled.
+    """The Runge–Kutta steps of ``STAGES`` and ``WEIGHTS``, written out, which is several times as fast as loops.
 
     Of f, x, constants that are added to f, the length h and number n of steps, and one over the tolerances, (nx,), it
     makes the state after them and the largest estimate of a step's error, in tolerances and squared.
-
-    Written out (as :mod:`dataclasses` writes ``__init__``) it is several times as fast as loops over stages and
-    components.
     """
     components = range(nx)
 
@@ -94,7 +90,7 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, float
         weighted = " + ".join(f"{c!r} * k{j}_{i}" for j, c in enumerate(ERROR) if c)
         lines += [f"        e{i} = h * s{i} * ({weighted})"]
     lines += ["        e = " + " + ".join(f"e{i} * e{i}" for i in components)]
-    lines += ["        if not e <= error:", "            error = e"]  # where it is no number, too
+    lines += ["        if not e <= error:", "            error = e"]  # where it is NaN, too
     lines += [f"    return ({unpacked('x')}), error"]
     namespace: dict[str, Any] = {}
     exec("\n".join(lines), namespace)
@@ -118,13 +114,13 @@ def forced(system: System, u: Components, w: Components) -> tuple[VectorField, C
 
 
 def _per_tolerance(kind: type[System], tolerance: float | None = None) -> tuple[float, ...]:
+    """One over the tolerance of each state's error, (nx,), of a class of systems."""
     if tolerance is None:
         tolerance = TOLERANCE if kind.rate is System.rate else ROUGH
     return tuple(2.0 / (high - low) / tolerance for low, high in kind.X)
 
 
-per_tolerance: Callable[..., tuple[float, ...]] = functools.lru_cache(maxsize=256)(_per_tolerance)
-"""One over the tolerance of each state's error, (nx,), of a class of systems; kept, as every step asks."""
+per_tolerance: Callable[..., tuple[float, ...]] = functools.lru_cache(maxsize=256)(_per_tolerance)  # every step asks
 
 
 def advance(system: System, x: Components, u: Components, w: Components, dt: float) -> Components:
@@ -159,24 +155,19 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
 
 def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: float) -> Components | None:
-    """What a batch of this state makes of it, where :func:`kkl_gym.elementary.where` may leave out what is infinite.
-
-    None if that escapes, too, or the equations are for floats alone.
-    """
+    """The next state by a batch, where `where` may leave out what is infinite; None if it escapes or fails there."""
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
-        found: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
+        end: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
     except Exception:
         return None
-    return found if np.isfinite(found).all() else None
+    return end if np.isfinite(end).all() else None
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
-    """One sampling interval with substeps whose length follows the error, as long as the motion stays within bounds.
-
-    For motions that change faster and faster within the interval, as when something ignites, and to make sure of an
-    escape: steps that were too long at the end may have led out of the bounds by themselves.
-    """
+    """One sampling interval with substeps whose length follows the error, as long as the motion stays within bounds."""
+    # For motions that change faster and faster, as when something ignites, and to make sure of an escape: steps that
+    # were too long at the end may have led out of the bounds by themselves.
     if system.discrete:
         return end
     left, h, field, d = dt, dt, *forced(system, u, w)
@@ -192,7 +183,7 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
             if error <= 1.0:
                 x = moved
                 left -= h
-            elif h < 1e-15 * dt:  # there is no number at all
+            elif h < 1e-15 * dt:  # every step is NaN
                 return end
             h *= 0.9 * max(1e-6, min(1e8, error)) ** -0.1
     except ArithmeticError:
@@ -224,7 +215,7 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
 
 def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
-    """The ends (nx, n) of substeps of one length for each row, NaN where these do not do, and whether any do not."""
+    """The ends (nx, n) of substeps of one length for each row, NaN where an error is too large, and whether any is."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need: Any = 1.0 if type(system).rate is System.rate else system.rate(x) * dt * PER_RATE
         if np.all(need <= 1):
@@ -279,11 +270,8 @@ def followed_rows(
 
 
 def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> tuple[np.ndarray, np.ndarray]:
-    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,), and the squares of its errors, (n,).
-
-    Few, large operations, because each call of numpy costs as much as its work on a thousand numbers: a stage is one
-    product of its coefficients with x, d and the slopes so far.
-    """
+    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,), and the squares of its errors, (n,)."""
+    # A stage is one product of its coefficients with x, d and the slopes so far: few, large operations.
     field, d = forced(system, u, w)
     rows = np.empty((2 + len(STAGES), *x.shape))
     rows[0] = x

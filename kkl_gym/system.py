@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from kkl_gym.declarations import complete
-from kkl_gym.equations import components, rate_at
+from kkl_gym.equations import components, rate_at, target_of
 from kkl_gym.loading import load_class
 from observers.checks import is_finite, mapping, shown
 
@@ -26,6 +26,8 @@ DT = 0.01  # s, where it suits
 SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)  # rate * dt beyond which DT does not suit, and what then does
 PROCESS_NOISE = 0.05  # in multiples of a system's scale in a second of its pace: where none is given
 NOISE_SHARE = 0.05  # of an output's range: measurement noise where none is given
+# Names in a class whose body states nothing; Python 3.13 adds the last two.
+EMPTY = {"__module__", "__qualname__", "__doc__", "__firstlineno__", "__static_attributes__"}
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,12 @@ class System:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        complete(cls, System)
+        if not vars(cls).keys() <= EMPTY:  # cloudpickle makes a class empty, and fills in what is complete already
+            complete(cls, System)
 
     def __post_init__(self) -> None:
+        if "discrete" not in vars(type(self)):
+            complete(type(self), System)
         own = vars(type(self)).get("__dataclass_fields__", {})
         for name, kind in inspect.get_annotations(type(self)).items():
             if name not in own and "ClassVar" not in str(kind):
@@ -160,7 +165,7 @@ class System:
 
     @property
     def duration(self) -> float:
-        """Seconds for which motions are followed in training and evaluation, where nothing else is said."""
+        """Seconds for which motions are followed in training and evaluation, by default."""
         return 50.0 * self.pace
 
     @property
@@ -174,15 +179,16 @@ class System:
         levels = tuple(float(f"{NOISE_SHARE * size:.2g}") for size in self.output_range)
         return levels[0] if len(set(levels)) == 1 else levels
 
-    @property
+    @functools.cached_property
     def output_range(self) -> tuple[float, ...]:
         """How far each output, without noise, ranges over a thousand starts; 1 where it does not move. Length ny."""
-        return _output_range(self)
+        size = np.ptp(self.output(_starts(self)), axis=0)
+        return tuple(np.where(size > 0, size, 1.0).tolist())
 
-    @property
+    @functools.cached_property
     def typical_rate(self) -> float:
         """Median rate of f(x) + g(x) u over a thousand starts and the largest input, in 1/s; ValueError if it is 0."""
-        return _typical_rate(self)
+        return typical_rate(self, _starts(self))
 
     def f(self, x: Components) -> Components:
         """Drift f(x): from nx components as many, each of the kind that the components of ``x`` are, or a number.
@@ -198,24 +204,7 @@ class System:
         """The next state of a system in discrete time, one sampling interval after x under the held input u.
 
         A system that defines it needs no f and g, sets ``dt``, and is not integrated. Process noise adds w dt to the
-        next state. f then is the mean derivative over the interval, without input.
-
-        Parameters
-        ----------
-        x : sequence of length nx
-            Components of the state: floats, arrays, tensors or symbols.
-        u : sequence of length nu
-            Components of the input, in its own units.
-
-        Returns
-        -------
-        sequence of length nx
-            Components of the next state.
-
-        Raises
-        ------
-        NotImplementedError
-            If the system is one in continuous time.
+        next state. f then is the mean derivative over the interval, without input. Components are those of :meth:`f`.
         """
         raise NotImplementedError(f"{type(self).__name__} is integrated from f; it defines no step")
 
@@ -225,19 +214,7 @@ class System:
         Override it where not every point of X is a state, as with an angle given by its cosine and sine. What it draws
         must lie within the bounds. Such a system also sets ``process_noise = 0.0``, which would push states off.
 
-        Parameters
-        ----------
-        rng : Generator
-            Of everything random.
-        n : int
-            How many.
-        factor : float, default 1
-            How far starts may lie from the middle, in multiples of X.
-
-        Returns
-        -------
-        ndarray, shape (n, nx)
-            The starts.
+        Returns ``n`` states, (n, nx), which lie within ``factor`` times X.
         """
         return rng.uniform(*self.box(factor), (n, self.nx))
 
@@ -248,6 +225,35 @@ class System:
     def h(self, x: Components) -> Components:
         """Output map h(x): ny components, from components as :meth:`f` takes them. Every subclass defines it."""
         raise NotImplementedError(f"{type(self).__name__} does not define h")
+
+    def reward(self, x: Components, u: Components) -> Any:
+        """Reward of a sampling interval, as environments pay it; default: 1 at :attr:`target`, and less away from it.
+
+        The default is 1 / (1 + 4 c) with c = mean(((x - target) / scale)^2). A system that overrides it, or
+        :meth:`terminated`, states a task of its own, for which ``kkl-gym agent train`` trains.
+
+        Parameters
+        ----------
+        x : sequence of length nx
+            Components of the state at the end of the interval: floats or arrays.
+        u : sequence of length nu
+            Components of the input that acted, in its own units.
+
+        Returns
+        -------
+        float, or of the kind that the components of ``x`` are
+            The reward.
+        """
+        return nearness(goal_of(self), x, u)
+
+    def terminated(self, x: Components) -> Any:
+        """Whether an episode ends at x, from components as :meth:`f` takes them; it also ends beyond ``bounds``."""
+        return False
+
+    @property
+    def states_task(self) -> bool:
+        """Whether the system states a reward or an end of episodes of its own."""
+        return type(self).reward is not System.reward or type(self).terminated is not System.terminated
 
     def output(self, x: np.ndarray) -> np.ndarray:
         """Outputs h(x), without noise, of many states. Shapes: ``x`` (..., nx); returns (..., ny)."""
@@ -261,18 +267,8 @@ class System:
         """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the default ``dt`` follows.
 
         The default differentiates f numerically, with each state in units of X's half-width, so that it does not depend
-        on the user's units. An estimate of the error then says how many substeps an interval takes. A formula in its
-        place says so itself, as where f jumps: a substep lasts 0.4 / rate at most.
-
-        Parameters
-        ----------
-        x : sequence of length nx
-            Components of the state.
-
-        Returns
-        -------
-        float, or of the kind that the components of ``x`` are
-            The rate in 1/s.
+        on the user's units. An estimate of the error then sets the number of substeps. A formula in
+        its place limits them, as where f jumps: a substep lasts 0.4 / rate at most.
         """
         return slope(self.f, x, self.X)
 
@@ -286,29 +282,41 @@ class System:
         return low, high
 
     def replace(self, parameters: Mapping[str, float]) -> "System":
-        """The same system with some parameters changed.
-
-        Parameters
-        ----------
-        parameters : mapping of str to float
-            New values by name.
-
-        Returns
-        -------
-        System
-            An instance of the same class.
-
-        Raises
-        ------
-        ValueError
-            If a name is unknown or a value is not a finite number.
-        """
+        """The same system with some parameters changed; ValueError on an unknown name and on what is not finite."""
         known = self.parameters
         parameters = mapping("parameters", parameters)
         for name in parameters:
             if name not in known:
                 raise ValueError(f"{self.name} has no parameter {shown(name)}; it has {', '.join(known) or 'none'}")
         return type(self)(**{**known, **parameters})
+
+
+def goal_of(system: System) -> list[tuple[float, float]]:
+    """The target of each state, and the weight of its square in the cost, (nx,)."""
+    return [(t, 1.0 / (system.nx * size * size)) for t, size in zip(target_of(system), system.scale, strict=True)]
+
+
+def nearness(goal: Iterable[tuple[float, float]], x: Components, u: Components) -> Any:
+    """The default reward."""
+    cost = 0.0
+    for xi, (target, weight) in zip(x, goal):
+        cost = cost + weight * ((xi - target) * (xi - target))
+    return 1.0 / (1.0 + 4.0 * cost)
+
+
+def nearness_of_rows(target: np.ndarray, weight: np.ndarray, x: np.ndarray, u: Components) -> np.ndarray:
+    """The default reward of a batch, in few operations. Shapes: ``target`` and ``weight`` (nx,), ``x`` (nx, n)."""
+    deviation = x - target[:, None]
+    deviation *= deviation
+    return 1.0 / (1.0 + 4.0 * (weight @ deviation))
+
+
+def reward_of(system: System, *, rows: bool = False) -> Callable[[Any, Components], Any]:
+    """The reward of a system, of one state or of rows; the default one reads the target here, once."""
+    if type(system).reward is not System.reward:
+        return system.reward
+    goal = goal_of(system)
+    return functools.partial(nearness_of_rows, *np.array(goal).T) if rows else functools.partial(nearness, goal)
 
 
 def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> np.ndarray:
@@ -340,7 +348,7 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
     units = [5e-7 * (high - low) for low, high in X]  # a millionth of the half-widths
     fx, total = field(x), 0.0
     for j, unit in enumerate(units):
-        step = max(unit, 2e-8 * max(map(abs, X[j])))  # more where X lies so far from zero that floats hardly tell it
+        step = max(unit, 2e-8 * max(map(abs, X[j])))  # more where X lies so far from zero that floats hardly resolve it
         moved = field([*x[:j], x[j] + step, *x[j + 1 :]])
         ratios = ((b - a) / other * (unit / step) for a, b, other in zip(fx, moved, units, strict=True))
         total = total + sum(ratio**2 for ratio in ratios)
@@ -356,22 +364,11 @@ def rate_under(system: System, x: Components, u: Components) -> Any:
 
 def typical_rate(system: System, starts: np.ndarray) -> float:
     """Median over some starts of how fast f changes. Shapes: ``starts`` (n, nx)."""
-    rate_at(system, starts.T)  # or say what is wrong with it
+    rate_at(system, starts.T)  # or raise an EquationError
     rate = float(np.median(np.broadcast_to(rate_under(system, starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:
-        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
+        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it with how fast f changes")
     return rate
-
-
-@functools.lru_cache(maxsize=256)
-def _typical_rate(system: System) -> float:
-    return typical_rate(system, _starts(system))
-
-
-@functools.lru_cache(maxsize=256)
-def _output_range(system: System) -> tuple[float, ...]:
-    size = np.ptp(system.output(_starts(system)), axis=0)
-    return tuple(np.where(size > 0, size, 1.0).tolist())
 
 
 def _restored(kind: "type[System] | str", parameters: Mapping[str, float]) -> System:

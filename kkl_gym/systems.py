@@ -40,7 +40,6 @@ class ReverseDuffing(System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,))
     scale: ClassVar[tuple[float, ...]] = (2.0, 1.5)
     dt: ClassVar[float] = 0.01
-    process_noise: ClassVar[float] = 0.05
     measurement_noise: ClassVar[float] = 0.5
 
     def f(self, x: Components) -> Components:
@@ -77,7 +76,6 @@ class VanDerPol(System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,))
     scale: ClassVar[tuple[float, ...]] = (2.0, 4.0)
     dt: ClassVar[float] = 0.01
-    process_noise: ClassVar[float] = 0.05
     measurement_noise: ClassVar[float] = 0.5
 
     def f(self, x: Components) -> Components:
@@ -122,7 +120,6 @@ class Rossler(System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,), (0.0,), (0.0,))
     scale: ClassVar[tuple[float, ...]] = (8.0, 8.0, 10.0)
     dt: ClassVar[float] = 0.01
-    process_noise: ClassVar[float] = 0.05
     measurement_noise: ClassVar[float] = 0.5
     portrait: ClassVar[tuple[int, int]] = (0, 1)
 
@@ -177,7 +174,6 @@ class Lorenz(System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,), (0.0,))
     scale: ClassVar[tuple[float, ...]] = (15.0, 18.0, 20.0)
     dt: ClassVar[float] = 0.01
-    process_noise: ClassVar[float] = 0.05
     measurement_noise: ClassVar[float] = 0.5
 
     def f(self, x: Components) -> Components:

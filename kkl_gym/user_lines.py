@@ -1,9 +1,6 @@
 """Where in a user's code an exception comes from."""
 
-import dis
-import itertools
 import linecache
-import re
 import sys
 from pathlib import Path
 from types import CodeType, TracebackType
@@ -28,9 +25,13 @@ def steps_within(error: BaseException, code: CodeType | None) -> list[TracebackT
 
 def line_of(step: TracebackType) -> str:
     """File, number and text of the line of a step."""
-    code = step.tb_frame.f_code
-    text = linecache.getline(code.co_filename, step.tb_lineno).strip()
-    return f"{path_of(code)}, line {step.tb_lineno}" + (f" (`{text}`)" if text else "")
+    text = text_of(step)
+    return f"{path_of(step.tb_frame.f_code)}, line {step.tb_lineno}" + (f" (`{text}`)" if text else "")
+
+
+def text_of(step: TracebackType) -> str:
+    """Text of the line of a step; empty where there is no source."""
+    return linecache.getline(step.tb_frame.f_code.co_filename, step.tb_lineno).strip()
 
 
 def path_of(code: CodeType) -> str:
@@ -39,18 +40,8 @@ def path_of(code: CodeType) -> str:
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
 
-def called_function(step: TracebackType) -> str:
-    """Name of the function that was being called at a step; empty where it was no call, or there is no source."""
-    code = step.tb_frame.f_code
-    line, _, column, _ = next(itertools.islice(code.co_positions(), step.tb_lasti // 2, None))
-    if "CALL" not in dis.opname[code.co_code[step.tb_lasti]] or line is None or column is None:
-        return ""
-    called = re.match(r"[\w.]*", linecache.getline(code.co_filename, line).encode()[column:].decode())
-    return called[0].rpartition(".")[2] if called else ""
-
-
 def _steps(error: BaseException) -> list[TracebackType]:
-    steps, step = [], error.__traceback__
+    step, steps = error.__traceback__, list[TracebackType]()
     while step is not None:
         steps.append(step)
         step = step.tb_next

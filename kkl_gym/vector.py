@@ -1,8 +1,7 @@
 """Many environments at once, simulated as one batch."""
 
-import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,16 +10,17 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from kkl_gym.compiled import SamplingStep, batch_step
-from kkl_gym.equations import components, target_of
+from kkl_gym.equations import components
 from kkl_gym.plant import NOISE_BLOCK, OfPlant, Plant
-from kkl_gym.rendering import ARRAYS, Canvas, Trails, check_render_mode, render_metadata
-from kkl_gym.sensor import Readings, Sensor
+from kkl_gym.rendering import ARRAYS, Canvas, Trails, render_metadata
+from kkl_gym.sensor import Readings
 from kkl_gym.simulate import followed_rows
-from kkl_gym.system import Box, System
+from kkl_gym.system import System, reward_of
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
-from observers.machine import MANY_ROWS
 
 Infos = dict[str, Any]
+Rows = np.ndarray | slice
+ALL = slice(None)  # rows: an index by it is a view
 ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for the cache
 MOST_ENVS = 1_000_000  # of which 256 samples of noise are kept, some 10 kB each
 
@@ -43,20 +43,6 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         As for :class:`KKLEnv`.
     num_envs : int
         How many.
-    dt : float, optional
-        Sampling interval in seconds. None takes the system's own, 0.01 s for those that ship.
-    process_noise : float, optional
-        As for :class:`KKLEnv`.
-    measurement_noise : float or sequence of float, length ny, optional
-        As for :class:`KKLEnv`.
-    observe : {"state", "output"}
-        What the agent sees.
-    parameters : mapping of str to float, optional
-        As for :class:`KKLEnv`.
-    start_box : tuple of (float, float), length nx, optional
-        As for :class:`KKLEnv`.
-    sensor : Sensor or mapping of its parameters, optional
-        As for :class:`KKLEnv`.
     render_mode : {None, "rgb_array"}
         Whether :meth:`render` draws.
     max_episode_steps : int, optional
@@ -64,6 +50,9 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         it is left out there.
     autoreset_mode : str or gymnasium.vector.AutoresetMode
         One of Gymnasium's, see above.
+    **options
+        ``dt``, ``process_noise``, ``measurement_noise``, ``observe``, ``parameters``, ``start_box`` and ``sensor``, as
+        for :class:`KKLEnv`.
 
     Raises
     ------
@@ -89,38 +78,22 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         system: str | System,
         num_envs: int = 1,
         *,
-        dt: float | None = None,
-        process_noise: float | None = None,
-        measurement_noise: float | Sequence[float] | None = None,
-        observe: Literal["state", "output"] = "state",
-        parameters: Mapping[str, float] | None = None,
-        start_box: Box | None = None,
-        sensor: Sensor | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        **options: Any,
     ) -> None:
         num_envs = integer("num_envs", num_envs, 1, MOST_ENVS)
         if max_episode_steps == -1:  # as gym.make has it
             max_episode_steps = None
         if max_episode_steps is not None:
             max_episode_steps = integer("max_episode_steps", max_episode_steps, 1)
-        self.plant = Plant(
-            system,
-            dt,
-            process_noise=process_noise,
-            measurement_noise=measurement_noise,
-            observe=observe,
-            parameters=parameters,
-            start_box=start_box,
-            sensor=sensor,
-        )
+        self.plant = Plant(system, **options)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = autoreset_mode_of(autoreset_mode)
-        check_render_mode(render_mode, ARRAYS)
         self.render_mode = render_mode
-        self.metadata = {**render_metadata(self.plant.dt, ARRAYS), "autoreset_mode": self.autoreset_mode}
+        self.metadata = render_metadata(self.plant.dt, ARRAYS, render_mode) | {"autoreset_mode": self.autoreset_mode}
         self.single_observation_space = self.plant.observation_space
         self.single_action_space = self.plant.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -129,6 +102,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         nx, ny = self.system.nx, self.plant.ny
         self._readings = None if self.sensor is None else Readings(self.sensor, ny, self.plant.dt, num_envs)
         self._u_max = np.array(self.system.u_max, dtype=float)
+        self._bounds = np.array(self.system.bounds, dtype=float).T[..., None]
         self._exchanged()
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
@@ -139,7 +113,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._x = np.full((nx, num_envs), np.nan)  # component first, as everything inside
         self._y = self._held = np.full((ny, num_envs), np.nan)
         self._sample = np.zeros(num_envs, dtype=np.int64)
-        self._terminated, self._truncated = np.zeros((2, num_envs), dtype=bool)
+        self._escaped, self._terminated, self._truncated = np.zeros((3, num_envs), dtype=bool)
         self._ready = False
         self.emitted = b""  # the last observations, as observers around it compare what reaches them
         self._u = np.zeros((self.system.nu, num_envs))  # kept, as the trails are, for rendering
@@ -148,11 +122,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
     @property
     def compiled(self) -> bool:
-        """Whether steps run as compiled code (the extra ``fast``); compiles them if no step has done so.
-
-        Where they do not, the logger ``kkl_gym`` has said why at level INFO, and
-        ``kkl_gym.compiled.batch_step(env.system).obstacle`` says it again.
-        """
+        """Whether steps run as compiled code (the extra ``fast``); if not, the logger ``kkl_gym`` reports why."""
         return self._advance.obstacle is None
 
     def reset(
@@ -166,7 +136,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             One for each row, or one number n for n, n + 1, ...; None goes on with the generators as they are.
         options : mapping, optional
             ``"x0"`` is the start, shape (nx,) for all or (num_envs, nx), which is otherwise uniform in ``start_box``.
-            ``"reset_mask"``, boolean of shape (num_envs,), says which rows to reset, otherwise all.
+            ``"reset_mask"``, boolean of shape (num_envs,), marks the rows to reset, otherwise all.
 
         Raises
         ------
@@ -203,23 +173,12 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return self._observation(), self._info(mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
-        """Hold the inputs over one sampling interval.
+        """Hold the inputs over one sampling interval; rewards are 0 in rows that reset instead, or stay at their end.
 
         Parameters
         ----------
         actions : array_like, shape (num_envs, nu)
             Inputs over their bounds; values outside [-1, 1] are clipped.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            Of all rows.
-        rewards : ndarray, shape (num_envs,)
-            0 in rows that began anew instead, or stay at their end.
-        terminated, truncated : ndarray of bool, shape (num_envs,)
-            Whether a row's state left its declared bounds, or its time is over.
-        info : dict
-            Of all rows, with masks of those that reported it.
 
         Raises
         ------
@@ -233,14 +192,12 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         u = self._inputs(actions)
         self._u = u
         over = self._terminated | self._truncated
+        rows = np.flatnonzero(~over) if over.any() else ALL
+        reward = np.zeros(self.num_envs)
+        if not over.all():
+            reward[rows] = self._move(rows, u[:, rows])
         info: Infos = {}
-        if not over.any():
-            reward = self._move(self._everyone, u)
-        else:
-            rows = np.flatnonzero(~over)
-            reward = np.zeros(self.num_envs)
-            if len(rows):
-                reward[rows] = self._move(rows, u[:, rows])
+        if rows is not ALL:
             u[:, over] = 0.0
             if self.autoreset_mode is AutoresetMode.NEXT_STEP:
                 self._begin(np.flatnonzero(over))
@@ -273,7 +230,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return tuple(self._canvas.draw(*row) for row in zip(self._trails.rows, guesses, self._u.T))
 
     def __getstate__(self) -> dict[str, Any]:
-        # What cannot be copied is made anew.
+        # What cannot be copied is made again.
         return {**self.__dict__, "_step": None, "_canvas": None}
 
     @property  # type: ignore[override]
@@ -317,13 +274,10 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._y[:, rows] = self._measure(self._x[:, rows], self._noise(rows)[1], rows, start=True)
         self._u[:, rows] = 0.0
         self._sample[rows] = 0
-        self._terminated[rows] = self._truncated[rows] = False
+        self._escaped[rows] = self._terminated[rows] = self._truncated[rows] = False
 
     def _exchanged(self) -> None:
-        low, high = np.array(self.system.bounds, dtype=float).T.copy()
-        target = np.array(target_of(self.system), dtype=float)
-        judge = _compiled_judge() if self.num_envs >= MANY_ROWS else _judge
-        self._judged = functools.partial(judge, low, high, target, self.plant.weights)
+        self._reward = reward_of(self.system, rows=True)
         self._step: SamplingStep[np.ndarray] | None = None
 
     @property
@@ -332,30 +286,30 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             self._step = batch_step(self.system)
         return self._step
 
-    def _move(self, rows: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def _move(self, rows: Rows, u: np.ndarray) -> Any:
         """Advance some rows by a sampling interval; returns their rewards."""
-        whole = len(rows) == self.num_envs
-        before = self._x if whole else self._x[:, rows]
+        before = self._x[:, rows]
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
-        inside, reward = self._judged(x)
-        if not inside.all():  # unless that is but an error of the method
-            x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(~inside))
-            inside, reward = self._judged(x)
-        if inside.all():
-            y = self._measure(x, v, rows, start=False)
-        else:  # the last state and output inside
-            x = np.where(inside, x, before)
-            y = np.where(inside, self._measure(x, v, rows, start=False), self._y[:, rows])
-            reward = self._judged(x)[1]
-        sample = self._sample[rows] + 1
-        truncated = sample >= (self.max_episode_steps or np.inf)
-        if whole:
-            self._x, self._y, self._sample, self._terminated, self._truncated = x, y, sample, ~inside, truncated
+        escaped = self._outside(x)
+        if escaped.any():  # unless that is but an error of the method
+            x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(escaped))
+            escaped = self._outside(x)
+        if escaped.any():  # the last state and output inside
+            x = np.where(escaped, before, x)
+            y = np.where(escaped, self._y[:, rows], self._measure(x, v, rows, start=False))
         else:
-            self._x[:, rows], self._y[:, rows], self._sample[rows] = x, y, sample
-            self._terminated[rows], self._truncated[rows] = ~inside, truncated
+            y = self._measure(x, v, rows, start=False)
+        reward, ended = self._judged(x, u)
+        self._x[:, rows], self._y[:, rows], self._escaped[rows], self._terminated[rows] = x, y, escaped, escaped | ended
+        self._sample[rows] += 1
+        self._truncated[rows] = self._sample[rows] >= (self.max_episode_steps or np.inf)
         return reward
+
+    def _outside(self, x: np.ndarray) -> np.ndarray:
+        """Which states (nx, n) lie outside their bounds, or are not finite; (n,)."""
+        low, high = self._bounds
+        return ~((x >= low) & (x <= high)).all(0)
 
     def _inputs(self, actions: np.ndarray) -> np.ndarray:
         values = real_array("actions", actions)
@@ -366,23 +320,17 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             raise ValueError(f"actions must be numbers; NaN in rows {np.flatnonzero(np.isnan(u).any(0)).tolist()}")
         return u
 
-    def _noise(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _noise(self, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
         """One sample of w, (nx, rows), and of v, (ny, rows)."""
-        whole = len(rows) == self.num_envs
-        used = self._used if whole else self._used[rows]
-        together = whole and (used == used[0]).all()  # most often
-        if (used[0] if together else used.max()) == NOISE_BLOCK:
-            self._draw(rows[used == NOISE_BLOCK])
-            used = np.where(used == NOISE_BLOCK, 0, used)
-        if whole:
-            self._used = used + 1
+        used, drawn = self._used[rows].copy(), self._everyone[rows]
+        if used.max() == NOISE_BLOCK:
+            self._draw(drawn[used == NOISE_BLOCK])
+            used[used == NOISE_BLOCK] = 0
+        self._used[rows] = used + 1
+        if rows is ALL and (used == used[0]).all():  # most often
+            w, v = self.plant.noise(self._w[used[0]].T, self._v[used[0]].T)
         else:
-            self._used[rows] = used + 1
-        if together:
-            drawn = self._w[used[0]].T, self._v[used[0]].T
-        else:
-            drawn = self._w[used, :, rows], self._v[used, :, rows]
-        w, v = self.plant.noise(*drawn)
+            w, v = self.plant.noise(self._w[used, :, drawn], self._v[used, :, drawn])
         return w.T, v.T
 
     def _draw(self, rows: np.ndarray) -> None:
@@ -396,15 +344,15 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             for block, drawn in ((self._w, w), (self._v, v)):
                 block[:, :, at] = drawn[: len(some)].transpose(1, 2, 0)
 
-    def _measure(self, x: np.ndarray, v: np.ndarray, rows: np.ndarray, *, start: bool) -> np.ndarray:
+    def _measure(self, x: np.ndarray, v: np.ndarray, rows: Rows, *, start: bool) -> np.ndarray:
         # As System.output, component first and in a third of its time, which a step would feel.
-        white = v if self._readings is None else np.zeros((self.plant.ny, len(rows)))
+        white = v if self._readings is None else np.zeros((self.plant.ny, x.shape[1]))
         try:
             y = np.array([hi + vi for hi, vi in zip(self.system.h(x), white, strict=True)])
         except Exception:
-            components(self.system.h, x)  # says what went wrong
+            components(self.system.h, x)  # raises an EquationError
             raise
-        return y if self._readings is None else self._readings.read(y, v, rows, start=start)
+        return y if self._readings is None else self._readings.read(y, v, self._everyone[rows], start=start)
 
     def _observation(self) -> np.ndarray:
         self._held = self._y if self._readings is None else np.where(np.isnan(self._y), self._held, self._y)
@@ -418,7 +366,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
     def _info(self, rows: np.ndarray) -> Infos:
         info: Infos = {}
-        arrays = {"y": self._y.T, "x": self._x.T, "u": self._u.T, "sample": self._sample, "escaped": self._terminated}
+        arrays = {"y": self._y.T, "x": self._x.T, "u": self._u.T, "sample": self._sample, "escaped": self._escaped}
         for key, values in arrays.items():
             info |= {key: values.copy(), f"_{key}": rows.copy()}
         return info
@@ -426,29 +374,6 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     def _trace(self) -> None:
         if self._trails is not None:
             self._trails.add(self._x.T, self._sample)
-
-
-@np.errstate(over="ignore", invalid="ignore")  # of states that have escaped; a block would take twice as long
-def _judge(
-    low: np.ndarray, high: np.ndarray, target: np.ndarray, weights: np.ndarray, x: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which states (nx, n) are within their bounds, and what reward they earn: (n,) each."""
-    inside, cost = np.ones(x.shape[1], np.bool_), np.zeros(x.shape[1])
-    for i in range(len(x)):
-        deviation = x[i] - target[i]
-        cost += weights[i] * (deviation * deviation)
-        inside &= (low[i] <= x[i]) & (x[i] <= high[i])
-    return inside, 1.0 / (1.0 + 4.0 * cost)
-
-
-@functools.cache
-def _compiled_judge() -> Any:
-    """The same in one pass over the rows, a third of the time, where Numba is installed."""
-    try:
-        import numba
-    except ImportError:
-        return _judge
-    return numba.njit(_judge.__wrapped__)  # type: ignore[attr-defined]
 
 
 def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any] | None, np.ndarray]:

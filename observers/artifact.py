@@ -296,7 +296,8 @@ class Artifact:
         def differ(what: str, here: Any, there: Any) -> None:
             raise ArtifactError(
                 f"the observer was made for {what} {here!r}, but the environment has {there!r}; change the "
-                "environment, or train an observer for it (kkl-gym train) and pass its path"
+                "environment, train an observer for it (kkl-gym train) and pass its path, or, for a plant that differs "
+                "on purpose, exchange env.unwrapped.system once the observer is around it"
             )
 
         self.require_system()

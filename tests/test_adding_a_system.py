@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from training.systems import Profile
+from training.presets import Profile
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "guides" / "own_system.md").read_text()
@@ -82,7 +82,7 @@ from kkl_gym import ENV_IDS, get_system
 from training.agents.agent import Agent
 from training.presets import preset
 from training.agents.tasks import TASKS
-from training.systems import controller
+from training.presets import controller
 
 assert list(ENV_IDS)[-1] == "fitzhugh_nagumo" and ENV_IDS["fitzhugh_nagumo"] == "KKLFitzHughNagumo-v0"
 system = get_system("fitzhugh_nagumo")

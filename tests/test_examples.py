@@ -65,12 +65,19 @@ def test_own_system(tmp_path):
     assert example("own_system")(inverse_steps=100, trajectories=30, out=tmp_path) < 40.0
 
 
+@pytest.mark.slow
+def test_own_task(tmp_path):
+    found = example("own_task")(timesteps=8192, inverse_steps=100, trajectories=30, out=tmp_path)
+    assert 50 < found["y"] < 2000
+    assert 50 < found["x_hat"] < 2000
+
+
 # What makes each of the commands for a system of one's own a matter of seconds.
 SMALL = {
     "diagnose": "",
     "train": "--set trajectories=20 duration=5 samples=20 width=4 batch=64 inverse_steps=9 runs=100",
     "evaluate": "--trajectories 4 --duration 8",
-    "certify": "--trajectories 2",
+    "lipschitz": "",
     "agent train": "--timesteps 1",
     "agents": "--information state x_hat --seeds 1 --episodes 2 --timesteps 1 --jobs 1",
     "demo": "--duration 1",

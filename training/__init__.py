@@ -4,84 +4,56 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from training.config import Config
-    from training.diagnosis import Observability, observability
-    from training.evaluation.errors import errors, unseen_trajectories
-    from training.evaluation.metrics import nrmse, smape
-    from training.export.torch_memory import TorchMemory
-    from training.export.torch_observer import TorchObserver
-    from training.identification.learning import adapt, identify
-    from training.lessons.calibrate import calibrate
-    from training.lessons.flow import learn_flow
-    from training.lessons.map import Maps, learn_map
-    from training.lessons.run import Run
-    from training.presets import preset
-    from training.rollouts import learn
-    from training.rollouts.callback import KKLTrainingCallback
-    from training.sources.recorded import RecordedSource, recorded_preset
-    from training.sources.simulated import SimulatedSource
-    from training.sources.source import Source
-    from training.train_observer import Result, train
+    from training.calibration import calibrate as calibrate
+    from training.config import Config as Config
+    from training.diagnosis import Observability as Observability
+    from training.diagnosis import observability as observability
+    from training.evaluation.errors import errors as errors
+    from training.evaluation.errors import unseen_trajectories as unseen_trajectories
+    from training.evaluation.metrics import nrmse as nrmse
+    from training.evaluation.metrics import smape as smape
+    from training.export.torch_memory import TorchMemory as TorchMemory
+    from training.export.torch_observer import TorchObserver as TorchObserver
+    from training.identification.learning import adapt as adapt
+    from training.identification.learning import identify as identify
+    from training.lessons import Maps as Maps
+    from training.lessons import Result as Result
+    from training.lessons import learn_flow as learn_flow
+    from training.lessons import learn_map as learn_map
+    from training.lessons import train as train
+    from training.presets import preset as preset
+    from training.rollouts import learn as learn
+    from training.rollouts.callback import KKLTrainingCallback as KKLTrainingCallback
+    from training.run import Run as Run
+    from training.sources.recorded import RecordedSource as RecordedSource
+    from training.sources.recorded import recorded_preset as recorded_preset
+    from training.sources.simulated import SimulatedSource as SimulatedSource
+    from training.sources.source import Source as Source
 
-__all__ = [
-    "Config",
-    "KKLTrainingCallback",
-    "Maps",
-    "Observability",
-    "RecordedSource",
-    "Result",
-    "Run",
-    "SimulatedSource",
-    "Source",
-    "TorchMemory",
-    "TorchObserver",
-    "adapt",
-    "calibrate",
-    "errors",
-    "identify",
-    "learn",
-    "learn_flow",
-    "learn_map",
-    "nrmse",
-    "observability",
-    "preset",
-    "recorded_preset",
-    "smape",
-    "train",
-    "unseen_trajectories",
-]
-
-_MODULES = {
-    "Config": "config",
-    "KKLTrainingCallback": "rollouts.callback",
-    "Maps": "lessons.map",
-    "Observability": "diagnosis",
-    "RecordedSource": "sources.recorded",
-    "Result": "train_observer",
-    "Run": "lessons.run",
-    "SimulatedSource": "sources.simulated",
-    "Source": "sources.source",
-    "TorchMemory": "export.torch_memory",
-    "TorchObserver": "export.torch_observer",
-    "adapt": "identification.learning",
-    "calibrate": "lessons.calibrate",
-    "errors": "evaluation.errors",
-    "identify": "identification.learning",
-    "learn": "rollouts",
-    "learn_flow": "lessons.flow",
-    "learn_map": "lessons.map",
-    "nrmse": "evaluation.metrics",
-    "observability": "diagnosis",
-    "preset": "presets",
-    "recorded_preset": "sources.recorded",
-    "smape": "evaluation.metrics",
-    "train": "train_observer",
-    "unseen_trajectories": "evaluation.errors",
+_NAMES = {
+    "calibration": "calibrate",
+    "config": "Config",
+    "diagnosis": "Observability observability",
+    "evaluation.errors": "errors unseen_trajectories",
+    "evaluation.metrics": "nrmse smape",
+    "export.torch_memory": "TorchMemory",
+    "export.torch_observer": "TorchObserver",
+    "identification.learning": "adapt identify",
+    "lessons": "Maps Result learn_flow learn_map train",
+    "presets": "preset",
+    "rollouts": "learn",
+    "rollouts.callback": "KKLTrainingCallback",
+    "run": "Run",
+    "sources.recorded": "RecordedSource recorded_preset",
+    "sources.simulated": "SimulatedSource",
+    "sources.source": "Source",
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    """What is public, imported when it is asked for: torch takes seconds, and parts of the package need none."""
+    """Import a public name on demand: torch takes seconds, and parts of the package do without."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

@@ -65,8 +65,6 @@ EXTRAS = {
     "plots": {"PIL", "matplotlib"},
     "parquet": {"pyarrow"},
     "envs": {"h5py", "minari"},
-    "dask": {"distributed"},
-    "ray": {"ray"},
     "onnx": {"onnx", "onnxruntime", "onnxscript"},
 }
 

@@ -15,8 +15,6 @@ from observers.names import suggestion
 
 Pipeline = Literal["input-aware", "spinn"]
 Optimiser = Literal["adam", "soap"]
-Activation = Literal["tanh", "silu"]
-Collocation = Literal["motions", "box"]
 Scaling = Literal["relative", "range"]
 
 Positive = Annotated[float, Field(gt=0)]
@@ -51,8 +49,7 @@ class Config:
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
     """Real eigenvalues of A, in 1/s; B is all ones for each output."""
     pairs: tuple[tuple[Annotated[float, Field(lt=0)], Positive], ...] = ()
-    """Complex pairs a +- iw of eigenvalues of A beside the real ones, as (a, w): a in 1/s and negative, w in rad/s and
-    positive. A slow pair averages the noise on a component of y that oscillates at its frequency."""
+    """Complex pairs a +- iw of eigenvalues of A, as (a, w) in 1/s and rad/s: they average noise at that frequency."""
     dt: Positive = 0.01
     """Sampling interval in seconds."""
     trajectories: Count = 500
@@ -65,7 +62,7 @@ class Config:
     """Neurons in each hidden layer."""
     depth: Count = 3
     """Number of hidden layers."""
-    activation: Activation = "tanh"
+    activation: Literal["tanh", "silu"] = "tanh"
     """Activation of the hidden layers."""
     optimiser: Optimiser = "soap"
     """Optimiser of all networks: adam, or soap, which needs a fraction of the batches."""
@@ -77,16 +74,14 @@ class Config:
     """Batches for the forward map (spinn)."""
     inverse_steps: Count = 1500
     """Batches for each inverse map."""
-    collocation: Collocation = "motions"
-    """Where the forward map's equation is asked to hold, and where x' lies (spinn). motions: along the trajectories,
-    from their starts on. box: uniform in X, as in the paper's sec. 8.1."""
+    collocation: Literal["motions", "box"] = "motions"
+    """Where the forward map's equation must hold, and x' lies (spinn). box: uniform in X, as in the paper."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
     """Most trajectories start in this multiple of the training box X, the others in X (spinn)."""
     solved_output_layer: bool = True
     """Whether the output layer of a trained forward map is solved for by least squares in the end (spinn)."""
     transients: bool = True
-    """Whether T_inv is fitted at every age since reset, where the filter holds T(x(t)) + e^{At} (z_0 - T(x_0)), and at
-    every level of measurement noise (spinn); otherwise to T(x) alone."""
+    """Whether T_inv is fitted at every age since reset and every level of noise (spinn); otherwise to T(x) alone."""
     scaling: Scaling = "relative"
     """How states are scaled. relative: in units of their standard deviation, and errors of T_inv count relative to the
     state's size. range: in units of half their range, and all errors count alike. Input-aware maps are relative."""
@@ -100,17 +95,14 @@ class Config:
     (n, nx) to actions (n, nu) in [-1, 1]. It acts on states with an error and explores, but for one trajectory in
     twelve. There are no free motions then."""
     free_inverse: bool = True
-    """Whether an input-aware map has a second inverse, of z_y alone, for as long as no input has acted. Never under a
-    policy."""
+    """Whether an input-aware map has a second inverse, of z_y alone, until an input acts. Never under a policy."""
     lead_in_input: NotNegative = 0.0
-    """Inputs lead the starts of some free trajectories out of X: for 20 s constant ones, up to this multiple of their
-    bounds, or for 10 s random ones within their bounds if it is 0."""
+    """Some free trajectories start where inputs have led: for 20 s constant ones, up to this multiple of their bounds;
+    0: for 10 s random ones within their bounds."""
     process_noise_share: Share = 0.35
-    """Share of an input-aware map's trajectories with process noise. Each has a level of its own, up to the system's.
-    The map is given the level unless the share is 0."""
+    """Share of an input-aware map's trajectories with process noise, up to the system's; 0: no level is an input."""
     measurement_noise_max: Levels = 1.0
-    """Largest standard deviation of the measurement noise that a map is trained for (spinn with transients too), of all
-    outputs or of each."""
+    """Largest standard deviation of the measurement noise that a map is trained for, of all outputs or of each."""
     noise_free_share: Share = 0.2
     """Share of the samples without measurement noise, where a map is given its level."""
     high_noise_emphasis: Positive = 2.0
@@ -119,17 +111,14 @@ class Config:
     windows: Count = 8000
     """Starts of the filter for each age (recorded motions)."""
     members: Count = 1
-    """Networks that are fitted from other random numbers and averaged into one, as wide as all together: they
-    extrapolate differently."""
+    """Networks of other seeds that are averaged into one, as wide as all together: they extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()
-    """Measured signals whose zero is arbitrary, such as angles of encoders: the map depends on their changes alone
-    (recorded motions)."""
+    """Measured signals of which the map depends on the changes alone, such as angles of encoders (recorded motions)."""
     held_out: Annotated[float, Field(ge=0, lt=1)] = 0.2
     """Share of the records that is not trained on, on which covariances are calibrated and errors measured; whole
     records where there are five or more, else the end of each."""
     tracking: bool = True
-    """Whether the observer tracks (all but spinn): a Kalman filter on the system's equations, or on a learned flow,
-    that T_inv initialises."""
+    """Whether a Kalman filter on the equations, or on a learned flow, tracks from T_inv's estimate (all but spinn)."""
     flow_steps: Count = 5000
     """Batches for a flow, which is learned where there are no equations."""
     runs: Annotated[int, Field(ge=100)] = 400
@@ -142,8 +131,7 @@ class Config:
     """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
     values, as a part of these; "all" stands for each that is not named. Some motions keep the values themselves."""
     bias: float | tuple[float, ...] = 0.0
-    """Largest constant bias of the outputs, of all or of each, that the observer estimates as further states behind x
-    (input-aware, without uncertain parameters)."""
+    """Largest constant bias of all outputs, or of each, which become states (input-aware, no uncertain parameters)."""
     estimate_parameters: bool = False
     """Whether the map gives the uncertain parameters too."""
     cpu_seconds: Positive | None = None
@@ -177,12 +165,11 @@ class Config:
             )
         if (self.pipeline == "spinn") != (self.forward_steps > 0):
             raise ValueError(f"pipeline {self.pipeline!r} does not go with forward_steps = {self.forward_steps}")
-        if self.pipeline != "spinn":
-            own = ("collocation", "box_factor", "solved_output_layer", "transients")
-            defaults = {entry.name: entry.default for entry in dataclasses.fields(self)}
-            changed = [f"{name} = {getattr(self, name)!r}" for name in own if getattr(self, name) != defaults[name]]
-            if changed:
-                raise ValueError(f"{', '.join(changed)}: settings of the pipeline 'spinn', not {self.pipeline!r}")
+        own = ("collocation", "box_factor", "solved_output_layer", "transients")
+        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(self) if one.name in own}
+        changed = [f"{name} = {value!r}" for name, value in values.items() if value != getattr(Config, name)]
+        if changed and self.pipeline != "spinn":
+            raise ValueError(f"{', '.join(changed)}: settings of the pipeline 'spinn', not {self.pipeline!r}")
         return self
 
 
@@ -216,22 +203,21 @@ def checked_changes(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
     """The configuration in an artifact's account of its training, with some settings changed."""
-    known = setting_types()
-    found = {name: value for name, value in training.items() if name in known and value is not None}
-    if not {"pipeline", "eigenvalues"} <= set(found):
-        raise ValueError("the observer does not say how it was trained, so that it cannot be trained again")
-    return Config(**{**_validated(found, "the observer's training"), **changes})
+    settings = {name: training[name] for name in setting_types() if training.get(name) is not None}
+    if not {"pipeline", "eigenvalues"} <= set(settings):
+        raise ValueError("the observer holds no settings of its training, so that it cannot be trained again")
+    return Config(**{**_validated(settings, "the observer's training"), **changes})
 
 
 def _validated(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Settings that came through JSON, each of its type and within its limits."""
-    types, found = setting_types(), {}
+    types, checked = setting_types(), {}
     for name, value in settings.items():
         try:
-            found[name] = TypeAdapter(types[name]).validate_json(json.dumps(value), strict=True)
+            checked[name] = TypeAdapter(types[name]).validate_json(json.dumps(value), strict=True)
         except ValidationError as error:
             raise ValueError(f"{where}: {name} = {value!r}: {error.errors()[0]['msg']}") from None
-    return found
+    return checked
 
 
 def override(config: Config, changes: Mapping[str, Any]) -> Config:

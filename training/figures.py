@@ -1,6 +1,6 @@
 """One style for all figures, on a light ground or a dark one, and how figures and moving pictures are written.
 
-Colours are named by what they are for, as places in the cycle of colours: what is drawn in them follows the theme.
+Colours are named for their use, as places in the cycle of colours, so that they follow the theme.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from kkl_gym.rendering import ESTIMATE, TARGET
+from kkl_gym.rendering import ESTIMATE as ESTIMATE
+from kkl_gym.rendering import TARGET as TARGET
 from observers.storage import replacing
 
 if TYPE_CHECKING:
@@ -58,13 +59,12 @@ def style(theme: Theme | None = None) -> Iterator[None]:
     import matplotlib
 
     chosen = _around.get() if theme is None else theme
-    chosen_looks = looks(chosen)
-    outer = _around.set(chosen)
-    try:
-        with matplotlib.rc_context(chosen_looks):
+    with matplotlib.rc_context(looks(chosen)):
+        outer = _around.set(chosen)
+        try:
             yield
-    finally:
-        _around.reset(outer)
+        finally:
+            _around.reset(outer)
 
 
 def looks(theme: Theme = "light") -> dict[Any, Any]:
@@ -113,22 +113,6 @@ def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> Non
     colours[np.abs(colours - ground).max(axis=1) < NEAR] = ground  # and nothing that is nearly like it
     few.putpalette([*colours.ravel().tolist(), *own.round().astype(int).ravel().tolist()])
     first, *others = (frame.quantize(palette=few, dither=Image.Dither.NONE) for frame in frames)
-    duration = round(1000 * seconds / len(frames))
+    how: dict[str, Any] = {"save_all": True, "duration": round(1000 * seconds / len(frames)), "loop": 0}
     with replacing(path) as temporary:
-        first.save(temporary, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
-
-
-__all__ = [
-    "ALARM",
-    "ESTIMATE",
-    "MEASURED",
-    "RIVAL",
-    "TARGET",
-    "TRUTH",
-    "Theme",
-    "drawing",
-    "looks",
-    "save",
-    "save_moving",
-    "style",
-]
+        first.save(temporary, format="GIF", append_images=others, **how)

@@ -1,7 +1,6 @@
 """Extended Kalman filters that know the equations of motion: what a control engineer would try first."""
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +54,9 @@ class ExtendedKalmanFilter:
     ) -> None:
         self._system, self._dt, self._Q, self._R = system, dt, Q, R
         self._start = start or unknown_start(system)
-        self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
+        self._low, self._high = np.array(system.bounds, dtype=float).T
+        low, high = system.box()
+        self._aside = ASIDE * (high - low) / 2
 
     def start(self, n: int) -> Belief:
         """Return n rows before their first sample."""
@@ -63,7 +64,7 @@ class ExtendedKalmanFilter:
 
     def advance(self, state: Belief, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Belief:
         """Predict over dt, by default that of the samples, in rows that have begun; then correct."""
-        x, P, begun = state.x, state.P, state.begun
+        x, P, begun = state
         if begun.any():
             held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
             moved, spread = self._predicted(x, P, held, self._dt if dt is None else dt)
@@ -79,13 +80,7 @@ class ExtendedKalmanFilter:
         return np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1))
 
     def _inside(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
-        inside: np.ndarray = np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
-        return inside
-
-    @cached_property
-    def _aside(self) -> np.ndarray:
-        low, high = self._system.box()
-        return np.asarray(ASIDE * (high - low) / 2)
+        return np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
 
     @np.errstate(over="ignore", invalid="ignore")  # of filters that are lost, which start again
     def _predicted(self, x: np.ndarray, P: np.ndarray, u: np.ndarray, dt: float) -> Gaussian:
@@ -100,10 +95,10 @@ class ExtendedKalmanFilter:
 
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
         """Mean and covariance given the samples y, (n, ny); lost filters start again."""
-        inside = self._inside(x, P)
-        if not inside.all():
+        lost = ~self._inside(x, P)
+        if lost.any():
             x, P = x.copy(), P.copy()
-            x[~inside], P[~inside] = self._start
+            x[lost], P[lost] = self._start
         aside, R = np.diag(self._aside), self._R
         beside = self._system.output(x[:, None] + np.stack([aside, -aside])[:, None])
         H = ((beside[0] - beside[1]) / (2 * self._aside[:, None])).mT

@@ -12,17 +12,9 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from rich import progress as columns
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress, Task, TaskID
 
 LOG = "log.txt"  # in the folder of a run
 
@@ -31,27 +23,23 @@ BEAT = 1.0  # seconds between looks at the clock
 
 
 class ProgressBars(Progress):
-    """Bars with counts, the time that passed and the time that is left; lines where the console is no terminal.
-
-    ``add_task``, ``update``, ``advance`` and ``track`` are those of :class:`rich.progress.Progress`.
-    """
+    """Bars with counts, the time that passed and the time that is left; lines where the console is no terminal."""
 
     def __init__(self, console: Console | None, log: Path | None = None, **options: Any) -> None:
         self._drawn = console is not None and (console.is_interactive or console.is_jupyter)
         super().__init__(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            columns.TextColumn("{task.description}", markup=False),
+            columns.BarColumn(),
+            columns.MofNCompleteColumn(),
+            columns.TimeElapsedColumn(),
+            columns.TimeRemainingColumn(),
             console=console or Console(quiet=True),
             disable=not self._drawn,
             speed_estimate_period=3600.0,
             **options,
         )
-        self._log, self._logged = log, False
+        self._log, self._logged, self._ended = log, False, threading.Event()
         self._due: dict[TaskID, float] = {}
-        self._ended = threading.Event()
 
     def bar(self, description: str, total: float | None = None) -> Callable[[float], None]:
         """Begin a phase."""
@@ -97,10 +85,9 @@ class ProgressBars(Progress):
             for task in self.tasks:
                 passed = task.elapsed or 0.0
                 due = self._due.get(task.id, FIRST_LINE)
-                if due == math.inf or passed < (FIRST_LINE if task.finished else due):
-                    continue
-                self._due[task.id] = math.inf if task.finished else passed + NEXT_LINE
-                self._write(_line(task, passed), printed=not self._drawn)
+                if due < math.inf and passed >= (FIRST_LINE if task.finished else due):
+                    self._due[task.id] = math.inf if task.finished else passed + NEXT_LINE
+                    self._write(_line(task, passed), printed=not self._drawn)
 
     def _beat(self) -> None:
         while not self._ended.wait(BEAT):
@@ -128,9 +115,9 @@ def progress_bars(console: Console | ProgressBars | None, log: Path | None = Non
 
 def _line(task: Task, passed: float) -> str:
     count = "" if task.total is None else f" {task.completed:.0f} of {task.total:.0f},"
-    line = f"{task.description}:{count} {timedelta(seconds=round(passed))} passed"
     left = None if task.finished else task.time_remaining
-    return line if left is None else f"{line}, {timedelta(seconds=round(left))} left"
+    rest = "" if left is None else f", {timedelta(seconds=round(left))} left"
+    return f"{task.description}:{count} {timedelta(seconds=round(passed))} passed{rest}"
 
 
 def duration(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""Who draws from which stream of random numbers: whatever the seeds, no two purposes ever share one."""
+"""Streams of random numbers: whatever the seeds, no two purposes share one."""
 
 from enum import IntEnum
 

@@ -24,7 +24,7 @@ function ticks([low, high], count) {
 const shownNumber = (value) => String(value).replace("-", "−");
 const name = (i) => `x${"₁₂₃"[i]}`;
 
-/** A canvas as sharp as the screen, which draws itself anew where its size or the colours change. */
+/** A canvas as sharp as the screen, redrawn when its size or the colours change. */
 class Picture {
   constructor(canvas) {
     this.canvas = canvas;
@@ -281,7 +281,7 @@ export class Traces extends Picture {
     const { look } = this, points = shown.map((sample) => [T(sample.t), Y(Math.min(sample.score ?? 0, SCORES))]);
     const alarm = (context.globalAlpha = 1) && shown.at(-1).score > 1;
     context.fillStyle = look.alarm;
-    context.beginPath(); // what is above the limit
+    context.beginPath(); // the part above the limit
     points.forEach(([x, y]) => context.lineTo(x, Math.min(y, Y(1))));
     context.lineTo(points.at(-1)[0], Y(1));
     context.lineTo(points[0][0], Y(1));

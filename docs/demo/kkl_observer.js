@@ -80,7 +80,7 @@ class InverseMap {
     this.network = network(tensors, prefix, this.activation);
   }
 
-  /** What is assumed of noise; measured is a level for each output, cut at the largest in training. */
+  /** The assumed noise; measured is a level for each output, cut at the largest in training. */
   tell(measured, process) {
     this.gain = this.whiten.map((_, i) => 1 / (1 + this.noise_gain.reduce((sum, gains, k) => sum + (measured[k] * gains[i]) ** 2, 0)));
     this.conditions = [];
@@ -98,7 +98,7 @@ class InverseMap {
     return this.network(inputs).map((value, i) => this.x_offset[i] + this.x_scale[i] * value);
   }
 
-  /** The covariance of the estimate's error at an age in seconds; null where there is none. */
+  /** The covariance of the estimate's error at an age in seconds; null without a covariance. */
   at(age) {
     if (!this.levels) return null;
     const nx = Math.sqrt(this.byAge.length / this.ages.length);
@@ -115,7 +115,7 @@ const shifted = (x, V, w, sign = 1) => x.map((value, i) => V.reduce((sum, column
 const defined = (values, others) => values.map((value, k) => (Number.isFinite(value) ? value : others[k]));
 const finite = (...arrays) => arrays.flat(2).every(Number.isFinite);
 
-/** L of P = L L^T; NaN where there is none. */
+/** L of P = L L^T; NaN where P is not positive definite. */
 function factor(P) {
   const L = P.map((row) => row.map(() => 0));
   for (let i = 0; i < P.length; i++) {
@@ -150,7 +150,7 @@ class Tracker {
     if (!this.field) this.network = network(tensors, "motion.", this.activation);
   }
 
-  /** What is assumed of noise; measured is a level for each output, shares are levels in multiples of the largest. */
+  /** The assumed noise; measured is a level for each output, shares are levels in multiples of the largest. */
   tell(measured, process, [share, processShare]) {
     const level = Math.max(process, this.least_process_noise);
     this.Q = this.error.map((error, i) => (level * this.process_noise[i]) ** 2 + error ** 2);
@@ -217,7 +217,7 @@ class Tracker {
     return [mean, S, across];
   }
 
-  /** What a sample says, of which NaN is missing: mean + V white and P - V V^T are what is known then. */
+  /** The update by a sample, NaN for missing entries: the state is then mean + V white with covariance P - V V^T. */
   #corrected(mean, P, y) {
     const [expected, S, V] = this.#transformed(mean, P, this.R, (s, first) => { // where h is undefined, it is that nearby
       const h = defined(...[s, this.#within(s)].map((at) => this.output(this.state(at))));
@@ -249,7 +249,7 @@ class Tracker {
     return finite(next[0], factor(next[1])) ? next : [mean, P, across];
   }
 
-  /** Take in a sample, of which outputs may be NaN, after an input; returns it, with what was expected in their place. */
+  /** Take in a sample, of which outputs may be NaN, after an input; returns it, with the predicted outputs in their place. */
   advance(y, u, before) {
     let prediction = this.#transformed(this.x, this.P, this.Q, (s) => this.#moved(s, u));
     for (let turn = 0; turn < this.relinearisations && this.seen < this.window; turn++) prediction = this.#relinearised(prediction, y, u);
@@ -274,7 +274,7 @@ class Tracker {
 
   /** Take T_inv's estimate at an age in samples where it is surer, soon after a reset, or where the filter diverged. */
   supervise(map, z, age) {
-    const lost = !(this.nis <= this.limit); // also where it is no number
+    const lost = !(this.nis <= this.limit); // true for NaN as well
     if (!lost && this.seen >= this.window) return;
     const P = map.at(Math.min(this.seen, this.window) * this.dt); // what misled the filter may have misled z as well
     const logDeterminant = (matrix) => factor(matrix).reduce((sum, row, i) => sum + Math.log(row[i]), 0);
@@ -322,7 +322,7 @@ class Monitor {
 const holds = (values, count, gaps = false) =>
   values?.length === count && Array.from(values).every((value) => Number.isFinite(value) || (gaps && Number.isNaN(value ?? NaN)));
 
-/** What was given in place of numbers. */
+/** The invalid value, for a message. */
 const shown = (value) => {
   if (typeof value !== "object" || !value) return typeof value === "string" ? JSON.stringify(value) : String(value);
   return value.length === undefined ? "an object" : `[${Array.from(value, shown).join(", ")}]`;
@@ -344,7 +344,7 @@ export class Observer {
     this.tell(this.described.measurement_noise ?? 0, this.described.process_noise ?? 0);
   }
 
-  /** The levels of noise that are assumed: of all outputs or each, and of the state. The monitor begins anew. */
+  /** The levels of noise that are assumed: of all outputs or each, and of the state. The monitor restarts. */
   tell(measurementNoise = this.measurementNoise, processNoise = this.processNoise) {
     Object.assign(this, { measurementNoise, processNoise });
     const each = Array.from({ length: this.ny }, (_, i) => {

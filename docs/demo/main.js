@@ -9,9 +9,9 @@ const MOST_STEPS = 60; // of a frame: a page that was hidden does not make up fo
 const NOTES = {
   none: "Every sample is the output and noise.",
   bias: "A fifth of the output's range is added to every sample.",
-  frozen: "The sensor says what it said last.",
-  dead: "The sensor says 0.",
-  missing: "There are no samples. The observer is told so and goes on by its own prediction.",
+  frozen: "The sensor repeats its last value.",
+  dead: "The sensor reads 0.",
+  missing: "Samples are missing. The observer knows and continues by its own prediction.",
 };
 const $ = (id) => document.getElementById(id);
 

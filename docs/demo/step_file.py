@@ -52,7 +52,7 @@ def _by_output(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap, ny: int) -> dict[str, Any]:
-    """Add a map's arrays; returns what else there is to say of it."""
+    """Add a map's arrays; return its settings that are not arrays."""
     tensors |= {f"{prefix}{name}": getattr(inverse, name) for name in _MAP_ARRAYS}
     tensors[f"{prefix}noise_gain"] = np.atleast_2d(inverse.noise_gain)
     storage.put_mlp(tensors, prefix, inverse.mlp)
@@ -68,7 +68,7 @@ def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: Inverse
 
 
 def _described_motion(tensors: dict[str, np.ndarray], motion: Motion, dt: float) -> dict[str, Any]:
-    """Add a motion's arrays; returns what else there is to say of it."""
+    """Add a motion's arrays; return its settings that are not arrays."""
     arrays = tracker_arrays(motion) | {name: getattr(motion, name) for name in _MOTION_ARRAYS}
     arrays |= {name: getattr(motion.factors, name) for name in ("levels", "ages")}
     arrays["factors"] = motion.factors.factors[[0, -1]].ravel()  # without process noise, and with the most

@@ -1,4 +1,4 @@
-// The four systems: x' = f(x) + G u + w, and their simulation. What is no equation comes from systems.json.
+// The four systems: x' = f(x) + G u + w, and their simulation. Everything but the equations comes from systems.json.
 
 const EQUATIONS = {
   reverse_duffing: {
@@ -32,7 +32,7 @@ const EQUATIONS = {
 };
 const SUBSTEPS = 8; // of a sampling interval: Van der Pol is stiff far from its cycle
 
-/** What systems.json says of a system, with its equations and what the page makes of them. */
+/** A system of systems.json with its equations and the page's settings. */
 export class System {
   constructor(described) {
     Object.assign(this, described, EQUATIONS[described.name]);
@@ -57,7 +57,7 @@ export class System {
     return x.every((value, i) => value >= this.bounds[i][0] && value <= this.bounds[i][1]);
   }
 
-  /** A start, uniform in what is shown of the training box. */
+  /** A start, uniform in the visible part of the training box. */
   start(random) {
     return this.X.map(([low, high], i) => {
       const [least, most] = [Math.max(low, this.range[i][0]), Math.min(high, this.range[i][1])];

@@ -15,7 +15,7 @@ from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS
 from training.cli import COMMANDS, Commands, load
 from training.config import Config, Pipeline, setting_types
-from training.markdown import table
+from training.files import table
 from training.presets import Preset, preset
 from training.sources.recorded import RECORDED
 

@@ -4,7 +4,8 @@ from training.cli import main
 
 COMMANDS = {
     "benchmark": ("examples.research.benchmark.command", "Benchmark"),
-    "certify": ("examples.research.certificates.command", "Certify"),
+    "hyperkkl": ("examples.research.hyperkkl", "HyperKKL"),
+    "lipschitz": ("examples.research.lipschitz", "Lipschitz"),
     "agents": ("examples.research.agents.command", "Compare"),
     "speed": ("examples.research.speed.speed", "Speed"),
     "torch": ("examples.research.speed.torch_steps", "TorchSpeed"),

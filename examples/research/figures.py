@@ -22,8 +22,6 @@ from examples.research.agents import picture
 from examples.research.agents.comparison import read_results
 from examples.research.agents.tables import draw_curves, draw_scores
 from examples.research.benchmark.results import draw_results as draw_benchmark
-from examples.research.certificates import command as certify
-from examples.research.certificates.settled import record_settled
 from examples.research.speed import sizes
 from kkl_gym import SYSTEMS
 from observers import Artifact, load
@@ -34,6 +32,7 @@ from training.agents.agent import Agent, find
 from training.agents.play import Episodes, play
 from training.agents.seeds import agent_evaluation_seed
 from training.agents.tasks import Task
+from training.calibration import chi_square
 from training.commands import demo
 from training.commands.options import shown
 from training.commands.portraits import animate
@@ -43,7 +42,6 @@ from training.evaluation.faults import FAULTS
 from training.evaluation.metrics import percentage_error
 from training.figures import ALARM, ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
 from training.files import write
-from training.lessons.calibrate import chi_square
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,15 +101,6 @@ def agents_over_time() -> Draw:
     """States, outputs and inputs of both agents."""
     task, played = agents()
     return lambda path: picture.draw(task, played, path)
-
-
-def certificate(name: str, trajectories: int = 200) -> Draw:
-    """What ``python -m examples.research certify`` draws of a map that ships."""
-    artifact = Artifact.read(resolve(name))
-    system = SYSTEMS[artifact.system]()
-    noise: dict[str, Any] = {"measurement_noise": artifact.measurement_noise, "process_noise": system.process_noise}
-    motion = record_settled(artifact, system, **noise, trajectories=trajectories, seed=0)
-    return lambda path: certify.draw(path, artifact, system, name=name, noise=noise, motion=motion)
 
 
 def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
@@ -232,25 +221,6 @@ def _set_logarithmic(ax: "Axes", lowest: float) -> None:
     ax.yaxis.set_major_formatter("{x:g}")
 
 
-def coverage(path: Path, rows: pd.DataFrame) -> None:
-    """Draw the coverage of 90 % regions by level of noise, a panel for each span."""
-    spans = list(rows.span.unique())
-    with drawing(path, 4.0 * len(spans), 3.4) as figure:
-        axes: Any = figure.subplots(1, len(spans), sharey=True, squeeze=False)[0]
-        cases = list(rows[["starts", "driven"]].drop_duplicates().itertuples(index=False, name=None))
-        for ax, span in zip(axes, spans, strict=True):
-            for (who, starts, driven), group in rows[rows.span == span].groupby(
-                ["observer", "starts", "driven"], sort=False
-            ):
-                label = f"{who}, {starts}{', driven' if driven else ''}"
-                look, color = "o-" if who == "KKL" else "s--", f"C{cases.index((starts, driven))}"
-                ax.plot(group.measurement_noise.astype(str), group["90"], look, color=color, label=label)
-            ax.axhline(90, color=TRUTH, linewidth=0.8)
-            ax.set(title=span, xlabel="measurement noise", ylim=(0, 102))
-        axes[0].set_ylabel("errors in the 90 % region, %")
-        axes[-1].legend(loc="lower right")
-
-
 def draw_faults(path: Path, runs: pd.DataFrame) -> None:
     """Draw how many runs exceed a threshold of the monitor's score in time, sound ones and faulty ones."""
     observers = list(runs.observer.unique())
@@ -278,7 +248,6 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "figures/errors_over_time.png": errors_over_time,
     "figures/error_bars.png": error_bars,
     "figures/noise_levels.png": noise_levels,
-    "results/certificates/rossler-spinn.png": partial(certificate, "rossler-spinn"),
     "results/benchmark/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "benchmark"),
     "results/ablation/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "ablation"),
     "results/agents/scores.png": lambda: partial(draw_scores, results=read_results(RESULTS / "agents")),

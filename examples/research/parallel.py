@@ -1,6 +1,5 @@
-"""Independent jobs on joblib: worker processes of this machine, or a cluster of Dask's or Ray's."""
+"""Independent jobs in worker processes of this machine."""
 
-import logging
 import os
 import threading
 import time
@@ -10,16 +9,12 @@ from contextlib import chdir, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import get_reusable_executor
 
-Backend = Literal["loky", "dask", "ray"]
-
-DEFAULT_WORKERS = 2  # processes of this machine
 TRIES = 3  # of a job whose worker dies
-ADDRESSES = {"dask": "tcp://HOST:8786", "ray": "auto, or HOST:6379"}
 
 Job = TypeVar("Job")
 
@@ -64,24 +59,15 @@ def _attempt(run: Callable[[Job], None], folder: Path, index: int, job: Job) -> 
 
 
 @contextmanager
-def engine(workers: int | None = None, *, backend: Backend = "loky", address: str | None = None) -> Iterator[Engine]:
-    """Find workers for jobs, for as long as the context lasts."""
-    if workers is not None and workers < 1:
+def engine(workers: int) -> Iterator[Engine]:
+    """Worker processes for jobs, for as long as the context lasts."""
+    if workers < 1:
         raise ValueError(f"jobs = {workers} at a time: give at least one worker process")
-    if backend == "loky":
-        if address is not None:
-            raise ValueError(f"--address {address} is a cluster's: add --backend dask or --backend ray")
-        workers = workers or DEFAULT_WORKERS
-        with parallel_config("loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)):
-            try:
-                yield Engine(workers)
-            finally:
-                get_reusable_executor(reuse=True).shutdown(kill_workers=True)
-    elif address is None:
-        raise ValueError(f"--backend {backend} needs the --address of its cluster, as in {ADDRESSES[backend]}")
-    else:
-        with _CLUSTERS[backend](address) as cores, parallel_config(backend):
-            yield Engine(min(workers or cores, cores))
+    with parallel_config("loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)):
+        try:
+            yield Engine(workers)
+        finally:
+            get_reusable_executor(reuse=True).shutdown(kill_workers=True)
 
 
 def _end_with(parent: int) -> None:
@@ -93,38 +79,3 @@ def _end_with(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def _dask(address: str) -> Iterator[int]:
-    """Connect to a scheduler of Dask's; gives the number of its workers."""
-    from distributed import Client
-
-    with Client(address) as client:
-        threads = client.nthreads()
-        if set(threads.values()) != {1}:  # a job counts the CPU time of its process
-            raise ValueError(
-                f"--backend dask needs workers of one thread each, dask worker {address} --nthreads 1; got "
-                f"{threads or 'no worker'}"
-            )
-        yield len(threads)
-
-
-@contextmanager
-def _ray(address: str) -> Iterator[int]:
-    """Connect to Ray; gives the number of its cores."""
-    import ray
-    from ray.util.joblib import register_ray
-    from ray.util.joblib.ray_backend import RayBackend
-
-    register_ray()
-    # RayBackend inherits False from the pool of multiprocessing; Ray's own pool hands results over as they come.
-    RayBackend.supports_return_generator = True
-    ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
-    try:
-        yield int(ray.cluster_resources().get("CPU", 1))
-    finally:
-        ray.shutdown()
-
-
-_CLUSTERS = {"dask": _dask, "ray": _ray}

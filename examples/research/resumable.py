@@ -4,27 +4,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
-import tyro
 from rich.console import Console
 
-from examples.research.parallel import Backend, engine
-from training.jobs import check_identity, claimed_job
+from examples.research.parallel import engine
+from training.files import check_identity, claimed_job
 from training.progress import LOG, ProgressBars, progress_bars
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Where jobs run; docs/guides/many_machines.md says more."""
+    """Where jobs run."""
 
-    jobs: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 2, or all cores of a cluster)")] = None
+    jobs: int = 2
     """Jobs at a time, each in a process of one thread."""
-    backend: Backend = "loky"
-    """loky: processes of this machine. dask, ray: a cluster that shares the folder of results
-    (docs/guides/many_machines.md)."""
-    address: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: none)")] = None
-    """Of the cluster: tcp://HOST:8786 for Dask's scheduler; auto or HOST:6379 for Ray's head."""
 
 
 class Job(ABC):
@@ -101,7 +95,7 @@ def run_missing(
         running = ", ".join(names[: here.workers])
         return f"{what} (now {running})" if running else what
 
-    with engine(workers.jobs, backend=workers.backend, address=workers.address) as here:
+    with engine(workers.jobs) as here:
         progress.update(bar, description=described())
         for job, failure in here.run(run, todo):
             names.remove(job.name)

@@ -24,7 +24,7 @@ from observers.storage import UNFINISHED
 from training import checkpoints
 from training.agents.agent import Agent
 from training.agents.play import play
-from training.lessons.run import LOG_EVERY
+from training.run import LOG_EVERY
 
 pytestmark = pytest.mark.long
 

@@ -1,7 +1,7 @@
 """Settings with which agents and their observers are learned in no time, and badly."""
 
+from training import calibration as calibrate
 from training.agents import learning, observing
-from training.lessons import calibrate
 from training.sources import recorded
 
 NET = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [8]}, "n_timesteps": 64}

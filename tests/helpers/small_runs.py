@@ -8,7 +8,7 @@ import torch
 from kkl_gym import VanDerPol
 from observers import Artifact, LinearFilter
 from training import preset
-from training.config import override
+from training.config import Config, override
 from training.maps.inverse import TrajectorySampler
 from training.maps.networks import Network
 from training.spectrum import papers_spectrum
@@ -35,6 +35,9 @@ def toy(system, pipeline="input-aware", **changes):
     return override(preset(system, pipeline, "fast"), SIZES | steps | changes)
 
 
+BATCHES = Config("input-aware", (-1.0,), measurement_noise_max=1.0, batch=4096)
+
+
 @cache
 def open_loop(process_noise_share=0.0):
     """Batches along trajectories of Van der Pol's oscillator, the trajectories, and the filter beside them."""
@@ -45,8 +48,7 @@ def open_loop(process_noise_share=0.0):
     sampler = TrajectorySampler(
         data,
         linear,
-        measurement_noise_max=1.0,
-        batch=4096,
+        BATCHES,
         device=CPU,
         process_noise_max=VanDerPol.process_noise if process_noise_share else 0.0,
     )
@@ -56,7 +58,6 @@ def open_loop(process_noise_share=0.0):
 def untrained(sampler, linear):
     """A network with weights that nobody trained, and the observer that it makes."""
     torch.manual_seed(0)
-    told = np.size(sampler.measurement_noise_max) + 1 + bool(sampler.process_noise_max)
-    inputs = len(sampler.coordinates.whiten) + told
+    inputs = sampler(torch.Generator()).inputs.shape[1]
     network = Network(inputs, 2, width=8, depth=1, activation="tanh")
-    return network, Artifact(linear, sampler.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
+    return network, Artifact(linear, sampler.inverse_map(network.export()), "van_der_pol", {"mu": 3.0})

@@ -169,10 +169,6 @@ def compared(unit, second):
     return variant(f, X=((-unit, unit),), bounds=((-9 * unit, 9 * unit),), rate=lambda self, x: 1.0 / second)
 
 
-def from_table(self, x):
-    return (-TABLE["k"] * x[0],)
-
-
 @pytest.mark.parametrize(
     ("step_of", "system", "why"),
     [
@@ -251,13 +247,6 @@ def test_what_the_equations_read_is_looked_up_anew(where, name, value, monkeypat
     after, expected = moved(single_step, Decaying())
     np.testing.assert_allclose(after, expected, rtol=1e-12)
     assert not np.allclose(after, before)
-
-
-def test_what_a_batchs_equations_read_elsewhere_is_compared_anew(monkeypatch):
-    system = variant(from_table)
-    assert batch_step(system).obstacle is None
-    monkeypatch.setitem(TABLE, "k", 3.0)
-    np.testing.assert_allclose(*moved(batch_step, system), rtol=1e-12)
 
 
 def episode(env, seed, steps, gain=0.5):

@@ -49,10 +49,10 @@ def test_a_parameter_that_is_not_declared_anew_is_refused():
 
 
 def test_what_would_be_lost_is_refused_of_parents_too():
-    with pytest.raises(TypeError, match="Tank defines __init__, and would be made anew without what that sets"):
+    with pytest.raises(TypeError, match="Tank defines __init__, and would be copied without what that sets"):
         declared(__init__=lambda self: None)
     hardware = type("Hardware", (), {"__init__": lambda self: None})
-    with pytest.raises(TypeError, match="Boat defines __init__, and would be made anew"):
+    with pytest.raises(TypeError, match="Boat defines __init__, and would be copied without"):
         type("Boat", (hardware, VanDerPol), {"name": "boat"})
     with pytest.raises(TypeError, match=r"Mixed: mu = 2\.0 does not change the parameter mu"):
         type("Mixed", (type("Softer", (), {"mu": 2.0}), VanDerPol), {"name": "mixed"})

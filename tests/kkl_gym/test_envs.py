@@ -49,12 +49,6 @@ def test_checkers_are_content(name, observe):
     sb3.check_env(env)
 
 
-def test_checkers_are_content_with_rendering():
-    for needed in ("matplotlib", "pygame"):
-        pytest.importorskip(needed)
-    check_env(gym.make("KKLLorenz-v0").unwrapped)
-
-
 @everyone
 @both
 def test_equal_seeds_give_equal_episodes(name, observe):
@@ -114,21 +108,16 @@ def test_any_start_and_any_actions(name, observe, data, seed):
     assert info["x"].tolist() == list(x0)
     assert obs in env.observation_space
     assert list(info) == ["y", "x", "u", "sample", "escaped"]
-    assert not info["escaped"]
-    assert info["u"].tolist() == [0.0] * env.system.nu
-    assert info["sample"] == 0
+    assert (info["escaped"], info["u"].tolist(), info["sample"]) == (False, [0.0] * env.system.nu, 0)
     for action in actions:
         obs, reward, terminated, truncated, info = env.step(np.array([action], np.float32))
         assert obs.dtype == np.float32
         assert np.isfinite(obs).all()
         assert obs in env.observation_space
         assert np.array_equal(obs, info["x" if observe == "state" else "y"].astype(np.float32))
-        assert type(reward) is float
+        assert (type(reward), type(terminated), truncated) == (float, bool, False)
         assert 0 <= reward <= 1
-        assert type(terminated) is bool
-        assert truncated is False
         assert info["escaped"] == terminated
-        assert list(info) == ["y", "x", "u", "sample", "escaped"]
         assert {key: (info[key].dtype, info[key].shape) for key in info} == {
             **{key: (np.float64, (size,)) for key, size in sizes.items()},
             "sample": (np.int64, ()),
@@ -235,9 +224,6 @@ def test_start_box():
     assert ((starts >= box[:, 0]) & (starts <= box[:, 1])).all()
     assert np.ptp(starts[:, 0]) > 4
     assert (gym.make_vec("KKLVanDerPol-v0", num_envs=50, start_box=box).reset(seed=0)[1]["x"] == starts).all()
-    env = KKLEnv("van_der_pol", start_box=box)
-    box[:] = 100.0  # it was copied
-    assert env.reset(seed=0)[0] in env.observation_space
     point = gym.make("KKLVanDerPol-v0", start_box=((1, 1), (2, 2)))
     assert point.reset(seed=0)[1]["x"].tolist() == [1, 2]
 
@@ -249,16 +235,6 @@ def test_step_and_render_before_reset():
             call()
 
 
-def test_autonomous_user_system(script):
-    env = KKLEnv(f"{script}:Pendulum")
-    assert env.action_space.shape == (0,)
-    check_env(env, skip_render_check=True)
-    obs, _ = env.reset(seed=0)
-    obs, _, _, _, info = env.step(np.zeros(0, np.float32))
-    assert info["u"].shape == (0,)
-    assert obs in env.observation_space
-
-
 def test_render():
     pytest.importorskip("matplotlib")
     silent, env = (gym.make("KKLRossler-v0", render_mode=mode) for mode in (None, "rgb_array"))
@@ -268,13 +244,10 @@ def test_render():
     assert first.dtype == np.uint8
     assert first.shape == (480, 480, 3)
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 5
-    assert np.array_equal(env.render(), first)
-    for _ in range(50):
-        env.step(np.zeros(1, np.float32))
+    env.step(np.zeros(1, np.float32))
     assert not np.array_equal(env.render(), first)
     env.reset(seed=0)
     assert np.array_equal(env.render(), first)
-    env.close()
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

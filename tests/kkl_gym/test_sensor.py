@@ -172,11 +172,9 @@ def test_equal_seeds_copies_and_specifications():
     for _ in range(300):
         a, b = (one.step([0.3])[4]["y"] for one in (env, again))
         assert np.array_equal(a, b, equal_nan=True)
-    for twin in (copy.deepcopy(again), pickle.loads(pickle.dumps(again.unwrapped))):
-        b = [twin.step([0.3])[4]["y"] for _ in range(300)]
-        fresh = copy.deepcopy(again)
-        a = [fresh.step([0.3])[4]["y"] for _ in range(300)]
-        assert np.array_equal(a, b, equal_nan=True)
+    twins = copy.deepcopy(again), pickle.loads(pickle.dumps(again.unwrapped))
+    a, b = ([twin.step([0.3])[4]["y"] for _ in range(300)] for twin in twins)
+    assert np.array_equal(a, b, equal_nan=True)
     assert identity(env)["kwargs"]["sensor"] == json.loads(json.dumps(ALL))
 
 

@@ -1,7 +1,6 @@
 import functools
 import math
 import warnings
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from pushed_systems import Pendulum, TwoInputs
 
 from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.compiled import batch_step, single_step
-from kkl_gym.elementary import exp, sign, sin, where
+from kkl_gym.elementary import exp, sign, sin
 from kkl_gym.simulate import (
     SubstepsError,
     advance,
@@ -41,33 +40,6 @@ class Flushed(System):
 
     def h(self, x):
         return (x[0],)
-
-
-@dataclass(frozen=True)
-class Drift(System):
-    """Constant f: its numerical rate is a plain number for batches too."""
-
-    name = "drift"
-    X = ((-1, 1),)
-    bounds = ((-5, 5),)
-
-    def f(self, x):
-        return (2.0,)
-
-    def h(self, x):
-        return (x[0],)
-
-
-@dataclass(frozen=True)
-class Exploding(Drift):
-    name = "exploding"
-    bounds = ((-1e6, 1e6),)
-
-    def f(self, x):
-        return (exp(x[0]) + sin(exp(x[0])),)
-
-    def rate(self, x):
-        return 0.0 * x[0]
 
 
 def without_formula(name):
@@ -159,13 +131,6 @@ def test_order_six():
     assert ((orders > 5.5) & (orders < 7.0)).all()
 
 
-def test_energy_is_conserved():
-    x0 = np.random.default_rng(3).uniform(*ReverseDuffing().box(2), (20, 2))
-    x = simulate(ReverseDuffing(), x0, 1000, DT)
-    energy = x[..., 1] ** 4 / 4 + x[..., 0] ** 2 / 2
-    assert np.allclose(energy, energy[0], rtol=1e-7)
-
-
 def one_by_one(system, x0, u, w, dt):
     out = [x0]
     for uk, wk in zip(u.tolist(), w.tolist(), strict=True):
@@ -189,30 +154,20 @@ def test_scalar_and_batch_agree_to_rounding_in_each_step(system):
         assert (error <= 1e-13 * (1.0 + np.abs(scalar[:, stays]).max(-1))).all()
 
 
-def counting(kind):
-    class Counting(kind):
-        name = "counting"
-        calls = []  # noqa: RUF012
-
-        def f(self, x):
-            self.calls.append(x)
-            return super().f(x)
-
-    return Counting()
-
-
 def test_a_jump_takes_a_few_substeps():
+    calls = []
+
     class Rubbing(Relaxing):
         name = "rubbing"
         X, bounds = ((-1.0, 1.0), (-1.0, 1.0)), ((-9.0, 9.0), (-9.0, 9.0))
 
         def f(self, x):
+            calls.append(x)
             return x[1], -x[0] - 0.5 * sign(x[1])
 
-    system = counting(Rubbing)
-    found = simulate(system, [[1.0, 1.0]], 300, DT)
+    found = simulate(Rubbing(), [[1.0, 1.0]], 300, DT)
     assert np.abs(found[-1]).max() < 0.6  # where friction holds it
-    assert len(system.calls) / 300 < 1000
+    assert len(calls) / 300 < 1000
 
 
 def test_escape_leaves_nan_rows_and_no_warning():
@@ -293,13 +248,6 @@ def test_the_shipped_systems_never_need_substeps_of_unequal_length(name):
     assert not equal_substeps(system, x, u, np.zeros_like(x), 0.01)[1]
 
 
-def test_overflow_in_a_users_functions_is_an_escape():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert not np.isfinite(advance(Exploding(), (800.0,), (), (0.0,), 1.0)).any()
-        assert not np.isfinite(simulate(Exploding(), np.array([[800.0], [5.0]]), 3, 1.0)[-1]).any()
-
-
 @pytest.mark.parametrize("system", [Lorenz(), Pendulum(), TwoInputs()], ids=lambda s: s.name)
 def test_inputs_and_noise(system):
     rng, n, steps = np.random.default_rng(5), 2, 20
@@ -333,10 +281,8 @@ def test_no_starts_no_steps_and_signals_that_are_left_out():
     ("wrong", "match"),
     [
         ({"x0": np.zeros(3)}, r"x0 .* \(n, 3\)"),
-        ({"x0": np.zeros((2, 2))}, r"x0 .* \(2, 2\)"),
         ({"x0": [[0.0, math.nan, 0.0]]}, "x0 must be finite"),
         ({"u": np.zeros((5, 2))}, r"u must have shape \(5, 2, 1\), got \(5, 2\)"),
-        ({"u": np.zeros((4, 2, 1))}, "u must have shape"),
         ({"w": np.zeros((5, 2, 1))}, r"w must have shape \(5, 2, 3\)"),
         ({"dt": 0.0}, "dt must be"),
     ],
@@ -361,34 +307,6 @@ def test_what_an_input_speeds_up_is_followed():
     assert Flushed().typical_rate == pytest.approx(400.02, rel=1e-6)  # from which the default dt follows
 
 
-class Pumped(Flushed):
-    name = "pumped"
-    u_max = (1.0,)
-
-    def g(self, x):
-        return ((where(x[0] > 0, -1.0, 0.0),),)
-
-
-def test_a_pump_that_stops_at_zero_takes_no_more_substeps():
-    for step in (single_step(Pumped()), functools.partial(advance, Pumped())):
-        for dt in (0.01, 1.0):
-            assert step((0.0,), [1.0], [0.0], dt)[0] == 0.0
-
-
-def test_a_step_in_discrete_time_that_leaves_out_a_division_by_zero():
-    class Kicked(System):
-        name = "kicked"
-        X, bounds, dt = ((-1, 1),), ((-5, 5),), 0.1
-
-        def step(self, x, u):
-            return (where(abs(x[0]) > 0.1, 0.09 * x[0] / x[0], 1.0 - 0.5 * x[0]),)
-
-        def h(self, x):
-            return (x[0],)
-
-    assert advance(Kicked(), (0.0,), [], [0.0], 0.1)[0] == 1.0
-
-
 def test_a_compiled_step_may_take_the_steps():
     pytest.importorskip("numba")
     system, rng = Lorenz(), np.random.default_rng(0)
@@ -405,10 +323,6 @@ def test_huge_steps_of_a_batch_are_refused():
     x, none = np.ones((2, 1)), np.zeros((2, 1))
     with pytest.raises(SubstepsError, match=r"dt = 1e\+06 s of two_inputs, .* at x = \[.*take a smaller dt"):
         advance_batch(TwoInputs(), x, none, none, 1e6)
-
-
-def test_rates_that_do_not_depend_on_the_state():
-    assert np.allclose(simulate(Drift(), [[0.0], [1.0]], 4, 0.5)[:, :, 0].T, [[0, 1, 2, 3, 4], [1, 2, 3, 4, 5]])
 
 
 def test_an_own_rate_stands_for_inputs_too():

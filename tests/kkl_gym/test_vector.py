@@ -18,6 +18,7 @@ from kkl_gym import (
     KKLObservation,
     KKLVectorEnv,
     KKLVectorObservation,
+    Lorenz,
     VectorActionRepeat,
 )
 from kkl_gym.plant import NOISE_BLOCK
@@ -281,16 +282,6 @@ def test_frames_are_those_of_single_environments(saved):
     assert not np.array_equal(*estimated)
 
 
-def test_where_only_z_is_estimated_frames_show_no_estimate(saved):
-    pytest.importorskip("matplotlib")
-    drawn = vector("lorenz", "NextStep", render_mode="rgb_array")
-    with pytest.raises(gym.error.ResetNeeded):
-        drawn.render()
-    env = KKLVectorObservation(drawn, saved(system="lorenz"), estimate="z")
-    env.reset(seed=0)
-    assert np.array_equal(env.render(), env.unwrapped.render())
-
-
 def test_a_repeat_inside_the_observer_is_noticed(saved):
     env = KKLVectorObservation(VectorActionRepeat(vector("lorenz", "Disabled"), 2), saved(system="lorenz"))
     env.reset(seed=0)
@@ -310,8 +301,14 @@ def test_foreign_and_mixed_vectors(saved):
     mixed = SyncVectorEnv([partial(single, "lorenz", measurement_noise=noise) for noise in (0.1, 0.2)])
     with pytest.raises(ValueError, match="one observer cannot serve all"):
         KKLVectorObservation(mixed, saved(system="lorenz"))
-    with pytest.raises(ValueError, match="rho"):
+    with pytest.raises(ValueError, match=r"rho.*on purpose, exchange env\.unwrapped\.system once the observer is"):
         KKLVectorObservation(vector("lorenz", "NextStep", parameters={"rho": 20.0}), saved(system="lorenz"))
+    envs = SyncVectorEnv([partial(single, "lorenz")] * 2)
+    observed = KKLVectorObservation(envs, saved(system="lorenz"))
+    envs.set_attr("system", [Lorenz(rho=20.0), Lorenz(rho=24.0)])
+    observed.reset(seed=0, options={"x0": [1.0, 1.0, 20.0]})
+    x, y = observed.step(np.zeros((2, 1)))[4]["x"]
+    assert x[1] != y[1]
 
 
 def test_a_blind_map_under_action(saved):

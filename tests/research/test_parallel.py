@@ -1,4 +1,4 @@
-"""Jobs in worker processes and on clusters: failures, interruptions, and processes that are killed."""
+"""Jobs in worker processes: failures, interruptions, and processes that are killed."""
 
 import os
 import signal
@@ -16,8 +16,8 @@ FAILURES = {"bad": "this one is bad", "silent": "ValueError", "leaving": "left w
 needs_proc = pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
 
 
-def run(jobs, workers=2, **options):
-    with engine(workers, **options) as here:
+def run(jobs, workers=2):
+    with engine(workers) as here:
         return {job.name: failure for job, failure in here.run(work, jobs)}
 
 
@@ -94,53 +94,6 @@ def test_workers_end_when_the_context_is_left(tmp_path):
     assert not alive(long.processes[0])
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"workers": 0}, "jobs = 0 at a time: give at least one"),
-    ({"address": "tcp://nowhere:8786"}, "add --backend dask or --backend ray"),
-    ({"backend": "dask"}, "--backend dask needs the --address of its cluster, as in tcp://HOST:8786"),
-    ({"backend": "ray"}, "--backend ray needs the --address of its cluster, as in auto, or HOST:6379"),
-])  # fmt: skip
-def test_engines_that_cannot_be(options, message):
-    with pytest.raises(ValueError, match=message), engine(**options):
+def test_an_engine_needs_a_worker():
+    with pytest.raises(ValueError, match="jobs = 0 at a time: give at least one"), engine(0):
         raise AssertionError
-
-
-# What the libraries themselves leave open when a cluster ends.
-leaky = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-
-
-@leaky
-@pytest.mark.parametrize(("workers", "found"), [(0, "no worker"), (1, r"\{.*: 2\}")])
-def test_dask_without_workers_of_one_thread(workers, found):
-    distributed = pytest.importorskip("distributed")
-    options = {"n_workers": workers, "threads_per_worker": 2, "processes": False, "dashboard_address": ":0"}
-    with (
-        distributed.LocalCluster(**options) as cluster,
-        pytest.raises(ValueError, match=f"of one thread each, dask worker .* --nthreads 1; got {found}"),
-        engine(backend="dask", address=cluster.scheduler_address),
-    ):
-        raise AssertionError
-
-
-def run_on(backend, address, folder, monkeypatch):
-    monkeypatch.chdir(folder)  # of the workers, too
-    jobs = [Busy("a", Path()), Busy("bad", Path()), Busy("victim", Path(), kills=1)]
-    assert run(jobs, backend=backend, address=address) == {"a": None, "bad": FAILURES["bad"], "victim": None}
-    assert os.getpid() not in {number for job in jobs for number in job.processes}
-
-
-@leaky
-@pytest.mark.slow
-def test_dask(tmp_path, monkeypatch):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
-        run_on("dask", cluster.scheduler_address, tmp_path, monkeypatch)
-
-
-@leaky
-@pytest.mark.slow
-def test_ray(tmp_path, monkeypatch):
-    pytest.importorskip("ray")
-    for name, value in {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "disabled", **IMPORTS}.items():
-        monkeypatch.setenv(name, value)
-    run_on("ray", "local", tmp_path, monkeypatch)

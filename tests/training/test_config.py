@@ -27,6 +27,9 @@ from training.config import override, read_changes
         ({"noise_free_share": float("nan")}, "share"),
         ({"high_noise_emphasis": 0.0}, "high_noise_emphasis"),
         ({"policy": "controller", "inputs": False}, "policy"),
+        ({"uncertain": {"mu": 1.0}}, "less than 1"),
+        ({"estimate_parameters": True, "uncertain": {"all": 0.0}}, "needs uncertain parameters"),
+        ({"uncertain": {"mu": 0.1}, "pipeline": "spinn", "forward_steps": 9}, "needs the pipeline 'input-aware'"),
     ],
 )
 def test_impossible_configurations(change, message):

@@ -7,24 +7,13 @@ from kkl_gym import SYSTEMS, get_system
 from training.agents.environments import vector
 from training.agents.play import play
 from training.agents.tasks import TASKS, TOLERANCE, control_task, get_task, scores, successes
-from training.presets import preset
-from training.systems import PROFILES, Profile, controller, profile
+from training.presets import Profile, controller, profile
 from training.trajectories.equations import linearised
 from training.trajectories.policies import linear_quadratic
 
 
 def nothing(obs):
     return np.zeros((len(obs), 1))
-
-
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_a_profile_fits_its_system(name):
-    found, system = PROFILES[name], get_system(name)
-    assert profile(system) is found
-    assert TASKS[name].system == name
-    config = preset(system, "input-aware", "fast")
-    assert {key: getattr(config, key) for key in found.settings} == dict(found.settings)
-    assert found.eigenvalues is None or config.eigenvalues == pytest.approx(found.eigenvalues, abs=1e-6)
 
 
 def test_a_system_of_ones_own_has_the_defaults_and_no_controller_without_input(script):

@@ -10,13 +10,12 @@ from linear_system import Oscillator
 from small_runs import toy
 
 import kkl_gym
-from kkl_gym.equations import EquationError
 from kkl_gym.simulate import simulate
 from observers.estimator import Running
 from training import errors, preset, train, unseen_trajectories
 from training.kalman import ExtendedKalmanFilter
-from training.smoothness import smooth_spectrum
-from training.systems import controller
+from training.presets import controller
+from training.spectrum import smooth_spectrum
 
 
 def test_a_step_in_closed_form_is_the_integration():
@@ -30,11 +29,6 @@ def test_a_step_in_closed_form_is_the_integration():
     for action in rng.uniform(-1, 1, (20, 1)).astype(np.float32):
         found, expected = (env.step(action)[0] for env in (single, integrated))
         np.testing.assert_allclose(found, expected, rtol=1e-6)
-
-
-def test_another_interval_is_refused():
-    with pytest.raises(ValueError, match=r"steps of dt = 1\.0 s"):
-        kkl_gym.KKLEnv(Henon(), dt=0.01)
 
 
 def test_the_kalman_filter_follows_a_map_as_it_follows_its_integration():
@@ -88,17 +82,3 @@ def test_the_equation_of_continuous_time_is_refused(tmp_path):
         train(Henon(), toy(Henon(), "spinn"), tmp_path)
     with pytest.raises(ValueError, match="input-aware"):
         smooth_spectrum(Henon(), 1.0)
-
-
-@pytest.mark.parametrize(
-    ("body", "message"),
-    [
-        ("return x[0]", r"step\(x, u\) of 'wrong' .* must return 2 components"),
-        ("return x[0], nothing", "NameError"),
-    ],
-)
-def test_steps_that_are_wrong_are_named(tmp_path, body, message):
-    lines = ("from discrete_systems import Henon", "class Wrong(Henon):", "    name = 'wrong'")
-    (tmp_path / "wrong.py").write_text("\n".join((*lines, "    def step(self, x, u):", f"        {body}\n")))
-    with pytest.raises(EquationError, match=message):
-        kkl_gym.KKLEnv(f"{tmp_path / 'wrong.py'}:Wrong")

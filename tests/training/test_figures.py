@@ -42,12 +42,6 @@ def test_a_drawing_is_written_at_its_end(tmp_path, theme):
     assert (picture == np.round(255 * np.array(to_rgb(CYCLES[theme][3])))).all(axis=2).any()
 
 
-def test_a_drawing_that_fails_leaves_no_file(tmp_path):
-    with pytest.raises(KeyError), drawing(tmp_path / "figure.png", 3, 2):
-        raise KeyError
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("theme", THEMES)
 def test_moving_pictures_keep_ground_and_colours(tmp_path, theme):
     """A line of one pixel is too little for a palette to notice, and blends with the ground are many."""

@@ -61,14 +61,6 @@ def test_the_circle_pendulum_is_gymnasiums(pendulum):
         assert (cosine, sine) == pytest.approx((-rate * np.sin(angle), rate * np.cos(angle)))
 
 
-def test_motions_stay_on_the_circle(pendulum):
-    env = kkl_gym.KKLEnv(pendulum)
-    env.reset(seed=0)
-    for _ in range(500):
-        _, _, _, _, info = env.step(env.action_space.sample())
-    assert np.hypot(*info["x"][:2]) == pytest.approx(1.0, abs=1e-6)
-
-
 def test_starts_beyond_x_are_on_the_circle_too(pendulum):
     x = starts(pendulum, "2X", 100, np.random.default_rng(0))
     np.testing.assert_allclose(np.hypot(x[:, 0], x[:, 1]), 1.0)

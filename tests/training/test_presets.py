@@ -8,7 +8,7 @@ from linear_system import Oscillator, TwoOutputs, TwoUnits
 from kkl_gym import Lorenz, Rossler, VanDerPol
 from training import preset, presets
 from training.config import Config
-from training.systems import PROFILES
+from training.presets import PROFILES
 
 
 def test_paper_preset_has_the_papers_table():

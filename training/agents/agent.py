@@ -19,7 +19,7 @@ from observers.errors import ArtifactError
 from observers.names import matching, resolve
 from training.agents.information import ESTIMATED, INFORMATION, Information, make
 from training.agents.tasks import Task
-from training.jobs import describe
+from training.files import describe
 
 FORMAT = 2
 KEY = "kkl-gym-agent"

@@ -19,7 +19,7 @@ def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
 
 
 class Cost(VectorWrapper):
-    """Pays minus the cost, see :func:`paid`.
+    """Pays minus the cost, see :func:`paid`, where a system does not state a reward of its own.
 
     The environment's reward is flat far from the target, where c still tells an agent which way to go. Escaping never
     pays.

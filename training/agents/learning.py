@@ -237,7 +237,8 @@ class _Learner:
         info_keys: Sequence[str],
     ) -> None:
         given = deepcopy({key: value for key, value in settings.items() if key not in _OF_THE_RUN})
-        self._seed, self._pays, self._keys = seed, task if task.system is not None else None, info_keys
+        pays = task.system is not None and not get_system(task.system).states_task
+        self._seed, self._pays, self._keys = seed, task if pays else None, info_keys
         vec_env = self._monitored(env)
         for key in ("learning_rate", "clip_range"):
             if isinstance(given.get(key), str):

@@ -13,6 +13,7 @@ from kkl_gym.wrappers.vector import VectorEnv
 from training.agents.environments import CLEAN, CLEAN_Y, single, vector
 from training.agents.information import FeatureObservation, Information, make
 from training.agents.tasks import Task
+from training.lessons import train
 from training.maps.coordinates import SETTLED
 from training.progress import ProgressBars
 from training.records import Record
@@ -20,7 +21,6 @@ from training.rollouts.callback import KKLTrainingCallback
 from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
 from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset, split
 from training.spectrum import evenly_spaced
-from training.train_observer import train
 
 OBSERVER = "observer.safetensors"
 HEADROOM = 1.5  # of the noise that a map is trained for over the noise that there is

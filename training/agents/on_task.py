@@ -17,7 +17,8 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     """Shows an agent what ``kkl-gym agent train SYSTEM`` shows it, and pays it the same.
 
     The agent sees (x_hat - target) / scale and acts once in a period of the task, while the observer sees every sample.
-    It is paid minus the cost. Row i of the task's vector environment behaves as this one does with that row's seed.
+    It is paid minus the cost, or by the system's own ``reward``. Row i of the task's vector environment behaves as this
+    one does with that row's seed.
 
     Noise, starts and length of the episodes are the environment's: make it with the
     ``env_kwargs`` of ``training.agents.tasks.get_task(SYSTEM)``. The files in training/agents/hyperparameters do so for
@@ -46,8 +47,8 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Act for a period. Shapes: ``action`` (nu,); returns ``observation`` (nx,)."""
         _, total, terminated, truncated, info = self.env.step(action)
-        reward = float(paid(self._task, total, info["sample"], terminated))
-        return self._seen(info), reward, terminated, truncated, info
+        pays = total if self._system.states_task else paid(self._task, total, info["sample"], terminated)
+        return self._seen(info), float(pays), terminated, truncated, info
 
     def _seen(self, info: dict[str, Any]) -> np.ndarray:
         return deviation(self._system, info["x_hat"]).astype(np.float32)

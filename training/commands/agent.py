@@ -20,7 +20,7 @@ from training.agents.tasks import TOLERANCE, scores, successes
 from training.commands.agent_task import Measured, TaskOptions
 from training.commands.options import NoiseLevel
 from training.evaluation.levels import show_level
-from training.jobs import locked
+from training.files import locked
 from training.progress import LOG, ProgressBars, progress_bars
 
 TRANSIENT = 20  # steps of an episode whose estimates are not judged
@@ -228,8 +228,9 @@ def evaluate(progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, tru
         ("episodes", str(n)),
         ("return", _mean(played.returns)),
     ]
-    if task.system is not None:
-        system, x = get_system(task.system), played.signals("x")
+    system = None if task.system is None else get_system(task.system)
+    if system is not None and not system.states_task:
+        x = played.signals("x")
         rows += [
             ("score", _mean(scores(system, x))),
             (f"holds the target within {TOLERANCE:g}", f"{_mean(100.0 * successes(system, x))} %"),

@@ -102,7 +102,7 @@ class Diagnose:
 
     def _of_system(self, progress: ProgressBars) -> "Iterator[Finding]":
         from training.diagnosis import check  # here, because it imports torch, which help need not wait for
-        from training.systems import named_policy
+        from training.presets import named_policy
 
         system = self._system()
         policy = named_policy(system, self.policy) if self.policy else None

@@ -14,7 +14,7 @@ from kkl_gym.system import System
 from observers import Artifact, shipped
 from observers.names import resolve
 from training.evaluation.levels import Level, read_level
-from training.systems import named_policy
+from training.presets import named_policy
 from training.trajectories.parameters import EVERY, blind, with_bias
 from training.trajectories.policies import Controller
 

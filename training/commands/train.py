@@ -25,9 +25,9 @@ from training.spectrum import Spectrum
 from training.trajectories.parameters import nominal_share, relative_ranges
 
 if TYPE_CHECKING:
+    from training.lessons import Result
     from training.sources.recorded import RecordedSource
     from training.sources.simulated import SimulatedSource
-    from training.train_observer import Result
 
 RECORDED = "recorded"  # name of an observer from records, where the user gives none
 NAME = r"[\w][\w.-]*"  # of an observer, and so of a file
@@ -64,8 +64,8 @@ class Train:
     preset: Preset = "fast"
     """fast: about half a minute; it made the shipped maps. paper: the paper's sizes."""
     size: Size = "default"
-    """large: a T_inv that is accurate without tracking, for certificates and for use without a model; about ten minutes
-    (input-aware). Writes NAME-large."""
+    """large: a T_inv that is accurate without tracking, for use without a model; about ten minutes (input-aware).
+    Writes NAME-large."""
     parameters: Parameters = ()
     uncertain: HalfWidths = ()
     """How far a parameter may be from its value, as a part of that: mu=0.1, or 0.1 for all. Some motions in training
@@ -90,7 +90,7 @@ class Train:
         import torch
 
         from training.evaluation.report import write_report
-        from training.train_observer import train
+        from training.lessons import train
 
         if self.device == "cuda" and not torch.cuda.is_available():
             raise ValueError("device cuda: torch sees no GPU; leave --device out to train on the CPU")

@@ -13,10 +13,9 @@ from training.kalman import Belief, ExtendedKalmanFilter
 from training.maps.coordinates import noise_covariance, settling_time
 from training.presets import eigenvalues
 from training.records import Record, Signals
-from training.smoothness import smooth_spectrum
 from training.sources.recorded import split
 from training.sources.simulated import unknown_start
-from training.spectrum import Spectrum
+from training.spectrum import Spectrum, smooth_spectrum
 
 FOLLOWED, STEPS = 20, 2000  # motions that are followed, and samples of each
 SHORTEST = 10  # samples

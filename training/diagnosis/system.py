@@ -15,7 +15,7 @@ from kkl_gym.simulate import SubstepsError, simulate
 from kkl_gym.system import NOISE_SHARE, Box, System, rate_under
 from training.diagnosis.finding import Finding, Verdict, number, percent, point
 from training.evaluation.levels import Level
-from training.systems import named_policy
+from training.presets import named_policy
 from training.trajectories.motions import DRIVEN, random_inputs, under_policy
 from training.trajectories.policies import Controller
 

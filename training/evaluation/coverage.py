@@ -7,9 +7,9 @@ import numpy as np
 from kkl_gym.system import System
 from observers import Artifact
 from observers.factors import standard_deviations
+from training.calibration import chi_square, squared_distance
 from training.evaluation.errors import UnseenTrajectories, follow, measured, observer_of
 from training.evaluation.levels import Level
-from training.lessons.calibrate import chi_square, squared_distance
 
 REGIONS = (0.5, 0.9, 0.99)  # parts of the errors that regions should hold
 CHUNK = 200  # trajectories at once: each sample has a matrix

@@ -9,9 +9,9 @@ import pandas as pd
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.evaluation.levels import Level
+from training.presets import profile
 from training.seeds import Stream, generator
 from training.sources.simulated import sound_motions
-from training.systems import profile
 from training.trajectories.policies import Controller
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]

@@ -11,15 +11,15 @@ import numpy as np
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.factors import COVERAGE
+from training.calibration import chi_square, squared_distance
 from training.config import settings_of
 from training.evaluation.errors import follow
 from training.evaluation.levels import Level, show_level
 from training.figures import ESTIMATE, TRUTH, drawing
-from training.lessons.calibrate import chi_square, squared_distance
+from training.lessons import Result
 from training.maps.forward import residual
 from training.sources.simulated import SimulatedSource
 from training.sources.source import Runs, Source, TooFewRunsError
-from training.train_observer import Result
 
 RUNS = 100  # simulated motions
 OTHER_SEED = 2**31  # added to that of the training

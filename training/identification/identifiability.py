@@ -38,7 +38,7 @@ def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fra
     seen = np.linalg.svd(hidden)[0][:, k:].T if k else np.eye(p)
     rows: list[np.ndarray] = []
     pivots: list[int] = []
-    for _ in range(p - k):  # Gauss-Jordan, the largest entry of what is left first
+    for _ in range(p - k):  # Gauss-Jordan, the largest remaining entry first
         left = np.abs(seen)
         left[: len(rows)] = 0.0
         row, column = np.unravel_index(left.argmax(), left.shape)

@@ -62,7 +62,7 @@ class Identified:
         }
 
     def summary(self) -> list[str]:
-        """Lines for people: parameters and products with their standard errors, and what is not identifiable."""
+        """Lines for people: parameters and products with their standard errors, and the unidentifiable ones."""
         values = self.system.parameters
         lines = [f"{name} = {values[name]:.6g} +- {e:.2g}" for name, e in self.standard_errors.items() if e is not None]
         lines += [f"{name} is at its limit: give it a wider range" for name in self.at_limits]

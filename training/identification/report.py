@@ -1,4 +1,4 @@
-"""What was identified, in one picture."""
+"""A picture of an identified system."""
 
 from pathlib import Path
 from typing import Any

@@ -1,6 +1,5 @@
 """What networks read and give: coordinates of z with the noise in them, and scaled states."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -63,38 +62,27 @@ def settling_time(linear: LinearFilter) -> float:
 
 def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
     """Covariances (ages, ny, size, size) of z's error due to unit white noise on each output, by age in samples."""
-    phi = linear.transition
-    out = np.empty((len(ages), linear.B.shape[1], linear.size, linear.size))
-    for j, (early, late, equilibrium) in enumerate(_columns(linear)):
-        drive = phi @ late + early
-        after_first = phi @ equilibrium + early  # s_1 = after_first v_0
-        own = late @ late.T
-        covariance, at = after_first @ after_first.T, 1
-        for i, age in enumerate(ages):
-            if age == 0:
-                out[i, j] = equilibrium @ equilibrium.T
-                continue
-            for _ in range(int(age) - at):
-                covariance = phi @ covariance @ phi.T + drive @ drive.T
-            at = int(age)
-            out[i, j] = covariance + own
-    return out
+    phi, (early, late, equilibrium) = linear.transition, _columns(linear)
+    drive, after_first = phi @ late + early, phi @ equilibrium + early  # s_1 = after_first v_0
+    covariance, at, out = after_first @ after_first.mT, 1, []
+    for age in ages.astype(int):
+        for _ in range(age - at):
+            covariance = phi @ covariance @ phi.T + drive @ drive.mT
+        at = max(at, age)
+        out.append(covariance + late @ late.mT if age else equilibrium @ equilibrium.mT)
+    return np.array(out)
 
 
 def stationary_covariance(linear: LinearFilter) -> np.ndarray:
     """Limit of :func:`noise_covariance` at great ages, (ny, size, size)."""
-    phi = linear.transition
-    out = []
-    for early, late, _ in _columns(linear):
-        drive = phi @ late + early
-        out.append(scipy.linalg.solve_discrete_lyapunov(phi, drive @ drive.T) + late @ late.T)
-    return np.array(out)
+    phi, (early, late, _) = linear.transition, _columns(linear)
+    drive = phi @ late + early
+    return np.array([scipy.linalg.solve_discrete_lyapunov(phi, one) for one in drive @ drive.mT]) + late @ late.mT
 
 
-def _columns(linear: LinearFilter) -> Iterator[tuple[np.ndarray, ...]]:
-    """Each output's columns of early_y, late_y and equilibrium, each (size, 1)."""
-    for j in range(linear.B.shape[1]):
-        yield tuple(matrix[:, j : j + 1] for matrix in (linear.early_y, linear.late_y, linear.equilibrium))
+def _columns(linear: LinearFilter) -> list[np.ndarray]:
+    """Each output's columns of early_y, late_y and equilibrium, each (ny, size, 1)."""
+    return [matrix.T[..., None] for matrix in (linear.early_y, linear.late_y, linear.equilibrium)]
 
 
 def root(covariance: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,13 +12,12 @@ from torch import nn
 from kkl_gym.equations import components
 from kkl_gym.system import Components, System
 from observers import Artifact, ForwardMap, LinearFilter
+from training.config import Config
 from training.maps.coordinates import StateScale, spread
 from training.maps.networks import Network, compiled, from_mlp, tensor
 
 SOLVED = 20_000  # pairs, and points, from which the output layer is solved for in the end
 RIDGE = 1e-5  # of the least squares for it, over the mean column of their matrix
-
-TensorMap = Callable[[torch.Tensor], torch.Tensor]
 
 
 def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
@@ -44,6 +44,25 @@ def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[tor
     return x, f
 
 
+class Equation(NamedTuple):
+    """T's equation, dT/dx f(x) = A T(x) + B h(x), for a network between scaled states and scaled z."""
+
+    system: System
+    A: torch.Tensor
+    B: torch.Tensor
+    x_offset: torch.Tensor
+    x_scale: torch.Tensor
+    z_offset: torch.Tensor
+    z_scale: torch.Tensor
+
+    def residual(self, network: nn.Sequential, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The residual (n, nz) in units of z per second, and the speed |f| in scaled states (n,), at x (n, nx)."""
+        f, h = on_tensors(self.system.f, x) / self.x_scale, on_tensors(self.system.h, x)
+        value, derivative = along(network, (x - self.x_offset) / self.x_scale, f)
+        T, derivative = self.z_offset + self.z_scale * value, self.z_scale * derivative
+        return derivative - T @ self.A.T - h @ self.B.T, f.norm(dim=-1)
+
+
 class ForwardProblem(nn.Module):
     """The physics-informed risk R_S1(theta) (paper, eq. emp-risk-theta) of a forward network.
 
@@ -59,79 +78,75 @@ class ForwardProblem(nn.Module):
 
     def __init__(
         self,
-        network: Network,
         system: System,
-        *,
         linear: LinearFilter,
+        config: Config,
+        *,
         pairs: tuple[np.ndarray, np.ndarray],
         points: np.ndarray,
-        scale: StateScale,
-        physics_weight: float,
-        batch: int,
         device: torch.device,
     ) -> None:
         super().__init__()
         x, z = pairs
-        self.network, self.system, self.linear = network.to(device), system, linear
-        self.scale = scale
+        self.network = Network.of(config, system.nx, linear.size).to(device)
+        self.system, self.linear, self.config = system, linear, config
+        self.scale = StateScale.of(points, config.scaling)
         self.z_offset, self.z_scale = z.mean(0), spread(z)
-        self._xo, self._xs = tensor(scale.offset, device), tensor(scale.scale, device)
-        self._zo, self._zs = tensor(self.z_offset, device), tensor(self.z_scale, device)
-        self._A, self._B = tensor(linear.A, device), tensor(linear.B, device)
-        self._x = tensor(scale(x), device)
-        self._z = tensor((z - self.z_offset) / self.z_scale, device)
+        scales = (self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
+        self.equation = Equation(system, *(tensor(each, device) for each in (linear.A, linear.B, *scales)))
+        self._x, self._z = tensor(self.scale(x), device), tensor((z - self.z_offset) / self.z_scale, device)
         self._points = tensor(points, device)
         self._rates = tensor(np.linalg.norm(linear.A, axis=1), device)
-        self._physics_weight, self._batch = physics_weight, batch
         self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """The risk on a batch of pairs and as many collocation points."""
-        device = self._x.device
-        rows = torch.randint(len(self._x), (self._batch,), generator=generator, device=device)
-        points = torch.randint(len(self._points), (self._batch,), generator=generator, device=device)
+        shape, device = (self.config.batch,), self._x.device
+        rows = torch.randint(len(self._x), shape, generator=generator, device=device)
+        points = torch.randint(len(self._points), shape, generator=generator, device=device)
         loss, data, physics = self._risk(self._x[rows], self._z[rows], self._points[points])
         return {"loss": loss, "data": data.detach(), "physics": physics.detach(), "error": data.detach().sqrt()}
 
     def risk(self, x: torch.Tensor, z: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """The risk, and the terms of pairs and of points that it is made of."""
         data = ((self.network(x) - z) ** 2).mean()
-        residual, speed = self.residual(points)
-        physics = ((residual / self._zs / (speed[:, None] + self._rates)) ** 2).mean()
-        return data + self._physics_weight * physics, data, physics
-
-    def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """PDE residual (n, nz) in units of z per second, and the speed |f| in scaled states (n,), at states (n, nx)."""
-        f, h = on_tensors(self.system.f, x) / self._xs, on_tensors(self.system.h, x)
-        value, derivative = along(self.network, (x - self._xo) / self._xs, f)
-        T, derivative = self._zo + self._zs * value, self._zs * derivative
-        return derivative - T @ self._A.T - h @ self._B.T, f.norm(dim=-1)
+        residual, speed = self.equation.residual(self.network, points)
+        physics = ((residual / self.equation.z_scale / (speed[:, None] + self._rates)) ** 2).mean()
+        return data + self.config.physics_weight * physics, data, physics
 
     @torch.no_grad()
     def solve_output_layer(self, rng: np.random.Generator, report: Callable[[int], object] = lambda done: None) -> None:
-        """Put the output layer where it minimises the risk for the features that the other layers have learned.
+        """Put the output layer where it minimises the risk for the features phi that the other layers have learned.
 
-        That is linear least squares, in float64 and on more samples than a batch has; gradients come close to it.
+        In the coordinates of A's eigenvectors, dT/dx f = A T + B h is one linear equation for each component of T: with
+        T_i = w . phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point. Pairs add
+        T_i = z_i. Both are solved in the mean square, in float64 and on more samples than a batch has, by a QR
+        factorisation with a small ridge.
         """
         *hidden, last = self.network.to(device="cpu", dtype=torch.float64)
         assert isinstance(last, nn.Linear)
-        features = nn.Sequential(*hidden)
+        features, linear, device = nn.Sequential(*hidden), self.linear, self._x.device
         some = torch.as_tensor(rng.permutation(len(self._x))[:SOLVED])
         at = torch.as_tensor(rng.permutation(len(self._points))[:SOLVED])
-        device, x = self._x.device, self._points.cpu()[at].double()
-        q, f = (x - self._xo.cpu()) / self._xs.cpu(), on_tensors(self.system.f, x) / self._xs.cpu()
-        value, derivative = along(features, q, f)
-        weights = _output_layer(
-            self.linear,
-            equation=(value.numpy(), derivative.numpy(), on_tensors(self.system.h, x).numpy()),
-            speed=f.norm(dim=-1).numpy(),
-            pairs=(
-                features(self._x.cpu()[some].double()).numpy(),
-                self.z_offset + self.z_scale * self._z.cpu()[some].double().numpy(),
-            ),
-            physics_weight=self._physics_weight,
-            report=report,
-        )
+        x, offset, scale = self._points.cpu()[at].double(), self.equation.x_offset.cpu(), self.equation.x_scale.cpu()
+        f, h = on_tensors(self.system.f, x) / scale, on_tensors(self.system.h, x).numpy()
+        value, derivative = (each.numpy() for each in along(features, (x - offset) / scale, f))
+        phi = np.column_stack([value, np.ones(len(at))])
+        phi_along = np.column_stack([derivative, np.zeros(len(at))])
+        pairs = np.column_stack([features(self._x.cpu()[some].double()).numpy(), np.ones(len(some))])
+        z = self.z_offset + self.z_scale * self._z.cpu()[some].double().numpy()
+        poles, V = np.linalg.eig(linear.A)
+        driven, target = (np.linalg.solve(V, each.T).T for each in (h @ linear.B.T, z / np.sqrt(len(some))))
+        solved = np.empty((len(poles), phi.shape[1]), dtype=V.dtype)
+        for i, pole in enumerate(poles):
+            report(i)
+            row = np.sqrt(self.config.physics_weight / len(at)) / (f.norm(dim=-1).numpy() + abs(pole))
+            matrix = np.vstack([(phi_along - pole * phi) * row[:, None], pairs / np.sqrt(len(some))])
+            ridge = RIDGE * np.linalg.norm(matrix) / np.sqrt(phi.shape[1]) * np.eye(phi.shape[1])
+            right = np.concatenate([driven[:, i] * row, target[:, i]])
+            Q, R = qr(np.vstack([matrix, ridge]), mode="economic", overwrite_a=True, check_finite=False)
+            solved[i] = solve_triangular(R, Q[: len(right)].conj().T @ right)
+        weights = np.real(V @ solved)
         weights[:, -1] -= self.z_offset
         weights /= self.z_scale[:, None]
         last.weight.copy_(torch.as_tensor(weights[:, :-1]))
@@ -143,55 +158,15 @@ class ForwardProblem(nn.Module):
         return ForwardMap(self.network.export(), self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
 
 
-def _output_layer(
-    linear: LinearFilter,
-    *,
-    equation: tuple[np.ndarray, np.ndarray, np.ndarray],
-    speed: np.ndarray,
-    pairs: tuple[np.ndarray, np.ndarray],
-    physics_weight: float,
-    report: Callable[[int], object],
-) -> np.ndarray:
-    """Solve for the weights with which fixed features phi make T(x) = W [phi(x), 1].
-
-    In the coordinates of A's eigenvectors, dT/dx f = A T + B h is one linear equation for each component of T: with
-    T_i = w . phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point. Pairs add T_i = z_i.
-    Both are solved in the mean square by a QR factorisation with a small ridge. As in :class:`ForwardProblem`, the
-    equation's rows are divided by the local speed plus the rate of the mode.
-
-    Shapes: ``equation`` (m, features), (m, features) and (m, ny), ``speed`` (m,), ``pairs`` (n, features) and (n, nz);
-    returns (nz, features + 1).
-    """
-    value, derivative, h = equation
-    phi, phi_along = np.column_stack([value, np.ones(len(value))]), np.column_stack([derivative, np.zeros(len(value))])
-    poles, V = np.linalg.eig(linear.A)
-    driven = np.linalg.solve(V, linear.B @ h.T).T
-    known = np.column_stack([pairs[0], np.ones(len(pairs[0]))]) / np.sqrt(len(pairs[0]))
-    target = np.linalg.solve(V, pairs[1].T).T / np.sqrt(len(pairs[0]))
-    solved = np.empty((len(poles), phi.shape[1]), dtype=V.dtype)
-    for i, pole in enumerate(poles):
-        report(i)
-        row = np.sqrt(physics_weight / len(phi)) / (speed + abs(pole))
-        matrix = np.vstack([(phi_along - pole * phi) * row[:, None], known])
-        ridge = RIDGE * np.linalg.norm(matrix) / np.sqrt(phi.shape[1]) * np.eye(phi.shape[1])
-        right = np.concatenate([driven[:, i] * row, target[:, i]])
-        Q, R = qr(np.vstack([matrix, ridge]), mode="economic", overwrite_a=True, check_finite=False)
-        solved[i] = solve_triangular(R, Q[: len(right)].conj().T @ right)
-    return np.real(V @ solved)
-
-
 def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
     """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x): (n, nz)."""
     T = artifact.forward
     if T is None:
         raise ValueError("this observer holds no forward map T")
-    at, scale, z_scale, A, B = map(torch.tensor, (x, T.x_scale, T.z_scale, artifact.filter.A, artifact.filter.B))
-    f, h = on_tensors(system.f, at), on_tensors(system.h, at)
-    network = from_mlp(T.mlp, dtype=torch.float64)
-    value, derivative = along(network, (at - torch.tensor(T.x_offset)) / scale, f / scale)
-    value, derivative = torch.tensor(T.z_offset) + z_scale * value, z_scale * derivative
-    P: np.ndarray = (derivative - value @ A.T - h @ B.T).numpy()
-    return P
+    scales = (T.x_offset, T.x_scale, T.z_offset, T.z_scale)
+    equation = Equation(system, *map(torch.tensor, (artifact.filter.A, artifact.filter.B, *scales)))
+    P, _ = equation.residual(from_mlp(T.mlp, dtype=torch.float64), torch.tensor(x))
+    return np.asarray(P.numpy())
 
 
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:

@@ -1,14 +1,14 @@
 """The inverse T_inv: batches along motions or of T(x), and what its training minimises on them."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import nn
 
-from observers import InverseMap, LinearFilter
-from training.config import Scaling
+from observers import MLP, ForwardMap, InverseMap, LinearFilter
+from training.config import Config
 from training.maps.coordinates import (
     StateScale,
     coordinates,
@@ -17,7 +17,6 @@ from training.maps.coordinates import (
     settling_time,
     stationary_covariance,
 )
-from training.maps.forward import TensorMap
 from training.maps.networks import Network, compiled, tensor
 from training.trajectories.motions import Pairs
 
@@ -38,21 +37,34 @@ class Batch(NamedTuple):
     cell: torch.Tensor
 
 
-class TrajectorySampler:
-    """Batches along trajectories: every age since reset, every noise level up to ``measurement_noise_max``.
+class Sampler(Protocol):
+    """Batches for T_inv, in cells whose errors are made equally small, and the map that a network on them makes."""
 
-    With several outputs there is a level for each. In half of the samples these are the same part of their largest
-    ones; in the others they are drawn one by one, some of them zero.
+    cells: int
+    kinds_of_plant: int
+    parameters: int
+    _map: dict[str, Any]
+
+    def __call__(self, generator: torch.Generator) -> Batch:
+        """One batch."""
+        ...
+
+    def inverse_map(self, mlp: MLP) -> InverseMap:
+        """The map of a network that was trained on these batches."""
+        return InverseMap(mlp=mlp, **self._map)
+
+
+class TrajectorySampler(Sampler):
+    """Batches along trajectories: every age since reset, every noise level up to ``measurement_noise_max``.
 
     Noise is drawn from the covariance that the filter gives it at each age, and added to noise-free z. The network
     that fits such data in the mean square is the conditional mean of x.
 
-    The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall
-    into ``cells`` of like age and levels, and the loss divides each by its cell's own recent error, so that all
-    improve in proportion. Where parameters differ, motions of the system's own are in cells apart: their errors can be
-    smaller, and in cells with the others they would count for little.
+    The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall into
+    ``cells`` of like age and levels, and the loss divides each by its cell's recent error. Where parameters differ,
+    motions of the system's own, whose errors can be smaller, have cells of their own.
 
-    Shapes: ``error`` (size, size), ``silent`` (size, k), ``noise_gain`` (modes,) or (ny, modes).
+    Shapes: ``error`` (size, size), ``silent`` (size, k).
     """
 
     AGES_PER_BATCH = 32
@@ -64,59 +76,61 @@ class TrajectorySampler:
         self,
         data: Pairs,
         linear: LinearFilter,
+        config: Config,
         *,
-        measurement_noise_max: float | tuple[float, ...],
-        batch: int,
         device: torch.device,
         measurement_noise: float | tuple[float, ...] = 0.5,
-        noise_free_share: float = 0.2,
-        high_noise_emphasis: float = 2.0,
         process_noise_max: float = 0.0,
-        error: np.ndarray | None = None,
         parameters: int = 0,
-        scaling: Scaling = "relative",
+        error: np.ndarray | None = None,
         silent: np.ndarray | None = None,
     ) -> None:
-        m, n, size = data.z.shape
-        ny = linear.B.shape[1]
-        largest = np.broadcast_to(np.asarray(measurement_noise_max, dtype=float), ny)
-        usual = np.where(measurement_noise, measurement_noise, largest / 2)
-        self.measurement_noise_max, self.measurement_noise_unit = largest, MEASUREMENT_NOISE_UNIT * usual
+        (m, n, size), ny = data.z.shape, linear.B.shape[1]
+        largest = np.broadcast_to(np.asarray(config.measurement_noise_max, dtype=float), ny)
+        unit = MEASUREMENT_NOISE_UNIT * np.where(measurement_noise, measurement_noise, largest / 2)
         rows = np.random.default_rng(0).permutation(m * n)[:SAMPLES]
         each = stationary_covariance(linear)
         together = np.einsum("j,jab->ab", (largest / largest.max()) ** 2, each)
-        self.coordinates = coordinates(data.z.reshape(m * n, size)[rows], together, silent)
-        gain, whiten = self.coordinates.noise_gain, self.coordinates.whiten
-        self.noise_gain = gain
-        if ny > 1:
-            self.noise_gain = np.sqrt(np.maximum(np.einsum("ma,jab,mb->jm", whiten, each, whiten), 0.0))
+        whitened = coordinates(data.z.reshape(m * n, size)[rows], together, silent)
+        gain, whiten = whitened.noise_gain, whitened.whiten
+        gains = np.sqrt(np.maximum(np.einsum("ma,jab,mb->jm", whiten, each, whiten), 0.0)) if ny > 1 else gain
+        scale = StateScale.of(data.x, config.scaling, nx=data.x.shape[-1] - parameters)
+        age_unit, age_max = AGE_UNIT * linear.dt, float(min(data.ages[-1] * linear.dt, settling_time(linear)))
+        named = {"z_y": True, "z_u": linear.nu, "measurement_noise": True, "process_noise": process_noise_max}
+        self._map = {
+            "features": (*(name for name, used in named.items() if used), "age"),
+            "z_offset": whitened.offset,
+            "whiten": whiten,
+            "noise_gain": gains,
+            "x_offset": scale.offset,
+            "x_scale": scale.scale,
+            "measurement_noise_unit": _float_or_tuple(unit),
+            "measurement_noise_max": _float_or_tuple(largest),
+            "process_noise_unit": PROCESS_NOISE_UNIT * process_noise_max or 1.0,
+            "process_noise_max": process_noise_max or math.inf,
+            "age_unit": age_unit,
+            "age_max": age_max,
+        }
         self.parameters = parameters
-        self.scale = StateScale.of(data.x, scaling, nx=data.x.shape[-1] - parameters)
-        self.process_noise_max = process_noise_max
-        self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))
-        self.age_unit = AGE_UNIT * linear.dt
-        self._noise_free_share, self._high_noise_emphasis = noise_free_share, high_noise_emphasis
-        self._per_age = batch // self.AGES_PER_BATCH
+        self._config, self._per_age = config, config.batch // self.AGES_PER_BATCH
         self._modes = torch.empty((m, n, len(gain)), device=device)
         for i in range(m):
-            self._modes[i] = tensor(self.coordinates(data.z[i]), device)
-        self._x = tensor(self.scale(data.x), device)
-        self._weight = tensor(self.scale.weight(data.x), device)
-        self._gain, self._each_gain = tensor(gain, device), tensor(np.atleast_2d(self.noise_gain)[:, None], device)
-        self._level_max, self._level_unit = (
-            tensor(values[:, None], device) for values in (self.measurement_noise_max, self.measurement_noise_unit)
-        )
+            self._modes[i] = tensor(whitened(data.z[i]), device)
+        self._x, self._weight = tensor(scale(data.x), device), tensor(scale.weight(data.x), device)
+        self._gain, self._gains = tensor(gain, device), tensor(np.atleast_2d(gains)[:, None], device)
+        self._level_max, self._level_unit = (tensor(values[:, None], device) for values in (largest, unit))
         # Noise in units of the stationary one, so that its covariances are well conditioned.
-        unit = whiten / np.where(gain > 0, gain, 1.0)[:, None]
+        relative = whiten / np.where(gain > 0, gain, 1.0)[:, None]
         late = int(np.ceil(2 * settling_time(linear) / linear.dt))
         saturated = np.minimum(data.ages, late)
-        self._noise_root = tensor(root(unit @ noise_covariance(linear, saturated) @ unit.T), device)
+        self._noise_root = tensor(root(relative @ noise_covariance(linear, saturated) @ relative.T), device)
         self._error_root = None if error is None else tensor(root(whiten @ error @ whiten.T), device)
-        self._age = tensor(data.ages * linear.dt, device)
+        self._age = torch.log1p(tensor(data.ages * linear.dt, device).clamp(max=age_max) / age_unit)
         position = np.log1p(data.ages) / np.log1p(data.ages[-1])
         age_cell = np.minimum((position * self.AGE_CELLS).astype(int), self.AGE_CELLS - 1)
         self._age_cell = torch.as_tensor(age_cell, device=device)
         trajectory_cell, self._trajectory_cells, self.kinds_of_plant = np.zeros(n, int), 1, 1
+        self._process: torch.Tensor | None = None
         if process_noise_max:
             part = data.process_noise / process_noise_max
             self._process = tensor(np.log1p(part / PROCESS_NOISE_UNIT), device)
@@ -140,13 +154,10 @@ class TrajectorySampler:
         modes = self._modes[ages, rows] + (level[..., None] * self._gain * noise).sum(1)
         if self._error_root is not None:
             modes = modes + torch.randn(modes.shape, generator=generator, device=device) @ self._error_root.mT
-        modes = modes / (1.0 + ((level[..., None] * self._each_gain) ** 2).sum(1))
-        conditions = [torch.log1p(level / self._level_unit).mT]
-        if self.process_noise_max:
-            conditions.append(self._process[rows][..., None])
-        age = torch.log1p(self._age[ages].clamp(max=self.age_max) / self.age_unit)
-        conditions.append(age[..., None].expand(*shape, 1))
-        inputs = torch.cat([modes, *conditions], -1)
+        modes = modes / (1.0 + ((level[..., None] * self._gains) ** 2).sum(1))
+        process = [] if self._process is None else [self._process[rows][..., None]]
+        age = self._age[ages][..., None].expand(*shape, 1)
+        inputs = torch.cat([modes, torch.log1p(level / self._level_unit).mT, *process, age], -1)
         level_cell = 1 + (position.mean(1) * self.LEVELS).long().clamp(0, self.LEVELS - 1)
         level_cell = torch.where((level > 0).any(1), level_cell, 0)
         cell = self._age_cell[ages] * (1 + self.LEVELS) + level_cell
@@ -162,40 +173,15 @@ class TrajectorySampler:
     def _draw_levels(self, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """Levels of measurement noise, (ages, ny, rows), and how far along their two decades they are, 0 to 1."""
         shape = (self.AGES_PER_BATCH, len(self._level_max), self._per_age)
-        position = (torch.rand(shape, generator=generator, device=generator.device) - self._noise_free_share) / (
-            1 - self._noise_free_share
-        )
+        quiet = self._config.noise_free_share
+        position = (torch.rand(shape, generator=generator, device=generator.device) - quiet) / (1 - quiet)
         if shape[1] > 1:
             alike = torch.rand(position[:, :1].shape, generator=generator, device=generator.device) < ALIKE
             position = torch.where(alike, position[:, :1], position)
         loud = position > 0
-        position = position.clamp(min=0.0) ** (1 / self._high_noise_emphasis)
+        position = position.clamp(min=0.0) ** (1 / self._config.high_noise_emphasis)
         level = self._level_max * 100 ** (position - 1)  # over two decades
         return position, torch.where(loud, level, torch.zeros_like(level))
-
-    def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
-        """The map that a network trained on these batches makes."""
-        return InverseMap(
-            mlp=network.export(),
-            features=(
-                "z_y",
-                *(["z_u"] if linear.nu else []),
-                "measurement_noise",
-                *(["process_noise"] if self.process_noise_max else []),
-                "age",
-            ),
-            z_offset=self.coordinates.offset,
-            whiten=self.coordinates.whiten,
-            noise_gain=self.noise_gain,
-            x_offset=self.scale.offset,
-            x_scale=self.scale.scale,
-            measurement_noise_unit=_float_or_tuple(self.measurement_noise_unit),
-            measurement_noise_max=_float_or_tuple(self.measurement_noise_max),
-            process_noise_unit=PROCESS_NOISE_UNIT * self.process_noise_max or 1.0,
-            process_noise_max=self.process_noise_max or math.inf,
-            age_unit=self.age_unit,
-            age_max=self.age_max,
-        )
 
 
 def _float_or_tuple(values: np.ndarray) -> float | tuple[float, ...]:
@@ -203,37 +189,36 @@ def _float_or_tuple(values: np.ndarray) -> float | tuple[float, ...]:
     return tuple(values.tolist()) if len(values) > 1 else float(values[0])
 
 
-class ForwardMapSampler:
+class ForwardMapSampler(Sampler):
     """The paper's second data set S_2: drawn x', z' = T(x') by the map (sec. 5.2), without transients.
 
     The filter's z differs from T(x) by the error of T, which an inverse fitted to T(x') alone would magnify by its
     Lipschitz constant (paper, lemma R-eta-bound). z' is therefore blurred by Gaussian noise with the covariance of that
     error, measured on the forward map's own data, and each coordinate is shrunk to its linear conditional mean.
 
-    Shapes: ``error`` (n, nz), ``points`` (n, nx).
+    Shapes: ``error`` (nz, nz), its covariance, ``points`` (n, nx).
     """
 
     cells, kinds_of_plant, parameters = 1, 1, 0
 
     def __init__(
-        self,
-        forward: TensorMap,
-        error: np.ndarray,
-        *,
-        points: np.ndarray,
-        batch: int,
-        device: torch.device,
-        scaling: Scaling = "relative",
+        self, T: ForwardMap, error: np.ndarray, config: Config, *, points: np.ndarray, device: torch.device
     ) -> None:
-        self.scale = StateScale.of(points, scaling)
-        self._x, self._weight = tensor(self.scale(points), device), tensor(self.scale.weight(points), device)
-        with torch.no_grad():
-            parts = [forward(part).cpu().numpy() for part in torch.split(tensor(points, device), SAMPLES)]
-        z = np.concatenate(parts).astype(float)
+        scale = StateScale.of(points, config.scaling)
+        self._x, self._weight = tensor(scale(points), device), tensor(scale.weight(points), device)
+        z = np.concatenate([T(part) for part in np.array_split(points, 1 + len(points) // SAMPLES)])
         some = np.random.default_rng(0).permutation(len(z))[:SAMPLES]
-        self.coordinates = coordinates(z[some], error.T @ error / len(error))
-        self._modes = tensor(self.coordinates(z), device)
-        self._blur, self._batch = tensor(self.coordinates.noise_gain, device), batch
+        whitened = coordinates(z[some], error)
+        self._modes, self._batch = tensor(whitened(z), device), config.batch
+        self._blur = tensor(whitened.noise_gain, device)
+        self._map = {
+            "features": ("z_y",),
+            "z_offset": whitened.offset,
+            "whiten": whitened.whiten / (1.0 + whitened.noise_gain**2)[:, None],
+            "noise_gain": np.zeros(len(whitened.noise_gain)),
+            "x_offset": scale.offset,
+            "x_scale": scale.scale,
+        }
 
     def __call__(self, generator: torch.Generator) -> Batch:
         """One batch."""
@@ -243,22 +228,6 @@ class ForwardMapSampler:
         modes = modes + self._blur * torch.randn(modes.shape, generator=generator, device=device)
         cell = torch.zeros(len(rows), dtype=torch.long, device=device)
         return Batch(modes / (1.0 + self._blur**2), self._x[rows], self._weight[rows], cell)
-
-    def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
-        """The map that a network trained on these batches makes: the paper's, of z alone."""
-        found = self.coordinates
-        return InverseMap(
-            mlp=network.export(),
-            features=("z_y",),
-            z_offset=found.offset,
-            whiten=found.whiten / (1.0 + found.noise_gain**2)[:, None],
-            noise_gain=np.zeros(len(found.noise_gain)),
-            x_offset=self.scale.offset,
-            x_scale=self.scale.scale,
-        )
-
-
-Sampler = TrajectorySampler | ForwardMapSampler
 
 
 class InverseProblem(nn.Module):

@@ -2,14 +2,15 @@
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from scipy.linalg import block_diag
 from torch import nn
 
-from observers import MLP, ForwardMap
+from observers import MLP
+from training.config import Config
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU}
 
@@ -27,6 +28,11 @@ class Network(nn.Sequential):
         for layer in self.linear_layers():
             nn.init.xavier_normal_(layer.weight)
             nn.init.zeros_(layer.bias)
+
+    @classmethod
+    def of(cls, config: Config, inputs: int, outputs: int) -> Self:
+        """A network of the configured size."""
+        return cls(inputs, outputs, width=config.width, depth=config.depth, activation=config.activation)
 
     def linear_layers(self) -> list[nn.Linear]:
         """The layers that hold weights, in order."""
@@ -74,17 +80,3 @@ def from_mlp(mlp: MLP, *, device: torch.device | None = None, dtype: torch.dtype
         )
         layers += [layer, ACTIVATIONS[mlp.activation]()]
     return nn.Sequential(*layers[:-1]).requires_grad_(False)
-
-
-def on_torch(forward: ForwardMap, device: torch.device) -> Callable[[torch.Tensor], torch.Tensor]:
-    """A forward map on tensors, (n, nx) to (n, nz), in float32."""
-    network = from_mlp(forward.mlp, device=device)
-    xo, xs, zo, zs = (
-        tensor(values, device) for values in (forward.x_offset, forward.x_scale, forward.z_offset, forward.z_scale)
-    )
-
-    def T(x: torch.Tensor) -> torch.Tensor:
-        z: torch.Tensor = zo + zs * network((x - xo) / xs)
-        return z
-
-    return T

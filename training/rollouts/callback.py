@@ -21,10 +21,10 @@ from observers import Artifact, KKLObserver
 from observers.checks import integer, shown
 from observers.samples import check_replacement
 from training.config import Config, settings_of
+from training.lessons import train
 from training.maps.coordinates import settling_time
 from training.records import ROLES, Record, Signals, check_dt, resampled
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, check_plant, recorded_errors
-from training.train_observer import train
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again
 LONGEST = 250  # steps of a piece: episodes without an end are cut, so that some of each can be held out

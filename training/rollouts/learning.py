@@ -9,7 +9,7 @@ from rich.console import Console
 
 from observers import Artifact
 from training.config import Config
-from training.jobs import refuse_checkpoints
+from training.files import refuse_checkpoints
 from training.progress import ProgressBars, progress_bars
 from training.rollouts.playing import RANDOM, Policy, make, policy_of, roll_out
 from training.sources.recorded import RecordedSource, recorded_preset
@@ -64,7 +64,7 @@ def learn(
     ValueError
         If an argument is invalid, or as :func:`training.train`.
     """
-    from training.train_observer import train  # torch takes seconds to import
+    from training.lessons import train  # torch takes seconds to import
 
     if episodes is None and steps is None:
         steps = 100_000

@@ -10,11 +10,11 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact, Equations, LinearFilter
 from training.config import Config
-from training.jobs import describe
+from training.files import describe
 from training.maps.coordinates import spread
+from training.presets import named_policy
 from training.seeds import Stream, generator
 from training.sources.source import Increments, Pairs, Report, Runs
-from training.systems import named_policy
 from training.trajectories.equations import field_expression, output_expression, output_facts, output_matrix
 from training.trajectories.motions import (
     DRIVEN,

@@ -10,7 +10,7 @@ import numpy as np
 
 from examples.research.agents.comparison import COLUMNS, IDLE, IN_ENVIRONMENTS, KINDS, ON_SYSTEMS, ComparedAgent
 from examples.research.agents.statistics import interval, middle, normalised
-from training import markdown
+from training import files
 from training.evaluation.levels import as_cell, as_name
 from training.figures import MEASURED, RIVAL, drawing
 from training.files import write
@@ -154,7 +154,7 @@ def _table_of_systems(
         "Interquartile mean over agents [bootstrap 95 % interval], success rate in %, number of agents. Observers see "
         f"every sample of y; agents on y see it once for each action.{partial}",
         "",
-        *markdown.table(["", *tasks], table),
+        *files.table(["", *tasks], table),
         "",
         f"CPU minutes for one training: {spent}.",
     ]
@@ -189,11 +189,11 @@ def _table_of_environments(
         "agents that see the full state without noise, with a bootstrap 95 % interval; then the number of agents. The "
         f"steps from which an observer was learned count.{partial}",
         "",
-        *markdown.table([*heads, "random"], rows),
+        *files.table([*heads, "random"], rows),
         "",
         "CPU seconds for one training:",
         "",
-        *markdown.table(heads, spent),
+        *files.table(heads, spent),
     ]
 
 

@@ -31,13 +31,13 @@ from training.agents.observing import (
 )
 from training.agents.tasks import Task
 from training.config import Config
-from training.lessons.run import Stage, optimise
 from training.maps.inverse import Batch, InverseProblem
 from training.maps.networks import Network
 from training.progress import ProgressBars
 from training.records import Record
 from training.rollouts.callback import rehearsed
 from training.rollouts.playing import Recorder
+from training.run import Stage, optimise
 from training.sources.recorded import RECORDED
 
 KEY = "kkl-gym-window"

@@ -17,17 +17,6 @@ BUDGETS = {
         "quick", trajectories=200, duration=20.0, samples=50, cpu_seconds=math.inf, width=64, depth=2, steps=300
     ),
     "short": Budget("short", trajectories=1000, duration=50.0, samples=200, cpu_seconds=40.0),
-    # 8 million points, as in the paper
-    "paper": Budget(
-        "paper",
-        trajectories=1600,
-        duration=50.0,
-        samples=5000,
-        cpu_seconds=3600.0,
-        width=512,
-        depth=4,
-        activation="silu",
-    ),
 }
 
 PROTOCOL = Protocol()

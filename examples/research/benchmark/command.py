@@ -26,23 +26,19 @@ class Benchmark:
 
     Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
     OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
-    trained observer. A run that was interrupted goes on where it stopped. --systems and --methods do a part of the
-    work; table and figure then name the missing observers.
+    trained observer. A run that was interrupted goes on where it stopped.
     """
 
-    budget: Literal["short", "cpu", "paper"] = "cpu"
-    """cpu: 400,000 points and 300 CPU seconds for each training. short: a half of that, 40 s. paper: 8 million
-    points, networks of 4 x 512, an hour each; wants a GPU."""
+    budget: Literal["short", "cpu"] = "cpu"
+    """cpu: 400,000 points and 300 CPU seconds for each training. short: a half of that, 40 s."""
     quick: bool = False
     """In place of the budget: trainings of 300 batches, no search, few and short test trajectories; a matter of
     minutes, with the same results each time."""
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Names, or classes of yours as script.py:Class or module:Class."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
-    """default, spinn, ae, dmf, dmf-noise, node, node-noise, gru, kalmannet, rkn, ekf, ukf, ekf-wrong, default-wrong,
-    spinn-wrong, ekf-untuned; or, with the maps that ship, shipped, shipped-spinn, shipped-large; or classes
-    of yours as script.py:Class or module:Class. Those that end in -wrong believe in parameters 10 % too large; a system
-    must have some."""
+    """default, spinn, node, node-noise, gru, lru, transformer, ekf, ukf; or, with the maps that ship, shipped,
+    shipped-spinn, shipped-large; or classes of yours as script.py:Class or module:Class."""
     measurement_noise: NoiseLevels = None
     """Standard deviations of the noise on each sample of y. 0.1,0.3 is one for each output."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
@@ -80,23 +76,21 @@ class Benchmark:
                     collect(out, self.beside)
             if self.report or trained:
                 with progress.phase("drawing the table and the figure"):
-                    note = report(out)
-                progress.say(f"wrote results.csv, methods.csv, table.md and heatmap.png in {out}. {note}")
+                    report(out)
+                progress.say(f"wrote results.csv, methods.csv, table.md and heatmap.png in {out}")
         check_failures(failures, jobs, "observers")
         return out
 
     def jobs(self, name: str, out: Path) -> "list[Training]":
         """Make the jobs of a budget; raises ValueError if an option is invalid."""
-        import torch  # which, as the next ones, takes seconds that help need not wait for
-
-        from examples.research.benchmark import budgets
+        from examples.research.benchmark import budgets  # torch takes seconds that help need not wait for
         from examples.research.benchmark.jobs import Training
-        from examples.research.methods import METHODS, WrongParameters, get_method
+        from examples.research.methods import METHODS, get_method
 
         methods, levels = tuple(METHODS) if self.methods is None else self.methods, self.measurement_noise
         if not self.systems or not methods or levels == ():
             raise ValueError("give at least one system, method and noise level")
-        generator(Stream.EVALUATION, self.seed)  # refuses some seeds, now rather than when all is trained
+        generator(Stream.EVALUATION, self.seed)  # raises for an invalid seed before anything is trained
         named = [[get_system(name).name for name in self.systems], [get_method(name).name for name in methods]]
         for names in (*named, [show_level(level) for level in levels or ()]):
             if len(set(names)) < len(names):
@@ -104,7 +98,6 @@ class Benchmark:
         protocol = replace(budgets.QUICK_PROTOCOL if self.quick else budgets.PROTOCOL, seed=self.seed)
         budget = budgets.BUDGETS[name]
         search = None if self.quick else budgets.SEARCH * budget.cpu_seconds
-        device = "cuda" if name == "paper" and torch.cuda.is_available() else "cpu"
         jobs = []
         for given in self.systems:
             system = get_system(given)
@@ -112,9 +105,6 @@ class Benchmark:
             noise = noise or tuple(dict.fromkeys([0.0, multiple(system, 1.0)]))
             for method in methods:
                 contender = get_method(method)
-                if self.methods is None and isinstance(contender, WrongParameters) and not system.parameters:
-                    continue
-                contender.believed(system)  # refuses some systems now rather than when their turn comes
                 job = Training(
                     system=given,
                     method=method,
@@ -123,7 +113,6 @@ class Benchmark:
                     protocol=replace(budgets.paced_protocol(protocol, system), measurement_noise=noise),
                     search=search,
                     validation=replace(budgets.paced_protocol(budgets.VALIDATION, system), measurement_noise=noise),
-                    device=device,
                 )
                 jobs.append(job)
         return jobs

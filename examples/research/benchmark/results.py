@@ -1,10 +1,8 @@
 """The results of a benchmark's jobs, put together: as CSV files, as a table and as a figure."""
 
 import json
-from collections.abc import Iterable, Mapping
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,30 +15,17 @@ from training.evaluation.levels import read_level, show_level
 from training.files import write
 
 FILES = ("results.csv", "methods.csv")  # a row for each trajectory, and for each method on each system
-NAMED = 4  # of the methods that are missing, by their names
-
-
-def _full_set(found: Iterable[str]) -> list[str]:
-    """The shipped methods, in order, of the comparison that some are of: the benchmark, the ablation, or both."""
-    names = set(found)
-    ablation = bool(names & (set(ABLATION) - set(METHODS)))
-    benchmark = bool(names & (set(METHODS) - set(ABLATION)))
-    if ablation:
-        return list(METHODS | ABLATION if benchmark else ABLATION)
-    return list(METHODS)
 
 
 def collect(out: Path, beside: Path | None = None) -> None:
-    """Write one CSV file of all errors and one of all costs, from every job found in the folder."""
+    """Write one CSV file of all errors and one of all costs, of every job in the folder."""
     errors, costs = [], []
-    rules: dict[str, Any] = {}
-
     for folder in sorted(path.parent for path in (out / "jobs").glob("*/*/errors.csv")):
         with explained(folder, ValueError):
             errors.append(pd.read_csv(folder / "errors.csv"))
             info, job = (json.loads((folder / file).read_text()) for file in ("info.json", "job.json"))
-            its = _rules(job, folder.parent.name)
             speed = folder / "speed.json"
+            times = json.loads(speed.read_text()) if speed.exists() else {"us_batch_1": None, "us_batch_1000": None}
             costs.append(
                 {
                     "system": folder.parent.name,
@@ -50,21 +35,15 @@ def collect(out: Path, beside: Path | None = None) -> None:
                     "configuration": json.dumps(info["configuration"]),
                     "validation": json.dumps(info["validation"]),
                     "train_seconds": info["train_seconds"],
-                    **(
-                        json.loads(speed.read_text()) if speed.exists() else {"us_batch_1": None, "us_batch_1000": None}
-                    ),
+                    **times,
                     "trajectories": info["trajectories"],
                     "seed": job["protocol"]["seed"],
                 }
             )
-        for rule, value in its.items():
-            if rules.setdefault(rule, value) != value:
-                raise ValueError(
-                    f"{out} holds jobs of several benchmarks: {rule} = {value} in {folder}, "
-                    f"{rules[rule]} elsewhere; remove the ones that do not belong there"
-                )
-    for name, found in zip(FILES, (pd.concat(errors), pd.DataFrame(costs))):
-        rows = _as_written(StringIO(found.to_csv(index=False, float_format="%.4g")))
+    if len(benchmarks := {(cost["budget"], cost["seed"]) for cost in costs}) > 1:
+        raise ValueError(f"{out} holds jobs of several benchmarks, {sorted(benchmarks)}; remove those of one")
+    for name, frame in zip(FILES, (pd.concat(errors), pd.DataFrame(costs))):
+        rows = _as_written(StringIO(frame.to_csv(index=False, float_format="%.4g")))
         if beside is not None:
             with explained(beside / name, ValueError):
                 rows = _joined(rows, _as_written(beside / name))
@@ -100,23 +79,10 @@ def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
     """First what ships, in its order, then the user's systems and methods; rows of an observer stay as they are."""
     places = [
         {name: place for place, name in enumerate(dict.fromkeys([*shipped, *sorted(set(column))]))}
-        for shipped, column in ((SYSTEMS, rows.system), (_full_set(rows.method), rows.method))
+        for shipped, column in ((SYSTEMS, rows.system), (ABLATION | METHODS, rows.method))
     ]
     keys = [[place[name] for name in column] for place, column in zip(places, (rows.system, rows.method))]
     return rows.iloc[np.lexsort(keys[::-1])]
-
-
-def _rules(job: Mapping[str, Any], system: str) -> dict[str, Any]:
-    """What the jobs of one benchmark agree in. Systems of the user's have sampling intervals and noise of their own."""
-    budget, dt = dict(job["budget"]), job["budget"]["dt"]
-    budget |= {"duration": f"{budget['duration'] / dt:.0f} samples", "dt": None}
-    own = "" if system in SYSTEMS else f" of {system}"
-    rules = {"budget": budget, f"dt{own}": dt}
-    for name in ("protocol", "validation"):
-        described = dict(job[name])
-        rules[f"measurement_noise{own}"] = described.pop("measurement_noise")
-        rules[name] = described | {"duration": f"{described['duration'] / dt:.0f} samples"}
-    return rules | {name: job[name] for name in ("search", "seed", "version")}
 
 
 def check_results(folder: Path) -> None:
@@ -126,40 +92,22 @@ def check_results(folder: Path) -> None:
             raise ValueError(f"{folder / name} does not exist; run the benchmark first")
 
 
-def report(out: Path) -> str:
+def report(out: Path) -> None:
     """Write table.md and heatmap.png from the CSV files."""
-    results, methods, note, missing = _read(out)
-    write_table(out / "table.md", results, methods, note=note + missing)
+    results, methods, note = _read(out)
+    write_table(out / "table.md", results, methods, note=note)
     draw(out / "heatmap.png", results, methods, note=note)
-    return note + missing
 
 
 def draw_results(out: Path, path: Path) -> None:
     """Draw the heatmap alone from the CSV files."""
-    results, methods, note, _ = _read(out)
+    results, methods, note = _read(out)
     draw(path, results, methods, note=note)
 
 
-def _read(out: Path) -> tuple[pd.DataFrame, pd.DataFrame, str, str]:
-    """Results and methods, what was compared, and which are missing."""
+def _read(out: Path) -> tuple[pd.DataFrame, pd.DataFrame, str]:
+    """Results and methods, and the conditions."""
     check_results(out)
     results, methods = (pd.read_csv(out / name) for name in FILES)
     note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."
-    partial, missing = _missing(methods)
-    return results, methods, note + partial, missing
-
-
-def _missing(methods: pd.DataFrame) -> tuple[str, str]:
-    """How many observers there are of a full set, the user's included, and which are not; empty if all are there."""
-    systems = dict.fromkeys([*SYSTEMS, *methods.system])
-    names = dict.fromkeys([*_full_set(methods.method), *methods.method])
-    there = set(zip(methods.system, methods.method, strict=True))
-    missing = {name: [system for system in systems if (system, name) not in there] for name in names}
-    few = [name if len(on) == len(systems) else f"{name} on {', '.join(on)}" for name, on in missing.items() if on]
-    if not few:
-        return "", ""
-    more = f" and {len(few) - NAMED} more methods" if len(few) > NAMED else ""
-    return (
-        f" Partial: {len(there)} of {len(systems) * len(names)} observers.",
-        f" Missing: {'; '.join(few[:NAMED])}{more}.",
-    )
+    return results, methods, note

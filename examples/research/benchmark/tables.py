@@ -12,22 +12,14 @@ import pandas as pd
 
 from training.evaluation.levels import read_level, show_level
 from training.figures import save, style
-from training.files import write
-from training.markdown import table
+from training.files import table, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-INTERVAL = "{median} ± {half_iqr} [{low}, {high}]"
 PAPERS_MEASURE = "The paper's measure: median ± half the interquartile range [bootstrap 95 % interval of the median]."
-SETTLING = "Median time from which the error stays below a tenth of the trajectory's size."
-# Column of results.csv, title, form of a cell, explanation.
-MEASURES = (
-    ("smape", "SMAPE in %, all steps", INTERVAL, PAPERS_MEASURE),
-    ("smape_late", "SMAPE in % after the first 20 %", INTERVAL, "The same."),
-    ("rmse_late", "RMSE after the first 20 %", INTERVAL, "The same, in units of the state."),
-    ("settling", "Settling time in s", "{median}", SETTLING),
-)
+# Column of results.csv, and title.
+MEASURES = (("smape", "SMAPE in %, all steps"), ("smape_late", "SMAPE in % after the first 20 %"))
 NRMSE = re.compile(r"nrmse\d+")  # columns of results.csv
 NEVER = 1e12  # stands for an infinite time or error, of which no quantile can be taken
 NARROWEST = 7.0  # inches, of a figure with its title
@@ -53,8 +45,9 @@ def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
         low, median, high = np.quantile(finite, [0.25, 0.5, 0.75])
         interval = (median, median)
         if len(set(finite)) > 1:
-            found = bootstrap((finite,), np.median, method="percentile", n_resamples=1000, rng=np.random.default_rng(0))
-            interval = found.confidence_interval
+            rng = np.random.default_rng(0)
+            drawn = bootstrap((finite,), np.median, method="percentile", n_resamples=1000, rng=rng)
+            interval = drawn.confidence_interval
         rows.append((*key, len(values), median, (high - low) / 2, *interval))
     names = ["system", "method", "starts", "noise", "n", "median", "half_iqr", "low", "high"]
     return pd.DataFrame(rows, columns=names)
@@ -68,11 +61,11 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         key=lambda case: (list(DOMAINS).index(case[0]), _size(case[1])),
     )
     lines = ["# Benchmark", "", note, ""]
-    for column, title, form, explanation in MEASURES:
+    for column, title in MEASURES:
         summary = summarise(results, column).set_index(["starts", "noise", "system", "method"])
         for case in cases:
-            lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", explanation, ""]
-            lines += _by_method(methods, partial(_spread, summary, form, case))
+            lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", PAPERS_MEASURE, ""]
+            lines += _by_method(methods, partial(_spread, summary, case))
     states = [column for column in results if NRMSE.fullmatch(column)]  # none in the published results.csv
     if states:
         medians = results[results.escaped == 0].groupby(["starts", "noise", "system", "method"])[states].median()
@@ -80,8 +73,12 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
             lines += [f"## NRMSE in % after the first 20 %, {DOMAINS[case[0]]}, noise {case[1]}", ""]
             lines += ["Of each state: median of its rms error over its standard deviation in all trajectories.", ""]
             lines += _by_method(methods, partial(_each_state, medians, case))
-    lines += ["## Lost trajectories in %", "", "Above 50 % after the first 20 %, or not finite. In this order: "]
-    lines[-1] += ", ".join(f"{starts} at noise {noise}" for starts, noise in cases) + "."
+    order = ", ".join(f"{starts} at noise {noise}" for starts, noise in cases)
+    lines += [
+        "## Lost trajectories in %",
+        "",
+        f"Above 50 % after the first 20 %, or not finite. In this order: {order}.",
+    ]
     lost = results[results.escaped == 0].groupby(["system", "method", "starts", "noise"]).lost.mean() * 100
     lines += ["", *_by_method(methods, partial(_lost, lost, cases))]
     noise_free = results[results.noise == "0"]
@@ -90,23 +87,16 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         lines += [
             "## Component-wise SMAPE in % after the first 20 %, no noise",
             "",
-            "Median for starts in X / 1.5X \\ X / 2X \\ X. In brackets what the notebooks released with the paper "
-            "print for 1.5X \\ X, from other networks, budgets and data. They contradict a heatmap in the same "
-            "notebooks: docs/results/benchmark.md says how, and what they rest on.",
+            "Median for starts in X / 1.5X \\ X / 2X \\ X. In brackets the figures that the notebooks released with "
+            "the paper print for 1.5X \\ X, from other networks, budgets and data; docs/results/benchmark.md has more.",
             "",
             *_by_method(methods, partial(_beside_printed, component["median"])),
         ]
     costs = methods.set_index(["system", "method"])
-    lines += [
-        "## Cost",
-        "",
-        "CPU seconds of training; CPU time of one step, for one trajectory and for 1,000 at once.",
-        "",
-    ]
+    lines += ["## Cost", "", "CPU seconds of training; CPU time of a step of one trajectory and of 1,000 at once.", ""]
     lines += _by_method(methods, partial(_cost, costs))
     lines += ["## Configuration", "", "Chosen on validation trajectories, or the first where there was no search.", ""]
     lines += _by_method(methods, partial(_configuration, costs))
-    lines += ["## Starts that escape", "", *_escaped(results)]
     write(path, "\n".join(lines) + "\n")
 
 
@@ -123,8 +113,8 @@ def _by_method(methods: pd.DataFrame, cell: Callable[[tuple[str, str]], str]) ->
 
 def _by_text_of_noise(results: pd.DataFrame) -> pd.DataFrame:
     """The same with levels of noise as text, whether they are numbers or one for each output."""
-    shown = {noise: show_level(read_level(str(noise))) for noise in results.noise.unique()}
-    return results.assign(noise=results.noise.map(shown))
+    texts = {noise: show_level(read_level(str(noise))) for noise in results.noise.unique()}
+    return results.assign(noise=results.noise.map(texts))
 
 
 def _size(noise: str) -> list[float]:
@@ -141,11 +131,11 @@ def _each_state(medians: pd.DataFrame, case: tuple[str, str], job: tuple[str, st
     return " / ".join("–" if np.isnan(value) else _number(value) for value in row[: known.max(initial=0) + 1])
 
 
-def _spread(summary: pd.DataFrame, form: str, case: tuple[str, str], job: tuple[str, str]) -> str:
+def _spread(summary: pd.DataFrame, case: tuple[str, str], job: tuple[str, str]) -> str:
     if (*case, *job) not in summary.index:  # every trajectory escaped
         return "–"
-    row = summary.loc[(*case, *job)]
-    return form.format(**{name: _number(value) for name, value in row.items()})
+    row = summary.loc[(*case, *job)].map(_number)
+    return f"{row['median']} ± {row.half_iqr} [{row.low}, {row.high}]"
 
 
 def _number(value: float) -> str:
@@ -175,16 +165,6 @@ def _cost(costs: pd.DataFrame, job: tuple[str, str]) -> str:
 def _configuration(costs: pd.DataFrame, job: tuple[str, str]) -> str:
     configuration = json.loads(costs.loc[job].configuration)
     return ", ".join(f"{key} {value}" for key, value in configuration.items()).replace("_", " ") or "only one"
-
-
-def _escaped(results: pd.DataFrame) -> list[str]:
-    trajectories = results.drop_duplicates(["system", "starts", "trajectory"])
-    lines = [
-        f"- {system}, {DOMAINS[starts]}: {group.escaped.sum()} of {len(group)}, in no figure above."
-        for (system, starts), group in trajectories.groupby(["system", "starts"], sort=False)
-        if group.escaped.any()
-    ]
-    return lines or ["None."]
 
 
 def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> None:

@@ -8,13 +8,12 @@ from dataclasses import replace
 from typing import Any
 
 from examples.research.methods.base import Configuration, Task
-from examples.research.methods.kkl import KKLMethod, within
+from examples.research.methods.kkl import KKLMethod, trained, within
 from observers import Artifact
 from training.config import Pipeline
 from training.evaluation.levels import multiple
 from training.presets import Size, preset
 from training.spectrum import papers_spectrum
-from training.train_observer import train
 
 Settings = Mapping[str, Any]
 
@@ -62,7 +61,7 @@ class Ablation(KKLMethod):
         size: Size = "large" if self.pipeline == "input-aware" else "default"
         config = within(preset(task.system, self.pipeline, size=size), task.budget, task.seed)
         config = replace(config, **self.changes(task))
-        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
+        return trained(task, config)
 
 
 def papers_modes(task: Task) -> Settings:

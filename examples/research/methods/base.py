@@ -3,29 +3,25 @@
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-import torch
 from torch import nn
 
 from kkl_gym.system import System
 from observers import storage
 from observers.estimator import Estimator
 from training.evaluation.levels import Level
-from training.evaluation.plants import off_by
-from training.jobs import describe
-from training.lessons.run import Loss, Stage, optimise
+from training.files import describe
 from training.progress import progress_bars
+from training.run import Loss, Stage, optimise
 from training.seeds import Stream, generator
 from training.trajectories.motions import recording_ages, trajectories
 
 _KEY = "kkl-gym-method"
-
-WRONG = 0.1  # share by which every parameter of a wrong model is too large
 
 Trained = TypeVar("Trained")
 Configuration = Mapping[str, Any]
@@ -81,7 +77,6 @@ class Task:
     budget: Budget
     folder: Path
     seed: int = 0
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
     @cached_property
     def data(self) -> Data:
@@ -129,14 +124,6 @@ class Method(ABC, Generic[Trained]):
         """Propose at most three; the benchmark takes the one with the least error on validation trajectories."""
         return ({},)
 
-    def believed(self, system: System) -> System:
-        """The system on which it is trained: the true one, unless its model is to be wrong."""
-        return system
-
-    def settled(self, configuration: Configuration, trained: Trained) -> Configuration:
-        """The configuration of the full training, after the short one with the least error."""
-        return configuration
-
     @abstractmethod
     def train(self, task: Task, configuration: Configuration) -> Trained:
         """Train."""
@@ -163,14 +150,3 @@ class Method(ABC, Generic[Trained]):
         if described.get("method") != self.name:
             raise ValueError(f"{path} was written by method {described.get('method')!r}, not {self.name!r}")
         return arrays  # type: ignore[return-value]
-
-
-class WrongParameters:
-    """First of two bases of a method that is trained on wrong parameters; the second is the method itself.
-
-    Its configurations are compared on trajectories of the true system.
-    """
-
-    def believed(self, system: System) -> System:
-        """The same equations with every parameter too large."""
-        return off_by(system, WRONG)

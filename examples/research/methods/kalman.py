@@ -1,22 +1,20 @@
-"""Kalman filters with the exact model, or a wrong one, as methods of the benchmark."""
+"""Kalman filters with the exact model as methods of the benchmark."""
 
 from typing import Any, ClassVar
 
 import numpy as np
 
-from examples.research.methods.base import Arrays, Configuration, Method, Task, WrongParameters
+from examples.research.methods.base import Arrays, Configuration, Method, Task
 from examples.research.methods.unscented import UnscentedKalmanFilter
 from kkl_gym.system import System
 from observers.estimator import Estimator
 from training.evaluation.levels import Level
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
-from training.sources.simulated import unknown_start
 
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
 # white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
-# linearisation, for there is none in the trajectories.
+# linearisation: the trajectories have no process noise.
 DIFFUSION = (1e-4, 1e-3, 1e-2)
-WRONG_DIFFUSION = (1e-3, 1e-2, 1e-1)  # which has to make up for a wrong model as well
 
 
 def diffusion_intensity(trained: Arrays, system: System) -> np.ndarray:
@@ -33,11 +31,10 @@ class EKF(Method[Arrays]):
     name: ClassVar[str] = "ekf"
     label: ClassVar[str] = "EKF"
     filter: ClassVar[type[ExtendedKalmanFilter]] = ExtendedKalmanFilter
-    diffusion: ClassVar[tuple[float, ...]] = DIFFUSION
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """Three levels of diffusion, in multiples of the scale per square root of a second of its pace."""
-        return tuple({"diffusion": level} for level in self.diffusion)
+        return tuple({"diffusion": level} for level in DIFFUSION)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
         """Nothing to learn."""
@@ -47,7 +44,7 @@ class EKF(Method[Arrays]):
         """The filter for a noise level."""
         Q = diffusion_intensity(trained, system)
         R = measurement_covariance(system, noise)
-        return self.filter(self.believed(system), dt, Q=Q, R=R)
+        return self.filter(system, dt, Q=Q, R=R)
 
 
 class UKF(EKF):
@@ -56,28 +53,3 @@ class UKF(EKF):
     name: ClassVar[str] = "ukf"
     label: ClassVar[str] = "UKF"
     filter: ClassVar[type[ExtendedKalmanFilter]] = UnscentedKalmanFilter
-
-
-class WrongEKF(WrongParameters, EKF):
-    """The same filter, tuned the same way, with every parameter 10 % too large."""
-
-    name: ClassVar[str] = "ekf-wrong"
-    label: ClassVar[str] = "EKF, model 10 % off"
-    diffusion: ClassVar[tuple[float, ...]] = WRONG_DIFFUSION
-
-
-class UntunedEKF(Method[Arrays]):
-    """The exact model with the covariances that filterpy starts from: P, Q (per sample) and R are the identity."""
-
-    name: ClassVar[str] = "ekf-untuned"
-    label: ClassVar[str] = "EKF, untuned"
-
-    def train(self, task: Task, configuration: Configuration) -> Arrays:
-        """Nothing to learn."""
-        return {}
-
-    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
-        """The filter, whatever the noise."""
-        x0, _ = unknown_start(system)
-        eye = np.eye(system.nx)
-        return ExtendedKalmanFilter(system, dt, Q=eye / dt, R=np.eye(system.ny), start=(x0, eye))

@@ -5,16 +5,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from examples.research.methods.base import Budget, Configuration, Method, Task, WrongParameters
+import torch
+
+from examples.research.methods.base import Budget, Configuration, Method, Task
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.estimator import Estimator
 from observers.names import resolve
 from training.config import Config
 from training.evaluation.levels import Level
+from training.lessons import train
 from training.presets import preset
 from training.spectrum import evenly_spaced
-from training.train_observer import train
 
 # Intervals of the eigenvalues of A in 1/s among which methods with a real spectrum choose; the first is the paper's.
 SPECTRA = ((-3.0, -1.5), (-8.0, -1.0), (-20.0, -2.0))
@@ -62,6 +64,11 @@ def within(config: Config, budget: Budget, seed: int) -> Config:
     )
 
 
+def trained(task: Task, config: Config) -> Artifact:
+    """Train by the package's pipeline, on a CPU as all methods."""
+    return train(task.system, config, task.folder, resume=True, device=torch.device("cpu")).artifact
+
+
 class Default(KKLMethod):
     """The package's own: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
 
@@ -77,14 +84,7 @@ class Default(KKLMethod):
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
         config = within(preset(task.system, size="large"), task.budget, task.seed)
-        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
-
-
-class WrongDefault(WrongParameters, Default):
-    """The package's own, trained with every parameter 10 % too large."""
-
-    name: ClassVar[str] = "default-wrong"
-    label: ClassVar[str] = "T_inv alone, model 10 % off"
+        return trained(task, config)
 
 
 class Shipped(KKLMethod):
@@ -137,11 +137,4 @@ class SPINN(KKLMethod):
         fastest, slowest = configuration["spectrum"]
         changes = {"eigenvalues": spectrum(task.system, fastest, slowest), "pairs": (), "box_factor": 1.0}
         config = within(preset(task.system, "spinn", changes=changes), task.budget, task.seed)
-        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
-
-
-class WrongSPINN(WrongParameters, SPINN):
-    """The paper's, trained with every parameter 10 % too large."""
-
-    name: ClassVar[str] = "spinn-wrong"
-    label: ClassVar[str] = "SPINN, model 10 % off"
+        return trained(task, config)

@@ -31,10 +31,10 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         lost = ~self._inside(x, P)
         if lost.any():
             start = self._starts(int(lost.sum()))
-            anew = self._updated(*start, y[lost])
-            sound = self._inside(*anew)  # or else the start stands as it is
-            x[lost] = np.where(sound[:, None], anew[0], start[0])
-            P[lost] = np.where(sound[:, None, None], anew[1], start[1])
+            restarted = self._updated(*start, y[lost])
+            sound = self._inside(*restarted)  # else the start stays without the sample
+            x[lost] = np.where(sound[:, None], restarted[0], start[0])
+            P[lost] = np.where(sound[:, None, None], restarted[1], start[1])
         return x, P
 
     def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:

@@ -17,8 +17,7 @@ from training.commands.options import NoiseLevel, SystemName
 from training.config import read_changes
 from training.evaluation.levels import level_for
 from training.figures import ESTIMATE, TRUTH, drawing
-from training.files import write
-from training.jobs import locked
+from training.files import locked, write
 from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars
 
@@ -88,7 +87,7 @@ class Sizes:
 
     def _trained(self, system: System, changes: Mapping[str, Any], out: Path, progress: ProgressBars) -> Artifact:
         """Train an observer, or read an earlier training of the same."""
-        from training.train_observer import train
+        from training.lessons import train
 
         config = preset(system, size="large", changes={"tracking": False, **changes})
         progress.say(f"an observer for {system.name} with hidden layers of {config.width}")

@@ -15,7 +15,7 @@ from kkl_gym.simulate import simulate
 from observers import KKLObserver, load
 from observers.machine import MANY_ROWS
 from training import TorchMemory, TorchObserver
-from training.markdown import table
+from training.files import table
 
 MOTIONS, SETTLED, STEPS = 1024, 60, 5  # motions, steps before those that are timed, and these
 NY, NU, TAU, TAU_U = 8, 2, (1.0, 2.0, 4.0, 8.0), (1.0, 4.0)  # of the memory

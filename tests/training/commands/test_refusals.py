@@ -9,7 +9,7 @@ import pytest
 from recorded_runs import as_csv, swing
 
 from training.cli import main
-from training.jobs import locked
+from training.files import locked
 from training.progress import ProgressBars
 
 OSCILLATOR = f"{linear_system.__file__}:Oscillator"

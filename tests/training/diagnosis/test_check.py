@@ -22,7 +22,7 @@ from kkl_gym.systems import Lorenz
 from training.cli import main
 from training.diagnosis import FIRST, THEN, check
 from training.diagnosis.system import Subject
-from training.systems import controller
+from training.presets import controller
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 

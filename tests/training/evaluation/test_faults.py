@@ -12,7 +12,7 @@ import training.evaluation.faults
 from kkl_gym import VanDerPol
 from kkl_gym.elementary import sin
 from observers import KKLObserver, Limits
-from training import markdown
+from training import files
 from training.cli import main
 from training.commands.faults import HEADER, fault_rows
 from training.evaluation.faults import FAULTS, simulate_faults
@@ -68,7 +68,7 @@ def test_the_table_on_the_page_is_that_of_the_file():
     results = Path(__file__).parents[3] / "docs" / "results"
     published = pd.read_csv(results / "faults" / "faults.csv")
     assert ",".join(published) == COLUMNS
-    assert "\n".join(markdown.table(["", *HEADER], fault_rows(published))) in (results / "faults.md").read_text()
+    assert "\n".join(files.table(["", *HEADER], fault_rows(published))) in (results / "faults.md").read_text()
 
 
 def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path, capsys):

@@ -13,8 +13,8 @@ from tracking import DT, of_t_inv, tracking_observer
 import training.evaluation.report
 from training import RecordedSource, SimulatedSource, preset
 from training.evaluation.report import Followed, held_out, write_report
+from training.lessons import Result
 from training.sources.recorded import recorded_preset
-from training.train_observer import Result
 
 
 def source():

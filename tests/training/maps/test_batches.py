@@ -1,13 +1,13 @@
 """Batches: what they hold, and that the observer shows its network the same."""
 
-import dataclasses
-import functools
+from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import pytest
 import torch
 from linear_system import TwoUnits
-from small_runs import CPU, open_loop, untrained
+from small_runs import BATCHES, CPU, open_loop, untrained
 
 from observers.decoder import Decoder
 from training.maps.coordinates import noise_covariance
@@ -16,54 +16,36 @@ from training.spectrum import Spectrum
 from training.trajectories.motions import KINDS, Motions, record, recording_ages
 
 
-@pytest.fixture(scope="module")
-def sampler():
-    return open_loop()
-
-
-def test_batches_cover_quiet_and_loud(sampler):
-    sampler, _, _ = sampler
-    inputs, x, weight, cell = sampler(torch.Generator().manual_seed(0))
-    assert inputs.shape == (4096, len(sampler.coordinates.noise_gain) + 2)
-    assert x.shape == (4096, 2)
-    assert torch.isfinite(inputs).all()
-    assert (weight > 0).all()
-    noise_free = inputs[:, -2] == 0
-    assert 0.15 < noise_free.float().mean() < 0.25
-    assert ((cell % 7 == 0) == noise_free).all()
-    assert cell.max() < sampler.cells
+def batches_of(data, linear, measurement_noise=0.5, **settings):
+    return TrajectorySampler(
+        data, linear, replace(BATCHES, **settings), device=CPU, measurement_noise=measurement_noise
+    )
 
 
 @pytest.mark.parametrize(("noise_free_share", "high_noise_emphasis"), [(0.2, 2.0), (1.0, 2.0), (0.0, 1e-3)])
-def test_how_often_batches_hold_each_noise_level(sampler, noise_free_share, high_noise_emphasis):
-    _, data, linear = sampler
-    batches = TrajectorySampler(
-        data,
-        linear,
-        measurement_noise_max=0.5,
-        batch=32_768,
-        device=CPU,
-        noise_free_share=noise_free_share,
-        high_noise_emphasis=high_noise_emphasis,
-    )
-    inputs, *_ = batches(torch.Generator().manual_seed(0))
+def test_how_often_batches_hold_each_noise_level(noise_free_share, high_noise_emphasis):
+    _, data, linear = open_loop()
+    how = {"noise_free_share": noise_free_share, "high_noise_emphasis": high_noise_emphasis}
+    batches = batches_of(data, linear, measurement_noise_max=0.5, batch=32_768, **how)
+    inputs, x, weight, cell = batches(torch.Generator().manual_seed(0))
+    assert x.shape == (32_768, 2)
     assert torch.isfinite(inputs).all()
+    assert (weight > 0).all()
     level = (0.02 * torch.expm1(inputs[:, -2].double())).numpy()
+    assert ((cell % 7 == 0).numpy() == (level == 0)).all()
+    assert cell.max() < batches.cells
     assert (level == 0).mean() == pytest.approx(noise_free_share, abs=0.01)
     for below in (0.05, 0.2):  # of which a part of the two decades below 0.5 is left out
         expected = noise_free_share + (1 - noise_free_share) * (1 + np.log10(below / 0.5) / 2) ** high_noise_emphasis
         assert (level <= below).mean() == pytest.approx(expected, abs=0.01)
 
 
-def test_motions_of_the_systems_own_parameters_are_in_cells_apart(sampler):
-    _, data, linear = sampler
+def test_motions_of_the_systems_own_parameters_are_in_cells_apart():
+    _, data, linear = open_loop()
     nominal = np.arange(data.x.shape[1]) % 3 == 0
-    size = np.where(nominal, 0.0, 1e6)  # by which the states say whose they are
-    marked = dataclasses.replace(data, x=data.x * 0 + size[:, None] + 1, nominal=nominal)
-    alike, apart = (
-        TrajectorySampler(each, linear, measurement_noise_max=0.5, batch=1024, device=CPU)
-        for each in (dataclasses.replace(marked, nominal=None), marked)
-    )
+    size = np.where(nominal, 0.0, 1e6)  # by which the states are marked
+    marked = replace(data, x=data.x * 0 + size[:, None] + 1, nominal=nominal)
+    alike, apart = (batches_of(each, linear, batch=1024) for each in (replace(marked, nominal=None), marked))
     assert apart.cells == 2 * alike.cells
     together, found = (each(torch.Generator().manual_seed(0)) for each in (alike, apart))
     torch.testing.assert_close(found.inputs, together.inputs)
@@ -72,24 +54,23 @@ def test_motions_of_the_systems_own_parameters_are_in_cells_apart(sampler):
     assert 0.25 < own.float().mean() < 0.42
 
 
-@functools.cache
+@cache
 def of_two_outputs():
     """Batches along trajectories of a system whose outputs have units of their own, and what they are made of."""
     system = TwoUnits()
     linear = Spectrum((-0.5, -2.0, -8.0)).filter(2, 0.01, 1)
     motions, ages = Motions(KINDS), recording_ages(300, 20)
     data = record(system, linear, n=30, steps=300, ages=ages, rng=np.random.default_rng(0), motions=motions)
-    options = {"measurement_noise_max": (200.0, 0.2), "measurement_noise": system.measurement_noise}
-    sampler = TrajectorySampler(data, linear, batch=4096, device=CPU, **options)
+    sampler = batches_of(data, linear, system.measurement_noise, measurement_noise_max=(200.0, 0.2))
     return sampler, data, linear
 
 
 def test_each_of_several_outputs_has_a_level_of_its_own():
-    sampler, _, _ = of_two_outputs()
+    sampler, _, linear = of_two_outputs()
+    inverse = untrained(sampler, linear)[1].inverse
     inputs, _, _, cell = sampler(torch.Generator().manual_seed(0))
-    assert inputs.shape == (4096, len(sampler.coordinates.whiten) + 3)
-    level = 0.04 * np.array(TwoUnits().measurement_noise) * np.expm1(inputs[:, -3:-1].double().numpy())
-    part = level / sampler.measurement_noise_max
+    assert inputs.shape == (4096, len(inverse.whiten) + 3)
+    part = 0.04 * np.array(TwoUnits().measurement_noise) * np.expm1(inputs[:, -3:-1].double().numpy()) / (200.0, 0.2)
     assert part.max(0) == pytest.approx(1.0, abs=0.01)
     alike = np.isclose(part[:, 0], part[:, 1], rtol=1e-3)
     assert alike.mean() == pytest.approx(0.5 + 0.5 * 0.2**2, abs=0.03)
@@ -100,20 +81,16 @@ def test_each_of_several_outputs_has_a_level_of_its_own():
     loud = cell.numpy() % 7 == 6
     assert part[loud].mean() > 0.5
     assert part[~loud].mean() < 0.3
-    assert cell.max() < sampler.cells
 
 
 @pytest.mark.parametrize(("made", "largest"), [(open_loop, 1.0), (of_two_outputs, (200.0, 0.2))])
 def test_batches_hold_the_noise_that_the_filter_would_pass_on(made, largest):
     sampler, data, linear = made()
-    usual = {"measurement_noise": TwoUnits().measurement_noise} if made is of_two_outputs else {}
-    quiet = TrajectorySampler(
-        data, linear, measurement_noise_max=largest, batch=4096, device=CPU, noise_free_share=1.0, **usual
-    )
-    _, artifact = untrained(sampler, linear)
-    inverse, whiten, ny = artifact.inverse, sampler.coordinates.whiten, np.size(largest)
+    usual = TwoUnits().measurement_noise if made is of_two_outputs else 0.5
+    quiet = batches_of(data, linear, usual, measurement_noise_max=largest, noise_free_share=1.0)
+    inverse, ny = untrained(sampler, linear)[1].inverse, np.size(largest)
+    whiten, gain = inverse.whiten, np.atleast_2d(inverse.noise_gain)
     covariance = whiten @ noise_covariance(linear, data.ages) @ whiten.T  # (ages, outputs, modes, modes)
-    gain = np.atleast_2d(sampler.noise_gain)
     heard = gain.max(0) > 1e-3 * gain.max()  # modes that are about inputs hold no noise
     measured, expected, count = 0.0, 0.0, 0
     for seed in range(30):
@@ -149,16 +126,17 @@ def assert_shown(batch, row, artifact, data):
     return trajectory
 
 
-@pytest.mark.parametrize("made", [open_loop, functools.partial(open_loop, 0.5), of_two_outputs])
+@pytest.mark.parametrize("made", [open_loop, partial(open_loop, 0.5), of_two_outputs])
 def test_batches_are_what_the_observer_shows_its_network(made):
     sampler, data, linear = made()
     _, artifact = untrained(sampler, linear)
     batch = sampler(torch.Generator().manual_seed(0))
-    modes, ny = len(sampler.coordinates.whiten), artifact.ny
+    inverse = artifact.inverse
+    modes, ny = len(inverse.whiten), artifact.ny
     quiet = (batch.inputs[:, modes : modes + ny] == 0).all(1)
     for row in torch.nonzero(quiet)[::50, 0].tolist():
         trajectory, cell = assert_shown(batch, row, artifact, data), batch.cell[row]
-        if sampler.process_noise_max:
+        if "process_noise" in inverse.features:
             level = data.process_noise[trajectory]
             assert cell % 3 == int(level > 0) + int(level > 0.025)
             cell = cell // 3

@@ -70,8 +70,5 @@ def test_range_scale_reaches_from_minus_one_to_one_and_weighs_all_alike():
     np.testing.assert_allclose(scale(x).min(0), -1.0)
     np.testing.assert_allclose(scale(x).max(0), 1.0)
     assert (scale.weight(x) == 1).all()
-
-
-def test_states_that_never_change_are_not_divided_by_zero():
     for scaling in ("relative", "range"):
         assert np.isfinite(StateScale.of(np.ones((10, 2)), scaling)(np.ones(2))).all()

@@ -9,8 +9,7 @@ import torch
 from kinked_systems import SYSTEMS as KINKED
 from linear_system import Autonomous, C, F, Oscillator, exact_observer, sylvester
 from quadrature import backward_quadrature
-from random_artifacts import random_artifact
-from small_runs import CPU
+from small_runs import CPU, toy
 from wrong_systems import Branching, Late
 
 from kkl_gym import EquationError, ReverseDuffing, get_system
@@ -18,7 +17,6 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import on_states
 from observers import MLP, Artifact, ForwardMap, LinearFilter
 from observers.names import resolve
-from training.maps.coordinates import StateScale
 from training.maps.forward import ForwardProblem, along, on_tensors, residual, transients, truncation_step
 from training.maps.networks import Network, from_mlp
 from training.spectrum import Spectrum
@@ -52,18 +50,8 @@ def problem_of_the_oscillator(unit=1.0):
     x = unit * np.random.default_rng(0).uniform(-1, 1, (3000, 2))
     exact = sylvester(linear.A, linear.B)
     torch.manual_seed(0)
-    problem = ForwardProblem(
-        Network(2, 3, width=40, depth=2, activation="tanh"),
-        system,
-        linear=linear,
-        pairs=(x, x @ exact.T),
-        points=x,
-        scale=StateScale.of(x, "relative"),
-        physics_weight=0.1,
-        batch=256,
-        device=CPU,
-    )
-    return problem, exact
+    config = toy(system, "spinn", width=40, batch=256)
+    return ForwardProblem(system, linear, config, pairs=(x, x @ exact.T), points=x, device=CPU), exact
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-14])
@@ -159,29 +147,6 @@ def test_the_residual_is_that_of_the_equation():
     assert np.allclose(residual(wrong, Oscillator(), x), expected, atol=1e-5)
     with pytest.raises(ValueError, match="no forward map"):
         residual(dataclasses.replace(exact, forward=None), Oscillator(), x)
-
-
-def test_the_residual_is_the_same_in_training_and_in_a_certificate():
-    system = get_system("rossler")
-    artifact = random_artifact("rossler", inputs=False, age=False, forward=True)
-    linear, rng = artifact.filter, np.random.default_rng(0)
-    x = rng.uniform(*system.box(), (50, 3))
-    torch.manual_seed(0)
-    problem = ForwardProblem(
-        Network(3, linear.size, width=16, depth=2, activation="tanh"),
-        system,
-        linear=linear,
-        pairs=(x, rng.normal(size=(50, linear.size))),
-        points=x,
-        scale=StateScale.of(x, "relative"),
-        physics_weight=1.0,
-        batch=64,
-        device=CPU,
-    )
-    found, speed = problem.residual(torch.as_tensor(x, dtype=torch.float32))
-    expected = residual(dataclasses.replace(artifact, forward=problem.forward_map()), system, x)
-    np.testing.assert_allclose(found.detach(), expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
-    np.testing.assert_allclose(speed, np.linalg.norm(system.drift(x) / problem.scale.scale, axis=1), rtol=1e-5)
 
 
 @pytest.mark.parametrize("activation", ["tanh", "silu"])

@@ -266,7 +266,7 @@ def test_environments_that_are_refused(pendulum, tmp_path):
     two.envs[1] = wrapped("Pendulum-v1", tmp_path / "other.safetensors")
     for env, settings, told in (
         (gym.make("Pendulum-v1"), {}, r"the environment has none: put KKLObservation"),
-        (wrapped("Pendulum-v1", tmp_path / "plain.safetensors"), {}, "does not say how it was trained"),
+        (wrapped("Pendulum-v1", tmp_path / "plain.safetensors"), {}, "holds no settings of its training"),
         (hiding, {}, r"environment 0 has no 'x': KKLObservation tells the true obs\[2\] as 'x'"),
         (ActionRepeat(wrapped("Pendulum-v1", pendulum), 2), {}, "showed sample 4 after 2: put wrappers that skip"),
         (noise, {"measurement_noise_max": 0.01}, r"measurement_noise_max = 0\.01 is less than the noise 0\.05"),

@@ -13,7 +13,7 @@ from scipy.linalg import solve_discrete_are
 
 from observers import Artifact, KKLObserver
 from training import RecordedSource, recorded_preset, train
-from training.lessons.calibrate import chi_square, squared_distance
+from training.calibration import chi_square, squared_distance
 from training.maps.networks import Network, averaged
 from training.records import Record, resampled
 from training.sources.recorded import check_plant, linear_output, recorded_errors, signal_rate, split

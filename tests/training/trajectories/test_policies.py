@@ -6,7 +6,7 @@ from linear_system import Autonomous
 from unstable_system import Falling
 
 from kkl_gym.simulate import simulate
-from training.systems import controller, named_policy
+from training.presets import controller, named_policy
 from training.trajectories.motions import POLICYS_OWN, Motions, trajectories, under_policy
 
 SYSTEM = Falling()

@@ -1,0 +1,103 @@
+"""Trainings for plants whose parameters are known roughly."""
+
+import io
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from rich.console import Console
+from small_runs import CPU, toy
+
+from kkl_gym import VanDerPol
+from kkl_gym.system import System
+from training import SimulatedSource, errors, train, unseen_trajectories
+from training.evaluation.plants import parameter_errors
+from training.spectrum import Spectrum
+
+
+@dataclass(frozen=True)
+class Spring(System):
+    """x1' = x2, x2' = -stiffness x1 + u: its frequency is the root of the stiffness."""
+
+    stiffness: float = 4.0
+
+    name: ClassVar[str] = "spring"
+    X: ClassVar = ((-1.0, 1.0), (-2.0, 2.0))
+    bounds: ClassVar = ((-9.0, 9.0), (-18.0, 18.0))
+    u_max: ClassVar = (0.5,)
+    G: ClassVar = ((0.0,), (1.0,))
+    dt: ClassVar = 0.05
+    process_noise: ClassVar = 0.0
+    measurement_noise: ClassVar = 0.02
+
+    def f(self, x):
+        return x[1], -self.stiffness * x[0]
+
+    def h(self, x):
+        return (x[0],)
+
+
+@cache
+def trained(**uncertain):
+    """An observer of free motion, for one plant or many."""
+    system = Spring()
+    own = {"inputs": False, "trajectories": 200, "duration": 15.0, "inverse_steps": 1200, "width": 24}
+    own |= {"uncertain": uncertain, "estimate_parameters": True} if uncertain else {}
+    config = toy(system, eigenvalues=(-0.4, -0.8, -1.6, -3.2, -6.4), **own)
+    return train(system, config, device=CPU).artifact
+
+
+def test_an_observer_for_uncertain_plants_holds_on_another():
+    system = Spring()
+    plant = system.replace({"stiffness": 4.8})
+    late = {}
+    for name, artifact in {"one": replace(trained(), motion=None), "many": trained(stiffness=0.3)}.items():
+        assert artifact.nx == 2
+        for what, moving in {"model": system, "plant": plant}.items():
+            runs = unseen_trajectories(moving, 0.05, n=20, duration=15.0, seed=3)
+            late[name, what] = np.median(errors(artifact, moving, runs, measurement_noise=0.02, seed=3).late)
+    assert late["many", "plant"] < 0.6 * late["one", "plant"]
+    assert late["many", "model"] < 2.5 * late["one", "model"]  # at this toy size
+
+
+def test_it_identifies_the_plant_while_it_runs():
+    system, artifact = Spring(), trained(stiffness=0.3)
+    assert artifact.estimated_parameters == ("stiffness",)
+    assert artifact.parameter_ranges == {"stiffness": (2.8, 5.2)}
+    drawn = 30.0 / np.sqrt(3)  # in percent, of who only knows the range
+    how = {"trajectories": 30, "duration": 15.0, "seed": 5}
+    clean, noisy = (parameter_errors(artifact, system, measurement_noise=level, **how)[0] for level in (0.0, 0.02))
+    assert clean < noisy < 0.5 * drawn
+
+
+def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate():
+    config = toy(VanDerPol(), uncertain={"mu": 0.1}, trajectories=60, duration=1.0)
+    for estimated in (False, True):
+        source = SimulatedSource(VanDerPol(), replace(config, estimate_parameters=estimated))
+        linear = Spectrum(config.eigenvalues).filter(1, config.dt, 1)
+        pairs = source.pairs(linear)
+        assert source.plant.state_names == ("x1", "x2", "mu")
+        assert pairs.x.shape[-1] == 2 + estimated
+        assert source.sampling(linear)["parameters"] == estimated
+    mu = pairs.x[..., 2]
+    np.testing.assert_array_equal(pairs.nominal, mu[0] == 3)
+    assert 0.4 < pairs.nominal.mean() < 0.9
+    np.testing.assert_allclose(mu, np.broadcast_to(mu[0], mu.shape), rtol=1e-9)
+    assert 2.7 <= mu.min() < 2.8 < 3.2 < mu.max() <= 3.3
+
+
+def test_it_does_not_track_and_says_why():
+    said = Console(file=io.StringIO(), width=200)
+    config = toy(Spring(), uncertain={"stiffness": 0.3}, duration=1.0, inverse_steps=2, inputs=False)
+    artifact = train(Spring(), config, device=CPU, console=said).artifact
+    assert "does not track: a motion is of one plant, not of a range of stiffness" in said.file.getvalue()
+    assert artifact.motion is None
+    assert artifact.inverse.error_covariance.nx == 2
+
+
+def test_a_name_that_is_no_parameter_is_refused_before_any_work(tmp_path):
+    with pytest.raises(ValueError, match="no parameter 'nu' to be uncertain; it has mu"):
+        train(VanDerPol(), toy(VanDerPol(), uncertain={"nu": 0.1}), tmp_path / "run", device=CPU)
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,247 @@
+"""The lesson of calibration: covariances and limits of a monitor, from one pass of motions nothing was trained on."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from kkl_gym.system import System
+from observers import Artifact, ErrorCovariance, Factors, InverseMap, KKLObserver, Limits, Motion
+from observers.checks import noise_levels
+from observers.decoder import Decoders
+from observers.factors import COVERAGE
+from training.config import settings_of
+from training.progress import ProgressBars, progress_bars
+from training.sources.simulated import SimulatedSource
+from training.sources.source import Runs, Source, TooFewRunsError
+from training.trajectories.filtering import filter_states
+
+LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of measurement noise, in multiples of the largest in training
+AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds at the usual pace
+PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
+FEWEST = 50  # errors from which a covariance or a quantile is taken
+LEAST_VARIANCE = 1e-6  # added to that of each state, over its range squared
+WINDOW, WARM_UP = 0.5, 5.0  # seconds of the monitor, likewise
+MARGIN = 1.05  # on limits, which are from finitely many motions
+
+
+def calibrate(
+    artifact: Artifact,
+    source: Source | System,
+    *,
+    motion: Motion | None = None,
+    false_alarms: float | None = None,
+    console: Any = None,
+) -> Artifact:
+    """Find the covariances of an observer's errors and the limits of its monitor.
+
+    Motions that nothing was trained on are followed from their start at several levels of measurement noise. From them
+    follow the covariance of T_inv's errors by level and age; the factor of the tracker's covariance, likewise; and
+    the limits of the residual y - h(x_hat) in sound operation.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        An observer.
+    source : Source or System
+        What it was made for.
+    motion : Motion, optional
+        By which it is to track; by default the one that it has, if any.
+    false_alarms : float, optional
+        Probability that a sound motion of twenty seconds, at the pace of the shipped systems, exceeds a limit; by
+        default that of its training.
+    console : rich.console.Console or ProgressBars, optional
+        Where progress is shown.
+
+    Returns
+    -------
+    Artifact
+        The same with covariances and limits.
+
+    Raises
+    ------
+    ValueError
+        If most motions leave the system's bounds, or too few are held out; :class:`observers.ArtifactError` (a
+        ValueError) if the observer was made for another system.
+    """
+    if isinstance(source, System):
+        artifact.check(source.name, source.parameters, dt=artifact.filter.dt, ny=source.ny, nu=source.nu)
+        source = SimulatedSource(source, settings_of(artifact.training))
+    if false_alarms is None:
+        false_alarms = artifact.training.get("false_alarms", 0.01)
+    if not 0 < false_alarms < 1:
+        raise ValueError(f"false_alarms must lie between 0 and 1, got {false_alarms!r}")
+    sizes, expected = (source.nx, source.ny, source.nu), (artifact.nx, artifact.ny, artifact.nu)
+    if sizes != expected:
+        raise ValueError(f"a source of {sizes} states, outputs and inputs does not fit an observer of {expected}")
+    with progress_bars(console) as progress:
+        with progress.phase("motions for calibration") as report:
+            runs = source.runs(report=report)
+        return _Calibration(artifact, source, runs, false_alarms).calibrated(motion or artifact.motion, progress)
+
+
+class _Calibration:
+    """Tables of an observer's errors, from the same runs at each level of measurement noise."""
+
+    def __init__(self, artifact: Artifact, source: Source, runs: Runs, false_alarms: float) -> None:
+        self.artifact, self.source, self.runs, self.false_alarms = artifact, source, runs, false_alarms
+        self.dt, self.noisy = artifact.filter.dt, runs.process_noise > 0
+        self.knots, self.spans = _knots(len(runs.u), source.pace / self.dt)
+        self.ages = np.unique(np.concatenate(self.spans))
+        self.informed = "measurement_noise" in artifact.inverse.features
+        largest = (artifact.inverse if self.informed else source.config).measurement_noise_max
+        self.levels = np.multiply.outer(LEVELS, largest)
+
+    def calibrated(self, motion: Motion | None, progress: ProgressBars) -> Artifact:
+        """The artifact with all tables, and with a motion."""
+        replace = dataclasses.replace
+        artifact = replace(self.artifact, motion=None, limits=None)
+        monitored = artifact.knows_output and self.runs.sound
+        if self.informed:
+            artifact = self.with_covariances(artifact)
+            if motion is not None:  # factors are of P as the filter has it
+                artifact = replace(artifact, motion=replace(motion, factors=Factors.ones()))
+        if artifact.motion is None and not monitored:
+            return artifact
+        with progress.phase("calibrating", len(LEVELS)) as report:
+            distances, extremes = self.followed(artifact, report)
+        if artifact.motion is not None:
+            groups = (~self.noisy, self.noisy) if self.noisy.any() else (~self.noisy,)
+            usual = self.runs.usual
+            factors = [[self.by_knot(each, usual & group, self.factor) for each in distances] for group in groups]
+            table = Factors(np.array(LEVELS), self.knots * self.dt, np.array(factors))
+            artifact = replace(artifact, motion=replace(artifact.motion, factors=table))
+        return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
+
+    def groups(self) -> Iterator[tuple[int, dict[str, Any], np.ndarray, np.ndarray, np.ndarray]]:
+        """Index of a level of measurement noise, both levels of noise, their runs (n,), outputs and inputs."""
+        runs, rng = self.runs, np.random.default_rng(0)
+        for i, level in enumerate(self.levels):
+            y = runs.y + level * rng.standard_normal(runs.y.shape)
+            measurement_noise = noise_levels("measurement_noise", level, self.source.ny)
+            for noise in np.unique(runs.process_noise).tolist():
+                rows = runs.process_noise == noise
+                levels = {"measurement_noise": measurement_noise, "process_noise": noise}
+                yield i, levels, rows, y[:, rows], runs.u[:, rows]
+
+    def with_covariances(self, artifact: Artifact) -> Artifact:
+        """The covariance of T_inv's errors by level and age, of each map."""
+        seconds, x = self.ages * self.dt, self.runs.x[self.ages]
+        errors, finite = np.empty((len(LEVELS), *x.shape)), np.isfinite(x).all(-1)
+        for i, levels, rows, y, u in self.groups():
+            T_inv, z = Decoders(artifact, slice(artifact.nx), **levels), filter_states(artifact.filter, y, u, self.ages)
+            errors[i][:, rows] = x[:, rows] - T_inv(z, seconds[:, None])
+        least = np.diag(LEAST_VARIANCE * np.ptp(x[finite], axis=0) ** 2 + np.finfo(float).tiny)
+        acted = np.maximum.accumulate((self.runs.u != 0).any(-1), axis=0)
+        moved = np.concatenate([np.zeros_like(acted[:1]), acted])[self.ages]
+
+        def with_table(inverse: InverseMap, group: np.ndarray) -> InverseMap:
+            table = [self.by_knot(each, group, lambda e: _covariance(e, least)) for each in errors]
+            covariance = ErrorCovariance(np.array(LEVELS), self.knots * self.dt, np.array(table))
+            return dataclasses.replace(inverse, error_covariance=covariance)
+
+        if artifact.free_inverse is None:
+            return dataclasses.replace(artifact, inverse=with_table(artifact.inverse, finite))
+        return dataclasses.replace(
+            artifact,
+            inverse=with_table(artifact.inverse, finite & moved),
+            free_inverse=with_table(artifact.free_inverse, finite & ~moved),
+        )
+
+    def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Squared distances (levels, ages, n) of the estimates' errors; extremes (3, levels, n, ny) of residuals."""
+        from scipy.signal import lfilter  # takes half a second to import
+
+        runs, pace = self.runs, self.source.pace
+        distances = np.full((len(LEVELS), len(self.ages), runs.x.shape[1]), np.nan)
+        extremes = np.zeros((3, len(LEVELS), *runs.y.shape[1:]))
+        share, first = -np.expm1(-self.dt / (WINDOW * pace)), 1 + round(WARM_UP * pace / self.dt)
+        slots = {int(age): i for i, age in enumerate(self.ages)}
+        for i, levels, rows, y, u in self.groups():
+            report(i)
+            observer, x = KKLObserver(artifact, **levels), runs.x[:, rows]
+            x_hat = np.empty_like(x)
+            for k in range(len(y)):
+                x_hat[k] = observer.step(y[k], u[k - 1]) if k else observer.reset(y[0])
+                if artifact.motion is not None and k in slots:
+                    distances[i, slots[k], rows] = squared_distance(x[k] - x_hat[k], observer.covariance)
+            if artifact.knows_output:
+                residual = artifact.residual(y, x_hat)
+                mean, square = (lfilter([share], [1, share - 1], r, 0)[first:] for r in (residual, residual**2))
+                largest, high = np.abs(mean).max(0, initial=0.0), square.max(0, initial=0.0)
+                extremes[:, i, rows] = largest, square.min(0, initial=np.inf), high
+        return distances, extremes
+
+    def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
+        """A function of the values (ages, n, ...) about each knot; where these are too few, that of the next knot."""
+        finite = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
+        cells = [np.isin(self.ages, span)[:, None] & finite for span in self.spans]
+        enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
+        if not enough:
+            raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out")
+        entries = {i: find(values[cells[i]]) for i in enough}
+        return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
+
+    def factor(self, distances: np.ndarray) -> float:
+        """The factor with which regions of 90 % hold 90 % of the errors."""
+        return float(np.clip(_excess(distances, self.artifact.nx), 1e-6, 1e6))
+
+    def limits(self, extremes: np.ndarray) -> Limits:
+        """Limits that a sound motion exceeds with a sixth of the probability, and of an output's share in it, each."""
+        share, sound = self.false_alarms / (6 * self.artifact.ny), self.noisy if self.noisy.any() else ~self.noisy
+        largest, low, high = extremes[:, :, sound]
+        mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))
+        below = np.array([1 / (MARGIN * rare(1 / np.maximum(each, 1e-300), share)) for each in low])
+        below[~self.levels.reshape(len(LEVELS), -1).any(-1)] = 0.0
+        pace, seconds = self.source.pace, len(self.runs.u) * self.dt
+        return Limits(self.levels, mean, below, above, WINDOW * pace, WARM_UP * pace, self.false_alarms, seconds)
+
+
+def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Ages in samples at which tables have entries, and for each of these those that are looked at about it."""
+    last = max(1, min(4 * steps // 5, round(AGES[-1] * pace)))
+    knots = np.array(sorted({k for k in (round(age * pace) for age in AGES) if k < last} | {last}))
+    between = np.sqrt(knots[1:] * np.maximum(knots[:-1], 0.5))
+    edges = [0.0, *between.tolist(), float(steps)]
+    counts = [PER_AGE] * len(between) + [4 * PER_AGE]
+    spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts, strict=False))
+    return knots, [np.unique(span.round()).astype(int) for span in spans]
+
+
+def rare(extremes: np.ndarray, share: float) -> np.ndarray:
+    """Value that a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
+
+    Median and 90 % quantile decide, not a few motions that are lost. It is at most ten times the largest extreme, for
+    outputs that stand still in most motions. Shapes: ``extremes`` (n, ny); returns (ny,).
+    """
+    logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
+    middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)
+    at, half, tenth = (-np.log(-np.log1p(-p)) for p in (share, 0.5, 0.1))
+    beyond = middle + (upper - middle) * (at - half) / (tenth - half)
+    return np.asarray(np.exp(np.minimum(beyond, logs.max(0) + np.log(10.0))))
+
+
+def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """e^T P^-1 e, (...,): of Gaussian errors it has the chi-square distribution with nx degrees."""
+    scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # units may differ by orders of magnitude
+    scaled = error / scale
+    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
+    return np.asarray((scaled * np.linalg.solve(correlation, scaled[..., None])[..., 0]).sum(-1))
+
+
+def chi_square(shares: Any, degrees: int) -> np.ndarray:
+    """Quantiles of the chi-square distribution, of which scipy.stats has more and takes longer to import."""
+    return np.asarray(2 * gammaincinv(degrees / 2, shares))
+
+
+def _covariance(error: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Mean outer product of errors (n, nx), scaled so that the region of 90 % holds 90 % of them."""
+    covariance = error.T @ error / len(error) + least
+    return np.asarray(covariance * _excess(squared_distance(error, covariance), error.shape[1]))
+
+
+def _excess(distances: np.ndarray, degrees: int) -> float:
+    """The 90 % quantile of squared distances over that of the chi-square distribution."""
+    return float(np.quantile(distances, COVERAGE, method="weibull") / chi_square(COVERAGE, degrees))
