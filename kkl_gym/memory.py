@@ -31,19 +31,16 @@ class Memory:
 
     For a slow signal all w are nearly tau times its rate. So the memory holds combinations of them: the slowest first,
     and of each faster one the part that slower ones lack. They are uncorrelated and as large as y if y
-    wanders as an Ornstein-Uhlenbeck process does, with a correlation time of which only the order is known, from
-    twice the shortest time constant to eight times the longest. Nothing is fitted to data. White noise on y is
-    amplified at most threefold in the end. It is amplified more at first, where a rate rests on few samples:
-    by the default time constants 22-fold in the first step, and fourfold in the fifth.
+    wanders as an Ornstein-Uhlenbeck process does, with a correlation time from twice the shortest time constant to
+    eight times the longest. White noise on y is amplified at most threefold in the end, and more at first, where a rate
+    rests on few samples: by the default time constants 22-fold in the first step, and fourfold in the fifth.
 
-    An angle that is measured by its cosine and its sine is one signal: filters of these two hold its rate only as a
-    product with the angle. The angle itself is filtered, unwrapped. It is taken to turn by less than half a turn from
-    one sample to the next; a faster one is remembered as turning the other way. Where cosine and sine are both 0, it is
-    taken to rest. Memories of angles come after those of the other outputs.
+    Of an angle that is measured by its cosine and its sine, the angle itself is filtered, unwrapped. It is taken to
+    turn by less than half a turn from one sample to the next, and to rest where cosine and sine are both 0. Memories of
+    angles come after those of the other outputs.
 
-    Shapes: ``angles``, indices of cosines and sines, (number of angles, 2); ``time_constants`` of length m,
-    ``input_time_constants`` of length k, ``decay``, ``rise`` (m,), ``mixing`` (m, m), ``input_decay`` (k,). Outputs,
-    inputs and what is shown are those of one environment, (ny,), (nu,), (size,), or of a batch, (n, ...).
+    Shapes: ``angles``, indices of cosines and sines, (number of angles, 2); ``decay``, ``rise`` (m,), ``mixing``
+    (m, m), ``input_decay`` (k,); outputs, inputs and what is shown (..., ny), (..., nu), (..., size).
     """
 
     def __init__(

@@ -42,7 +42,9 @@ class Outputs:
         self._missing = missing  # whether NaN may stand for an entry that is missing
         self.measured = None if measured is None else _entries("measured", measured)
         self.angles = _angles(angles)
-        self.period = None if period is None else _period(period)
+        self.period = period
+        if period is not None and not (is_finite(period) and period > 0):
+            raise ValueError(f"period must be the positive length of a turn, such as 360, got {shown(period)}")
         if self.measured == ():
             raise ValueError("measured must name at least one entry of the observation; None measures all")
         self._source = f"the observation of {source}"
@@ -203,12 +205,6 @@ def _angles(values: Any) -> tuple[Any, ...]:
         _entries("angles", [name for value, pair in zip(values, pairs) for name in (value if pair else (value,))])
     )
     return tuple((next(names), next(names)) if pair else next(names) for pair in pairs)
-
-
-def _period(value: Any) -> float:
-    if not is_finite(value) or not value > 0:
-        raise ValueError(f"period must be the positive length of a turn, such as 360, got {shown(value)}")
-    return float(value)
 
 
 def _check_keys(name: str, keys: Collection[str], known: Collection[Any]) -> None:

@@ -91,7 +91,9 @@ class KKLEstimator:
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
         if flag("known_start", known_start) and artifact.nx > system.nx:
             raise ValueError("leave known_start out: this observer estimates a bias too, of which no start is known")
-        space = _estimate_space(plant, artifact.nx) if estimate == "x" else _unbounded(artifact.filter.size)
+        space: gym.spaces.Box = gym.spaces.Box(-np.inf, np.inf, (artifact.filter.size,))
+        if estimate == "x":
+            space = _estimate_space(plant, artifact.nx)
         if uncertainty:
             low, high = with_deviations(space.low, space.high)
             space = gym.spaces.Box(low, high, dtype=np.float32)
@@ -205,10 +207,6 @@ def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
     """Bounds (2 nx,) of states and of their standard deviations, which are no larger than the bounds are wide."""
     with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
         return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
-
-
-def _unbounded(size: int) -> gym.spaces.Box:
-    return gym.spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
 
 
 def _estimate_space(plant: Plant, nx: int) -> gym.spaces.Box:

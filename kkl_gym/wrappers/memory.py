@@ -58,13 +58,11 @@ class _Remembering:
             "input_time_constants": self.memory.input_time_constants,
         }
         unbounded, keys = np.full(self.memory.size - len(low), np.inf), self.outputs.keys
-        if weights is not None:
-            high = np.where(
-                np.isin(range(len(low)), self.outputs.pairs), 1.0, np.inf
-            )  # an expected output leaves others
+        if weights is not None:  # expected outputs may leave all other bounds
+            high = np.where(np.isin(range(len(low)), self.outputs.pairs), 1.0, np.inf)
             low = -high
-        self._beside = [] if keys is None else [*self.outputs.unseen, *range(len(low), self.memory.size)]
         low, high = np.append(low, -unbounded), np.append(high, unbounded)
+        self._beside = [] if keys is None else [*self.outputs.unseen, *range(len(self.outputs.low), self.memory.size)]
         if keys is not None:
             if weights is not None or "memory" in keys:
                 raise ValueError(f"{source}: weights, and a key that is named memory, need entries, measured=[0, 1]")
@@ -87,8 +85,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Shows what is measured and a memory of it and of the actions, around any environment.
 
     With it an agent without memory of its own, such as an MLP, can act where part of the state is hidden. The memory is
-    linear, stable and fixed: filters of the outputs and inputs, the linear half of a KKL observer. Nothing is
-    trained, and there is no file.
+    linear, stable and fixed: filters of the outputs and inputs, the linear half of a KKL observer.
 
     The observation is [y, memory of y, memory of u], float32. y are the entries that are measured. For each of
     them and each time constant follows what a first-order filter keeps of its changes, 0 where y rests; for each input
@@ -160,18 +157,9 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             other = "for vectors there is KKLVectorMemory, and make_vec_env of stable-baselines3 takes wrapper_class"
             raise ValueError(f"KKLMemory needs a gymnasium.Env ({other}), got {shown(env)}")
         check_autoreset(env)
-        self._of = _Remembering(
-            env,
-            env.action_space,
-            env.observation_space,
-            measured,
-            angles=angles,
-            period=period,
-            missing=missing,
-            weights=weights,
-            time_constants=time_constants,
-            input_time_constants=input_time_constants,
-        )
+        how: dict[str, Any] = {"angles": angles, "period": period, "missing": missing, "weights": weights}
+        how |= {"time_constants": time_constants, "input_time_constants": input_time_constants}
+        self._of = _Remembering(env, env.action_space, env.observation_space, measured, **how)
         RecordConstructorArgs.__init__(self, **self._of.arguments)
         gym.Wrapper.__init__(self, env)
         self.observation_space = self._of.space
@@ -202,11 +190,6 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             Steps with random actions; noise or short episodes ask for more.
         seed : int
             Of the environment and of the actions.
-
-        Raises
-        ------
-        ValueError
-            If the episodes are too few or too short.
         """
         env = KKLMemory(self.env, **self._of.arguments | {"weights": ()})  # of which the features are recorded
         memory, actions = cast(PredictiveMemory, env._of.memory), copy.deepcopy(self.action_space)
