@@ -16,8 +16,8 @@ class PredictiveMemory(Memory):
     """Shows the outputs as expected in the next step, and combinations of the filters that predict later ones.
 
     The filters are those of :class:`Memory`, over all outputs and angles: cosine and sine stand for a torque
-    that depends on the angle. ``weights``, (features, width), multiply the features [signals, w, v, 1]. The first columns give
-    the expected change of each output or angle, the others are shown as they are.
+    that depends on the angle. ``weights``, (features, width), multiply the features [signals, w, v, 1]. The first
+    columns give the expected change of each output or angle, the others are shown as they are.
     """
 
     def __init__(
