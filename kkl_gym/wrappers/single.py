@@ -78,8 +78,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the environment's
         system.
     estimate : {"x", "z"}
-        "x" shows the state estimate, clipped to the system's declared bounds. "z" shows the filter's state [z_y, z_u],
-        within the bounds that bounded outputs and inputs imply.
+        "x" shows the state estimate, clipped to the system's declared bounds. "z" shows the filter's state
+        [z_y, z_u].
     measurement_noise : float or sequence of float, length ny, optional
         The noise level that the observer assumes, of all outputs or each; None takes the environment's, or none where
         it is not ours. (Process noise is always taken from the environment, by maps that ask for it.)
