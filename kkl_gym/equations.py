@@ -54,7 +54,10 @@ def rate_at(system: Any, x: Any) -> Any:
 
 def check_task(system: Any, x: Any, u: Any) -> list[Any]:
     """Call a system's reward and terminated, and check what comes back. Shapes: ``x`` and ``u`` of length nx and nu."""
-    ended = _number_at(system.terminated, "a bool or a comparison such as x[0] > 1 for each state x", x)
+    wanted = "a bool or a comparison such as x[0] > 1 for each state x"
+    ended = _number_at(system.terminated, wanted, x)
+    if np.asarray(ended).dtype.kind != "b":
+        raise returned(system.terminated, wanted, shown(ended))
     return [_number_at(system.reward, "one number for each state x", x, u), ended]
 
 

@@ -22,6 +22,16 @@ def source_of(env: Any) -> str:
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
 
 
+def check_autoreset(env: Any) -> None:
+    """Raise ValueError if a wrapper inside begins the next episode by itself, at a step."""
+    base = env.unwrapped
+    for one in base.envs if isinstance(base, gym.vector.SyncVectorEnv) else [env]:
+        while isinstance(one, gym.Wrapper):
+            if isinstance(one, gym.wrappers.Autoreset):
+                raise ValueError("Autoreset inside hides where episodes begin: put it outside")
+            one = one.env
+
+
 def identity(env: Env) -> dict[str, Any]:
     """Id and arguments of an environment."""
     base: Any = env.unwrapped

@@ -11,11 +11,10 @@ from observers import LinearFilter
 from observers.checks import real_array, shown
 
 SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
-SMALL = 256  # numbers shown; beyond them the matrix of a step costs more than it saves
 CLOSEST = 1.5  # ratio of neighbouring ones; closer ones hold the same, and their coordinates would be rounding errors
 IMAGINED = 64  # steps before the first output
 FILLED = 20  # longest time constants, after which e^-20 is left of what was before
-TABLE = 1_000  # ages of which the factors are worked out once
+TURN = 2 * math.pi
 
 
 class Memory:
@@ -26,23 +25,32 @@ class Memory:
     w_k+1 = decay w_k + rise (y_k+1 - y_k). For each input u and time constant of inputs it is the low-pass
     v' = (u - v) / tau itself, u being held.
 
-    Of what was before the first output nothing is known. y is taken to have rested until 64 steps before it, and then
+    The past before the first output is unknown. y is taken to have rested until 64 steps before it, and then
     to have changed as fast as since, in the mean as each filter weighs it. At the age of k steps this multiplies w by
     (1 - decay^(k + 64)) / (1 - decay^k). No input is taken to have acted.
 
-    Of a slow signal all w say nearly the same, tau times its rate. So the memory holds combinations of them: the
-    slowest first, and of each faster one what slower ones do not tell. They are uncorrelated and as large as y if y
-    wanders as an Ornstein-Uhlenbeck process does, with a correlation time of which only the order is known, from
-    twice the shortest time constant to eight times the longest. Nothing is fitted to data. White noise on y is
-    amplified at most threefold in the end. It is amplified more at first, where there is little to tell a rate from:
-    by the default time constants 22-fold in the first step, and fourfold in the fifth.
+    For a slow signal all w are nearly tau times its rate. So the memory holds combinations of them: the slowest first,
+    and of each faster one the part that slower ones lack. They are uncorrelated and as large as y if y
+    wanders as an Ornstein-Uhlenbeck process does, with a correlation time from twice the shortest time constant to
+    eight times the longest. White noise on y is amplified at most threefold in the end, and more at first, where a rate
+    rests on few samples: by the default time constants 22-fold in the first step, and fourfold in the fifth.
 
-    Shapes: ``time_constants`` of length m, ``input_time_constants`` of length k, ``decay``, ``rise`` (m,), ``mixing``
-    (m, m), ``input_decay`` (k,).
+    Of an angle that is measured by its cosine and its sine, the angle itself is filtered, unwrapped. It is taken to
+    turn by less than half a turn from one sample to the next, and to rest where cosine and sine are both 0. Memories of
+    angles come after those of the other outputs.
+
+    Shapes: ``angles``, indices of cosines and sines, (number of angles, 2); ``decay``, ``rise`` (m,), ``mixing``
+    (m, m), ``input_decay`` (k,); outputs, inputs and what is shown (..., ny), (..., nu), (..., size).
     """
 
     def __init__(
-        self, ny: int, nu: int, *, time_constants: Sequence[float], input_time_constants: Sequence[float]
+        self,
+        ny: int,
+        nu: int,
+        angles: Sequence[tuple[int, int]] = (),
+        *,
+        time_constants: Sequence[float],
+        input_time_constants: Sequence[float],
     ) -> None:
         self.time_constants = output_time_constants("time_constants", time_constants)
         self.input_time_constants = _time_constants("input_time_constants", input_time_constants)
@@ -52,130 +60,76 @@ class Memory:
         decay = linear.transition.diagonal()[: len(tau)].copy()
         self.decay, self.input_decay, self.rise = decay[:m], decay[m:], 1 - linear.late_y[:m, 0]
         self.mixing = _mixing(self.time_constants, self.decay, self.rise)
+        pairs = np.array(angles, dtype=int).reshape(-1, 2)
+        self._cosines, self._sines = pairs.T
+        self._others = np.setdiff1d(np.arange(ny), pairs)
         self._ny, self._nu = ny, nu
-        self._filled = FILLED * math.ceil(self.time_constants[-1])
-        self._factors = np.array([_with_past(self.decay, age) for age in range(min(self._filled, TABLE))])
-        self._row: np.ndarray | None = None  # [y, w, v] of a single one
-        # It advances by one product, where it is small: every call of NumPy would be felt.
-        self._matrices = self._products() if self.size <= SMALL else None
-        self._y: np.ndarray | None = None  # of a batch, (n, ny); it has w, (m, n, ny), and v, (k, n, nu)
-
-    def _products(self) -> tuple[np.ndarray, np.ndarray]:
-        """What [y, w, v, next y, u] of a single row are multiplied by for its next state, and that to be shown."""
-        ny, nu, size, m = self._ny, self._nu, self.size, len(self.decay)
-        y, w, v = slice(ny), slice(ny, ny + m * ny), slice(ny + m * ny, size)
-        y_next, u = slice(size, size + ny), slice(size + ny, size + ny + nu)
-        update, combine = np.zeros((size + ny + nu, size)), np.eye(size)
-        update[w, w] = np.diag(np.repeat(self.decay, ny))
-        update[v, v] = np.diag(np.repeat(self.input_decay, nu))
-        update[y_next, y] = np.eye(ny)
-        update[y_next, w] = np.kron(self.rise, np.eye(ny))
-        update[y, w] = -update[y_next, w]
-        update[u, v] = np.kron(1 - self.input_decay, np.eye(nu))
-        combine[w, w] = np.kron(self.mixing.T, np.eye(ny))
-        return update, combine
-
-    @property
-    def size(self) -> int:
-        """How many numbers are shown."""
-        return self._ny * (1 + len(self.time_constants)) + self._nu * len(self.input_time_constants)
-
-    def bounds(
-        self,
-        low: np.ndarray,
-        high: np.ndarray,
-        u_low: np.ndarray,
-        u_high: np.ndarray,
-        *,
-        change: np.ndarray | float = np.inf,
-    ) -> np.ndarray:
-        """The least and the largest that can be shown at any age, (2, size); the worst signals come within 1 %."""
-        ages = {*range(1, min(64, self._filled)), *np.geomspace(64, max(64, self._filled), 64).astype(int).tolist()}
+        self.size = ny + (len(self._others) + len(pairs)) * m + nu * len(self.input_decay)  # of what is shown
+        ages = np.arange(FILLED * math.ceil(self.time_constants[-1]))[:, None]
         with np.errstate(under="ignore"):
-            weights = self.rise * self.decay ** np.arange(max(ages))[:, None]
-            reach, path = 1.002 * np.max([self._reach(weights[:age]) for age in ages], axis=0)  # of ages between, too
-        of_outputs = np.minimum(np.outer(reach, high - low), np.outer(path, np.broadcast_to(change, low.shape))).ravel()
-        of_inputs = np.tile([np.minimum(u_low, 0.0), np.maximum(u_high, 0.0)], len(self.input_decay))  # 0 at first
-        return np.hstack([[low, high], [-of_outputs, of_outputs], of_inputs])
-
-    def _reach(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far outputs from 0 to 1 can move coordinates, and outputs that change by 1 in each step.
-
-        w weighs their changes by the weights, the latest first.
-        """
-        of_changes = self.mixing @ (weights * _with_past(self.decay, len(weights))).T
-        within = np.maximum(np.diff(of_changes, prepend=0.0, append=0.0), 0.0).sum(1)
-        return within, np.abs(of_changes).sum(1)
+            self._with_past = (1 - self.decay ** (ages + IMAGINED)) / (1 - self.decay ** np.maximum(ages, 1))
+        self._y: np.ndarray | None = None  # (..., ny); there are w, (m, ..., signals), and v, (k, ..., nu)
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Forget all, as if outputs (ny,) or (n, ny) had rested at ``y0`` and no input had acted."""
-        if y0.ndim == 1:
-            if self._matrices is None:
-                return self.reset(y0[None])[0]
-            self._row, self._row_age = np.zeros(self.size), 0
-            self._row[: self._ny] = y0
-            return self._row.astype(np.float32)
-        self._y, self._ages = y0.copy(), np.zeros(len(y0), dtype=int)
-        self._w = np.zeros((len(self.decay), *y0.shape))
-        self._spare = np.empty_like(self._w)  # to find new memory at each step costs as much as to fill it
-        self._v = np.zeros((len(self.input_decay), len(y0), self._nu))
+        """Forget all, as if outputs (..., ny) had rested at ``y0`` and no input had acted."""
+        self._y, self._signals = y0.copy(), self._read(y0, 0.0)
+        self._w = np.zeros((len(self.decay), *self._signals.shape))
+        self._v = np.zeros((len(self.input_decay), *y0.shape[:-1], self._nu))
+        self._ages = np.zeros(y0.shape[:-1], dtype=int)
         return self.shown()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Forget the past in rows (n,) of a batch, whose first outputs are ``y0`` (number of True in rows, ny)."""
         if self._y is None:
             raise RuntimeError("reset all environments before some of them")
-        self._y[rows] = y0
+        self._y[rows], self._signals[rows] = y0, self._read(y0, 0.0)
         self._w[:, rows] = self._v[:, rows] = self._ages[rows] = 0
         return self.shown(rows)
 
     def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """Take in the next outputs, (ny,) or (n, ny), and the inputs, (nu,) or (n, nu), that led to them."""
-        if y.ndim == 1:
-            if self._row is None:
-                return self.advance(y[None], u[None])[0]
-            update, combine = self._matrices  # type: ignore[misc]  # there are some, where there is a row
-            self._row = np.concatenate((self._row, y, u)) @ update
-            self._row_age += 1
-            row, age, ny = self._row, self._row_age, self._ny
-            if age < self._filled:
-                factors = self._factors[age] if age < TABLE else _with_past(self.decay, age)
-                row = row.copy()
-                row[ny : ny + ny * len(factors)] *= factors.repeat(ny)
-            return (row @ combine).astype(np.float32)
-        if self._y is None:
-            raise RuntimeError("reset the environment before its first step")
-        decay, input_decay = self.decay[:, None, None], self.input_decay[:, None, None]
+        """Take in the next outputs (..., ny), and the inputs (..., nu) that led to them, in some rows or in all."""
+        self._check_begun()
+        of_filters = (-1, *(1,) * y.ndim)
+        decay, rise, input_decay = (each.reshape(of_filters) for each in (self.decay, self.rise, self.input_decay))
         if rows is not None:
-            y = np.where(rows[:, None], y, self._y)
+            y = np.where(rows[:, None], y, self._y)  # type: ignore[arg-type]
             decay, input_decay = (np.where(rows[:, None], kept, 1.0) for kept in (decay, input_decay))
-        change = y - self._y
+        signals = self._read(y, self._signals[..., len(self._others) :])
         self._w *= decay
-        for w, rise in zip(self._w, self.rise):
-            w += rise * change
+        self._w += rise * (signals - self._signals)
         self._v += (1 - input_decay) * (u - self._v)
-        self._y[:] = y
-        self._ages += 1 if rows is None else rows
+        self._y, self._signals = y.copy(), signals
+        self._ages = self._ages + (1 if rows is None else rows)
         return self.shown()
 
+    def _check_begun(self) -> None:
+        if self._y is None:
+            raise RuntimeError("reset the environment before its first step")
+
+    def _read(self, y: np.ndarray, before: np.ndarray | float) -> np.ndarray:
+        """The signals that are filtered: the other outputs, then the angles."""
+        if not len(self._cosines):
+            return y.copy()
+        angles = turned(y.take(self._cosines, -1), y.take(self._sines, -1), before)
+        return np.concatenate((y.take(self._others, -1), angles), axis=-1)
+
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """What is shown of a batch, or of its rows, as things stand: (n, size), or (number of True in rows, size)."""
-        w, coordinates = self._w, self._spare
-        if (self._ages < self._filled).any():
-            ages = np.minimum(self._ages, self._filled - 1)
-            factors = self._factors[ages].T if ages.max() < TABLE else _with_past(self.decay[:, None], ages)
-            w = w * factors[:, :, None]
-        np.matmul(self.mixing, w.reshape(len(w), -1), out=coordinates.reshape(len(w), -1))
-        parts = [self._y, *coordinates, *self._v]
+        """The outputs and the memory of them and of the inputs, (..., size), of all rows or some."""
+        self._check_begun()
+        w, filled = self._w, len(self._with_past)
+        if (self._ages < filled).any():
+            w = w * np.moveaxis(self._with_past[np.minimum(self._ages, filled - 1)], -1, 0)[..., None]
+        parts = [self._y, *(self.mixing @ w.reshape(len(w), -1)).reshape(w.shape), *self._v]
         if rows is not None:
             parts = [part[rows] for part in parts]
         return np.concatenate(parts, axis=-1, dtype=np.float32)
 
 
-def _with_past(decay: np.ndarray, age: int | np.ndarray) -> np.ndarray:
-    """What filters are multiplied by at an age in steps."""
-    with np.errstate(under="ignore"):
-        return (1 - decay ** (age + IMAGINED)) / (1 - decay ** np.maximum(age, 1))  # they are 0 at the age 0
+def turned(cosines: np.ndarray, sines: np.ndarray, before: np.ndarray | float) -> np.ndarray:
+    """Angles in rad within half a turn of those before, which stay where cosine and sine are both 0."""
+    angles = np.arctan2(sines, cosines)
+    nearest = angles - TURN * np.rint((angles - before) / TURN)
+    return np.where((cosines == 0) & (sines == 0), before, nearest)
 
 
 def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray) -> np.ndarray:

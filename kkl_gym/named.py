@@ -135,7 +135,7 @@ def _info(entry: str) -> tuple[str, int | None]:
 
 
 class InputReader:
-    """Reads named inputs from actions. Shapes: ``largest`` (n,)."""
+    """Reads named inputs from actions."""
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str) -> None:
         self._inputs, there = Inputs(space, source=source), acting(space)
@@ -143,7 +143,6 @@ class InputReader:
             if name not in there:
                 raise ValueError(f"inputs names {name!r}, but an action of {source} is {', '.join(there)}")
         self._take = np.array([there.index(name) for name in names], dtype=int)
-        self.largest = np.maximum(abs(self._inputs.low), abs(self._inputs.high))[self._take]
 
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
         """The inputs, (*batch, n): bounded boxes scaled to [-1, 1] and cut there, discrete actions one-hot."""

@@ -136,13 +136,8 @@ class OfPlant:
         return reward, ended
 
     dt = property(lambda self: self.plant.dt, doc="Sampling interval in seconds.")
-    process_noise = property(
-        lambda self: self.plant.process_noise, doc="Bound of the process noise, in multiples of ``scale`` per second."
-    )
-    measurement_noise = property(
-        lambda self: self.plant.measurement_noise,
-        doc="Standard deviation of the measurement noise, of all outputs or each.",
-    )
+    process_noise = property(lambda self: self.plant.process_noise, doc="Bound of w, in ``scale`` per second.")
+    measurement_noise = property(lambda self: self.plant.measurement_noise, doc="Standard deviations of v.")
     sensor = property(lambda self: self.plant.sensor, doc="The sensor, None if it is ideal.")
 
 

@@ -1,5 +1,6 @@
 """The real signals in values of Gymnasium's spaces, one or a batch of them: measured outputs, inputs that act."""
 
+import copy
 import math
 import operator
 from collections.abc import Collection, Iterator, Sequence
@@ -9,28 +10,41 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from observers.checks import LARGEST, all_finite, integer, real_array, shown
+from observers.checks import LARGEST, all_finite, integer, is_finite, real_array, shown
 
 Space = gym.Space[Any]
 Entries = Sequence[int] | Sequence[str]
 """Indices in a flattened observation, or keys of a Dict."""
 Angles = Sequence[int | Sequence[int]] | Sequence[str | Sequence[str]]
-"""Entries that are angles in rad, and pairs of entries that are the cosine and the sine of one."""
+"""Entries that are angles, and pairs of entries that are the cosine and the sine of one."""
+TURN = 2 * math.pi
+NARROW = 100.0  # width of bounds, below which they are in rad: 16 turns, and less than one in degrees
 
 
 class Outputs:
-    """What is measured of an environment's observations.
+    """The measured outputs in an environment's observations.
 
     Observations are read as :func:`gymnasium.spaces.flatten` writes them: boxes row by row, the parts of a Dict or
-    Tuple one after the other, Discrete ones one-hot. Of a Dict, keys that are not measured are not looked at.
+    Tuple one after the other, Discrete ones one-hot. Keys of a Dict that are not measured, and images among those that
+    are, are not read.
     """
 
     def __init__(
-        self, space: Space, measured: Entries | None, angles: Angles, *, source: str, missing: bool = False
+        self,
+        space: Space,
+        measured: Entries | None,
+        angles: Angles,
+        *,
+        period: float | None = None,
+        source: str,
+        missing: bool = False,
     ) -> None:
         self._missing = missing  # whether NaN may stand for an entry that is missing
         self.measured = None if measured is None else _entries("measured", measured)
         self.angles = _angles(angles)
+        self.period = period
+        if period is not None and not (is_finite(period) and period > 0):
+            raise ValueError(f"period must be the positive length of a turn, such as 360, got {shown(period)}")
         if self.measured == ():
             raise ValueError("measured must name at least one entry of the observation; None measures all")
         self._source = f"the observation of {source}"
@@ -39,6 +53,10 @@ class Outputs:
         if self.measured and keys:
             _check_keys("measured", self.measured, self._parts)
             self._parts = {key: part for key, part in self._parts.items() if key in self.measured}
+        # The keys that an agent sees, as they are; None of other observations, and where indices choose signals.
+        self.keys = dict(self._parts) if isinstance(space, spaces.Dict) and (keys or not self.measured) else None
+        if self.keys is not None:
+            self._parts = {key: part for key, part in self._parts.items() if not _is_image(part)}
         for key, part in self._parts.items():
             _check(part, self._source if key is None else f"{self._source}, {key!r},")
         owners = [key for key, part in self._parts.items() for _ in range(spaces.flatdim(part))]
@@ -57,12 +75,14 @@ class Outputs:
         at = [tuple(_positions("angles", (entry,), owners) for entry in angle) for angle in each]
         if not {i for angle in at for entry in angle for i in entry} <= set(taken):
             raise ValueError(f"angles must be among what is measured, {self.measured}, got {self.angles}")
-        in_radians = {i for angle in at if len(angle) == 1 for i in angle[0]}
-        self._take = np.repeat(taken, [1 + (i in in_radians) for i in taken])
+        plain = [i for angle in at if len(angle) == 1 for i in angle[0]]
+        units = {i: TURN / (self.period or self._period_of(low[i], high[i], self._names[i])) for i in plain}
+        self._take = np.repeat(taken, [1 + (i in units) for i in taken])
         self._whole = self._take.tolist() == list(range(len(owners)))
-        self._sines = np.flatnonzero(np.isin(self._take, list(in_radians)))[1::2]
+        self._sines = np.flatnonzero(np.isin(self._take, plain))[1::2]
         self._cosines = self._sines - 1
-        self.turning = list(zip(self._cosines.tolist(), self._sines.tolist()))
+        self._units = np.array([units[i] for i in self._take[self._sines]])  # rad in each
+        self.pairs = list(zip(self._cosines.tolist(), self._sines.tolist()))  # cosines and sines among the outputs
         place = self._take.tolist().index
         for angle, names in zip(at, each):
             if len(angle) == 2:
@@ -71,31 +91,61 @@ class Outputs:
                         f"a cosine and a sine of angles must be equally many, got {names}, which are {len(angle[0])} "
                         f"and {len(angle[1])} entries"
                     )
-                self.turning += [(place(cosine), place(sine)) for cosine, sine in zip(*angle)]
+                self.pairs += [(place(cosine), place(sine)) for cosine, sine in zip(*angle)]
         self.low, self.high = low[self._take], high[self._take]
         for side in (self._cosines, self._sines):
             self.low[side], self.high[side] = -1.0, 1.0
+        self.unseen = np.sort([*self._cosines, *self._sines]).astype(int)  # outputs that the keys do not show
 
-    def __call__(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The outputs in an observation. Shapes: returns (*batch, ny)."""
+    def _period_of(self, low: float, high: float, name: str) -> float:
+        """A turn of an angle, by its bounds."""
+        width = high - low
+        if width < NARROW or np.isinf(width):
+            return TURN
+        if width % 360 == 0:
+            return 360.0
+        raise ValueError(
+            f"the period of the angle in {name} of {self._source} is unknown: its bounds are {low:g} and {high:g}; "
+            "pass period=, 360 for degrees"
+        )
+
+    def flat(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
+        """An observation, or its measured keys, as one row of numbers. Shapes: returns (*batch, entries)."""
         parts = [
             _signals(self._source, part, observation if key is None else observation[key], batch)
             for key, part in self._parts.items()
         ]
-        y = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+
+    def __call__(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
+        """The outputs in an observation. Shapes: returns (*batch, ny)."""
+        return self.of_flat(self.flat(observation, batch))
+
+    def of_flat(self, y: np.ndarray) -> np.ndarray:
+        """The outputs in flat observations. Shapes: ``y`` (..., entries), returns (..., ny)."""
         if not self._whole:
             y = y[..., self._take]
         if not all_finite(np.where(np.isnan(y), 0.0, y) if self._missing else y):
             at = np.argwhere(~(np.abs(y) <= LARGEST))[0]
-            row = f", row {at[0]}" if batch else ""
+            row = f", row {at[0]}" if y.ndim > 1 else ""
             raise ValueError(
                 f"{self._source} holds {y[tuple(at)]} among what is read, in {self._names[self._take[at[-1]]]}{row}: "
                 "it would stay in the memory, so replace it, with gymnasium.wrappers.TransformObservation for instance"
             )
         if len(self._sines):
-            y[..., self._cosines] = np.cos(y[..., self._cosines])
-            y[..., self._sines] = np.sin(y[..., self._sines])
+            angles = self._units * y[..., self._sines]
+            y[..., self._cosines], y[..., self._sines] = np.cos(angles), np.sin(angles)
         return y
+
+    def kept(self, observation: Any, flat: np.ndarray) -> dict[str, Any]:
+        """The keys that an agent sees: boxes as in the flat observation, copies of all others."""
+        kept, at = {key: copy.deepcopy(observation[key]) for key in self.keys or ()}, 0
+        for key, part in self._parts.items():
+            end = at + spaces.flatdim(part)
+            if isinstance(part, spaces.Box):
+                kept[key] = flat[..., at:end].reshape(flat.shape[:-1] + part.shape).astype(part.dtype)
+            at = end
+        return kept
 
 
 class Inputs:
@@ -186,10 +236,14 @@ def _leaves(space: Space) -> Iterator[Space]:
         yield space
 
 
+def _is_image(space: Space) -> bool:
+    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) > 1
+
+
 def _check(space: Space, source: str) -> None:
     """Raise ValueError unless all that a space is made of has real signals."""
     for leaf in _leaves(space):
-        if isinstance(leaf, spaces.Box) and leaf.dtype == np.uint8 and len(leaf.shape) > 1:
+        if _is_image(leaf):
             raise ValueError(
                 f"{source} is an image, {leaf}: let an encoder turn it into a vector inside, with "
                 "gymnasium.wrappers.TransformObservation, or name what is measured beside it by measured=[...]"

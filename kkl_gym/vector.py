@@ -22,6 +22,7 @@ Infos = dict[str, Any]
 Rows = np.ndarray | slice
 ALL = slice(None)  # rows: an index by it is a view
 ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for the cache
+MANY_ROWS = 128  # from which on compiling is worth the seconds that it takes
 MOST_ENVS = 1_000_000  # of which 256 samples of noise are kept, some 10 kB each
 
 

@@ -1,12 +1,11 @@
 """Learned KKL observers at run time: arrays and artifacts, NumPy alone (and Numba for large batches, if installed)."""
 
 from observers.artifact import Artifact
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError
 from observers.expression import Expression
 from observers.factors import ErrorCovariance, Factors
 from observers.filter import LinearFilter
-from observers.forward import ForwardMap
-from observers.inverse import InverseMap
+from observers.inverse import ForwardMap, InverseMap
 from observers.monitor import Limits, Monitor
 from observers.motion import Equations, Flow, Motion
 from observers.names import load, shipped

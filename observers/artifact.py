@@ -5,17 +5,15 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, get_args
+from typing import Any, NoReturn, get_args
 
 import numpy as np
 
 from observers import storage
-from observers.checks import is_finite, noise_levels, shown
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError, is_finite, noise_levels, shown
 from observers.expression import Expression
 from observers.filter import LinearFilter
-from observers.forward import ForwardMap
-from observers.inverse import InverseMap
+from observers.inverse import ForwardMap, InverseMap
 from observers.monitor import Limits
 from observers.motion import Motion
 from observers.network import MLP
@@ -56,6 +54,8 @@ class Artifact:
     measurement_noise : float or tuple of float, length ny, default 0.5
         Standard deviation of the usual noise on each sample, of all outputs or each, which observers assume where none
         is given. It is cut at the largest in the maps' training.
+    u_max : tuple of float, length nu, optional
+        Largest absolute values of the inputs in training. Observers warn once of inputs beyond ten times these.
     parameter_ranges : mapping of str to (float, float), optional
         Low and high end of parameters that are not known exactly: the observer was trained for systems with any
         parameters within.
@@ -84,6 +84,7 @@ class Artifact:
     free_inverse: InverseMap | None = None
     motion: Motion | None = None
     measurement_noise: float | tuple[float, ...] = USUAL_NOISE
+    u_max: tuple[float, ...] | None = None
     parameter_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     estimated_parameters: tuple[str, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
@@ -111,6 +112,8 @@ class Artifact:
             raise ArtifactError(f"a noise_gain of {len(gain)} outputs does not fit {self.ny}")
         usual = noise_levels("measurement_noise", self.measurement_noise, self.ny)
         object.__setattr__(self, "measurement_noise", self.inverse.within(usual))
+        if self.u_max is not None and (len(self.u_max) != self.nu or not all(is_finite(each) for each in self.u_max)):
+            raise ArtifactError(f"u_max must be {self.nu} finite numbers, got {shown(self.u_max)}")
         free, nz = self.free_inverse, len(self.filter.A)
         if free is not None:
             self._check_free(free)
@@ -246,32 +249,30 @@ class Artifact:
 
     def require_forward(self) -> ForwardMap:
         """Return T, or raise ArtifactError if there is none."""
-        if self.forward is None:
-            raise ArtifactError(
-                f"this map for {self.system!r} holds no forward map T; take one of the pipeline spinn, which does: "
-                "for the package's systems those named SYSTEM-spinn ship, others are made by "
-                "kkl-gym train SYSTEM --pipeline spinn"
-            )
-        return self.forward
+        return self.forward or self._lacks(
+            "holds no forward map T; take one of the pipeline spinn, which does: for the package's systems those named "
+            "SYSTEM-spinn ship, others are made by kkl-gym train SYSTEM --pipeline spinn"
+        )
 
     def require_known_start(self) -> None:
         """Raise ArtifactError unless an observer can begin at a known state: by T, or by tracking from there."""
         if self.motion is None and self.forward is None:
-            raise ArtifactError(
-                f"this map for {self.system!r} can begin at no known state: it holds neither a motion nor T; kkl-gym "
-                "train makes one that tracks, and kkl-gym train SYSTEM --pipeline spinn one with T"
+            self._lacks(
+                "can begin at no known state: it holds neither a motion nor T; kkl-gym train makes one that tracks, "
+                "and kkl-gym train SYSTEM --pipeline spinn one with T"
             )
 
     def require_covariance(self) -> None:
         """Raise ArtifactError unless T_inv has a covariance."""
         if self.inverse.error_covariance is None:
-            raise ArtifactError(f"this map for {self.system!r} holds no covariance; kkl-gym train makes one that does")
+            self._lacks("holds no covariance; kkl-gym train makes one that does")
 
     def require_motion(self) -> Motion:
         """Return the motion by which the observer tracks, or raise ArtifactError if there is none."""
-        if self.motion is None:
-            raise ArtifactError(f"this map for {self.system!r} does not track; kkl-gym train makes one that does")
-        return self.motion
+        return self.motion or self._lacks("does not track; kkl-gym train makes one that does")
+
+    def _lacks(self, text: str) -> NoReturn:
+        raise ArtifactError(f"this map for {self.system!r} {text}")
 
     @property
     def process_noise_max(self) -> float | None:

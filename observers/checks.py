@@ -15,6 +15,17 @@ _TEXTS = (str, bytes, bytearray, memoryview)  # sequences too
 _LARGEST_LEVEL = 1e12  # of noise; outputs under it stay far within what observers take, and within float32
 
 
+class ArtifactError(ValueError):
+    """Raised for invalid, corrupt or incompatible artifacts and their files."""
+
+
+def check_shapes(owner: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise ArtifactError unless the arrays of a map have these shapes."""
+    for name, shape in shapes.items():
+        if (given := getattr(owner, name).shape) != shape:
+            raise ArtifactError(f"{name} does not fit the network: it must have shape {shape}, got {given}")
+
+
 def shown(value: object) -> str:
     """A value as error messages show it: on one line, and cut where it is long."""
     try:

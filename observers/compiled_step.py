@@ -1,7 +1,7 @@
-"""An observer's step as machine code, where Numba is installed: its numbers, as the kernel orders them."""
+"""A tracker's step as machine code, where Numba is installed: its numbers, as the kernel orders them."""
 
 import functools
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -15,80 +15,64 @@ MOST_OPERATIONS = 400  # of expressions; beyond, such as for a network as f, com
 
 
 class CompiledStep:
-    """The step of :class:`observers.kkl.KKL`, of rows of its state in place.
+    """The step of :class:`observers.kkl.KKL` with a tracker, of rows of its state in place.
 
     Raises ImportError without Numba, and ValueError where an expression is too long to compile.
     """
 
-    def __init__(self, artifact: Artifact, decoders: Decoders, tracker: Tracker | None) -> None:
-        nx, ny, nu, linear = artifact.nx, artifact.ny, artifact.nu, artifact.filter
-        motion = None if tracker is None else tracker.motion
-        equations, flow = (None, None) if motion is None else (motion.equations, motion.flow)
-        for expression in (None if equations is None else equations.field, artifact.h):
+    def __init__(self, artifact: Artifact, decoders: Decoders, tracker: Tracker) -> None:
+        motion, watch, linear = tracker.motion, tracker.supervision, artifact.filter
+        nx, ny, nu = self._sizes = artifact.nx, artifact.ny, artifact.nu
+        self._motion, self._linear, self._h = motion, linear, artifact.h
+        for expression in (None if motion.equations is None else motion.equations.field, artifact.h):
             if expression is not None and expression.operations > MOST_OPERATIONS:
                 raise ValueError("the expression takes too long to compile")
-        self._nothing = np.empty((1, 0, 0))
-        driven, free = _of_map(decoders.driven, nx), _of_map(decoders.free or decoders.driven, nx)
-        widest = max(driven[2], free[2], nx + nu)
-        states, r, watched, limit = np.zeros((3, nx)), np.ones(ny), [0.0] * 7, 0.0
-        if tracker is not None:
-            watch = tracker.supervision
-            states, r, limit = np.array([tracker.motion.low, tracker.motion.high, tracker.q]), tracker.r, watch.limit
-            watched = [float(watch.window), watch.share, watch.trend_share, watch.trend_square_share]
-            watched += [watch.trend_gain, watch.trend_limit, tracker.gate]
-        scaling, of_flow, packed, shape = (
+        maps = [_of_map(each) for each in (decoders.driven, decoders.free or decoders.driven)]
+        scaling, affine, network = (
             np.zeros((4, nx + nu)),
             np.zeros((nx, 1)),
-            np.zeros(0, np.float32),
-            np.zeros(1, int),
+            (np.zeros(0, np.float32), np.zeros(1, int)),
         )
-        if motion is not None and flow is not None:
+        if (flow := motion.flow) is not None:
             scaling[0, :nx], scaling[1, :nx], scaling[2, :nx] = motion.x_offset, motion.x_scale, flow.gain
-            scaling[3, :nu], of_flow = 1.0 / flow.u_scale, flow.linear
-            packed, shape = flow.mlp.packed()
-            widest = max(widest, *shape[1:])
-        self._equations, self._linear, self._h, self._sizes = equations, linear, artifact.h, (nx, ny, nu)
-        self._flags, self._widest = (int(tracker is not None), int(artifact.knows_output), len(linear.A)), int(widest)
-        self._seen = linear.size + ny + 1 + nx + nx**2 + 2  # where a row has the number of samples seen
-        self._window, self._tracks_equations = watched[0], tracker is not None and equations is not None
-        self._numbers = linear.dt, limit, *watched
-        self._model = (
-            states,
-            r,
-            np.zeros((ny, nx)) if artifact.C is None else np.array(artifact.C, dtype=float, order="C"),
+            scaling[3, :nu], affine, network = 1.0 / flow.u_scale, np.array(flow.linear, order="C"), flow.mlp.packed()
+        widths = [width for *_, shape in (network, *(of for of, _ in maps)) for width in shape[1:]]
+        self._flags = len(linear.A), int(max(nx + nu, *widths))
+        C = np.zeros((ny, nx)) if artifact.C is None else np.array(artifact.C, dtype=float, order="C")
+        self._model = np.array([motion.low, motion.high, tracker.q]), tracker.r, C
+        self._numbers = (
+            *(linear.dt, watch.limit, float(watch.window), watch.share, watch.trend_share),
+            *(watch.trend_square_share, watch.trend_gain, watch.trend_limit, tracker.gate),
         )
-        self._networks = (
-            (driven[0], free[0], driven[1], free[1]),
-            (scaling, np.array(of_flow, order="C"), packed, shape),
-        )
-        self._usual, self._one, self._first = self._at(linear), self._code(1), np.zeros(1, int)
+        self._parts = tuple(of for each in zip(*maps, strict=True) for of in each), (scaling, affine, *network)
+        self._window, self._seen = (
+            watch.window,
+            linear.size + ny + 1 + tracker.nis + 2,
+        )  # where a row has the number of samples seen
+        self._usual, self._first = self._at(linear), np.zeros(1, int)
+        self._one, self._many = self._code(1), cast(Any, None)
 
-    @functools.cached_property
-    def _many(self) -> tuple[Any, tuple[int, ...], Any]:
-        return self._code(_LANES)
-
-    def _code(self, W: int) -> tuple[Any, tuple[int, ...], Any]:
-        """The kernel for W rows at once, and the motion and the output by their addresses."""
+    def _code(self, W: int) -> Any:
+        """The kernel for W rows at once, with the addresses of the motion and of the output."""
         from observers import kernel, kernel_functions
 
-        nx, ny, nu = self._sizes
-        move = measure = None
-        if self._equations is not None:
-            move = kernel_functions.motion(self._equations.field, nx, nu, W, not self._equations.substeps)
+        (nx, ny, nu), equations, addresses = self._sizes, self._motion.equations, [0, 0]
+        if equations is not None:
+            move = kernel_functions.motion(equations.field, nx, nu, W, not equations.substeps)
+            addresses[0] = move.address
         if self._h is not None:
-            measure = kernel_functions.output(self._h, nx, W)
-        held = move, measure  # machine code is freed with the object that has its address
-        return kernel.steps(nx, ny, nu, W), tuple(0 if each is None else each.address for each in held), held
+            addresses[1] = kernel_functions.output(self._h, nx, W).address
+        return functools.partial(kernel.steps(nx, ny, nu, W), tuple(addresses))
 
     def _at(self, linear: LinearFilter) -> tuple[Any, ...]:
         """All that the kernel takes before rows and samples, at the sampling interval of a filter."""
-        samples, h = linear.dt / self._linear.dt, 0.0
+        samples, h, equations = linear.dt / self._linear.dt, 0.0, self._motion.equations
         substeps = -round(samples)  # of a flow
-        if self._equations is not None:
-            substeps = self._equations.steps(samples)
+        if equations is not None:
+            substeps = equations.steps(samples)
             h = linear.dt / substeps
-        flags, numbers = (*self._flags, substeps, self._widest), (h, samples, *self._numbers)
-        return flags, numbers, *self._model, _of_filter(linear.transition, linear.drive), *self._networks
+        of_filter = _of_filter(linear.transition, linear.drive)
+        return (*self._flags, substeps), (h, samples, *self._numbers), *self._model, of_filter, *self._parts
 
     def __call__(
         self,
@@ -103,28 +87,24 @@ class CompiledStep:
 
         Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu), ``record`` (steps, n, width).
         """
-        y, u = np.array(y, order="C"), np.array(u, order="C")  # Numba compiles anew for what is read-only
-        usual = linear is None or linear is self._linear
-        model = self._usual if linear is None or usual else self._at(linear)
-        given = rows, y, u, self._nothing if record is None else record
-        step, addresses, _ = self._one
+        y, u = np.array(y, order="C"), np.array(u, order="C")  # Numba would compile again for what is read-only
+        model = self._usual if linear is None or linear is self._linear else self._at(linear)
+        given = rows, y, u, np.empty((1, 0, 0)) if record is None else record
         few = self._first if len(rows) == 1 else np.arange(len(rows))
-        if len(rows) >= _LANES and self._tracks_equations:
-            old = rows[:, self._seen] >= self._window
-            few, many = few[~old], few[old]
-            if len(many):
-                self._many[0](self._many[1], *model, many, *given)
-        if len(few):
-            step(addresses, *model, few, *given)
+        if len(rows) >= _LANES and self._motion.equations is not None:
+            if self._many is None:
+                self._many = self._code(_LANES)
+            settled = rows[:, self._seen] >= self._window
+            few, many = few[~settled], few[settled]
+            self._many(*model, many, *given)  # even of no rows: the first batch compiles both, and no later one waits
+        self._one(*model, few, *given)
 
 
-def _of_map(decoder: Decoder, nx: int) -> tuple[Any, tuple[np.ndarray, np.ndarray], int]:
-    """A map's network, its covariances by age, and its largest width."""
-    error, network = decoder.error, decoder.network
-    ages, table = np.zeros(1), np.zeros((1, nx * nx))
-    if error is not None:
-        ages, table = error.ages, np.ascontiguousarray(error.covariance.reshape(len(error.ages), -1))
-    return network, (np.array(ages), table), int(max(*network[-1][1:], nx))
+def _of_map(decoder: Decoder) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, np.ndarray]]:
+    """A map's network, and its covariances by age."""
+    error = decoder.error
+    assert error is not None  # of a map that tracks
+    return decoder.network, (np.array(error.ages), error.covariance.reshape(len(error.ages), -1).copy())
 
 
 def _of_filter(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -132,6 +112,3 @@ def _of_filter(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, n
     diagonal = transition.diagonal()
     places = np.array(np.nonzero(transition - np.diag(diagonal)))
     return np.vstack([diagonal, drive]), places, transition[*places]
-
-
-__all__ = ["CompiledStep"]

@@ -32,10 +32,8 @@ class Decoders:
             return np.asarray(of(driven, z, age))
         nz = free.size  # behind it lies z_u, exactly 0 until an input acts
         moved = z[..., nz:].any(-1)
-        if moved.all():
-            return np.asarray(of(driven, z, age))
-        if not moved.any():
-            return np.asarray(of(free, z[..., :nz], age))
+        if moved.all() or not moved.any():
+            return np.asarray(of(driven, z, age) if moved.all() else of(free, z[..., :nz], age))
         ages = np.broadcast_to(age, moved.shape)
         of_driven, of_free = of(driven, z[moved], ages[moved]), of(free, z[~moved][:, :nz], ages[~moved])
         out = np.empty((*moved.shape, *of_driven.shape[1:]))
@@ -68,7 +66,7 @@ class Decoder:
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the estimate."""
         if z.ndim == 1 and self._machine and available():
-            from observers.network_kernel import decode_one
+            from observers.kernel_functions import decode_one
 
             x_hat = np.empty(len(self._inverse.x_offset))
             decode_one(z, float(age), self.network, x_hat)
@@ -92,7 +90,7 @@ class Decoder:
 
     @functools.cached_property
     def network(self) -> tuple[np.ndarray, ...]:
-        """What :func:`observers.network_kernel.decode` takes.
+        """What :func:`observers.kernel_functions.decode` takes.
 
         The coordinates in which the network sees z are a matrix product, as its first layer is: they are one, in
         doubles. (They are differences of filter states that are much alike, of which float32 would leave little.)

@@ -2,7 +2,7 @@
 
 import functools
 import reprlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -99,18 +99,24 @@ class Expression:
 
     @property
     def operations(self) -> int:
-        """Number of operations in all components."""
-        return sum(map(_operations, self.components))
+        """Number of arguments of all functions."""
+        named = [part for each in self.components for part in _parts(each) if isinstance(part, tuple)]
+        return sum(len(part) - 1 for part in named if part[0] not in ("x", "u"))
 
     @functools.cached_property
     def states(self) -> int:
         """Number of states that it needs."""
-        return max(_count(part, "x") for part in self.components)
+        return self._count("x")
 
     @functools.cached_property
     def inputs(self) -> int:
         """Number of inputs that it needs."""
-        return max(_count(part, "u") for part in self.components)
+        return self._count("u")
+
+    def _count(self, letter: str) -> int:
+        """One more than the largest index of a letter."""
+        parts = (part for each in self.components for part in _parts(each))
+        return max((int(part[1]) + 1 for part in parts if isinstance(part, tuple) and part[0] == letter), default=0)
 
 
 def _checked(part: Any, condition: bool, levels: int, left: list[int]) -> Any:
@@ -160,16 +166,9 @@ def _joined(source: str, sources: list[str], arity: int) -> str:
     return functools.reduce(source.format, sources[arity:], source.format(*sources[:arity]))
 
 
-def _operations(part: Any) -> int:
-    if isinstance(part, float) or part[0] in ("x", "u"):
-        return 0
-    return len(part) - 1 + sum(map(_operations, part[1:]))
-
-
-def _count(part: Any, letter: str) -> int:
-    """One more than the largest index of a letter."""
-    if isinstance(part, float):
-        return 0
-    if part[0] in ("x", "u"):
-        return int(part[1]) + 1 if part[0] == letter else 0
-    return max(_count(each, letter) for each in part[1:])
+def _parts(part: Any) -> Iterator[Any]:
+    """A part of an expression and all within it."""
+    yield part
+    if isinstance(part, tuple) and part[0] not in ("x", "u"):
+        for each in part[1:]:
+            yield from _parts(each)

@@ -5,8 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from observers.checks import shown
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError, shown
 
 COVERAGE = 0.9  # of the regions that calibration makes true
 _MAX_FACTOR = 1e12
@@ -58,7 +57,7 @@ class Factors:
         """Return the factors at levels in multiples of the largest. Shapes: returns (m,)."""
         share = min(process_noise, 1.0)
         table = (1.0 - share) * self.factors[0] + share * self.factors[-1]
-        return np.array([np.interp(measurement_noise, self.levels, column) for column in table.T])
+        return interpolated(measurement_noise, self.levels, table)
 
 
 @dataclass(frozen=True)
@@ -91,30 +90,23 @@ class ErrorCovariance:
         """Number of states."""
         return self.covariance.shape[-1]
 
-    def at_level(self, level: float) -> "CovarianceByAge":
-        """Return the covariances at a level, in multiples of the largest."""
-        level = min(max(level, 0.0), float(self.levels[-1]))
-        i = min(int(np.searchsorted(self.levels, level, side="right")), len(self.levels) - 1)
-        low, high = self.levels[max(i - 1, 0)], self.levels[i]
-        share = (level - low) / (high - low) if high > low else 0.0
-        return CovarianceByAge(self.ages, (1 - share) * self.covariance[max(i - 1, 0)] + share * self.covariance[i])
-
-
-class CovarianceByAge:
-    """Covariances (m, nx, nx) at ages (m,) in seconds, interpolated between them."""
-
-    def __init__(self, ages: np.ndarray, covariance: np.ndarray) -> None:
-        self.ages, self.covariance = ages, covariance
+    def at_level(self, level: float) -> Self:
+        """Return the covariances at a level alone, in multiples of the largest."""
+        return type(self)(np.zeros(1), self.ages, interpolated(level, self.levels, self.covariance)[None])
 
     def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
-        """Return the covariances at ages (...,), which broadcast to ``shape``; returns (..., nx, nx)."""
-        ages = np.broadcast_to(np.asarray(age, dtype=float), shape or np.shape(age))
-        i = np.clip(np.searchsorted(self.ages, ages, side="right"), 1, max(1, len(self.ages) - 1))
-        if len(self.ages) == 1:
-            return np.array(np.broadcast_to(self.covariance[0], (*ages.shape, *self.covariance.shape[1:])))
-        low, high = self.ages[i - 1], self.ages[i]
-        share = np.clip((ages - low) / (high - low), 0.0, 1.0)[..., None, None]
-        return np.asarray((1 - share) * self.covariance[i - 1] + share * self.covariance[i])
+        """Return those of the first level at ages (...,), which broadcast to ``shape``; returns (..., nx, nx)."""
+        return interpolated(np.broadcast_to(age, shape or np.shape(age)), self.ages, self.covariance[0])
+
+
+def interpolated(at: np.ndarray | float, points: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate values (k, ...) at rising points (k,) linearly; they stay as they are beyond the ends."""
+    last = len(points) - 1
+    i = np.clip(np.searchsorted(points, at, side="right"), min(1, last), last)
+    before = np.maximum(i - 1, 0)
+    share = np.clip((at - points[before]) / np.where(i > before, points[i] - points[before], 1.0), 0.0, 1.0)
+    share = share.reshape(np.shape(at) + (1,) * (values.ndim - 1))
+    return np.asarray((1 - share) * values[before] + share * values[i])
 
 
 def check_positive_definite(covariance: np.ndarray) -> None:

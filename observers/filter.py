@@ -1,6 +1,7 @@
 """The linear half of the observer, z' = A z + B y, integrated exactly between samples."""
 
 import copy
+import functools
 
 import numpy as np
 
@@ -96,6 +97,7 @@ class LinearFilter:
     def _on_z_y(self, matrix: np.ndarray) -> np.ndarray:
         return np.vstack([matrix, np.zeros((self.nu * len(self.A), matrix.shape[1]))])
 
+    @functools.lru_cache(maxsize=64)  # noqa: B019 - intervals of samples that are irregular often come again
     def at(self, dt: float) -> "LinearFilter":
         """Return the same filter at another sampling interval."""
         other = copy.copy(self)

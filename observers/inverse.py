@@ -1,4 +1,4 @@
-"""T_inv: from the filter's state, levels of noise and age to the state estimate."""
+"""T and T_inv: between the state and the filter's state."""
 
 import math
 from dataclasses import dataclass, replace
@@ -6,13 +6,42 @@ from typing import Any
 
 import numpy as np
 
-from observers.checks import is_finite
-from observers.errors import ArtifactError, check_shapes
+from observers.checks import ArtifactError, check_shapes, is_finite
 from observers.factors import ErrorCovariance
 from observers.network import MLP
 
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
+
+
+@dataclass(frozen=True)
+class ForwardMap:
+    """T: x -> z as learned, T(x) = z_offset + z_scale * mlp((x - x_offset) / x_scale).
+
+    Parameters
+    ----------
+    mlp : MLP
+        The network, of nx inputs and nz outputs.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Scaling of the states.
+    z_offset, z_scale : ndarray, shape (nz,)
+        Scaling of the filter's state.
+    """
+
+    mlp: MLP
+    x_offset: np.ndarray
+    x_scale: np.ndarray
+    z_offset: np.ndarray
+    z_scale: np.ndarray
+
+    def __post_init__(self) -> None:
+        nx, nz = self.mlp.inputs, self.mlp.outputs
+        check_shapes(self, {"x_offset": (nx,), "x_scale": (nx,), "z_offset": (nz,), "z_scale": (nz,)})
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Evaluate T. Shapes: ``x`` (..., nx); returns (..., nz)."""
+        z = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
+        return self.z_offset + self.z_scale * z
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,11 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from observers.kernel_functions import OPTIONS, padded
+from observers.kernel_functions import OPTIONS, decode, evaluate, padded
 from observers.lanes import choose, doubles, stack
 from observers.machine import kernel, part
 from observers.network import UNROLLED
-from observers.network_kernel import decode, evaluate
-from observers.supervision import INFLATION, RELINEARISATIONS
+from observers.tracker import INFLATION, RELINEARISATIONS
 
 _intrinsic: Any = intrinsic  # whose results take other arguments than the functions that it decorates
 _POINTER = types.CPointer(types.float64)
@@ -51,7 +50,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     square, cross, inputs, turns, inflation = nx * nx, nx * ny, max(nu, 1), RELINEARISATIONS, INFLATION
     of_states, of_outputs, of_innovations, of_network = (nx + nu) * wide, ny * wide, ny * ny, nx + inputs
     nis = nx + square  # where it lies in a row of the tracker
-    of_row = nis + 5 + ny
+    of_row, rejections, trends = nis + 4 + 2 * ny, nis + 4, nis + 4 + ny
 
     @_inlined
     def factorise(P: Any, L: Any, inverse: Any) -> None:
@@ -219,17 +218,13 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     @_inlined
     def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
         """Mark outputs whose innovations are beyond the gate, unless it is open."""
-        closed = choose(window, now[nis + 4], choose(now[nis + 2], window - 0.5, 1.0, 0.0), 0.0)
-        measured, far = 0.0, 0.0
         for k in range(ny):
-            innovation = y[k] - expected[k]
-            beyond = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)
-            measured += finite(y[k])
-            far += beyond
-            now[nis + 3] += beyond * closed
-            y[k] = choose(beyond * closed, 0.0, np.nan, y[k])
-        in_a_row = choose(measured, far, 0.0, now[nis + 4] + 1.0)
-        now[nis + 4] = choose(measured, 0.0, in_a_row, now[nis + 4])
+            innovation, count = y[k] - expected[k], now[rejections + k]
+            far = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)
+            rejected = choose(window, count, choose(now[nis + 2], window - 0.5, far, 0.0), 0.0)
+            now[nis + 3] += rejected
+            now[rejections + k] = choose(finite(y[k]), 0.0, choose(far, 0.0, count + 1.0, 0.0), count)
+            y[k] = choose(rejected, 0.0, np.nan, y[k])
 
     @_inlined
     def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
@@ -321,12 +316,12 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         sound = finite(total)
         count, squares, raised = 0.0, 0.0, 0.0
         for k in range(ny):
-            seen, trend = sound * finite(y[k]), now[nis + 5 + k]
+            seen, trend = sound * finite(y[k]), now[trends + k]
             trend = choose(seen, 0.0, trend + trend_share * (white[k] - trend), trend)
             count += seen
             squares += white[k] * white[k]
             raised += seen * trend * trend
-            now[nis + 5 + k] = trend
+            now[trends + k] = trend
         some = choose(count, 0.0, 1.0, 0.0)
         weight, each = count / float(ny), 1.0 / choose(count, 0.0, count, 1.0)
         average = now[nis] + share * weight * (squares * each - now[nis])
@@ -337,7 +332,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         now[nis + 1] = choose(some, 0.0, choose(square_average, trend_limit, 1.0, square_average), now[nis + 1])
         now[nis + 2] += some
         for k in range(ny):
-            now[nis + 5 + k] = choose(square_average, trend_limit, 0.0, now[nis + 5 + k])
+            now[trends + k] = choose(square_average, trend_limit, 0.0, now[trends + k])
         for i in range(nx):
             now[i] = choose(sound, 0.0, clipped(states, mean[i], i), now[i])
         for i in range(square):
@@ -388,28 +383,9 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 now[nx + i] = P[i]
         if lost:
             now[nis] = now[nis + 1] = 1.0
-            now[nis + 4] = window
             for k in range(ny):
-                now[nis + 5 + k] = 0.0
-
-    @_part
-    def fill(y: Any, z: Any, age: float, nz: int, h: Any, states: Any, maps: Any, scratch: Any, x_hat: Any, before: Any,
-             filled: Any) -> None:  # fmt: skip
-        """Replace what is missing of a sample by h(T_inv(z)), or by the output before where that is undefined."""
-        invert(z, age, nz, maps, scratch, x_hat)
-        address, C = h
-        at, to = stack(of_states, 1), stack(of_outputs, 1)
-        for i in range(nx):
-            at[i * wide] = x_hat[i]
-        if address:
-            call(address, at, to, 1, 0.0)
-        for k in range(ny):
-            if not address:
-                to[k * wide] = 0.0
-                for i in range(nx):
-                    to[k * wide] += C[k, i] * x_hat[i]
-            if np.isnan(y[k]):
-                filled[k] = to[k * wide] if np.isfinite(to[k * wide]) else before[k]
+                now[rejections + k] = window
+                now[trends + k] = 0.0
 
     @_part
     def follow(z: Any, before: Any, u: Any, y: Any, linear: Any, out: Any) -> None:
@@ -436,7 +412,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
         A record (steps, n, width) keeps the rows at each sample; (steps, n, 0) keeps none.
         """
-        tracks, knows_output, nz, substeps, widest = flags
+        nz, widest, substeps = flags
         h, samples, dt, limit = numbers[:4]
         watched = numbers[4:]
         model, of_output = (states, flow, substeps, addresses[0], h, samples), (addresses[1], C)
@@ -452,47 +428,33 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                     row = rows[first + min(w, count - 1)]  # lanes that are left over do the last row again
                     for i in range(ny):
                         ys[i * W + w] = y[k, row, i]
-                    if tracks:
-                        for j in range(nu):
-                            us[j * W + w] = u[k, row, j]
-                        for i in range(of_row):
-                            nows[i * W + w] = state[row, base + i]
-                if tracks:
-                    track(now, sample, held, model, of_output, r, watched, scratch, expected)
+                    for j in range(nu):
+                        us[j * W + w] = u[k, row, j]
+                    for i in range(of_row):
+                        nows[i * W + w] = state[row, base + i]
+                track(now, sample, held, model, of_output, r, watched, scratch, expected)
                 for w in range(count):
                     row = rows[first + w]
                     whole, before = state[row], state[row, size : size + ny]
-                    past, tracked, input_ = whole[:size], whole[base:], u[k, row]
-                    gap = False
+                    past, tracked = whole[:size], whole[base:]
                     for i in range(ny):
                         at = i * W + w
-                        gap = gap or np.isnan(ys[at])
                         filled[i] = ys[at]
                         if np.isnan(ys[at]):
-                            filled[i] = expecteds[at] if tracks and np.isfinite(expecteds[at]) else before[i]
-                    if single and gap and knows_output and not tracks:
-                        age = whole[base - 1]
-                        fill(sample, past, age * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
-                        follow(past, before, input_, filled, linear, z)
-                        age += samples
-                        fill(sample, z, age * dt, nz, of_output, states, maps, scratch, x_hat, before, filled)
-                    follow(past, before, input_, filled, linear, z)
+                            filled[i] = expecteds[at] if np.isfinite(expecteds[at]) else before[i]
+                    follow(past, before, u[k, row], filled, linear, z)
                     for i in range(size):
                         past[i] = z[i]
                     for i in range(ny):
                         before[i] = filled[i]
                     whole[base - 1] += samples
-                    if tracks:
+                    for i in range(of_row):
+                        tracked[i] = nows[i * W + w]
+                    lost = not tracked[nis] <= limit
+                    if lost or tracked[nis + 2] < watched[0]:
                         age = whole[base - 1] * dt
-                        for i in range(of_row):
-                            tracked[i] = nows[i * W + w]
-                        lost = not tracked[nis] <= limit
-                        if lost or tracked[nis + 2] < watched[0]:
-                            supervise(tracked, past, age, nz, dt, watched[0], lost, states, maps, scratch, x_hat)
+                        supervise(tracked, past, age, nz, dt, watched[0], lost, states, maps, scratch, x_hat)
                     for i in range(record.shape[2]):
                         record[k, row, i] = whole[i]
 
     return run
-
-
-__all__ = ["steps"]

@@ -1,6 +1,7 @@
 """The observer itself, with a state that the caller keeps: linear filter, T_inv, tracker and monitor."""
 
 import functools
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,32 @@ from observers.filter import LinearFilter
 from observers.monitor import Monitor
 from observers.tracker import Tracker
 
-_MAX_FILTERS = 64  # at sampling intervals other than the artifact's, which are kept
 _MAX_SAMPLES = 1000  # in one step
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
+
+
+@dataclass(frozen=True)
+class Pending:
+    """The inputs of the last samples, (n, delay, nu), and how many there are, (n,); no method changes either."""
+
+    inputs: np.ndarray
+    count: np.ndarray
+
+    def restarted(self, rows: np.ndarray) -> "Pending":
+        """Return the inputs without those of some rows."""
+        return Pending(self.inputs, np.where(rows, 0, self.count))
+
+    def after(self, u: np.ndarray, rows: np.ndarray) -> tuple["Pending", np.ndarray, np.ndarray]:
+        """Return the inputs after those of the next sample, (n, nu), in some rows.
+
+        Also those that led to the outputs which now arrive, (n, nu), and in which of the rows one does, (n,).
+        """
+        delay = self.inputs.shape[1]
+        due, first = rows & (self.count == delay), self.inputs[:, 0]
+        inputs = np.where(due[:, None, None], np.roll(self.inputs, -1, axis=1), self.inputs)
+        count, at = self.count + (rows & ~due), np.flatnonzero(rows)
+        inputs[at, count[at] - 1] = u[at]
+        return Pending(inputs, count), first, due
 
 
 class KKL(Estimator[np.ndarray]):
@@ -31,18 +55,18 @@ class KKL(Estimator[np.ndarray]):
         *,
         measurement_noise: float | tuple[float, ...],
         process_noise: float,
-        tracking: bool,
-        monitored: bool,
+        tracking: bool | None,
+        monitor: bool,
         compiled: bool | None,
         gate: float | None = None,
     ) -> None:
         levels: dict[str, Any] = {"measurement_noise": measurement_noise, "process_noise": process_noise}
         self.artifact, self._choice = artifact, compiled
-        self._filters: dict[float, LinearFilter] = {}  # at other sampling intervals
         self._options = levels | {"compiled": compiled}
         self.decoders = Decoders(artifact, slice(artifact.nx), **self._options)
-        self.tracker = Tracker(artifact, self.decoders, **levels, gate=gate) if tracking else None
-        limits = artifact.limits if monitored else None
+        tracks = artifact.motion is not None and (tracking is None or tracking)
+        self.tracker = Tracker(artifact, self.decoders, **levels, gate=gate) if tracks else None
+        limits = artifact.limits if monitor else None
         self.monitor = None if limits is None else Monitor(limits, measurement_noise, artifact.filter.dt)
         size, ny = artifact.filter.size, artifact.ny
         self.z, self.y, self.age = slice(size), slice(size, size + ny), size + ny
@@ -102,18 +126,12 @@ class KKL(Estimator[np.ndarray]):
         linear = self.artifact.filter
         if dt is None or dt == linear.dt:
             return linear
-        if dt not in self._filters:
-            if len(self._filters) >= _MAX_FILTERS:
-                self._filters.clear()
-            samples = dt / linear.dt
-            if samples > _MAX_SAMPLES:
-                raise ValueError(
-                    f"dt must be at most {_MAX_SAMPLES * linear.dt:g} s, got {dt:g}: reset after long gaps"
-                )
-            if self.tracker is not None:
-                self.tracker.motion.check_samples(samples)
-            self._filters[dt] = linear.at(dt)
-        return self._filters[dt]
+        samples = dt / linear.dt
+        if samples > _MAX_SAMPLES:
+            raise ValueError(f"dt must be at most {_MAX_SAMPLES * linear.dt:g} s, got {dt:g}: reset after long gaps")
+        if self.tracker is not None:
+            self.tracker.motion.check_samples(samples)
+        return linear.at(dt)
 
     def _stepped(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None) -> np.ndarray:
         """The step in NumPy, without the monitor."""
@@ -219,8 +237,11 @@ class KKL(Estimator[np.ndarray]):
 
     @functools.cached_property
     def _machine(self) -> CompiledStep | None:
-        """The step as machine code; None without Numba, or where NumPy is chosen or an expression is too long."""
-        if self._choice is False:
+        """A tracker's step as machine code; None without Numba, or where NumPy is chosen or an expression is too long.
+
+        The linear filter alone is a matrix product, which NumPy takes as quickly.
+        """
+        if self._choice is False or self.tracker is None:
             return None
         try:
             return CompiledStep(self.artifact, self.decoders, self.tracker)

@@ -1,14 +1,13 @@
 """How functions become machine code, where Numba is installed."""
 
 import hashlib
+import logging
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from typing import Any, TypeVar
 
-# From when on compiling is worth the seconds that it takes.
-MANY_ROWS = 128  # of a batch
-SOON = 1000  # single samples, after which a simulation will go on for long enough
+logger = logging.getLogger("observers")
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -51,6 +50,11 @@ def pointer(function: Callable[..., Any], signature: Any, **options: Any) -> Any
 
 
 @cache
+def _announce() -> None:
+    logger.info("Numba compiles, which takes some seconds; later processes read the machine code from disk")
+
+
+@cache
 def _forgiving() -> Any:
     """Numba's cache, except that files which cannot be read or written cost a compilation and raise nothing."""
     from numba.core.caching import FunctionCache
@@ -61,11 +65,14 @@ def _forgiving() -> Any:
 
         def load_overload(self, *arguments: Any) -> Any:
             try:
-                return super().load_overload(*arguments)  # type: ignore[no-untyped-call]
+                loaded = super().load_overload(*arguments)  # type: ignore[no-untyped-call]
             except Exception:  # cut off by a power failure, say
+                loaded = None
                 with suppress(Exception):
                     self.flush()  # type: ignore[no-untyped-call]
-                return None
+            if loaded is None:
+                _announce()
+            return loaded
 
         def save_overload(self, *arguments: Any) -> None:
             with suppress(Exception):  # a full disk, say

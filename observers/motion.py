@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from observers.checks import is_finite
-from observers.errors import ArtifactError, check_shapes
+from observers.checks import ArtifactError, check_shapes, is_finite
 from observers.expression import Expression
 from observers.factors import Factors, check_positive_definite
 from observers.network import MLP

@@ -7,8 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from observers.artifact import Artifact
-from observers.checks import shown
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError, shown
 from observers.observer import KKLObserver
 
 
@@ -73,6 +72,8 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
     if text.endswith(".safetensors"):
         return Path(text)
     names = shipped()
+    if ":" in text or text.endswith(".py"):
+        raise ArtifactError(f"{text} names a system; name its observer's file, such as runs/NAME/NAME.safetensors")
     if (name := matching(text, names)) is None:
         raise ArtifactError(
             f"unknown observer {shown(text)}{suggestion(text, names)}; shipped: {', '.join(names) or 'none'}; "

@@ -112,7 +112,7 @@ class MLP:
         return h
 
     def packed(self, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Layers from ``first`` on as :func:`observers.network_kernel.evaluate` takes them.
+        """Layers from ``first`` on as :func:`observers.kernel_functions.evaluate` takes them.
 
         These are biases and weights one after another, with rows of zeros up to a multiple of UNROLLED, and the number
         of the activation with all widths.

@@ -10,8 +10,7 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.checks import bool_array, check_dt, noise_level, noise_levels, real_array
 from observers.factors import standard_deviations
-from observers.kkl import KKL
-from observers.late import Pending
+from observers.kkl import KKL, Pending
 from observers.records import RecordEstimates
 from observers.samples import (
     check_arguments,
@@ -19,6 +18,7 @@ from observers.samples import (
     check_gate,
     check_output,
     check_replacement,
+    far_input,
     first_state,
     held_input,
 )
@@ -62,8 +62,8 @@ class KKLObserver(RecordEstimates):
     gate : float, optional
         Outputs whose innovation is larger than so many of its standard deviations are rejected: they count as missing,
         and :attr:`rejected` counts them. The gate is open in the first window, half a second for the maps that ship;
-        and where all that is measured has been rejected for a whole window, or the tracker diverged, until an output
-        fits again. It needs a map that tracks.
+        and for an output that was beyond it for a whole window, or where the tracker diverged, until that output fits
+        again: a jump that stays is accepted. It needs a map that tracks.
     delay : int, default 0
         Samples by which outputs are late. ``step(y, u)`` then takes the output of so many samples ago and the input
         held since the sample before, and the estimate is predicted by the motion to now. It needs a map that tracks.
@@ -92,10 +92,9 @@ class KKLObserver(RecordEstimates):
     ) -> None:
         check_arguments(artifact, monitor, compiled, tracking)
         self._gate, self._delay = check_gate(artifact, tracking, gate), check_delay(artifact, tracking, delay)
-        self.artifact, self._monitored = artifact, bool(monitor)
-        self._tracking, self._compiled = None if tracking is None else bool(tracking), compiled
+        self.artifact, self._warned = artifact, frozenset[str]()
+        self._options: dict[str, Any] = {"monitor": monitor, "tracking": tracking, "compiled": compiled}
         self._kkl: KKL
-        self._warned = False
         self._state: np.ndarray | None = None  # (n, width), never changed in place
         self._batch: tuple[int, ...] = ()
         self._process_noise = self._level(process_noise)
@@ -133,7 +132,7 @@ class KKLObserver(RecordEstimates):
 
     @gate.setter
     def gate(self, gate: float | None) -> None:
-        self._gate = check_gate(self.artifact, self._tracking, gate)
+        self._gate = check_gate(self.artifact, self._options["tracking"], gate)
         self._set_levels(self._measurement_noise, self._process_noise)
 
     @property
@@ -143,7 +142,7 @@ class KKLObserver(RecordEstimates):
 
     @delay.setter
     def delay(self, delay: int) -> None:
-        self._delay, self._state = check_delay(self.artifact, self._tracking, delay), None
+        self._delay, self._state = check_delay(self.artifact, self._options["tracking"], delay), None
 
     def _level(self, process_noise: float | None) -> float:
         if process_noise is None:
@@ -157,15 +156,8 @@ class KKLObserver(RecordEstimates):
 
     def _set_levels(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
         """Take maps, tracker and monitor for levels of noise; the monitor starts again."""
-        kkl = KKL(
-            self.artifact,
-            measurement_noise=measurement_noise,
-            process_noise=process_noise,
-            tracking=self.artifact.motion is not None and self._tracking is not False,
-            monitored=self._monitored,
-            compiled=self._compiled,
-            gate=self._gate,
-        )
+        levels: dict[str, Any] = {"measurement_noise": measurement_noise, "process_noise": process_noise}
+        kkl = KKL(self.artifact, gate=self._gate, **levels, **self._options)
         if self._state is not None and kkl.monitor is not None:
             self._state = np.hstack([self._state[:, : kkl.watched.start], kkl.monitor.start(len(self._state))])
         self._kkl, self._measurement_noise, self._process_noise = kkl, measurement_noise, process_noise
@@ -187,16 +179,8 @@ class KKLObserver(RecordEstimates):
             which restarts, and it holds no limits. The observer is then as it was.
         """
         check_replacement(self.artifact, artifact)
-        other = KKLObserver(
-            artifact,
-            self._measurement_noise,
-            process_noise=self._process_noise,
-            monitor=self._monitored,
-            tracking=self._tracking,
-            compiled=self._compiled,
-            gate=self._gate,
-            delay=self._delay,
-        )
+        how: dict[str, Any] = {**self._options, "gate": self._gate, "delay": self._delay}
+        other = KKLObserver(artifact, self._measurement_noise, process_noise=self._process_noise, **how)
         if self._state is not None:
             other._state, other._batch = other._kkl.take_over(self._kkl, self._state), self._batch
             other._pending = self._pending
@@ -364,7 +348,9 @@ class KKLObserver(RecordEstimates):
             raise RuntimeError("call reset(y0) before step(y)")
         if rows is not None:
             rows = bool_array("rows", rows, batch).ravel()
-        u = held_input(self.artifact, u, batch).reshape(len(state), self.artifact.nu)
+        u = held_input(self.artifact, u, batch)
+        self._warn_of_input(u)
+        u = u.reshape(len(state), self.artifact.nu)
         if y is None:
             y = np.full((len(state), self.artifact.ny), np.nan)
             self._warn_of_gaps()
@@ -386,13 +372,23 @@ class KKLObserver(RecordEstimates):
             self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows], dt)
 
     def _warn_of_gaps(self) -> None:
-        if not self.artifact.knows_output and not self._warned:
-            self._warned = True
-            warnings.warn(
+        if not self.artifact.knows_output:
+            self._warn(
                 f"the map for {self.artifact.system!r} holds no output h(x) by which to predict what is missing: it "
-                "holds the last value of a missing output",
-                stacklevel=4,
+                "holds the last value of a missing output"
             )
+
+    def _warn_of_input(self, u: np.ndarray) -> None:
+        """Warn of inputs (..., nu) far beyond those of training."""
+        if (far := far_input(self.artifact, u)) is not None:
+            most = ", ".join(f"{each:g}" for each in self.artifact.u_max or ())
+            self._warn(f"an input of {far:g} is far beyond those in training, at most {most}: estimates may be wrong")
+
+    def _warn(self, text: str) -> None:
+        """Warn once, by the first words."""
+        if text[:12] not in self._warned:
+            self._warned = self._warned | {text[:12]}
+            warnings.warn(text, stacklevel=5)
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Return the current estimate: T_inv(z), the network's half of :meth:`step`, or the tracker's.

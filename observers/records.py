@@ -17,15 +17,11 @@ class RecordEstimates:
     _kkl: KKL
     _delay: int
     _warn_of_gaps: Any
+    _warn_of_input: Any
     _begin: Any
 
     def estimate(
-        self,
-        y: np.ndarray,
-        u: np.ndarray | None = None,
-        *,
-        x0: np.ndarray | None = None,
-        t: np.ndarray | None = None,
+        self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None, t: np.ndarray | None = None
     ) -> np.ndarray:
         """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
 
@@ -77,6 +73,7 @@ class RecordEstimates:
             self._warn_of_gaps()
         dts = None if t is None else intervals(t, len(y))
         u = held_inputs(self.artifact, u, y.shape[:-1])
+        self._warn_of_input(u)
         x0 = None if x0 is None else real_array("x0", x0)
         state = self._begin(y[0], x0)
         samples, inputs = (each.reshape(len(each), len(state), each.shape[-1]) for each in (y, u))

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.checks import LARGEST, all_finite, flag, integer, is_finite, real_array, shown
-from observers.errors import ArtifactError
+from observers.checks import LARGEST, ArtifactError, all_finite, flag, integer, is_finite, real_array, shown
 from observers.machine import available
 
 MAX_DELAY = 1000  # samples
+FAR = 10.0  # in multiples of the largest input in training, from where on one warns
 
 
 def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tracking: bool | None) -> None:
@@ -50,7 +50,9 @@ def check_delay(artifact: Artifact, tracking: bool | None, delay: Any) -> int:
 
 def _check_tracks(artifact: Artifact, tracking: bool | None) -> None:
     if tracking is not None and not tracking:
-        raise ValueError("a gate and a delay need an observer that tracks: leave tracking=False out")
+        raise ValueError(
+            "a gate and a delay need an observer that tracks: leave tracking=False, or a wrapper's estimate='z', out"
+        )
     artifact.require_motion()
 
 
@@ -109,19 +111,15 @@ def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...])
     if u is None:
         return np.zeros((*batch, nu))
     u = real_array("u", u)
-    if nu == 0:
-        if u.shape[:-1] != batch:
-            raise ValueError(f"u must have a row of inputs for each of the batch, {batch}, got shape {u.shape}")
-        if u.any():
-            raise ValueError(
-                f"this map for {artifact.system} knows no inputs, but u = {u}; take one that does, "
-                "or pass u=None to ignore the input"
-            )
-        return np.zeros((*batch, 0))
-    if u.shape != (*batch, nu):
+    if u.shape[:-1] != batch or (nu and u.shape != (*batch, nu)):
         raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
+    if nu == 0 and u.any():
+        raise ValueError(
+            f"this map for {artifact.system} knows no inputs, but u = {u}; take one that does, "
+            "or pass u=None to ignore the input"
+        )
     _check_finite("u", u)
-    return u
+    return u if nu else u[..., :0]
 
 
 def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
@@ -167,6 +165,19 @@ def intervals(t: np.ndarray, steps: int) -> np.ndarray:
     if t.shape != (steps,) or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
         raise ValueError(f"t must be {steps} times in seconds, which rise, got {shown(t)}")
     return np.diff(t)
+
+
+def far_input(artifact: Artifact, u: np.ndarray) -> float | None:
+    """Return the first of inputs (..., nu) that is far beyond those of training, or None."""
+    if not artifact.u_max:
+        return None
+    if u.ndim == 1:  # fast path for one sample
+        for value, most in zip(u.tolist(), artifact.u_max):
+            if abs(value) > FAR * most:
+                return float(value)
+        return None
+    far = np.abs(u) > FAR * np.array(artifact.u_max)
+    return float(u[far][0]) if far.any() else None
 
 
 def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:

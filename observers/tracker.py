@@ -1,43 +1,88 @@
 """The tracker: an unscented Kalman filter that T_inv initialises where it is surer, and again where it diverged."""
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
 from observers.artifact import Artifact
 from observers.decoder import Decoders
-from observers.supervision import INFLATION, RELINEARISATIONS, Supervision
+from observers.motion import Motion
 from observers.unscented import add, factor, shift, solved, transformed, whitened
 
+# Normal quantiles of the limits: to start again in vain costs the estimate, to inflate a covariance in vain little. The
+# running means are more skewed than the chi-square distribution that the limits assume: chance exceeds the second some
+# twenty times as often as it says.
+_DIVERGED = 6.0  # 1e-9, of the NIS
+_COLOURED = 4.265  # 1e-5, of the mean square of the innovations' running mean
+_TREND = 0.25  # windows over which innovations are averaged to see whether they agree
+_LONG = 4.0  # windows over which the square of that is averaged
+INFLATION = 10.0  # of the covariance where innovations are not white
+RELINEARISATIONS = 2  # of a step within the first window: with 0 errors without noise rise by 40 to 80 %
 KNOWN = 1e-3  # standard deviation of a known start, in scales of the states
+
+
+@dataclass(frozen=True)
+class Supervision:
+    """Of a tracker, for all levels of noise."""
+
+    window: int
+    share: float
+    limit: float
+    trend_share: float
+    trend_square_share: float
+    trend_limit: float
+
+    @classmethod
+    def of(cls, motion: Motion, dt: float) -> Self:
+        """Return that of a motion on samples every ``dt`` seconds."""
+        window, ny = max(1, round(motion.window / dt)), len(motion.least_measurement_noise)
+        share, trend_share, long_share = (-math.expm1(-1 / (each * window)) for each in (1.0, _TREND, _LONG))
+        memory = (1 - trend_share) ** 2 * (1 - long_share)  # of a trend's square, a sample later
+        return cls(
+            window,
+            share,
+            _limit(ny * (2 - share) / share, _DIVERGED),
+            trend_share,
+            long_share,
+            _limit(ny * (2 - long_share) / long_share * (1 - memory) / (1 + memory), _COLOURED),
+        )
+
+    @property
+    def trend_gain(self) -> float:
+        """What the square of a trend is multiplied with to be 1 on average where innovations are independent."""
+        return (2 - self.trend_share) / self.trend_share
+
+
+def _limit(freedom: float, quantile: float) -> float:
+    """A quantile of the mean square of so many standard normal numbers, by Wilson and Hilferty's approximation."""
+    spread = 2 / (9 * freedom)
+    return float((1 - spread + quantile * math.sqrt(spread)) ** 3)
 
 
 class Tracker:
     """An unscented Kalman filter on the system's equations, or on a learned flow, for a batch of rows.
 
-    The filter starts at the mean and covariance of the states at which motions start, corrected by the first sample.
-    Within the first window each step is taken three times: once a sample has corrected a prediction, it also says more
-    of where the step began, and the motion is linearised anew over what is left of that uncertainty (Kullberg, Skog and
-    Hendeby, 2023).
+    It starts at the mean and covariance of the states at which motions start, corrected by the first sample. Within the
+    first window each step is taken three times, with the motion linearised about where the sample puts the start of
+    the step (Kullberg, Skog and Hendeby, 2023).
 
     The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's
+    within the first window where T_inv's covariance has the smaller determinant, and where the filter diverged: the
+    mean square of its innovations over the window (NIS) exceeds its limit, or its covariance is no longer positive
+    definite. T_inv's covariance is then that of an age of one window, since what misled the filter may have misled z.
 
-    - within the first window where T_inv's covariance has the smaller determinant, and
-    - where the filter diverged: the mean square of its innovations over the window (NIS) exceeds its limit, or its
-      covariance is no longer positive definite. T_inv's covariance is then that of an age of one window, since what
-      misled the filter may have misled z as well.
-
-    An error below the noise does not show in the NIS, but makes innovations correlated: where the mean square of their
-    running mean exceeds its limit, the covariance is multiplied by ten.
+    An error below the noise makes innovations correlated: where the mean square of their running mean exceeds its
+    limit, the covariance is multiplied by ten.
 
     With a gate, an output whose innovation is larger than so many of its standard deviations is rejected, and counts as
-    missing. The gate is open in the first window; and where all that is measured has been rejected for a whole window,
-    or the filter diverged, until an output fits again: a jump that stays is believed.
+    missing. The gate is open in the first window; and for an output that has been rejected for a whole window, or of a
+    filter that diverged, until that output fits again: a jump that stays is accepted.
 
     A row of the state, which the caller keeps, holds the estimate x (nx), its covariance P (nx^2), the NIS, the mean
-    square of the innovations' running mean, the number of samples seen, that of outputs rejected, that of samples
-    rejected in a row, and the running mean (ny).
+    square of the innovations' running mean, the number of samples seen, that of outputs rejected, that of samples in a
+    row beyond the gate (ny), and the running mean (ny).
     """
 
     def __init__(
@@ -59,8 +104,9 @@ class Tracker:
         shares = artifact.inverse.shares(measurement_noise, process_noise)
         self._log_factors = np.log(motion.factors.at_levels(*shares))
         self.x, self.P = slice(motion.nx), slice(motion.nx, motion.nx + motion.nx**2)
-        self.nis = self.P.stop
-        self.width = self.nis + 5 + len(self.r)
+        self.nis, ny = self.P.stop, len(self.r)
+        self.trends = self.nis + 4 + ny
+        self.width = self.trends + ny
 
     def covariance(self, rows: np.ndarray, age: np.ndarray) -> np.ndarray:
         """Calibrated covariances of the estimates' errors, (n, nx, nx), at ages (n,) in samples."""
@@ -81,7 +127,7 @@ class Tracker:
         else:
             x, P = x0, np.tile(np.diag((KNOWN * motion.x_scale) ** 2), (n, 1, 1))
         seen = np.full((n, 1), 0.0 if x0 is None else self.supervision.window)
-        return self._packed(x, P, np.concatenate([np.ones((n, 2)), seen, np.zeros((n, 2 + y.shape[1]))], 1))
+        return self._packed(x, P, np.concatenate([np.ones((n, 2)), seen, np.zeros((n, 1 + 2 * y.shape[1]))], 1))
 
     def take_over(self, rows: np.ndarray) -> np.ndarray:
         """Return the rows of a tracker with another motion, within the bounds of this one."""
@@ -134,22 +180,21 @@ class Tracker:
             expected, S, cross = self._expected(mean, moved)
             V, white = whitened(y - expected, S, cross, np.isnan(y))
         P, watched = self._watched(rows[:, self.nis :], add(moved, V, V, -1.0), white, ~np.isnan(y))
-        watched[:, 3:5] = rejected
+        watched[:, 3 : self.trends - self.nis] = rejected
         return self._packed(shift(mean, V, white), P, watched), np.where(np.isnan(y), expected, y)
 
     def _gated(
         self, rows: np.ndarray, y: np.ndarray, innovation: np.ndarray, S: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Outputs (n, ny), NaN where they are rejected, and how many outputs and samples in a row were, (n, 2)."""
-        count, in_a_row = rows[:, self.nis + 3], rows[:, self.nis + 4]
+        """Outputs (n, ny), NaN where they are rejected, and the counts of rejected outputs (n, 1 + ny)."""
+        counts, window = rows[:, self.nis + 3 : self.trends], self.supervision.window
         if self.gate == math.inf:
-            return y, np.stack([count, in_a_row], 1)
-        window = self.supervision.window
-        measured, open_ = ~np.isnan(y), (in_a_row >= window) | (rows[:, self.nis + 2] < window)
-        far = measured & (innovation**2 > self.gate**2 * np.diagonal(S, axis1=1, axis2=2))
-        rejected = far & ~open_[:, None]
-        in_a_row = np.where(measured.any(1), np.where((far == measured).all(1), in_a_row + 1, 0.0), in_a_row)
-        return np.where(rejected, np.nan, y), np.stack([count + rejected.sum(1), in_a_row], 1)
+            return y, counts
+        count, in_a_row = counts[:, :1], counts[:, 1:]
+        far = innovation**2 > self.gate**2 * np.diagonal(S, axis1=1, axis2=2)
+        rejected = far & (in_a_row < window) & (rows[:, self.nis + 2, None] >= window)
+        in_a_row = np.where(np.isnan(y), in_a_row, np.where(far, in_a_row + 1, 0.0))
+        return np.where(rejected, np.nan, y), np.hstack([count + rejected.sum(1, keepdims=True), in_a_row])
 
     def _expected(self, x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean and covariance of the outputs to measure, and their covariance with the states."""
@@ -166,18 +211,18 @@ class Tracker:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Update the statistics of white innovations (n, ny), and inflate covariances where these are not white."""
         watch, count = self.supervision, seen.sum(-1)
-        nis, trend_square, samples = watched[:, :3].T
+        (nis, trend_square, samples), trend = watched[:, :3].T, watched[:, -seen.shape[1] :]
         weight = count / seen.shape[1]  # of the outputs that are measured; fewer scatter more
         per_output = 1 / np.maximum(count, 1)
         nis = nis + watch.share * weight * (per_output * (white**2).sum(-1) - nis)
-        trend = watched[:, 5:] + watch.trend_share * np.where(seen, white - watched[:, 5:], 0.0)
+        trend = trend + watch.trend_share * np.where(seen, white - trend, 0.0)
         square = watch.trend_gain * per_output * (np.where(seen, trend, 0.0) ** 2).sum(-1)
         trend_square = trend_square + watch.trend_square_share * weight * (square - trend_square)
         coloured = (trend_square > watch.trend_limit) & (count > 0)
         if coloured.any():
             P = np.where(coloured[:, None, None], INFLATION * P, P)
             trend_square, trend = np.where(coloured, 1.0, trend_square), np.where(coloured[:, None], 0.0, trend)
-        return P, np.column_stack([nis, trend_square, samples + (count > 0), watched[:, 3:5], trend])
+        return P, np.column_stack([nis, trend_square, samples + (count > 0), watched[:, 3 : -seen.shape[1]], trend])
 
     def supervise(self, rows: np.ndarray, z: np.ndarray, age: np.ndarray) -> np.ndarray:
         """Return rows with T_inv's estimate of z, (n, size), at ages (n,) in samples, where that replaces theirs."""
@@ -198,8 +243,8 @@ class Tracker:
         rows[where, self.x] = self._within(self._decoded(Decoders.__call__, z[where], age[where] * self._dt, where))
         rows[where, self.P] = P.reshape(len(where), -1)
         rows[lost, self.nis : self.nis + 2] = 1.0
-        rows[lost, self.nis + 4] = watch.window
-        rows[lost, self.nis + 5 :] = 0.0
+        rows[lost, self.nis + 4 : self.trends] = watch.window
+        rows[lost, self.trends :] = 0.0
         return rows
 
     def _decoded(self, of: Any, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:

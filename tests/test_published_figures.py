@@ -88,6 +88,13 @@ def test_errors_of_the_observers_that_ship(title, kind, column, condition):
     assert row(title, of_all(kind, column, condition)) in page(ACCURACY)
 
 
+@pytest.mark.parametrize(("title", "column"), [("all steps", "smape"), ("after 20 %", "smape_late")])
+def test_the_limit_under_noise(title, column):
+    levels = [of_evaluation("tracking/accuracy", "limit", column, "X", False, noise) for noise in (0.1, 0.5, 1.0)]
+    cells = list(map(" / ".join, zip(*levels, strict=True)))
+    assert row(f"limit at noise 0.1 / 0.5 / 1, {title}", cells) in page(ACCURACY)
+
+
 @pytest.mark.parametrize("starts", ["X", "2X \\ X"])
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_errors_of_spinn(starts, noise):
@@ -97,11 +104,7 @@ def test_errors_of_spinn(starts, noise):
 
 def test_the_readmes_table():
     quiet, noisy = (("X", False, noise) for noise in (0.0, 0.5))
-    titles = (
-        "`NAME`, the default",
-        "`NAME-large` with `tracking=False`: T_inv alone",
-        "extended Kalman filter that knows the equations",
-    )
+    titles = ("`NAME`, the default", "`NAME-large` with `tracking=False`: T_inv alone")
     cells = [[cell.split(" / ") for cell in of_all("accuracy", "smape", condition)] for condition in (quiet, noisy)]
     for i, title in enumerate(titles):
         pairs = [f"{without[i]} / {under[i]}" for without, under in zip(*cells, strict=True)]
@@ -109,6 +112,8 @@ def test_the_readmes_table():
     medians = of_benchmark()
     pairs = [" / ".join(text(medians[system, "ukf", noise]) for noise in (0.0, 0.5)) for system in SYSTEMS]
     assert row("unscented Kalman filter, tuned, on the benchmark's runs", pairs) in page("README.md")
+    limit = [f"– / {cell}" for cell in of_evaluation("tracking/accuracy", "limit", "smape", "X", False, 0.5)]
+    assert row("limit that noise sets (posterior Cramér-Rao bound)", limit) in page("README.md")
 
 
 def test_the_guide_on_noise_levels():

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from training.diagnosis import Observability as Observability
     from training.diagnosis import observability as observability
     from training.evaluation.errors import errors as errors
+    from training.evaluation.errors import noise_limit as noise_limit
     from training.evaluation.errors import unseen_trajectories as unseen_trajectories
     from training.evaluation.metrics import nrmse as nrmse
     from training.evaluation.metrics import smape as smape
@@ -25,16 +26,16 @@ if TYPE_CHECKING:
     from training.rollouts import learn as learn
     from training.rollouts.callback import KKLTrainingCallback as KKLTrainingCallback
     from training.run import Run as Run
+    from training.sources import Source as Source
     from training.sources.recorded import RecordedSource as RecordedSource
     from training.sources.recorded import recorded_preset as recorded_preset
     from training.sources.simulated import SimulatedSource as SimulatedSource
-    from training.sources.source import Source as Source
 
 _NAMES = {
     "calibration": "calibrate",
     "config": "Config",
     "diagnosis": "Observability observability",
-    "evaluation.errors": "errors unseen_trajectories",
+    "evaluation.errors": "errors noise_limit unseen_trajectories",
     "evaluation.metrics": "nrmse smape",
     "export.torch_memory": "TorchMemory",
     "export.torch_observer": "TorchObserver",
@@ -46,7 +47,7 @@ _NAMES = {
     "run": "Run",
     "sources.recorded": "RecordedSource recorded_preset",
     "sources.simulated": "SimulatedSource",
-    "sources.source": "Source",
+    "sources": "Source",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULES)

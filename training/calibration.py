@@ -14,9 +14,9 @@ from observers.decoder import Decoders
 from observers.factors import COVERAGE
 from training.config import settings_of
 from training.progress import ProgressBars, progress_bars
+from training.sources import Runs, Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
-from training.sources.source import Runs, Source, TooFewRunsError
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of measurement noise, in multiples of the largest in training
 AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds at the usual pace

@@ -6,6 +6,7 @@ command is called.
 
 import _thread
 import io
+import logging
 import os
 import re
 import signal
@@ -18,8 +19,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any, NoReturn
 
-Commands = Mapping[str, tuple[str, str]]
-"""The module and the class in it that are behind each command."""
+Commands = Mapping[str, tuple[str, str]]  # the module and the class of each command
 
 COMMANDS: Commands = {
     "demo": ("training.commands.demo", "Demo"),
@@ -39,10 +39,10 @@ A first look: kkl-gym demo. An observer for a system of yours: kkl-gym diagnose 
 One for any environment: kkl-gym record ENV_ID, kkl-gym train NAME --data. kkl-gym COMMAND --help has the options,
 kkl-gym --version the version."""
 
-RESUMES = "--resume goes on from the last checkpoint, if there is one"
 # Hints after an interruption, by the first words of the command.
-AFTER_INTERRUPTION = {("train",): RESUMES, ("identify",): RESUMES, ("agent", "train"): RESUMES}
-
+AFTER_INTERRUPTION = dict.fromkeys(
+    [("train",), ("identify",), ("agent", "train")], "--resume goes on from the last checkpoint, if there is one"
+)
 WIDE = 140  # columns of output into a file or a pipe, where tables of 80 would be cut
 PROG = "kkl-gym"
 MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
@@ -50,16 +50,7 @@ MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 # Modules that an extra of the package brings.
 EXTRAS = {
     "train": {
-        "filelock",
-        "joblib",
-        "pandas",
-        "pydantic",
-        "pytorch_optimizer",
-        "rich",
-        "scipy",
-        "sympy",
-        "torch",
-        "tyro",
+        *["filelock", "joblib", "pandas", "pydantic", "pytorch_optimizer", "rich", "scipy", "sympy", "torch", "tyro"]
     },
     "agents": {"sb3_contrib", "stable_baselines3", "yaml"},
     "plots": {"PIL", "matplotlib"},
@@ -67,6 +58,13 @@ EXTRAS = {
     "envs": {"h5py", "minari"},
     "onnx": {"onnx", "onnxruntime", "onnxscript"},
 }
+
+
+class _Notes(logging.Handler):
+    """Puts notes of the library, such as that it compiles, on stderr as it is then: a progress bar redirects it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(record.getMessage(), file=sys.stderr)
 
 
 def main(
@@ -81,6 +79,9 @@ def main(
     if arguments[:1] == ["--version"]:
         print(f"kkl-gym {version('kkl-gym')}")
         return
+    notes = logging.getLogger("observers")
+    notes.setLevel(logging.INFO)
+    notes.handlers = [_Notes()]
     with _noticing_interruptions() as interrupted:
         try:
             from rich.console import Console
@@ -106,7 +107,7 @@ def main(
 
 @contextmanager
 def _noticing_interruptions() -> Iterator[list[int]]:
-    """Give a list that is empty until there is an interruption."""
+    """Yield a list that is empty until there is an interruption."""
     noticed: list[int] = []
 
     def handler(number: int, frame: object) -> None:
@@ -140,7 +141,7 @@ def read(arguments: list[str], *, prog: str = PROG, commands: Commands = COMMAND
         from observers.names import suggestion  # with numpy, which help need not wait for
 
         _end(prog, f"unknown command {called[0]!r}{suggestion(called[0], commands)}: {', '.join(commands)}", MISUSED)
-    if called and called[0].startswith("--tyro"):  # completion of the shell wants to know all
+    if called and called[0].startswith("--tyro"):  # completion of the shell needs them all
         called = list(commands)
     classes = {name: (load if name in called else _described)(*behind) for name, behind in commands.items()}
     printed = io.StringIO()
@@ -181,8 +182,8 @@ def _without_box(text: str) -> str:
 
 def load(module: str, name: str) -> Callable[..., Any]:
     """Import the class of a command."""
-    found: Callable[..., Any] = getattr(import_module(module), name)
-    return found
+    command: Callable[..., Any] = getattr(import_module(module), name)
+    return command
 
 
 @cache
@@ -204,7 +205,7 @@ def _described(module: str, name: str) -> Callable[..., Any]:
 
 
 def _message(error: Exception) -> str:
-    """What is wrong; of a configuration, a line for each setting: ``name = value: what it should be``."""
+    """The message of an error; of a configuration, a line for each setting: ``name = value: requirement``."""
     from pydantic import ValidationError
 
     if isinstance(error, OSError) and error.filename and error.strerror:
@@ -212,8 +213,8 @@ def _message(error: Exception) -> str:
     if not isinstance(error, ValidationError):
         return str(error)
     lines = []
-    for found in error.errors(include_url=False, include_context=False):
-        name = ".".join(map(str, found["loc"]))
-        text = found["msg"].removeprefix("Value error, ").removeprefix("Input ")
-        lines.append(f"{name} = {found['input']!r}: {text}" if name else text)
+    for one in error.errors(include_url=False, include_context=False):
+        name = ".".join(map(str, one["loc"]))
+        text = one["msg"].removeprefix("Value error, ").removeprefix("Input ")
+        lines.append(f"{name} = {one['input']!r}: {text}" if name else text)
     return "\n".join(lines)

@@ -69,11 +69,23 @@ class ExtendedKalmanFilter:
             held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
             moved, spread = self._predicted(x, P, held, self._dt if dt is None else dt)
             x, P = np.where(begun[:, None], moved, x), np.where(begun[:, None, None], spread, P)
-        return Belief(*self._corrected(x, P, y), np.ones(len(y), dtype=bool))
+        begun = begun | np.isfinite(y).any(-1)  # a sample that is missing begins no row
+        return Belief(*self._corrected(x, P, np.where(begun[:, None], y, np.nan)), begun)
 
     def estimate(self, state: Belief) -> Estimate:
         """Return means and covariances."""
         return Estimate(state.x.copy(), state.P.copy())
+
+    def along(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Covariances (steps + 1, n, nx, nx) with derivatives along motions (steps + 1, n, nx) themselves.
+
+        With the plant's own noise that is the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
+        """
+        state, y, covariances = self.start(x.shape[1]), self._system.output(x), []
+        for k in range(len(x)):
+            state = self.advance(state._replace(x=x[max(k - 1, 0)]), y[k], u[k - 1])  # the first sample has no input
+            covariances.append(state.P)
+        return np.array(covariances)
 
     def _starts(self, n: int) -> Gaussian:
         x0, P0 = self._start

@@ -24,8 +24,8 @@ from training.presets import preset
 from training.progress import ProgressBars
 from training.run import Run
 from training.seeds import Stream, generator
+from training.sources import OF_MEDIAN, Pairs, Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
-from training.sources.source import OF_MEDIAN, Pairs, Source, TooFewRunsError
 from training.spectrum import Spectrum, check_continuous
 
 # Of a flow's network.
@@ -122,7 +122,8 @@ def train(
             "torch": torch.__version__,
             "numpy": np.__version__,
         }
-        artifact = Artifact(**vars(maps), **source.facts(), training=training, versions=versions)
+        facts = source.facts() | ({} if maps.filter.nu else {"u_max": None})
+        artifact = Artifact(**vars(maps), **facts, training=training, versions=versions)
         with run.timed("calibrating"):
             try:
                 artifact = calibrate(artifact, source, motion=motion, console=run.progress)

@@ -11,9 +11,10 @@ import numpy as np
 
 from kkl_gym.loading import load_function
 from kkl_gym.system import NOISE_SHARE, System
+from observers.names import suggestion
 from training.config import Config, Pipeline
 from training.spectrum import FASTEST_MODE, evenly_spaced, papers_spectrum, smooth_spectrum
-from training.trajectories.policies import Controller, checked_policy, linear_quadratic
+from training.trajectories.motions import Controller, checked_policy, linear_quadratic
 
 Preset = Literal["fast", "paper"]
 Size = Literal["default", "large"]
@@ -135,6 +136,10 @@ def controller(system: System) -> Controller:
 
 def named_policy(system: System, name: str) -> Controller:
     """A policy under which motions of a system are simulated."""
+    if ":" not in name and name != "controller":
+        raise ValueError(
+            f"unknown policy {name!r}{suggestion(name, ['controller'])}: it is controller, or script.py:function"
+        )
     if name != "controller":
         return checked_policy(load_function(name), system, name)
     try:

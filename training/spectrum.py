@@ -12,8 +12,7 @@ from kkl_gym.system import System
 from observers import LinearFilter
 from training.maps.coordinates import settling_time
 from training.seeds import Stream, generator
-from training.trajectories.filtering import filter_states
-from training.trajectories.motions import recording_ages
+from training.trajectories.motions import filter_states, recording_ages
 
 FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
 SMOOTH = 0.85  # least exponent of a smooth T: differences in z fall as distance^0.85 where neighbours come closer

@@ -35,7 +35,6 @@ from training.agents.tasks import Task
 from training.calibration import chi_square
 from training.commands import demo
 from training.commands.options import shown
-from training.commands.portraits import animate
 from training.evaluation.errors import estimates as estimates_of
 from training.evaluation.errors import unseen_trajectories
 from training.evaluation.faults import FAULTS
@@ -78,7 +77,7 @@ def estimates(duration: float = 15.0) -> Draw:
 def portraits(name: str | None = None, duration: float = 12.0) -> Draw:
     """Phase portraits that move: ``kkl-gym demo --gif --seed 7 --duration 12``, of one system or all."""
     episodes = [demo.play(one, round(duration / one.system.dt), None, seed=SEED) for one in shown(name, None)]
-    return lambda path: animate(path, [episode.motion for episode in episodes])
+    return lambda path: demo.animate(path, episodes)
 
 
 def agents() -> tuple[Task, Mapping[str, Episodes]]:
@@ -111,26 +110,25 @@ def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
     width = chi_square(BAND, 1)[()] ** 0.5 * standard_deviations(observer.estimate_covariance(episode.y))
 
     def draw(path: Path) -> None:
-        motion = episode.motion
-        t = np.arange(len(motion.x)) * motion.dt
+        t = np.arange(len(episode.x)) * episode.dt
         with drawing(path, 9, 4.6) as figure:
-            axes = figure.subplots(2, motion.system.nx, sharex=True, height_ratios=[3, 2], squeeze=False)
+            axes = figure.subplots(2, episode.system.nx, sharex=True, height_ratios=[3, 2], squeeze=False)
             for i, (above, below) in enumerate(axes.T):
                 if i == 0:  # the measured state
-                    above.plot(t, motion.y[:, 0], ".", ms=1.5, color=MEASURED, label="measured")
+                    above.plot(t, episode.y[:, 0], ".", ms=1.5, color=MEASURED, label="measured")
                 for ax, middle, label in (
-                    (above, motion.x_hat[:, i], f"{100 * BAND:.0f} % band"),
+                    (above, episode.x_hat[:, i], f"{100 * BAND:.0f} % band"),
                     (below, 0 * t, None),
                 ):
                     ax.fill_between(
                         t, middle - width[:, i], middle + width[:, i], color=ESTIMATE, alpha=0.3, lw=0, label=label
                     )
-                above.plot(t, motion.x[:, i], color=TRUTH, label="true")
-                above.plot(t, motion.x_hat[:, i], "--", color=ESTIMATE, lw=1.0, label="estimate")
-                below.plot(t, motion.x[:, i] - motion.x_hat[:, i], color=TRUTH, lw=0.8)
-                margin, largest = 0.2 * np.ptp(motion.x[:, i]), 1.2 * width[t > FIRST, i].max()
-                name = motion.system.state_names[i]
-                above.set(ylabel=name, ylim=(motion.x[:, i].min() - margin, motion.x[:, i].max() + margin))
+                above.plot(t, episode.x[:, i], color=TRUTH, label="true")
+                above.plot(t, episode.x_hat[:, i], "--", color=ESTIMATE, lw=1.0, label="estimate")
+                below.plot(t, episode.x[:, i] - episode.x_hat[:, i], color=TRUTH, lw=0.8)
+                margin, largest = 0.2 * np.ptp(episode.x[:, i]), 1.2 * width[t > FIRST, i].max()
+                name = episode.system.state_names[i]
+                above.set(ylabel=name, ylim=(episode.x[:, i].min() - margin, episode.x[:, i].max() + margin))
                 below.set(xlabel="t in s", ylabel=f"error of {name}", ylim=(-largest, largest))
             axes[0, 0].legend(loc="lower right", ncols=2, markerscale=4)
 
@@ -181,8 +179,8 @@ def errors_of_runs(
         system, how = kind(), dict[str, Any](measurement_noise=level, seed=0)
         runs = unseen_trajectories(system, DT, n=trajectories, duration=duration or system.duration, seed=0)
         x_hats = (
-            estimates_of(Artifact.read(resolve(name)), system, runs, **how),
-            estimates_of(None, system, runs, **how),
+            estimates_of(Artifact.read(resolve(name)), system, runs, **how)[0],
+            estimates_of(None, system, runs, **how)[0],
         )
         errors[name] = [percentage_error(runs.x, x_hat) for x_hat in x_hats]
     return errors

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from rich.console import Console
-from training.files import table
 
 from kkl_gym.system import Box, Components, System
-from training.files import write
+from training.files import table, write
 from training.progress import LOG, progress_bars
 
 if TYPE_CHECKING:

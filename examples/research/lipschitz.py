@@ -14,7 +14,7 @@ from training.commands.options import NoiseLevel, Observers, OwnSystem, read_obs
 from training.evaluation.errors import unseen_trajectories
 from training.evaluation.levels import Level, beyond, level_for
 from training.maps.networks import from_mlp
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 # Least and greatest slope of each activation, rounded outwards; those of x sigmoid(x) are where its second derivative
 # vanishes, at |x| = 2.39936.

@@ -1,6 +1,5 @@
 """What single and vector wrappers share: an observer fitted to a plant, and what it shows."""
 
-import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -10,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from kkl_gym.plant import Plant
-from observers import Artifact, KKLObserver, LinearFilter, shipped
+from observers import Artifact, KKLObserver, shipped
 from observers.checks import choice, flag, shown
 from observers.estimator import Estimator, Running
 from observers.factors import standard_deviations
@@ -49,14 +48,14 @@ class KKLEstimator:
         artifact: Artifact,
         space: gym.spaces.Box,
         *,
-        estimate: str,
-        measurement_noise: float | Sequence[float] | None,
+        estimate: str = "x",
+        measurement_noise: float | Sequence[float] | None = None,
         process_noise: float | None = None,
         blind: bool = False,
         ignore_input: bool = False,
-        monitor: bool,
-        known_start: bool,
-        uncertainty: bool,
+        monitor: bool = False,
+        known_start: bool = False,
+        uncertainty: bool = False,
         compiled: bool | None = None,
     ) -> None:
         choice("estimate", estimate, ("x", "z"))
@@ -65,9 +64,9 @@ class KKLEstimator:
         self._known_start = flag("known_start", known_start)
         self._monitor = flag("monitor", monitor)
         self.estimate, self.space, self._blind = estimate, space, blind
-        self.observer = KKLObserver(
-            self.asked(artifact), measurement_noise, process_noise=process_noise, monitor=monitor, compiled=compiled
-        )
+        tracks = estimate == "x" or self._monitor or self._known_start
+        how: dict[str, Any] = {"process_noise": process_noise, "monitor": monitor, "compiled": compiled}
+        self.observer = KKLObserver(self.asked(artifact), measurement_noise, tracking=None if tracks else False, **how)
 
     @classmethod
     def of_plant(
@@ -75,13 +74,12 @@ class KKLEstimator:
         plant: Plant,
         observer: str | os.PathLike[str] | Artifact | None,
         *,
-        estimate: str,
-        measurement_noise: float | Sequence[float] | None,
-        ignore_input: bool,
-        monitor: bool,
-        known_start: bool,
-        uncertainty: bool,
-        compiled: bool | None = None,
+        estimate: str = "x",
+        measurement_noise: float | Sequence[float] | None = None,
+        ignore_input: bool = False,
+        known_start: bool = False,
+        uncertainty: bool = False,
+        **how: Any,
     ) -> "KKLEstimator":
         """An observer that was learned for a plant, at the plant's levels of noise."""
         choice("estimate", estimate, ("x", "z"))
@@ -92,7 +90,9 @@ class KKLEstimator:
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
         if flag("known_start", known_start) and artifact.nx > system.nx:
             raise ValueError("leave known_start out: this observer estimates a bias too, of which no start is known")
-        space = _filter_space(plant, artifact.filter) if estimate == "z" else _estimate_space(plant, artifact.nx)
+        space: gym.spaces.Box = gym.spaces.Box(-np.inf, np.inf, (artifact.filter.size,))
+        if estimate == "x":
+            space = _estimate_space(plant, artifact.nx)
         if uncertainty:
             low, high = with_deviations(space.low, space.high)
             space = gym.spaces.Box(low, high, dtype=np.float32)
@@ -104,10 +104,9 @@ class KKLEstimator:
             process_noise=plant.process_noise,
             blind=artifact.nu == 0 < system.nu,
             ignore_input=ignore_input,
-            monitor=monitor,
             known_start=known_start,
             uncertainty=uncertainty,
-            compiled=compiled,
+            **how,
         )
 
     def replace(self, observer: str | os.PathLike[str] | Artifact) -> None:
@@ -123,9 +122,7 @@ class KKLEstimator:
             raise ValueError(f"uncertainty=True is about x_hat: it needs estimate='x', got {self.estimate!r}")
         if self._uncertainty:
             artifact.require_covariance()
-        if self.estimate == "x" or self._monitor or self._known_start:
-            return artifact
-        return dataclasses.replace(artifact, motion=None)
+        return artifact
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
         """The input as far as the map knows it. Shapes: ``u`` (..., nu); returns (..., nu), or None."""
@@ -214,33 +211,3 @@ def _estimate_space(plant: Plant, nx: int) -> gym.spaces.Box:
     space, others = plant.state_space, np.full(max(0, nx - plant.system.nx), np.inf, dtype=np.float32)
     low, high = np.concatenate([space.low, -others]), np.concatenate([space.high, others])
     return gym.spaces.Box(low, high, dtype=np.float32)
-
-
-def _filter_space(plant: Plant, linear: LinearFilter) -> gym.spaces.Box:
-    """Bounds of the filter's state under outputs within the output space and inputs within their bounds.
-
-    A known start may lie outside for a while, where the motion that led to it did; what is shown is then clipped.
-    """
-    y_max = np.maximum(np.abs(plant.output_space.low), np.abs(plant.output_space.high)).astype(float)
-    bound = reach(linear, y_max, np.array(plant.system.u_max[: linear.nu])).astype(np.float32)
-    return gym.spaces.Box(-bound, bound, dtype=np.float32)
-
-
-def reach(linear: LinearFilter, y_max: np.ndarray, u_max: np.ndarray) -> np.ndarray:
-    """Largest sizes that the state of a filter can have.
-
-    Each is the response to the worst signal, the L1 norm of its impulse response. The filter starts from where a
-    constant output would have led, so that its start lies within as well.
-
-    Shapes: ``y_max`` (ny,), ``u_max`` (nu,); returns (size,).
-    """
-    driven = np.hstack([linear.early_y, linear.late_y, linear.held_u])
-    limits = np.concatenate([y_max, y_max, u_max])
-    endless = (driven[:, np.isinf(limits)] != 0).any(1)
-    limits = np.where(np.isinf(limits), 0.0, limits)
-    forgetting = np.abs(np.linalg.eigvals(linear.transition)).max()
-    bound = np.zeros(linear.size)
-    for _ in range(int(np.ceil(np.log(1e-4) / np.log(forgetting)))):
-        bound += np.abs(driven) @ limits
-        driven = linear.transition @ driven
-    return np.where(endless, np.inf, 1.001 * bound)  # for the tail of the sum

@@ -6,10 +6,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.identity import check_identity, source_of
+from kkl_gym.identity import check_autoreset, check_identity, source_of
 from kkl_gym.named import InputReader, Reader, observed, resolved
 from kkl_gym.signals import Inputs
-from kkl_gym.wrappers.estimator import KKLEstimator, reach, with_deviations
+from kkl_gym.wrappers.estimator import KKLEstimator, with_deviations
 from observers import Artifact, ArtifactError
 from observers.checks import choice, flag
 
@@ -24,27 +24,23 @@ class NamedEstimator(KKLEstimator):
         action_space: gym.Space[Any],
         artifact: Artifact,
         *,
-        estimate: str,
-        uncertainty: bool,
+        estimate: str = "x",
+        uncertainty: bool = False,
         **how: Any,
     ) -> None:
         choice("estimate", estimate, ("x", "z"))
         uncertainty = flag("uncertainty", uncertainty)
+        check_autoreset(env)
         check_identity(artifact, env)
         try:
             _check_actions(env, action_space)
             self.samples = Samples(artifact, observation_space, action_space, source=source_of(env))
         except ValueError as error:
             raise ArtifactError(f"the observer {artifact.system!r} does not fit: {error}") from error
-        measured, inputs = self.samples.outputs, self.samples.inputs
-        if estimate == "z":
-            with np.errstate(over="ignore"):
-                high = reach(artifact.filter, np.maximum(abs(measured.low), abs(measured.high)), inputs.largest)
-            low = -high
-        else:
-            low, high = _bounds(artifact, observation_space)
-            if uncertainty:
-                low, high = with_deviations(low, high)
+        measured, high = self.samples.outputs, np.full(artifact.filter.size, np.inf)
+        low, high = _bounds(artifact, observation_space) if estimate == "x" else (-high, high)
+        if uncertainty:
+            low, high = with_deviations(low, high)
         low, high = np.concatenate([measured.low, low]), np.concatenate([measured.high, high])
         with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
             space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)

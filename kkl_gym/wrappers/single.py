@@ -59,9 +59,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     array of shape (), above 1 where the samples do not fit the estimates (a faulty sensor, states that the map was not
     made for).
 
-    With ``estimate="z"`` the network is not evaluated, and nothing tracks (the map of :attr:`observer` holds no
-    motion), unless there is a monitor or the start is known. There is then no ``x_hat``, and :meth:`render` shows no
-    estimate.
+    With ``estimate="z"`` the network is not evaluated, and nothing tracks, unless there is a monitor or the start is
+    known. There is then no ``x_hat``, and :meth:`render` shows no estimate.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
     ``training.learn``). That one sees the signals of the observation that its file names, and the actions. The
@@ -79,8 +78,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the environment's
         system.
     estimate : {"x", "z"}
-        "x" shows the state estimate, clipped to the system's declared bounds. "z" shows the filter's state [z_y, z_u],
-        within the bounds that bounded outputs and inputs imply.
+        "x" shows the state estimate, clipped to the system's declared bounds. "z" shows the filter's state
+        [z_y, z_u].
     measurement_noise : float or sequence of float, length ny, optional
         The noise level that the observer assumes, of all outputs or each; None takes the environment's, or none where
         it is not ours. (Process noise is always taken from the environment, by maps that ask for it.)

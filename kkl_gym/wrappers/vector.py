@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +16,7 @@ from kkl_gym.vector import Infos, KKLVectorEnv, autoreset_mode_of, last_of_episo
 from kkl_gym.wrappers.estimator import Estimates, KKLEstimator, check_untouched, observation
 from kkl_gym.wrappers.rollouts import NamedEstimator, Samples
 from observers import Artifact
-from observers.checks import integer, shown
+from observers.checks import flag, integer, shown
 from observers.names import resolve
 
 VectorEnv = gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
@@ -252,18 +252,9 @@ class KKLVectorObservation(VectorEstimate):
         alone, or over the environment that the observer's file names.
     observer : str or path, optional
         As for :class:`kkl_gym.KKLObservation`.
-    estimate : {"x", "z"}
-        As for :class:`kkl_gym.KKLObservation`; with "z" the network is not evaluated, unless there is a monitor.
-    measurement_noise : float or sequence of float, length ny, optional
-        The noise level that the observer assumes, of all outputs or each; None takes the environment's.
-    ignore_input : bool
-        Whether to use a map that knows no inputs although the agent acts.
-    monitor : bool
-        Whether to keep the score.
-    known_start : bool
-        As for :class:`kkl_gym.KKLObservation`, at the start of each row's episodes.
-    uncertainty : bool
-        As for :class:`kkl_gym.KKLObservation`; ``info["x_cov"]`` has the shape (num_envs, nx, nx).
+    **options
+        All other arguments of :class:`kkl_gym.KKLObservation`; starts that are known are those of each row's episodes.
+        ``info["x_cov"]`` has the shape (num_envs, nx, nx).
 
     Attributes
     ----------
@@ -292,37 +283,20 @@ class KKLVectorObservation(VectorEstimate):
     >>> x_hat, reward, terminated, truncated, info = envs.step(np.zeros((4, 1)))
     """
 
-    def __init__(
-        self,
-        env: VectorEnv,
-        observer: str | os.PathLike[str] | None = None,
-        *,
-        estimate: Literal["x", "z"] = "x",
-        measurement_noise: float | Sequence[float] | None = None,
-        ignore_input: bool = False,
-        monitor: bool = False,
-        known_start: bool = False,
-        uncertainty: bool = False,
-    ) -> None:
+    def __init__(self, env: VectorEnv, observer: str | os.PathLike[str] | None = None, **options: Any) -> None:
         artifact = None if observer is None else Artifact.read(resolve(observer))
-        how: dict[str, Any] = {
-            "estimate": estimate,
-            "measurement_noise": measurement_noise,
-            "monitor": monitor,
-            "known_start": known_start,
-            "uncertainty": uncertainty,
-        }
         estimator: KKLEstimator
         if artifact is not None and artifact.environment is not None and isinstance(env, gym.vector.VectorEnv):
-            estimator = NamedEstimator(env, env.single_observation_space, env.single_action_space, artifact, **how)
+            flag("ignore_input", options.pop("ignore_input", False))
+            estimator = NamedEstimator(env, env.single_observation_space, env.single_action_space, artifact, **options)
             env = _Telling(env, estimator.samples)
         else:
-            estimator = KKLEstimator.of_plant(plant_of(env), artifact, ignore_input=ignore_input, **how)
+            estimator = KKLEstimator.of_plant(plant_of(env), artifact, **options)
             _check_process_noise(env, estimator.observer.artifact)
         super().__init__(env, estimator)
         self._estimator: KKLEstimator = estimator
         self.observer = estimator.observer
-        self.estimate = estimate
+        self.estimate = estimator.estimate
 
     def replace_observer(self, observer: str | os.PathLike[str] | Artifact) -> None:
         """As :meth:`kkl_gym.KKLObservation.replace_observer`, in all rows at once: the filters' states stay."""

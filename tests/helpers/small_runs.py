@@ -12,7 +12,7 @@ from training.config import Config, override
 from training.maps.inverse import TrajectorySampler
 from training.maps.networks import Network
 from training.spectrum import papers_spectrum
-from training.trajectories.motions import KINDS, Motions, record, recording_ages
+from training.trajectories.motions import KINDS, Motions, recording_ages
 
 CPU = torch.device("cpu")
 SIZES = {
@@ -42,9 +42,9 @@ BATCHES = Config("input-aware", (-1.0,), measurement_noise_max=1.0, batch=4096)
 def open_loop(process_noise_share=0.0):
     """Batches along trajectories of Van der Pol's oscillator, the trajectories, and the filter beside them."""
     linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
-    motions = Motions(KINDS, process_noise_share=process_noise_share)
+    motions = Motions(VanDerPol(), 0.01, 500, KINDS, process_noise_share=process_noise_share)
     ages, rng = recording_ages(500, 40), np.random.default_rng(0)
-    data = record(VanDerPol(), linear, n=50, steps=500, ages=ages, rng=rng, motions=motions)
+    data = motions.beside(linear, ages, 50, rng)
     sampler = TrajectorySampler(
         data,
         linear,

@@ -170,7 +170,7 @@ def test_what_would_poison_the_memory_is_an_error_that_names_it(poison):
         env.step(env.action_space.sample())
     env.unwrapped.poison = None
     env.reset(seed=0)
-    assert np.isfinite(env.step(env.action_space.sample())[0]).all()
+    assert np.isfinite(env.step(env.action_space.sample())[0]["memory"]).all()
     envs = KKLVectorMemory(SyncVectorEnv([Walk] * 3), measured=["place"])
     envs.reset(seed=0)
     envs.unwrapped.envs[2].poison = poison
@@ -200,6 +200,117 @@ def test_wrong_environments_say_what_to_do():
     envs.unwrapped.metadata = {}
     with pytest.raises(ValueError, match="does not say its autoreset mode"):
         KKLVectorMemory(envs)
+
+
+def dial(high=180.0, low=None, **arguments):
+    """A memory of a dial that turns by 0.1 turns in each step, in other units than rad."""
+
+    class Dial(gym.Env):
+        observation_space = spaces.Box(-high if low is None else low, high, (1,))
+        action_space = spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            self.turns = 0.0
+            return self.step(0)[0], {}
+
+        def step(self, action):
+            self.turns += 0.1
+            turn = 2 * high if low is None else 1 + high
+            return np.float32([(self.turns + 0.5) % 1 * turn + (-high if low is None else 0)]), 0.0, False, False, {}
+
+    return KKLMemory(Dial(), angles=[0], input_time_constants=(), **arguments)
+
+
+def test_the_period_of_angles_follows_from_the_bounds_or_is_given():
+    shown = []
+    for env in (dial(np.pi), dial(180.0), dial(4095.0, 0.0, period=4096)):
+        env.reset()
+        shown.append([env.step(0)[0][2:] for _ in range(30)])
+    assert np.allclose(shown[0], shown[0][-1], atol=0.03)  # a steady turn
+    for other in shown[1:]:
+        assert np.allclose(shown[0], other, atol=1e-3)
+    with pytest.raises(ValueError, match=r"the period of the angle in entry 0 .* unknown: its bounds are 0 and 4095"):
+        dial(4095.0, 0.0)
+    with pytest.raises(ValueError, match="period must be the positive length of a turn, such as 360, got -1"):
+        dial(period=-1)
+
+
+@modes
+def test_missing_values_are_held_within_an_episode(mode):
+    class Losing(Walk):
+        """Loses the second place in every third step, and never the first sample."""
+
+        observation_space = spaces.Box(-np.inf, np.inf, (2,))
+
+        def _seen(self):
+            return np.where([False, self.left % 3 == 0], np.float32(np.nan), self.place)
+
+        def reset(self, **arguments):
+            super().reset(**arguments)
+            return self.place.copy(), {}
+
+    ours = KKLVectorMemory(SyncVectorEnv([Losing] * 3, autoreset_mode=mode), missing="hold")
+    rows = SyncVectorEnv([lambda: KKLMemory(Losing(), missing="hold")] * 3, autoreset_mode=mode)
+    ours.action_space.seed(0)
+    assert len(compare(ours, rows, [ours.action_space.sample() for _ in range(25)], mode, ())) > 5
+    env = KKLMemory(Losing(), missing="hold")
+    before, held = env.reset(seed=0)[0], 0
+    for _ in range(env.unwrapped.left):
+        after = env.step(env.action_space.sample())[0]
+        held += after[1] == before[1]
+        assert np.isfinite(after).all()
+        before = after
+    assert held > 0
+    with pytest.raises(ValueError, match="missing must be 'error' or 'hold', got 'coast'"):
+        KKLMemory(Losing(), missing="coast")
+
+
+def test_a_dict_stays_a_dict():
+    """With images and other keys as they are, in memory of its own, and with cosine and sine where angles are none."""
+    env = KKLMemory(Walk(), angles=["way"], input_time_constants=())
+    first = env.reset(seed=0)[0]
+    assert first in env.observation_space
+    assert list(first) == ["place", "mark", "image", "way", "memory"]
+    assert first["memory"].shape == (2 + (3 + 2 + 1) * 4,)
+    place = first["place"].copy()
+    second = env.step(env.action_space.sample())[0]
+    assert np.array_equal(first["place"], place)
+    assert np.allclose(second["memory"][:2], [np.cos(second["way"][0]), np.sin(second["way"][0])])
+    flat = KKLMemory(gym.wrappers.FilterObservation(Walk(), ["place"]), measured=[0, 1])
+    assert np.array_equal(flat.reset(seed=0)[0][:2], place)  # entries are shown flat
+    with pytest.raises(ValueError, match="a key that is named memory"):
+        KKLMemory(env)
+
+
+class Reusing(Walk):
+    """Writes each observation into the same arrays."""
+
+    seen = None
+
+    def _seen(self):
+        new = super()._seen()
+        self.seen = self.seen or new
+        for key in ("place", "image", "way"):
+            self.seen[key][...] = new[key]
+        self.seen["mark"] = new["mark"]
+        return self.seen
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_arrays_that_an_environment_uses_again_are_copied(mode):
+    ours, theirs = (
+        SyncVectorEnv([lambda: KKLMemory(kind())] * 2, autoreset_mode=mode)  # noqa: B023
+        for kind in (Reusing, Walk)
+    )
+    ours.action_space.seed(0)
+    assert len(compare(ours, theirs, [ours.action_space.sample() for _ in range(20)], mode, ())) > 3
+
+
+@pytest.mark.parametrize("kind", [KKLMemory, KKLVectorMemory])
+def test_autoreset_inside_is_refused(kind):
+    env = gym.wrappers.Autoreset(gym.make("Pendulum-v1"))
+    with pytest.raises(ValueError, match="Autoreset inside hides where episodes begin"):
+        kind(env if kind is KKLMemory else SyncVectorEnv([lambda: env]))
 
 
 def test_other_actions_and_environments_that_take_no_seed():

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from kkl_gym import ActionRepeat, EquationError, KKLEnv, KKLVectorEnv, System
 from kkl_gym.elementary import where
-from observers.machine import MANY_ROWS
+from kkl_gym.vector import MANY_ROWS
 
 
 class Cart(System):
@@ -72,6 +72,7 @@ def changed(**methods):
         ({"reward": lambda self, x, u: -x[0] if x[0] > 0 else 0.0}, r"reward\(x, u\) of 'changed' .*elementary.where"),
         ({"reward": lambda self, x, u: (x[0],)}, r"reward\(x, u\) of 'changed' .* must return one number for each"),
         ({"reward": lambda self, x: x[0]}, r"must be defined as reward\(self, x, u\)"),
+        ({"terminated": lambda self, x: x[0]}, r"terminated\(x\) of 'changed' .* must return a bool or a comparison"),
         ({"terminated": lambda self, x: None}, r"terminated\(x\) of 'changed' .* must return a bool or a comparison"),
         ({"terminated": lambda self, x: max(x) > 1}, r"terminated\(x\) of 'changed' .* use kkl_gym.elementary.maximum"),
     ],

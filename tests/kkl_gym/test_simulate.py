@@ -184,19 +184,7 @@ def test_escape_leaves_nan_rows_and_no_warning():
     assert ((x[~gone] >= low) & (x[~gone] <= high)).all()
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_huge_states_are_nan_without_warning(name):
-    system = get_system(name)
-    u, w = [0.0] * system.nu, [0.0] * system.nx
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for x in ([1e200] * system.nx, [math.nan] * system.nx, [math.inf] * system.nx):
-            assert not np.isfinite(advance(system, x, u, w, DT)).any()
-            batch = advance_batch(system, np.array(x)[:, None], np.zeros((1, 1)), np.zeros((system.nx, 1)), DT)
-            assert not np.isfinite(batch).any()
-
-
-class Igniting(System):
+class Igniting(Relaxing):
     """x1' = -r, x2' = 100 r with r = x1 exp(0.06 x2): slow at first, then 400 times as fast, within one interval."""
 
     name = "igniting"
@@ -206,9 +194,6 @@ class Igniting(System):
     def f(self, x):
         r = x[0] * exp(0.06 * x[1])
         return -r, 100.0 * r
-
-    def h(self, x):
-        return (x[1],)
 
 
 class Rated(Igniting):
@@ -277,16 +262,11 @@ def test_no_starts_no_steps_and_signals_that_are_left_out():
     assert np.array_equal(x0, kept)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "match"),
-    [
-        ({"x0": np.zeros(3)}, r"x0 .* \(n, 3\)"),
-        ({"x0": [[0.0, math.nan, 0.0]]}, "x0 must be finite"),
-        ({"u": np.zeros((5, 2))}, r"u must have shape \(5, 2, 1\), got \(5, 2\)"),
-        ({"w": np.zeros((5, 2, 1))}, r"w must have shape \(5, 2, 3\)"),
-        ({"dt": 0.0}, "dt must be"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "match"), [
+    ({"x0": np.zeros(3)}, r"x0 .* \(n, 3\)"), ({"x0": [[0.0, math.nan, 0.0]]}, "x0 must be finite"),
+    ({"u": np.zeros((5, 2))}, r"u must have shape \(5, 2, 1\), got \(5, 2\)"), ({"dt": 0.0}, "dt must be"),
+    ({"w": np.zeros((5, 2, 1))}, r"w must have shape \(5, 2, 3\)"),
+])  # fmt: skip
 def test_wrong_arguments_raise(wrong, match):
     arguments = {"x0": np.zeros((2, 3)), "steps": 5, "dt": DT, **wrong}
     with pytest.raises(ValueError, match=match):

@@ -81,21 +81,21 @@ def test_what_is_measured_and_angles():
     )
     read = outputs(parts, ["way", "place"], ["way"])
     assert np.allclose(read({"place": values[:2], "way": values[1:2]}), [0.1, 2.0, np.cos(2.0), np.sin(2.0)])
-    assert read.turning == [(2, 3)]
+    assert read.pairs == [(2, 3)]
 
 
 def test_pairs_are_cosines_and_sines_that_are_measured():
     space = spaces.Box(-10.0, 10.0, (5,))
     read = outputs(space, [4, 3, 0, 1], [(0, 4), [1, 3]])
     assert read(np.arange(5.0)).tolist() == [4.0, 3.0, 0.0, 1.0]
-    assert read.turning == [(2, 0), (3, 1)]
+    assert read.pairs == [(2, 0), (3, 1)]
     assert read.angles == ((0, 4), (1, 3))
     read = outputs(space, None, [1, (4, 2)])
     assert np.allclose(read(np.arange(5.0)), [0, np.cos(1), np.sin(1), 2, 3, 4])
-    assert read.turning == [(1, 2), (5, 3)]
-    assert outputs(space, None, np.array([[0, 1], [2, 3]])).turning == [(0, 1), (2, 3)]
+    assert read.pairs == [(1, 2), (5, 3)]
+    assert outputs(space, None, np.array([[0, 1], [2, 3]])).pairs == [(0, 1), (2, 3)]
     joints = spaces.Dict(cos=spaces.Box(-1, 1, (2,)), other=spaces.Box(-1, 1, (1,)), sin=spaces.Box(-1, 1, (2,)))
-    assert outputs(joints, None, [("cos", "sin")]).turning == [(0, 3), (1, 4)]
+    assert outputs(joints, None, [("cos", "sin")]).pairs == [(0, 3), (1, 4)]
 
 
 THREE = spaces.Box(-1, 1, (3,))

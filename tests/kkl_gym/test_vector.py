@@ -23,7 +23,7 @@ from kkl_gym import (
 )
 from kkl_gym.plant import NOISE_BLOCK
 from kkl_gym.simulate import advance_batch
-from observers.machine import MANY_ROWS
+from kkl_gym.vector import MANY_ROWS
 
 modes = pytest.mark.parametrize("mode", list(AutoresetMode))
 N = 4

@@ -24,11 +24,7 @@ importlib.import_module("numba.core.event")
 
 ACCURATE = 1e-5
 ROWS = 12
-REFERENCE = {
-    "tanh": np.tanh,
-    "silu": lambda h: h / 2 * (1 + np.tanh(h / 2)),
-    "relu": lambda h: np.maximum(h, 0.0),
-}
+REFERENCE = {"tanh": np.tanh, "silu": lambda h: h / 2 * (1 + np.tanh(h / 2)), "relu": lambda h: np.maximum(h, 0.0)}
 
 
 FLOW = functools.partial(tracking, by="flow")

@@ -48,6 +48,29 @@ def test_a_jump_that_stays_is_believed():
     assert (observer.rejected < 200).all()
 
 
+@pytest.mark.parametrize("compiled", [None, False])
+def test_one_of_two_outputs_that_jumps_for_good_is_accepted_after_a_window(compiled):
+    artifact = tracking(outputs=2, surer=-9.0)
+    y, u = signals(artifact, 200)
+    y[100:, 1] += 40.0
+    observer, window = KKLObserver(artifact, 0.1, gate=8.0, compiled=compiled), round(artifact.motion.window / 0.01)
+    observer.reset(y[0])
+    for k in range(1, 200):
+        observer.step(y[k], u[k - 1])
+        if 100 <= k < 100 + window:
+            assert observer.rejected == k - 99
+    assert observer.rejected < 2 * window
+
+
+def test_an_input_far_beyond_training_warns_once():
+    observer = load("lorenz")
+    observer.reset([0.0])
+    observer.step([0.0], [20.0])
+    with pytest.warns(UserWarning, match="an input of 1000 is far beyond those in training, at most 10") as warned:
+        observer.step([0.0], [1000.0]), observer.estimate(np.zeros((3, 1)), np.full((2, 1), -1e3))
+    assert len(warned) == 1
+
+
 @pytest.mark.parametrize("nonlinear", [False, True])
 def test_outputs_are_rejected_one_by_one_in_numpy_and_numba(nonlinear):
     artifact = tracking(outputs=2, nonlinear=nonlinear, surer=-9.0)
@@ -187,6 +210,9 @@ def test_wrappers_have_the_gate_and_the_delay_of_their_observers():
     assert envs.reset(seed=0)[1]["rejected"].tolist() == [0, 0, 0]
     env.observer.gate = None
     assert env.observer.gate is None
+    of_z = kkl_gym.KKLObservation(gym.make("KKLLorenz-v0"), estimate="z")
+    with pytest.raises(ValueError, match="leave tracking=False, or a wrapper's estimate='z', out"):
+        of_z.observer.gate = 5.0
 
 
 def test_the_first_gap_that_no_map_fills_warns_once():
@@ -205,7 +231,7 @@ def test_what_is_wrong_is_named():
     for options in ({"gate": 5.0}, {"delay": 2}):
         with pytest.raises(ValueError, match="does not track"):
             KKLObserver(random_artifact(), **options)
-        with pytest.raises(ValueError, match="leave tracking=False out"):
+        with pytest.raises(ValueError, match="leave tracking=False, or"):
             KKLObserver(artifact, tracking=False, **options)
     observer, late = KKLObserver(artifact), KKLObserver(artifact, delay=2)
     for each in (observer, late):

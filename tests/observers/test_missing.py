@@ -123,8 +123,7 @@ def test_what_is_neither_there_nor_missing():
     for wrong in ([math.inf, 0.0], [math.nan, -math.inf], [1e16, math.nan]):
         for call in (observer.reset, lambda y: observer.step([y, y]), lambda y: observer.estimate([[0.0, 0.0], y])):
             with pytest.raises(
-                ValueError,
-                match=r"y holds NaN, infinity or .* 1e15: y\[.*(nan|inf|1e\+16); (NaN marks|outputs)",
+                ValueError, match=r"y holds NaN, infinity or .* 1e15: y\[.*(nan|inf|1e\+16); (NaN marks|outputs)"
             ):
                 call(wrong)
     assert np.array_equal(observer.z, z)

@@ -61,9 +61,7 @@ def test_the_estimate_is_the_formula(options, make_artifact):
 
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(
-    batch=st.lists(st.integers(0, 4), max_size=3).map(tuple),
-    options=st.sampled_from(KINDS),
-    seed=st.integers(0, 1000),
+    batch=st.lists(st.integers(0, 4), max_size=3).map(tuple), options=st.sampled_from(KINDS), seed=st.integers(0, 1000)
 )
 def test_batches_equal_their_rows_and_records_their_steps(make_artifact, batch, options, seed):
     observer = KKLObserver(make_artifact(**options))

@@ -9,7 +9,7 @@ from linear_system import C
 from tracking import DT, STD, exact_motion, tracking_observer
 
 from observers import KKLObserver
-from observers.supervision import Supervision
+from observers.tracker import Supervision
 
 LEVEL = 0.2
 

@@ -21,7 +21,7 @@ from tracking import (
 )
 
 from observers import ArtifactError, Expression, Factors, KKLObserver, Limits, unscented
-from observers.supervision import INFLATION, Supervision
+from observers.tracker import INFLATION, Supervision
 
 LEVEL, WINDOW = 0.2, 10  # samples within which T_inv is asked
 EXACT = {"rtol": 1e-9, "atol": 1e-11}

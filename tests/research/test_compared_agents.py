@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 from commands import research
 from PIL import Image
 
@@ -16,17 +15,13 @@ from examples.research.agents.comparison import KINDS, ComparedAgent, read_resul
 from examples.research.agents.filtered import kalman_filters, show_filtered
 from examples.research.agents.statistics import interval, middle, normalised
 from examples.research.agents.tables import write_table
-from examples.research.agents.window import Stacks, WindowObservation, learn_window, read
-from observers import MLP
 from training import figures
 from training.agents.agent import Agent, find
-from training.agents.environments import single
-from training.agents.observing import SETTINGS, wander
+from training.agents.observing import SETTINGS
 from training.agents.play import play
 from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, control_task
-from training.progress import progress_bars
 
-PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
+PENDULUM = HIDDEN_VELOCITIES["Pendulum-v1"]
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
 
 
@@ -50,36 +45,17 @@ def test_agents_on_a_system_are_compared_and_not_trained_again(tmp_path):
         research(*common, "--episodes", "3", "--information", "ekf")
 
 
-def test_agents_in_an_environment_are_compared_beside_earlier_ones(tmp_path, monkeypatch):
+def test_agents_in_an_environment_are_compared(tmp_path, monkeypatch):
     monkeypatch.setitem(SETTINGS, "inverse_steps", 20)
-    earlier = tmp_path / "earlier"
-    earlier.mkdir()
-    kept = {
-        "results.csv": ["Ball-v0,0.0,random,0,1.0,0.0", "Ball-v0,0.0,state,0,11.25,3.0", "Ball-v0,0.0,y,0,6.0,3.5"],
-        "curves.csv": ["Ball-v0,0.0,state,10,1.5,2.0", "Ball-v0,0.0,y,10,1.5,0.125"],
-    }
-    for name, rows in kept.items():
-        replaced = rows[-1].replace("Ball", "CartPole").replace("v0", "v1")
-        columns = [column for column in comparison.COLUMNS[name] if column != "success"]
-        (earlier / name).write_text("\n".join([",".join(columns), replaced, *rows]) + "\n")
-    common = ("agents", "CartPole-v1", "--seeds", "1", "--episodes", "2", "--timesteps", "600", "--aggregate", "1")
-    common += ("--jobs", "1", "--frames", "4", "--out", str(tmp_path / "out"), "--beside", str(earlier))
-    kinds = ["state", "stacked_x_hat", "y"]
-    research(*common, "--information", *kinds)
-    results, curves = (pd.read_csv(tmp_path / "out" / name) for name in kept)
-    assert list(results.shown) == ["random", "state", "y", "random", *kinds]
-    assert list(results.environment) == ["Ball-v0"] * 3 + ["CartPole-v1"] * 4
-    assert set(curves[curves.environment == "CartPole-v1"].shown) == set(kinds)
-    for name, rows in kept.items():
-        assert (tmp_path / "out" / name).read_text().splitlines()[1 : 1 + len(rows)] == rows
-    table = (tmp_path / "out" / "table.md").read_text()
-    assert "| Ball-v0 | 11.25 (1.00), 1 | – | 6 (0.49), 1 | 1 |" in table
-    assert "Agents on z, traces and stacked observations: `frames` 4." in table
+    kinds = ["state", "x_hat", "stacked"]
+    common = ("agents", "CartPole-v1", "--seeds", "1", "--episodes", "2", "--timesteps", "600", "--frames", "4")
+    research(*common, "--jobs", "1", "--out", str(tmp_path), "--information", *kinds)
+    results, curves = (pd.read_csv(tmp_path / name) for name in ("results.csv", "curves.csv"))
+    assert list(results.shown) == ["random", *kinds]
+    assert set(curves.shown) == set(kinds)
+    assert "Agents on z, traces and stacked observations: `frames` 4." in (tmp_path / "table.md").read_text()
     for name in ("scores.png", "curves.png"):
-        assert (tmp_path / "out" / name).stat().st_size > 1000
-    (earlier / "results.csv").write_text("environment,steps\n")
-    with pytest.raises(SystemExit, match=r"results.csv.*its columns are environment, steps, not environment, noise"):
-        research(*common)
+        assert (tmp_path / name).stat().st_size > 1000
 
 
 def test_impossible_comparisons(tmp_path):
@@ -87,7 +63,6 @@ def test_impossible_comparisons(tmp_path):
         ("--seeds 0", "must be positive"),
         ("lorenz lorenz", "give some names, each once"),
         ("lorenz CartPole-v1", "on systems or in environments"),
-        ("lorenz --information stacked_x_hat", "are not compared by stacked_x_hat"),
         ("CartPole-v1 --information ekf", "are not compared by ekf"),
         ("lorenz --observers rossler", "the observer rossler is for rossler"),
         ("lorenz --observers lorenz-spinn", "takes in no inputs"),
@@ -117,7 +92,7 @@ def test_settings_of_memories_and_stacks_concern_those_agents_alone():
         return {kind for kind, (one, other) in agents.items() if one.identity != other.identity}
 
     changed = replace(PENDULUM, time_constants=(1, 2, 4), frames=9)
-    assert differ(changed) == {"z", "traces", "stacked", "stacked_x_hat"}
+    assert differ(changed) == {"z", "traces", "stacked"}
     assert differ(replace(PENDULUM, angles=((0, 1),), past_actions=False)) == {"z", "traces", "stacked"}
 
 
@@ -142,49 +117,8 @@ def test_statistics_by_hand():
     assert np.isnan(interval(values[:2], best, -1.0)[1:]).all()
 
 
-@pytest.mark.parametrize("task", [PENDULUM, CART], ids=["pendulum", "cart"])
-def test_the_rival_is_fitted_to_the_stacks_that_it_will_see(task):
-    task, seen = replace(task, frames=5), []
-    env = WindowObservation(task, 1, MLP([np.eye(1)], [np.zeros(1)], "tanh"))
-    inside = env.env
-    inside.action_space.seed(0)
-    obs, _ = inside.reset(seed=0)
-    seen.append(obs[0])
-    for _ in range(450):
-        obs, *_, info = inside.step(inside.action_space.sample())
-        seen += [row for row in info.get("final_obs", []) if row is not None] + [obs[0]]
-    records = env.recorders[0].rollouts().records()
-    states = np.concatenate([record.x for record in records])
-    stacks = Stacks(task, records)
-    batch = stacks(torch.Generator().manual_seed(0))
-    inputs = batch.inputs.numpy() * stacks.scale + stacks.mean
-    apart = np.abs(inputs[:, None] - np.array(seen)[: len(states)]).max(-1)
-    here = apart.argmin(1)
-    np.testing.assert_allclose(apart.min(1), 0.0, atol=1e-5)
-    np.testing.assert_allclose(batch.x.numpy() * stacks.x_scale + stacks.x_mean, states[here], atol=1e-5)
-    ages = np.concatenate([np.arange(len(record.t)) for record in records])
-    np.testing.assert_array_equal(batch.cell, np.minimum(ages[here], 4))
-
-
-@pytest.mark.research
-@pytest.mark.parametrize("noise", [0.0, 0.2])
-def test_the_rival_estimates_hidden_signals(noise, tmp_path):
-    task = replace(PENDULUM, measurement_noise=noise)
-    with progress_bars(None) as bars:
-        path = learn_window(task, wander(task, 5000, seed=0, progress=bars), tmp_path, seed=0, progress=bars)
-    env, plain = WindowObservation(task, 1, read(path)), single(PENDULUM)
-    seen, exact = [env.reset(seed=7)[0][0]], [plain.reset(seed=7)[0]]
-    for _ in range(150):
-        action = env.action_space.sample()
-        seen.append(env.step(action)[0][0])
-        exact.append(plain.step(action[0])[0])
-    apart = np.std(np.subtract(seen, exact)[8:], 0) / np.std(exact, 0)
-    assert (apart[:2] < (0.25 if noise else 1e-6)).all()
-    assert apart[2] < (0.5 if noise else 0.1)
-
-
 def test_kalman_filters_that_know_the_input_follow_a_driven_state():
-    env = show_filtered(control_task("van_der_pol", 0.1, period=0.01, duration=5.0), "x_hat", 3, None)
+    env = show_filtered(control_task("van_der_pol", 0.1, period=0.01, duration=5.0), "x_hat", 3)
     env.reset(seed=0)
     errors = []
     for action in np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3, 1)):

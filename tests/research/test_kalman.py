@@ -11,13 +11,13 @@ from filterpy.kalman import UnscentedKalmanFilter as FilterpyUKF
 from linear_system import Autonomous, C, F, Oscillator, TwoOutputs
 from scipy.linalg import expm
 
+from examples.research.derivatives import jacobian
 from examples.research.methods.unscented import UnscentedKalmanFilter
 from kkl_gym import get_system
 from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance, simulate
 from observers.estimator import Running
 from training.kalman import ExtendedKalmanFilter, unknown_start
-from training.trajectories.equations import jacobian
 
 
 @pytest.fixture(params=[ExtendedKalmanFilter, UnscentedKalmanFilter])
@@ -176,6 +176,13 @@ def test_samples_count_where_h_is_undefined_at_some_sigma_points(filters):
     for k, sample in enumerate(y):
         x_hat = ours.step(sample) if k else ours.reset(sample)
     assert np.abs(x_hat - x[-1]).max() < 0.05
+
+
+def test_a_sample_that_is_missing_begins_no_row(filters):
+    ekf = running(filters, Oscillator(), 0.02, Q=np.eye(2), R=np.eye(1)).estimator
+    state = ekf.advance(ekf.start(2), np.array([[np.nan], [0.3]]))
+    assert state.begun.tolist() == [False, True]
+    np.testing.assert_array_equal(state.x[0], ekf.start(1).x[0])
 
 
 def test_missing_outputs_correct_nothing(filters):

@@ -12,7 +12,7 @@ from examples.research.lipschitz import decoder, lipschitz_lower, lipschitz_uppe
 from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import MLP, load
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 
 def test_constants_that_are_known():

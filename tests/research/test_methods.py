@@ -15,7 +15,7 @@ from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import LinearFilter
 from observers.estimator import Running
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 
 def run(estimator, y):

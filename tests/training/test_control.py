@@ -9,7 +9,7 @@ from training.agents.play import play
 from training.agents.tasks import TASKS, TOLERANCE, control_task, get_task, scores, successes
 from training.presets import Profile, controller, profile
 from training.trajectories.equations import linearised
-from training.trajectories.policies import linear_quadratic
+from training.trajectories.motions import linear_quadratic
 
 
 def nothing(obs):

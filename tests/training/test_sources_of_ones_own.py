@@ -8,8 +8,8 @@ from tracking import exact_equations, linear_motion
 from observers import KKLObserver
 from training import Config, Run, learn_flow, learn_map, train
 from training.maps.coordinates import settling_time
-from training.sources.source import Increments, Pairs, Runs
-from training.trajectories.filtering import filter_states
+from training.sources import Increments, Pairs, Runs
+from training.trajectories.motions import filter_states
 
 DT, NOISE = 0.05, 0.1
 PHI = np.array([[np.cos(DT), np.sin(DT)], [-np.sin(DT), np.cos(DT)]])
@@ -58,8 +58,11 @@ class Spring:
 
     def increments(self, *, report):
         x = self.motions(500, 1, 2)
-        found = Increments(x[0], np.zeros((500, 0)), x[1] - x[0])
-        return found.part(slice(400)), found.part(slice(400, None))
+        parts = (slice(400), slice(400, None))
+        learned, judged = (
+            Increments(x[0, part], np.zeros((len(x[0, part]), 0)), (x[1] - x[0])[part]) for part in parts
+        )
+        return learned, judged
 
     def tracking(self):
         parts = vars(linear_motion())

@@ -8,7 +8,7 @@ from linear_system import Oscillator, sylvester
 
 from kkl_gym import get_system
 from training.spectrum import SMOOTH, Spectrum, evenly_spaced, intervals, papers_spectrum, smooth_spectrum, smoothness
-from training.trajectories.motions import Motions, record
+from training.trajectories.motions import Motions
 
 
 def test_complex_modes_filter_a_linear_system_to_its_sylvester_solution():
@@ -18,9 +18,8 @@ def test_complex_modes_filter_a_linear_system_to_its_sylvester_solution():
         np.sort_complex(np.linalg.eigvals(linear.A)),
         np.sort_complex([-2.0, -0.9 + 1.7j, -0.9 - 1.7j, -1.5 + 0.4j, -1.5 - 0.4j]),
     )
-    data = record(
-        system, linear, n=20, steps=2500, ages=np.array([2400, 2500]), rng=np.random.default_rng(0), motions=Motions()
-    )
+    motions = Motions(system, linear.dt, 2500)
+    data = motions.beside(linear, np.array([2400, 2500]), 20, np.random.default_rng(0))
     np.testing.assert_allclose(data.z, data.x @ sylvester(linear.A, linear.B).T, atol=1e-4)  # as holding y is exact
 
 

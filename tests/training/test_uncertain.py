@@ -13,7 +13,7 @@ from small_runs import CPU, toy
 from kkl_gym import VanDerPol
 from kkl_gym.system import System
 from training import SimulatedSource, errors, train, unseen_trajectories
-from training.evaluation.plants import parameter_errors
+from training.evaluation.errors import parameter_errors
 from training.spectrum import Spectrum
 
 

@@ -1,4 +1,4 @@
-"""Agents from stable-baselines3 that act on what an observer shows."""
+"""Agents of stable-baselines3 that act on measurements, memories or estimates."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ __all__ = ["OnTask", "SB3VecEnv"]
 
 
 def __getattr__(name: str) -> Any:
-    """What is imported when it is asked for: stable-baselines3 takes seconds, and playing an agent needs none."""
+    """Import on first use: stable-baselines3 takes seconds to import, and playing an agent does without."""
     if name == "SB3VecEnv":
         from training.agents.bridge import SB3VecEnv
 

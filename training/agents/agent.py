@@ -14,8 +14,7 @@ import numpy as np
 from kkl_gym import SYSTEMS, get_system
 from kkl_gym.wrappers.vector import VectorEnv
 from observers import MLP, storage
-from observers.checks import choice, shown
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError, choice, shown
 from observers.names import matching, resolve
 from training.agents.information import ESTIMATED, INFORMATION, Information, make
 from training.agents.tasks import Task
@@ -64,7 +63,7 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Agent:
-    """A deterministic policy, the task it was trained on and what it sees of it.
+    """A deterministic policy, its task, and its information set.
 
     Shapes: ``mean`` and ``scale``, of normalised observations, (inputs,).
     """
@@ -160,7 +159,7 @@ class Agent:
             raise AgentError(f"an agent that sees {self.information} must name its observer")
         observer = observer or self.observer
         if observer is not None and fingerprint(observer) != self.fingerprint:
-            raise AgentError(f"the agent was trained on another observer than what is in {observer!r} now")
+            raise AgentError(f"the agent was trained on another observer than the one in {observer!r}")
         now = rules(self.task)
         for name in now:
             if self.rules.get(name) != now[name]:
@@ -214,7 +213,7 @@ class Agent:
 
 
 def rules(task: Task) -> dict[str, Any]:
-    """Return what the observations of a system follow from beside the task and the observer."""
+    """Return the properties of a system, beside task and observer, that its observations depend on."""
     if task.system is None:
         return {}
     system = get_system(task.system)

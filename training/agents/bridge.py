@@ -24,7 +24,7 @@ class SB3VecEnv(VecEnv):
     env : gymnasium.vector.VectorEnv
         With ``autoreset_mode`` SAME_STEP.
     info_keys : sequence of str
-        What of ``info`` to pass on in every step.
+        Keys of ``info`` to pass on in every step.
 
     Raises
     ------
@@ -68,7 +68,7 @@ class SB3VecEnv(VecEnv):
         done = terminated | truncated
         infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
         for row in np.flatnonzero(done).tolist():
-            self.reset_infos[row] = infos[row]  # what the environment says is of the new episode
+            self.reset_infos[row] = infos[row]  # the environment reports the new episode
             infos[row] = _row(info, row, _keys(info)) | _row(info["final_info"], row, _keys(info["final_info"]))
             infos[row]["terminal_observation"] = info["final_obs"][row]
             infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])

@@ -1,4 +1,4 @@
-"""What agents of systems are paid in training."""
+"""The reward of agents of systems in training."""
 
 from typing import Any
 

@@ -37,13 +37,13 @@ def vector(
 
 
 def single(task: Task, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
-    """Make one environment that is no system's, with flat observations and noise on what is measured."""
+    """Make one environment other than a system's, with flat observations and noise on the measured entries."""
     env = make(task.env_id, task.env_kwargs)
     if not (isinstance(env.observation_space, spaces.Box) and len(env.observation_space.shape) == 1):
         env = gym.wrappers.FlattenObservation(env)
     space = env.observation_space
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype != np.uint8):
-        raise ValueError(f"an observation of {task.env_id} is no row of numbers: {shown(space)}")
+        raise ValueError(f"an observation of {task.env_id} is not a vector of numbers: {shown(space)}")
     for entry in (*task.measured, *(task.hidden or ())):
         if entry >= space.shape[0]:
             raise ValueError(
@@ -58,9 +58,8 @@ def single(task: Task, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
 class MeasurementNoise(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
     """Adds independent Gaussian noise to some entries of an observation.
 
-    Its generator is its own, seeded as the environment is: with noise and without, the same seed begins the same
-    episodes. ``info`` holds what was before the noise: ``clean``, the whole observation, and ``clean_y``, the entries
-    on which noise lies.
+    It has a random generator of its own, so that the same seed starts the same episodes with and without noise.
+    ``info`` has the observation before the noise, ``clean``, and its noisy entries, ``clean_y``.
     """
 
     def __init__(self, env: gym.Env[np.ndarray, Any], entries: Sequence[int], standard_deviation: float) -> None:

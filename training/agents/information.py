@@ -1,4 +1,4 @@
-"""Information sets: what an agent sees of a task, as a vector environment of flat observations."""
+"""Information sets: the observations of an agent, as a vector environment of flat arrays."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -101,7 +101,7 @@ def state(task: Task, num_envs: int) -> VectorEnv:
 
 
 def outputs(task: Task, env: VectorEnv) -> VectorEnv:
-    """Show what is measured in a task's environments."""
+    """Show a task's measured signals."""
     if task.system is None:
         entries = list(task.measured)
         return FeatureObservation(env, lambda at: at["obs"][:, entries], len(entries))
@@ -110,7 +110,7 @@ def outputs(task: Task, env: VectorEnv) -> VectorEnv:
 
 
 def estimates(task: Task, information: Information, num_envs: int, observer: str) -> VectorEnv:
-    """Show what an observer makes of every sample: x_hat, beside y where y is exact, its error bars, or z."""
+    """Show an observer's x_hat (after y where y is exact), its standard deviations, or z; it sees every sample."""
     artifact = Artifact.read(resolve(observer))
     options: dict[str, Any] = {
         "observer": observer,

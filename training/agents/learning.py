@@ -29,8 +29,8 @@ from training.agents.bridge import SB3VecEnv
 from training.agents.checkpoint import Checkpoint
 from training.agents.cost import Cost
 from training.agents.environments import CLEAN_Y, vector
-from training.agents.information import ESTIMATED, OBSERVED, Information, observer_of
-from training.agents.observing import KKL, OBSERVER, Estimation, Privileged, estimated_entries, wander
+from training.agents.information import ESTIMATED, OBSERVED, Information, make, observer_of
+from training.agents.observing import OBSERVER, Privileged, estimated_entries, learn_observer, refits, wander
 from training.agents.policy import ALGORITHMS, CONTINUOUS, head_of, linear, lstm_in, perceptron
 from training.agents.seeds import agent_training_seed
 from training.agents.tasks import PREFERRED, Task
@@ -39,11 +39,11 @@ from training.progress import ProgressBars, progress_bars
 
 RECURRENT = "ppo_lstm"
 # Share of the steps of a training, the first ones, in which there are no estimates yet.
-PRIVILEGED = 0.9  # without noise: estimates come so near to the truth that what is right with the one is with the other
+PRIVILEGED = 0.9  # without noise: estimates are so near to the truth that the same policy is right
 WANDERED = 0.1  # under noise
 REHEARSAL = 0.05  # of the steps, the last ones, in which the agent acts without exploration and learns no more
 FILE = "agent.safetensors"
-_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
+_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # not of the algorithm
 _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # what rl-zoo3 makes a system's task of
 
 
@@ -91,7 +91,7 @@ def learn(
     observer_steps: int | None = None,
     aggregate: int = 0,
     resume: bool = False,
-    estimation: Estimation = KKL,
+    show: Callable[..., VectorEnv] = make,
     progress: ProgressBars | None = None,
 ) -> Agent:
     """Train one agent, with checkpoints; writes agent.safetensors, curve.csv and maybe observer.safetensors.
@@ -102,7 +102,7 @@ def learn(
     alone is learned. They count too.
 
     A training that goes on from a checkpoint begins new episodes, so that it makes another agent than one that never
-    stopped; ``Agent.training`` then says how many times it was resumed.
+    stopped; ``Agent.training`` then has the number of times it was resumed.
     """
     with closing(vector(task.without_noise, 1)) as env:
         actions, size = env.single_action_space, gym.spaces.flatdim(env.single_observation_space)
@@ -116,7 +116,7 @@ def learn(
         raise ValueError(f"an agent that sees {information!r} has no use for the observer {observer!r}")
     if aggregate and (task.system is not None or information not in ESTIMATED):
         raise ValueError(f"an agent that sees {information!r} of {task.env_id} has no observer to fit again")
-    if task.system is not None and information in OBSERVED and observer is None and estimation is KKL:
+    if task.system is not None and information in OBSERVED and observer is None and show is make:
         observer = observer_of(get_system(task.system))
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
     # Whether an observer is learned on the way.
@@ -136,9 +136,9 @@ def learn(
     if resumes and (folder / FILE).exists():
         return Agent.read(folder / FILE)  # nothing is left to do
     with progress_bars(progress) as bars:
-        fit = partial(estimation.learn, task, folder=folder, seed=seed, progress=bars)
+        fit = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
         privileged = None
-        if fits and task.measurement_noise:  # what is right with the truth is not with estimates then
+        if fits and task.measurement_noise:  # a policy that is right with the truth is not with estimates
             checkpoint.spent = first
             if not resumes:
                 fit(wander(task, first, seed=seed, progress=bars))
@@ -149,14 +149,14 @@ def learn(
             observer = str(folder / OBSERVER)
         left = steps - rehearsal - checkpoint.spent
 
-        def make() -> VectorEnv:
+        def make_envs() -> VectorEnv:
             if privileged is not None and checkpoint.privileged:
                 return privileged.make()
-            return estimation.show(task, information, rows, observer)
+            return show(task, information, rows, observer=observer)
 
         keys = ("y", "u", "x", "sample", CLEAN_Y) if aggregate else ()
         description = f"{task.name} {information} {seed}"
-        with closing(_Learner(name, settings, seed, task, make(), keys)) as learner:
+        with closing(Learner(name, settings, seed, task, make_envs(), keys)) as learner:
             learner.begin(checkpoint, left)
             if privileged is not None and checkpoint.privileged:
                 checkpoint.records = privileged.records
@@ -170,13 +170,13 @@ def learn(
                 fit(privileged.records())
                 checkpoint.privileged = False
                 checkpoint.restarts += 1
-                learner.move(make(), checkpoint.restarts)
+                learner.move(make_envs(), checkpoint.restarts)
             callbacks: list[BaseCallback] = [checkpoint]
             if aggregate:
                 before = [] if privileged is None else privileged.records()  # no random actions
                 checkpoint.records = lambda: before
                 every = max(1, (left - (first - checkpoint.spent)) // (aggregate + 1))
-                callbacks.append(estimation.refits(task, fit, every, rehearsal, folder / OBSERVER, before))
+                callbacks.append(refits(task, every, rehearsal, folder / OBSERVER, before))
             else:
                 checkpoint.records = list
             with bars.phase(description, left) as report:
@@ -224,7 +224,7 @@ def _check_actions(algorithm: str, space: gym.Space[Any], env_id: str) -> None:
         raise ValueError(f"{algorithm} cannot learn in {env_id}, whose actions are {space}: take {others}")
 
 
-class _Learner:
+class Learner:
     """An algorithm and its environments, with settings that mean what they mean in rl-zoo3."""
 
     def __init__(
@@ -301,7 +301,7 @@ class _Learner:
 
 
 class _Until(BaseCallback):
-    """Stops a training once there were so many steps, where an algorithm collects anew, and before the last time."""
+    """Stops a training after so many steps, between two rollouts, and before the last one."""
 
     def __init__(self, steps: int, last: int) -> None:
         super().__init__()

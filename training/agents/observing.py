@@ -1,43 +1,37 @@
 """An observer for an agent: from the first steps that it makes in an environment, and from later ones."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
 
 from kkl_gym.wrappers.vector import VectorEnv
 from training.agents.environments import CLEAN, CLEAN_Y, single, vector
-from training.agents.information import FeatureObservation, Information, make
+from training.agents.information import FeatureObservation
 from training.agents.tasks import Task
 from training.lessons import train
-from training.maps.coordinates import SETTLED
 from training.progress import ProgressBars
 from training.records import Record
 from training.rollouts.callback import KKLTrainingCallback
 from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
-from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset, split
-from training.spectrum import evenly_spaced
+from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset
 
 OBSERVER = "observer.safetensors"
 HEADROOM = 1.5  # of the noise that a map is trained for over the noise that there is
-# Per step, of filters under noise: more and slower modes, which average over more steps.
-MODES_UNDER_NOISE, SLOWEST_UNDER_NOISE, FASTEST_UNDER_NOISE = 8, 0.05, 1.0
 HELD_OUT = 0.2  # of the episodes
 KEPT = 100_000  # steps that an observer is learned from, the latest
 SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
 
 
 def hidden_entries(task: Task, size: int) -> tuple[int, ...]:
-    """Which entries of an observation of some size are hidden."""
+    """Entries of an observation of some size that are hidden."""
     return tuple(i for i in range(size) if i not in task.measured) if task.hidden is None else task.hidden
 
 
 def estimated_entries(task: Task, size: int) -> tuple[int, ...]:
-    """Which entries of an observation of some size an observer estimates; under noise also what is measured."""
+    """Entries of an observation of some size that an observer estimates; under noise the measured ones too."""
     hidden = hidden_entries(task, size)
     return tuple(sorted({*hidden, *task.measured})) if task.measurement_noise else hidden
 
@@ -106,20 +100,23 @@ def wander(task: Task, steps: int, *, seed: int, progress: ProgressBars) -> list
     return rollouts.records()
 
 
-def learn_observer(task: Task, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars) -> Path:
-    """Learn an observer from an agent's first steps."""
-    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, "tracking": False, **SETTINGS}
+def learn_observer(
+    task: Task,
+    records: Sequence[Record],
+    folder: Path,
+    *,
+    seed: int,
+    progress: ProgressBars,
+    tracking: bool | None = None,
+) -> Path:
+    """Learn an observer from recorded steps; unless ``tracking`` is given, it tracks under noise alone."""
+    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, **SETTINGS}
+    changes["tracking"] = bool(task.measurement_noise) if tracking is None else tracking
     if task.measurement_noise:
         spread = np.std(np.concatenate([record.y for record in records]), 0)
         changes["measurement_noise_max"] = tuple(
             np.maximum(RECORDED_NOISE * spread, HEADROOM * np.asarray(task.measurement_noise))
         )
-        dt = float(np.diff(records[0].t[:2])[0])
-        # The filter has to settle in one episode at least of those that are trained on; a beginner's may be short.
-        longest = max(record.duration for record in split(records, HELD_OUT, seed)[0])
-        fastest = FASTEST_UNDER_NOISE / dt
-        slowest = min(max(SLOWEST_UNDER_NOISE / dt, 1.1 * SETTLED / longest), fastest / 2)
-        changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, -slowest, -fastest))
     source = RecordedSource(records, recorded_preset(records, changes), task.env_id)
     artifact = train(source, console=progress).artifact
     path = folder / OBSERVER
@@ -127,32 +124,9 @@ def learn_observer(task: Task, records: Sequence[Record], folder: Path, *, seed:
     return path
 
 
-def refits(
-    task: Task,
-    learn: Callable[[Sequence[Record]], Path],
-    every: int,
-    rehearsal: int,
-    path: Path,
-    records: Sequence[Record],
-) -> BaseCallback:
-    """Make what fits an observer again to an agent's own steps, beside those of ``records``."""
+def refits(task: Task, every: int, rehearsal: int, path: Path, records: Sequence[Record]) -> KKLTrainingCallback:
+    """A callback that fits an observer again to an agent's own steps and to earlier ``records``."""
     outputs = CLEAN_Y if task.measurement_noise else "y"
     return KKLTrainingCallback(
         every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
     )
-
-
-def _show(task: Task, information: Information, rows: int, observer: str | None) -> VectorEnv:
-    return make(task, information, rows, observer=observer)
-
-
-@dataclass(frozen=True)
-class Estimation:
-    """How estimates are shown to an agent, learned from its steps and learned again; by default, by KKL observers."""
-
-    show: Callable[[Task, Information, int, str | None], VectorEnv] = _show
-    learn: Callable[..., Path] = learn_observer
-    refits: Callable[..., BaseCallback] = refits
-
-
-KKL = Estimation()

@@ -134,4 +134,4 @@ def _activation(described: dict[str, Any], default: str) -> str:
     for module, name in ACTIVATIONS.items():
         if named.rpartition(".")[2].removesuffix("'>") == module.__name__:
             return name
-    raise AgentError(f"the activation {named} is none of {', '.join(m.__name__ for m in ACTIVATIONS)}")
+    raise AgentError(f"the activation {named} is unknown; known are {', '.join(m.__name__ for m in ACTIVATIONS)}")

@@ -1,4 +1,4 @@
-"""Control tasks: an environment, how long each action is held, and what of it is measured; and scores of systems'."""
+"""Control tasks: an environment, its measured entries and the hold of an action; scores of systems' tasks."""
 
 import json
 import re
@@ -63,7 +63,7 @@ class Task:
                 )
             object.__setattr__(self, "measurement_noise", float(self.measurement_noise))  # type: ignore[arg-type]
             if self.repeat != 1:
-                raise ValueError(f"only environments of systems repeat actions, and {self.env_id} is none")
+                raise ValueError(f"only environments of systems repeat actions, not {self.env_id}")
         else:
             if isinstance(self.measurement_noise, list):
                 object.__setattr__(self, "measurement_noise", tuple(self.measurement_noise))
@@ -166,10 +166,15 @@ def get_task(name: str, measurement_noise: Level | None = None, **changes: Any) 
     """Return the task of a system, of a script's class or of any environment id, with changes of its fields."""
     name = matching(name, SYSTEMS) or name
     if name not in SYSTEMS and (name in gym.registry or re.search(r"-v\d+$", name)):
+        if ":" not in name:
+            try:
+                gym.spec(name)
+            except gym.error.Error as error:
+                raise ValueError(f"unknown environment {name!r}: {error}") from error
         known = HIDDEN_VELOCITIES.get(name)
         if known is None and not changes.get("measured"):
             raise ValueError(
-                f"say what is measured of {name}, as in --measured 0,1; it is known of {', '.join(HIDDEN_VELOCITIES)}"
+                f"name the measured entries of {name} (--measured 0,1); {', '.join(HIDDEN_VELOCITIES)} have defaults"
             )
         task = known if known is not None and not changes.get("measured") else Task(name, tuple(changes["measured"]))
         return replace(task, **{"measurement_noise": measurement_noise or 0.0, **changes})

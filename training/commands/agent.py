@@ -1,9 +1,9 @@
 """``kkl-gym agent``: train, evaluate and convert agents."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -16,9 +16,17 @@ from training.agents.agent import Agent, find
 from training.agents.information import Information
 from training.agents.play import Episodes, play
 from training.agents.seeds import agent_evaluation_seed
-from training.agents.tasks import TOLERANCE, scores, successes
-from training.commands.agent_task import Measured, TaskOptions
-from training.commands.options import NoiseLevel
+from training.agents.tasks import TOLERANCE, Task, get_task, scores, successes
+from training.commands.options import (
+    EnvironmentArguments,
+    NoiseLevel,
+    RunOptions,
+    hint,
+    merged,
+    names_in,
+    set_threads,
+    words,
+)
 from training.evaluation.levels import show_level
 from training.files import locked
 from training.progress import LOG, ProgressBars, progress_bars
@@ -38,13 +46,64 @@ AgentFile = Annotated[
 ]
 Trust = Annotated[
     str | None,
-    tyro.conf.arg(
+    hint(
         metavar="NAME",
         help="The agent's system or environment if it is one of your own: script.py:Class, module:Class or module:ID, "
         "as the agent's file names it.",
-        help_behavior_hint="",
     ),
 ]
+
+
+def numbers(kind: type, form: str, count: int | None = None) -> Callable[[str], tuple[Any, ...]]:
+    """A reader of numbers with commas between them."""
+
+    def read(text: str) -> tuple[Any, ...]:
+        try:
+            values = tuple(map(kind, names_in(text)))
+        except ValueError:
+            values = None
+        if values is None or (count and len(values) != count):
+            raise ValueError(f"got {text!r}, not {form}")
+        return values
+
+    return read
+
+
+_INDICES = words(numbers(int, "indices in the flattened observation, as in 0,1"), "INDICES", 1)
+_PAIR = words(numbers(int, "the cosine's entry and the sine's, once for each angle, as in 0,1", 2), "PAIR", 1)
+_STEPS = words(numbers(float, "numbers of steps, as in 1,2"), "STEPS", 1)
+Measured = Annotated[tuple[int, ...], _INDICES, hint("the positions, of environments known here")]
+
+
+@dataclass(frozen=True)
+class TaskOptions:
+    """Options of a task; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
+
+    measured: Measured = ()
+    """Entries of the flattened observation that agents may see, with commas between them, as in 0,1. Of systems y is
+    measured."""
+    hidden: Annotated[tuple[int, ...], _INDICES, hint("all others")] = ()
+    """Entries that an observer estimates."""
+    env_kwargs: EnvironmentArguments = ()
+    time_constants: Annotated[tuple[float, ...], _STEPS, hint("1,2,4,8")] = ()
+    """Time constants of z's memory and of traces, in actions. Where there is no noise, 1 or 1,2 may be easier to learn
+    with."""
+    frames: Annotated[int | None, hint("8")] = None
+    """Number of stacked observations, each with the action before it."""
+    no_past_actions: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Leave past actions out of z, traces and stacked."""
+    angles: Annotated[tuple[Annotated[tuple[int, ...], _PAIR], ...], tyro.conf.UseAppendAction, hint("none")] = ()
+    """Measured entries that are the cosine and the sine of an angle, once for each angle, as in 0,1. Then z holds how
+    far it has turned."""
+
+    def task(self, name: str, measurement_noise: Any = None) -> Task:
+        """The task of a system or an environment with these options."""
+        options = {name: value for name, value in vars(self).items() if value not in ((), None)}
+        if self.env_kwargs:
+            options["env_kwargs"] = merged("--env-kwargs", self.env_kwargs)
+        if options.pop("no_past_actions"):
+            options["past_actions"] = False
+        return get_task(name, measurement_noise, **options)
 
 
 @dataclass(frozen=True)
@@ -52,37 +111,27 @@ class Train:
     """Train an agent with stable-baselines3: to hold a system's target, or in any environment of which it sees a part.
 
     Writes agent.safetensors (the policy, with its task and observer) and curve.csv (steps, CPU seconds and return of
-    each episode) into the run's folder. Hyperparameters are those of training/agents/hyperparameters.
+    each episode) into the run's folder. Hyperparameters are those of training/agents/hyperparameters. A resumed agent
+    is another than without a stop.
     """
 
     name: Name
     information: Information = "x_hat"
-    """What the agent sees: docs/guides/agents.md explains each."""
+    """The agent's observation: docs/guides/agents.md explains each."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
-    """Standard deviation of the noise on each sample of what is measured."""
-    timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None
+    """Standard deviation of the noise on each measured sample."""
+    timesteps: Annotated[int | None, hint("the hyperparameters'")] = None
     """Actions to learn from, in all environments together."""
-    observer: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: the system's; of environments one is learned)"),
-    ] = None
+    observer: Annotated[str | None, hint("the system's; of environments one is learned", metavar="MAP")] = None
     """A shipped map's name or a .safetensors file, for an agent that sees x_hat, x_hat_std or z."""
     algorithm: Annotated[
         Literal["ppo", "sac", "td3", "tqc", "dqn", "a2c", "ppo_lstm"] | None,
-        tyro.conf.arg(help_behavior_hint="(default: sac for reverse_duffing and where it is tuned, else ppo)"),
+        hint("sac for reverse_duffing and where it is tuned, else ppo"),
     ] = None
     """The algorithm of stable-baselines3; recurrent agents learn by ppo_lstm."""
-    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/NAME-INFORMATION-SEED)")] = None
-    """The run's folder."""
-    resume: bool = False
-    """Go on from the checkpoint in the run's folder, if there is one. The agent is another than without a stop."""
-    threads: int = 1
-    """CPU threads of the networks."""
-    observer_steps: Annotated[
-        int | None, tyro.conf.arg(help_behavior_hint="(default: nine tenths of all, under noise one tenth)")
-    ] = None
+    observer_steps: Annotated[int | None, hint("nine tenths of all, under noise one tenth")] = None
     """First steps of an agent in an environment, from the latest 100,000 of which its observer is learned, where none
     is named. Without noise the agent learns from them too: it sees hidden signals where estimates will be. Under noise
     actions are random."""
@@ -90,23 +139,20 @@ class Train:
     """How often an observer is fitted again, to the agent's own steps, while the agent learns on estimates. The last
     twentieth of all steps is then without exploration, and followed by one more fit."""
     options: tyro.conf.OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
+    folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
     def run(self, console: Console) -> None:
         """Train, and play a hundred episodes."""
-        import torch  # which takes seconds to import, as stable-baselines3 does
-
-        from training.agents.learning import learn
+        from training.agents.learning import learn  # which takes seconds to import
         from training.checkpoints import SUFFIX
 
         task = self.options.task(self.name, self.measurement_noise)
-        folder = self.out or Path("runs/agents") / f"{task.name}-{self.information}-{self.seed}"
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
-        torch.set_num_threads(self.threads)
+        folder = self.folder.out or Path("runs/agents") / f"{task.name}-{self.information}-{self.seed}"
+        set_threads(self.folder.threads)
         with locked(folder), progress_bars(console, folder / LOG) as progress:
-            if (folder / "agent.safetensors").exists() and not self.resume:
+            if (folder / "agent.safetensors").exists() and not self.folder.resume:
                 raise FileExistsError(f"{folder} holds an agent already; choose another folder with --out")
-            if (folder / f"agent{SUFFIX}").exists() and not self.resume:
+            if (folder / f"agent{SUFFIX}").exists() and not self.folder.resume:
                 raise FileExistsError(
                     f"{folder} holds the checkpoint of a training: go on with it (--resume), remove it, or choose "
                     "another folder with --out"
@@ -122,7 +168,7 @@ class Train:
                 observer=self.observer,
                 observer_steps=self.observer_steps,
                 aggregate=self.aggregate,
-                resume=self.resume,
+                resume=self.folder.resume,
                 progress=progress,
             )
             evaluate(progress, agent, 100, trusted=task.system or task.env_id)
@@ -179,12 +225,12 @@ class Import:
     """The zip of an agent, trained without VecNormalize."""
     name: Name
     information: Information = "x_hat"
-    """What the agent sees."""
+    """The agent's observation."""
     out: Path = Path("agent.safetensors")
     """The agent's file."""
-    observer: Annotated[str | None, tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: the system's)")] = None
+    observer: Annotated[str | None, hint("the system's", metavar="MAP")] = None
     """The shipped map or .safetensors file that it was trained on."""
-    measured: Measured = ""
+    measured: Measured = ()
     """Entries of the flattened observation that the agent may see, as in 0,1."""
 
     def run(self, console: Console) -> None:

@@ -1,4 +1,4 @@
-"""``kkl-gym demo``: environments with their observers, in one table and one figure."""
+"""``kkl-gym demo``: environments with their observers, in one table, one figure and one moving picture."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -8,21 +8,25 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
 import kkl_gym
 from kkl_gym.simulate import check_duration
-from observers import load
+from kkl_gym.system import System
+from observers import Artifact, load
 from training.commands.options import NoiseLevel, OneObserver, OneSystem, OwnPolicy, Seconds, Shown, read_policy, shown
-from training.commands.portraits import Motion, animate
 from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
-from training.figures import ESTIMATE, MEASURED, RIVAL, TRUTH, drawing
+from training.figures import ESTIMATE, MEASURED, RIVAL, TRUTH, drawing, save_moving, style
 from training.files import require_writable
 from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports
+SECONDS = 12.0  # of moving pictures at the pace of the systems that ship, where they play as fast as the motion
+FRAMES = 144  # at most
+TRAIL = 0.35  # of the samples drawn: older points would hide the new ones
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ class Demo:
                     noise, seed = self.measurement_noise, self.seed
                     episodes.append(play(one, steps, noise, seed=seed, policy=self.policy, report=report))
             console.print(table(episodes))
-            path = self.out / ("estimates.png" if self.system is None else f"estimates-{episodes[0].name}.png")
+            path = self.out / ("estimates.png" if self.system is None else f"estimates-{episodes[0].system.name}.png")
             with progress.phase("drawing"):
                 draw(path, episodes)
             colours = "magenta and blue" if any(one.spinn is not None for one in episodes) else "magenta"
@@ -74,7 +78,7 @@ class Demo:
             if self.gif:
                 moving = path.with_suffix(".gif")
                 with progress.phase("drawing the moving picture"):
-                    animate(moving, [episode.motion for episode in episodes])
+                    animate(moving, episodes)
                 progress.say(f"wrote {moving}: states in black, estimates in magenta, measured outputs below")
         return path
 
@@ -83,9 +87,10 @@ class Demo:
 class Episode:
     """One episode of an environment with an observer; ``spinn`` is the paper's observer's estimate, where it ships."""
 
-    label: str
-    chosen: bool
-    env: kkl_gym.KKLObservation
+    environment: Shown
+    artifact: Artifact
+    dt: float
+    noise: str
     x: np.ndarray
     x_hat: np.ndarray
     spinn: np.ndarray | None
@@ -93,20 +98,9 @@ class Episode:
     seconds: float
 
     @property
-    def name(self) -> str:
-        """The system's."""
-        return self.env.unwrapped.system.name  # type: ignore[attr-defined]
-
-    @property
-    def motion(self) -> Motion:
-        """What a moving picture shows of it."""
-        env: Any = self.env.unwrapped
-        return Motion(env.system, env.dt, self.x, self.x_hat, self.y)
-
-    @property
-    def measurement_noise(self) -> str:
-        """The level as a text."""
-        return show_level(self.env.unwrapped.measurement_noise)  # type: ignore[attr-defined]
+    def system(self) -> System:
+        """The environment's."""
+        return self.environment.system
 
 
 def play(
@@ -119,39 +113,36 @@ def play(
     report: Callable[[int], object] = lambda done: None,
 ) -> Episode:
     """Play one episode with an observer, undriven unless it was trained under a policy."""
-    made = gym.make(
-        environment.env_id, **environment.options, measurement_noise=measurement_noise, max_episode_steps=steps
-    )
-    env = kkl_gym.KKLObservation(made, environment.observer)
-    acting = read_policy(env.observer.artifact, environment.system, policy)
+    options: dict[str, Any] = {"measurement_noise": measurement_noise, "max_episode_steps": steps}
+    env = kkl_gym.KKLObservation(gym.make(environment.env_id, **environment.options, **options), environment.observer)
+    base: Any = env.unwrapped
+    system, level, artifact = environment.system, base.measurement_noise, env.observer.artifact
+    acting = read_policy(artifact, system, policy)
     _, info = env.reset(seed=seed)
-    infos = [info]
-    idle = np.zeros(env.action_space.shape or (), np.float32)
-    seconds = list[float]()
-    for first in range(0, steps, EVERY):
-        for _ in range(first, min(first + EVERY, steps)):
-            action = idle if acting is None else np.asarray(acting(info["x"][None]), dtype=float)[0]
-            started = time.perf_counter()
-            _, _, terminated, _, info = env.step(action)
-            seconds.append(time.perf_counter() - started)
-            infos.append(info)
-            if terminated:
-                break
-        report(len(infos) - 1)
+    infos, seconds = [info], list[float]()
+    action = np.zeros(env.action_space.shape or (), np.float32)
+    for k in range(steps):
+        if acting is not None:
+            action = np.asarray(acting(info["x"][None]), dtype=float)[0]
+        started = time.perf_counter()
+        _, _, terminated, _, info = env.step(action)
+        seconds.append(time.perf_counter() - started)
+        infos.append(info)
         if terminated:
             break
+        if k % EVERY == 0:
+            report(k)
     x, x_hat, y = (np.array([info[key] for info in infos]) for key in ("x", "x_hat", "y"))
-    system, level = environment.system, env.unwrapped.measurement_noise  # type: ignore[attr-defined]
-    x_hat = x_hat[:, : system.nx]  # without a bias behind the states
-    ships = acting is None and type(system) in kkl_gym.SYSTEMS.values()  # SPINN's maps know no inputs
-    paper = f"{system.name}-spinn" if ships else None
+    # SPINN's maps know no inputs.
+    ships = acting is None and type(system) in kkl_gym.SYSTEMS.values()
     return Episode(
-        label=environment.label,
-        chosen=environment.observer is not None,
-        env=env,
+        environment,
+        artifact,
+        dt=base.dt,
+        noise=show_level(level),
         x=x,
-        x_hat=x_hat,
-        spinn=load(paper, level).estimate(y) if paper else None,
+        x_hat=x_hat[:, : system.nx],  # without a bias behind the states
+        spinn=load(f"{system.name}-spinn", level).estimate(y) if ships else None,
         y=y,
         seconds=float(np.median(seconds)),  # the first one compiles, or loads machine code
     )
@@ -159,11 +150,11 @@ def play(
 
 def table(episodes: Sequence[Episode]) -> Table:
     """Errors of the observers, and the time of a step."""
-    noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
+    noise = ", ".join(dict.fromkeys(episode.noise for episode in episodes))
     with_spinn = any(episode.spinn is not None for episode in episodes)
-    found = Table(
+    laid_out = Table(
         "environment",
-        "observer" if episodes[0].chosen else "default",
+        "observer" if episodes[0].environment.observer else "default",
         "late",
         *("SPINN", "late") if with_spinn else (),
         "µs a step",
@@ -176,8 +167,10 @@ def table(episodes: Sequence[Episode]) -> Table:
             for x_hat in estimates
             for skip in (0, len(episode.x) // 5)
         ]
-        found.add_row(episode.label, *(f"{error:.2f}" for error in errors), f"{1e6 * episode.seconds:.0f}")
-    return found
+        laid_out.add_row(
+            episode.environment.label, *(f"{error:.2f}" for error in errors), f"{1e6 * episode.seconds:.0f}"
+        )
+    return laid_out
 
 
 def draw(path: Path, episodes: Sequence[Episode]) -> None:
@@ -186,8 +179,8 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
     with drawing(path, max(6.0, 2.6 * len(episodes)), 1.9 * rows) as figure:
         axes = figure.subplots(rows, len(episodes), squeeze=False)
         for column, episode in enumerate(episodes):
-            system, C = episode.env.unwrapped.system, episode.env.observer.artifact.C  # type: ignore[attr-defined]
-            t = np.arange(len(episode.x)) * episode.env.unwrapped.dt  # type: ignore[attr-defined]
+            system, C = episode.system, episode.artifact.C
+            t = np.arange(len(episode.x)) * episode.dt
             for i in range(rows):
                 ax: Any = axes[i, column]
                 if i >= system.nx:
@@ -197,7 +190,7 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
                     if np.array_equal(row, np.eye(system.nx)[i]):
                         ax.plot(t, measured, color=MEASURED, alpha=0.6, lw=0.6, label="measured")
                 ax.plot(t, episode.x[:, i], color=TRUTH, lw=1.8, label="true")
-                label = "observer" if episode.chosen else "default observer"
+                label = "observer" if episode.environment.observer else "default observer"
                 ax.plot(t, episode.x_hat[:, i], "--", color=ESTIMATE, lw=1.0, label=label)
                 if episode.spinn is not None:
                     ax.plot(t, episode.spinn[:, i], ":", color=RIVAL, label="SPINN")
@@ -210,7 +203,75 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
         lines = [pair for ax in axes.flat for pair in zip(*ax.get_legend_handles_labels(), strict=True)]
         handles = {label: handle for handle, label in lines}
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=len(handles))
-        noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
+        noise = ", ".join(dict.fromkeys(episode.noise for episode in episodes))
         what = "one noisy output" if all(episode.y.shape[1] == 1 for episode in episodes) else "noisy outputs"
         end = "\n" if len(episodes) == 1 else " "  # so that a narrow figure has room
         figure.suptitle(f"Hidden states estimated from {what}{end}(standard deviation {noise} on every sample)")
+
+
+def animate(path: Path, motions: Sequence[Episode]) -> None:
+    """Draw states and estimates as they move, a column for each motion."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    side = 2.4 if len(motions) > 1 else 4.8  # one alone must have room for the legend
+    frames: list[Image.Image] = []
+    with style():
+        figure = Figure(figsize=(side * len(motions), side + 0.7), dpi=120)
+        canvas: Any = FigureCanvasAgg(figure)
+        axes = figure.subplots(2, len(motions), squeeze=False, height_ratios=[4, 1])
+        columns = [Column(motion, *pair) for motion, pair in zip(motions, axes.T, strict=True)]
+        columns[0].name_lines(figure)
+        canvas.draw()
+        still = canvas.copy_from_bbox(figure.bbox)
+        for share in np.arange(1, FRAMES + 1) / FRAMES:
+            canvas.restore_region(still)
+            for column in columns:
+                column.show(share)
+            frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
+    save_moving(path, frames, seconds=SECONDS)
+
+
+class Column:
+    """A phase portrait of the beginning of a motion, and the measured outputs below it."""
+
+    def __init__(self, motion: Episode, portrait: Any, strip: Any) -> None:
+        system, shown = motion.system, list(motion.system.portrait)
+        self.samples = min(len(motion.x), 1 + round(SECONDS * system.pace / motion.dt))
+        self.x, self.x_hat = (states[: self.samples, shown] for states in (motion.x, motion.x_hat))
+        self.y, self.t = motion.y[: self.samples], np.arange(self.samples) * motion.dt
+        low, high = self.x.min(0), self.x.max(0)
+        margin = 0.2 * np.where(high > low, high - low, 1.0)  # the first estimates may be far off
+        (left, bottom), (right, top) = low - margin, high + margin
+        names = [system.state_names[i] for i in shown]
+        portrait.set(xlim=(left, right), ylim=(bottom, top), title=system.name.replace("_", " "), xticks=[], yticks=[])
+        portrait.set_xlabel(names[0], labelpad=2)
+        portrait.set_ylabel(names[1], labelpad=2)
+        strip.set(xlim=(0.0, self.t[-1]), ylim=(self.y.min(), self.y.max()), yticks=[], xticks=[0, int(self.t[-1])])
+        strip.set_xlabel("t in s", labelpad=-8)
+        strip.set_ylabel("y", labelpad=2)
+        self.trails = [
+            (
+                portrait.plot([], [], style, color=color, lw=width, animated=True)[0],
+                portrait.plot([], [], "o", color=color, markersize=size, animated=True)[0],
+            )
+            for style, color, width, size in (("-", TRUTH, 1.4, 7), ("-", ESTIMATE, 1.2, 4))
+        ]
+        self.outputs = [strip.plot([], [], color=MEASURED, lw=0.6, animated=True)[0] for _ in self.y.T]
+
+    def name_lines(self, figure: Any) -> None:
+        """Put the legend of all columns above them."""
+        lines = [*(trail for trail, _ in self.trails), self.outputs[0]]
+        figure.legend(lines, ["state", "estimate", "what the observer sees"], loc="outside upper center", ncols=3)
+
+    def show(self, share: float) -> None:
+        """Draw a frame."""
+        now = max(1, round(share * self.samples))
+        first = max(0, now - round(TRAIL * self.samples))
+        for (trail, head), states in zip(self.trails, (self.x, self.x_hat), strict=True):
+            trail.set_data(*states[first:now].T)
+            head.set_data(*states[now - 1 : now].T)
+        for line, output in zip(self.outputs, self.y.T, strict=True):
+            line.set_data(self.t[:now], output[:now])
+        for artist in (*(artist for pair in self.trails for artist in pair), *self.outputs):
+            artist.axes.draw_artist(artist)

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -15,14 +15,22 @@ from kkl_gym import EquationError
 from kkl_gym.loading import load_class
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from training.commands.data import DataOptions, names_in
-from training.commands.options import SYSTEM, NoiseLevels, Parameters, merged
-from training.commands.record import PlayOptions
+from training.commands.options import (
+    NO_FILE,
+    SYSTEM,
+    DataOptions,
+    NoiseLevels,
+    Parameters,
+    PlayOptions,
+    hint,
+    merged,
+    names_in,
+)
 from training.files import require_writable, write
 from training.progress import ProgressBars, progress_bars
 
 if TYPE_CHECKING:
-    from training.diagnosis import Finding, Observability
+    from training.diagnosis import Finding
 
 COLOURS = {"ok": "green", "note": "yellow", "problem": "bold red"}
 # Options that are not for every subject. --measured and --hidden are for data, and make of a name an environment.
@@ -31,13 +39,12 @@ ONLY = {
     "an environment": ("episodes", "steps", "env_kwargs"),
     "recorded data": ("time", "inputs"),
     "a system or an environment": ("policy",),
-    "an environment or recorded data": ("csv",),
 }
 
 
 @dataclass(frozen=True)
 class Diagnose:
-    """Report before any training whether a system can be observed and learned, what is wrong, and what to change.
+    """Report before any training whether a system can be observed and learned, with problems and their remedies.
 
     Three kinds of subject: a system (NAME alone); an environment, which is played for it (NAME with --measured and
     --hidden); recorded data (--data, and no NAME). Takes some ten seconds.
@@ -49,31 +56,27 @@ class Diagnose:
 
     name: Annotated[
         tyro.conf.Positional[str | None],
-        tyro.conf.arg(
+        hint(
             metavar="[NAME]",
             help=f"{SYSTEM} With --measured and --hidden: an environment as gym.make takes it, such as Pendulum-v1.",
-            help_behavior_hint="",
         ),
     ] = None
-    measurement_noise: Annotated[
-        NoiseLevels,
-        tyro.conf.arg(help_behavior_hint="(default: of a system, its own; else 1 % and 10 % of each output's size)"),
-    ] = None
+    measurement_noise: Annotated[NoiseLevels, hint("of a system, its own; else 1 % and 10 % of each output's size")] = (
+        None
+    )
     """Standard deviations of noise on each sample of y, beside 0; one for all outputs or, as in 0.1,0.3, for each."""
-    dt: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
+    dt: Annotated[float | None, hint("the system's")] = None
     """Sampling interval of a system in seconds."""
-    duration: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
+    duration: Annotated[float | None, hint("the system's")] = None
     """Length in seconds of a system's motions that are followed."""
-    policy: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: random)")] = None
-    """What acts: on a system as for `kkl-gym train` ("controller", or a function of yours as script.py:function), in an
-    environment as for `kkl-gym record`."""
+    policy: Annotated[str | None, hint("random")] = None
+    """Chooses the inputs: of a system as for `kkl-gym train` ("controller", or a function of yours as
+    script.py:function), in an environment as for `kkl-gym record`."""
     parameters: Parameters = ()
     seed: int = 0
     """Seed of the environment's episodes and of the comparison."""
-    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
+    json: Annotated[Path | None, NO_FILE] = None
     """File to which the findings are written as well."""
-    csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
-    """File for the errors by window and level of noise, of data and environments."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
     """For an environment."""
     records: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
@@ -84,15 +87,14 @@ class Diagnose:
         named = bool(self.records.measured or self.records.hidden)
         subject = "recorded data" if self.records.data else "an environment" if named else "a system"
         self._refuse(subject)
-        for file in filter(None, (self.json, self.csv)):
-            require_writable(file.parent)
+        if self.json:
+            require_writable(self.json.parent)
         findings = []
         with progress_bars(console) as progress:
             for finding in self._of_system(progress) if subject == "a system" else self._of_signals(progress):
                 findings.append(finding)
                 progress.console.print(_row(finding))
-        problems = sum(finding.verdict == "problem" for finding in findings)
-        notes = sum(finding.verdict == "note" for finding in findings)
+        problems, notes = (sum(finding.verdict == kind for finding in findings) for kind in ("problem", "note"))
         console.print(f"{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}")
         if self.json:
             write(self.json, json.dumps([asdict(finding) for finding in findings], indent=2) + "\n")
@@ -104,50 +106,32 @@ class Diagnose:
         from training.diagnosis import check  # here, because it imports torch, which help need not wait for
         from training.presets import named_policy
 
-        system = self._system()
-        policy = named_policy(system, self.policy) if self.policy else None
-        progress.bar(f"checking {system.name}")
-        yield from check(
-            system, dt=self.dt, duration=self.duration, policy=policy, measurement_noise=self.measurement_noise
-        )
-
-    def _system(self) -> System:
         assert self.name is not None
         parameters = merged("--parameters", self.parameters)
         try:
-            return get_system(self.name, parameters)
-        except EquationError:  # of which the findings tell more
-            return load_class(self.name, System)().replace(parameters)
+            system = get_system(self.name, parameters)
+        except EquationError:  # the findings describe it
+            system = load_class(self.name, System)().replace(parameters)
         except ValueError as error:
             if not str(error).startswith("unknown system"):
                 raise
             raise ValueError(f"{error}; an environment needs --measured and --hidden") from error
+        policy = named_policy(system, self.policy) if self.policy else None
+        progress.bar(f"checking {system.name}")
+        levels = self.measurement_noise
+        yield from check(system, dt=self.dt, duration=self.duration, policy=policy, measurement_noise=levels)
 
     def _of_signals(self, progress: ProgressBars) -> "Iterator[Finding]":
-        observability = self._observability(progress)
-        yield from observability.findings()
-        if self.csv:
-            write(self.csv, observability.csv())
-
-    def _observability(self, progress: ProgressBars) -> "Observability":
         from training.diagnosis import observability, of_records
 
-        if not self.records.data:
-            assert self.name is not None
-            return observability(
-                self.name,
-                measured=names_in(self.records.measured),
-                hidden=names_in(self.records.hidden),
-                policy=self.policy or "random",
-                episodes=self.play.episodes,
-                steps=self.play.steps,
-                env_kwargs=dict(self.play.env_kwargs),
-                measurement_noise=self.measurement_noise,
-                seed=self.seed,
-                console=progress,
-            )
-        records = self.records.read(progress)
-        return of_records(records, measurement_noise=self.measurement_noise, seed=self.seed)
+        how: dict[str, Any] = {"measurement_noise": self.measurement_noise, "seed": self.seed}
+        if self.records.data:
+            yield from of_records(self.records.read(progress), **how).findings()
+            return
+        how |= {"measured": names_in(self.records.measured), "hidden": names_in(self.records.hidden)}
+        how |= {"episodes": self.play.episodes, "steps": self.play.steps, "env_kwargs": self.play.arguments}
+        policy = self.policy or "random"
+        yield from observability(self.name or "", policy=policy, console=progress, **how).findings()
 
     def _refuse(self, subject: str) -> None:
         """Raise ValueError if the subject is not named as it must be, or an option is for another."""

@@ -1,56 +1,65 @@
 """``kkl-gym evaluate``."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from training.commands.coverage import coverage_table, default_levels, judged
-from training.commands.faults import fault_table
 from training.commands.options import (
+    NO_FILE,
     NoiseLevels,
     Observers,
     OwnPolicy,
     OwnSystem,
     Plant,
     Seconds,
+    hint,
     merged,
+    model_of,
     read_observers,
     read_policy,
-    system_of,
 )
+from training.evaluation.coverage import REGIONS, coverage
 from training.evaluation.errors import (
     Domain,
+    Errors,
     NoStartsError,
     UnseenTrajectories,
     errors,
+    noise_limit,
+    off_by,
+    parameter_errors,
     unseen_trajectories,
 )
 from training.evaluation.levels import Level, as_cell, beyond, level_for, show_level
 from training.evaluation.metrics import by_state
-from training.evaluation.plants import off_by, parameter_errors, show_parameters, show_ranges
 from training.files import require_writable, write
 from training.progress import ProgressBars, progress_bars
-
-CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
-SKIPPED = 5.0  # seconds of driven runs at the pace of the shipped systems, half of the run at most
+from training.trajectories.motions import Controller
 
 if TYPE_CHECKING:
     import pandas as pd
 
+CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
+SKIPPED = 5.0  # seconds of driven runs at the pace of the shipped systems, half of the run at most
+FIRST, SETTLED = 2.0, 5.0  # seconds at that pace: error bars are judged before the first and after the second
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # levels of noise for error bars, in multiples of the map's largest
+FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %")
+
 
 @dataclass(frozen=True)
 class Motions:
-    """Which motions of which plant are estimated. The observer keeps its model, whichever plant moves."""
+    """The motions, and the plant that moves. The observer keeps its model."""
 
-    trajectories: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 100, with --faults 500)")] = None
+    trajectories: Annotated[int | None, hint("100, with --faults 500")] = None
     """Number of trajectories from each domain."""
     duration: Seconds = None
     """Length of each trajectory in seconds; 50 for the systems that ship."""
@@ -60,11 +69,11 @@ class Motions:
     """Level of the process noise, in multiples of the system's scale per second; the environments' default is 0.05."""
     plant: Plant = ()
     """Parameters of the plant that moves, such as mu=3.3."""
-    plant_error: Annotated[float | None, tyro.conf.arg(metavar="SHARE", help_behavior_hint="(default: none)")] = None
-    """In place of --plant: by what share every parameter of the plant is larger than the observer's; 0.1 is 10 %."""
+    plant_error: Annotated[float | None, hint("none", metavar="SHARE")] = None
+    """In place of --plant: share by which every parameter of the plant is larger than the observer's; 0.1 is 10 %."""
 
     def plant_of(self, system: System) -> System | None:
-        """The plant, where it is not the system."""
+        """Return the plant; None where it is the system."""
         changes = merged("--plant", self.plant)
         if self.plant_error is None:
             return system.replace(changes) if changes else None
@@ -75,23 +84,28 @@ class Motions:
 
 @dataclass(frozen=True)
 class Subject:
-    """An observer, its model, the plant where it is another one, and the duration if it is not the system's."""
+    """An observer, its system and its model, which may have a bias as a state, and motions of which plant and policy.
+
+    ``plant`` is None where the system moves.
+    """
 
     name: str
     artifact: Artifact
     system: System
+    model: System
     plant: System | None
-    seconds: float | None
-
-    @property
-    def duration(self) -> float:
-        """Seconds of a trajectory."""
-        return self.system.duration if self.seconds is None else self.seconds
+    duration: float
+    policy: Controller | None
 
     @property
     def on(self) -> str:
         """The plant, for titles."""
         return f", plant {show_parameters(self.plant)}" if self.plant else ""
+
+    def runs(self, **motions: Any) -> dict[str, Any]:
+        """Arguments of :func:`training.unseen_trajectories` beside some of them."""
+        plant = self.plant and model_of(self.artifact, self.plant)
+        return {"duration": self.duration, "policy": self.policy, "plant": plant, **motions}
 
 
 @dataclass(frozen=True)
@@ -124,13 +138,16 @@ class Evaluate:
     ekf: bool = False
     """Beside each observer, an extended Kalman filter that knows the equations, the inputs and the levels of noise.
     On another plant it knows those of the observer's model."""
+    limit: bool = False
+    """Beside each observer, for starts in X: the errors that noise leaves to any unbiased causal estimator (posterior
+    Cramér-Rao bound), by the plant's exact equations."""
     no_tracking: bool = False
     """T_inv alone of observers that track."""
     calibration: bool = False
     """In place of errors: coverage of the error bars."""
     faults: bool = False
     """In place of errors: how soon the monitor notices faults of the sensor."""
-    csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
+    csv: Annotated[Path | None, NO_FILE] = None
     """File to which the results of each trajectory are written as well."""
     motions: tyro.conf.OmitArgPrefixes[Motions] = field(default_factory=Motions)
 
@@ -140,175 +157,187 @@ class Evaluate:
 
         self._check()
         frames: list[pd.DataFrame] = []
-        subjects = [
-            Subject(*of, self.motions.plant_of(of[-1]), self.motions.duration)
-            for of in read_observers(self.observers, self.system)
-        ]
+        subjects = [self._subject(*of) for of in read_observers(self.observers, self.system)]
         judge = self._faults if self.faults else self._coverage if self.calibration else self._errors
         with progress_bars(console) as progress:
             for subject in subjects:
-                if self.no_tracking and subject.artifact.motion is not None:
-                    alone = replace(subject.artifact, motion=None)
-                    subject = replace(subject, name=f"{subject.name}, T_inv alone", artifact=alone)
                 left_out: list[str] = []
                 frames += judge(subject, progress, left_out)
                 for reason in left_out:
                     progress.say(f"{subject.name}, left out: {reason}")
         if not frames:
-            raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: the lines above say why")
+            raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: see the lines above")
         results = pd.concat(frames, ignore_index=True)
         if self.faults:
-            console.print(fault_table(results))
+            console.print(table("", [Column("observer", overflow="fold"), *FAULTS_HEADER], fault_rows(results)))
         if self.csv:
             write(self.csv, results.to_csv(index=False, float_format="%.6g"))
             console.print(f"wrote {self.csv}")
         return results
 
     def _check(self) -> None:
-        """Raise an error for options that make no sense, before any work."""
+        """Raise an error for invalid options, before any work."""
         levels = self.measurement_noise
         if levels is not None and not levels:
-            raise ValueError("give at least one level of measurement noise; 0 is none")
+            raise ValueError("give at least one level of measurement noise, such as 0")
         if self.csv is not None:
             if self.csv.is_dir() or not self.csv.name:
                 raise ValueError(f"csv = {self.csv} is a folder: name a file")
             require_writable(self.csv.parent)
-        if self.faults:
-            others = ("calibration", "ekf", "no_tracking"), ("plant", "plant_error", "process_noise")
-            given = [name for of, names in zip((self, self.motions), others, strict=True) for name in names
-                     if getattr(of, name)]  # fmt: skip
-            if given:
-                raise ValueError(f"--{given[0].replace('_', '-')}: of no use with --faults")
-            if levels is not None and len(levels) > 1:
-                raise ValueError(f"--faults takes one level of measurement noise, got {len(levels)}")
-            if len({*self.observers}) < len(self.observers):
-                raise ValueError(f"name each observer once, got {', '.join(self.observers)}")
+        refused = ("calibration", "ekf", "limit", "no_tracking", "plant", "plant_error", "process_noise")
+        options = vars(self) | vars(self.motions)
+        for kind, others in (("faults", refused), ("calibration", ("limit",))):
+            if options[kind] and (given := [name for name in others if options[name]]):
+                raise ValueError(f"--{given[0].replace('_', '-')}: of no use with --{kind}")
+        if self.faults and levels is not None and len(levels) > 1:
+            raise ValueError(f"--faults takes one level of measurement noise, got {len(levels)}")
+        if self.faults and len({*self.observers}) < len(self.observers):
+            raise ValueError(f"name each observer once, got {', '.join(self.observers)}")
+
+    def _subject(self, name: str, artifact: Artifact, system: System) -> Subject:
+        if self.no_tracking and artifact.motion is not None:
+            name, artifact = f"{name}, T_inv alone", replace(artifact, motion=None)
+        model, plant = model_of(artifact, system), self.motions.plant_of(system)
+        duration = system.duration if self.motions.duration is None else self.motions.duration
+        return Subject(name, artifact, system, model, plant, duration, read_policy(artifact, system, self.policy))
 
     def _errors(self, of: Subject, progress: ProgressBars, left_out: list[str]) -> list["pd.DataFrame"]:
         """Print tables of errors; rows of the CSV file."""
         import pandas as pd
 
-        process_noise = self.motions.process_noise
-        on = f"{of.on}, model {show_parameters(of.system)}" if of.plant else ""
-        smape = self._table(f"{of.name}: SMAPE in %, median (IQR) of {self._runs(of)}{on}", of.artifact)
-        if of.artifact.parameter_ranges:
-            smape.caption = f"trained for {show_ranges(of.artifact)}"
-        nrmse = self._table(f"{of.name}: NRMSE in % after transient, median{on}", of.artifact)
-        for table, measures in ((smape, ("all steps", "after transient", "escaped")), (nrmse, of.system.state_names)):
-            for measure in measures:
-                table.add_column(measure, justify="right")
-        frames = []
-        everyone: dict[str, Artifact | None] = {Path(of.name).stem if self.ekf else of.name: of.artifact}
+        process_noise, several, levels = self.motions.process_noise, self.ekf or self.limit, self._levels(of, left_out)
+        estimators: dict[str, Callable[..., Errors]] = {
+            Path(of.name).stem if several else of.name: partial(errors, of.artifact, of.model)
+        }
         if self.ekf:
-            everyone["EKF, same model" if of.plant else "exact EKF"] = None
-        levels = self._levels(of, left_out)
+            estimators["EKF, same model" if of.plant else "exact EKF"] = partial(errors, None, of.model)
+        if self.limit:
+            estimators["limit"] = partial(noise_limit, of.model)
+        frames, smape, nrmse = list[pd.DataFrame](), list[list[str]](), list[list[str]]()
+        inputs, on = bool(of.artifact.nu), f"{of.on}, model {show_parameters(of.system)}" if of.plant else ""
         for starts, driven, trajectories, level in self._cases(f"evaluating {of.name}", of, levels, progress, left_out):
             skip = min(SKIPPED * of.system.pace, of.duration / 2) if driven else None
-            for estimator, one in everyone.items():
-                found = errors(one, of.system, trajectories, measurement_noise=level, seed=self.motions.seed, skip=skip)
-                case = [*([estimator] if self.ekf else []), starts]
-                case += [*(["yes" if driven else "no"] if of.artifact.nu else [])]
-                case += [*([f"{process_noise:g}"] if process_noise else []), show_level(level)]
-                smape.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
-                nrmse.add_row(*case, *map(percent, np.median(found.nrmse, axis=0)))
-                columns = {
-                    "observer": estimator,
-                    **({"plant": show_parameters(of.plant)} if of.plant else {}),
-                    "starts": starts,
-                    "driven": driven,
-                    "process_noise": process_noise,
-                    "measurement_noise": as_cell(level),
-                    "trajectory": np.arange(len(found.full)),
-                    "smape": found.full,
-                    "smape_late": found.late,
-                    **by_state(found.nrmse),
-                }
+            for estimator, measure in estimators.items():
+                if estimator == "limit" and starts != "X":  # the variance of other starts is not known
+                    continue
+                one = measure(trajectories, measurement_noise=level, seed=self.motions.seed, skip=skip)
+                case = [estimator] * several + [starts] + [("no", "yes")[driven]] * inputs
+                case += [f"{process_noise:g}"] * bool(process_noise) + [show_level(level)]
+                smape.append([*case, spread(one.full), spread(one.late), str(one.escaped)])
+                nrmse.append([*case, *map(percent, np.median(one.nrmse, axis=0))])
+                columns: dict[str, Any] = {"observer": estimator} | (
+                    {"plant": show_parameters(of.plant)} if of.plant else {}
+                )
+                columns |= {"starts": starts, "driven": driven, "process_noise": process_noise}
+                columns |= {"measurement_noise": as_cell(level), "trajectory": np.arange(len(one.full))}
+                columns |= {"smape": one.full, "smape_late": one.late, **by_state(one.nrmse)}
                 frames.append(pd.DataFrame(columns))
-        if frames:
-            progress.console.print(smape, nrmse)
-            if of.artifact.estimated_parameters:
-                with progress.phase("estimating parameters"):
-                    table = self._parameters(of, levels)
-                progress.console.print(table)
+        if not frames:
+            return frames
+        left, right = ["observer"] * several + ["starts"] + ["driven"] * inputs, ["noise\non y"]
+        right = ["process\nnoise"] * bool(process_noise) + right
+        ranges = [f"{name} from {low:g} to {high:g}" for name, (low, high) in of.artifact.parameter_ranges.items()]
+        caption = f"trained for {', '.join(ranges)}" if ranges else None
+        title = f"{of.name}: SMAPE in %, median (IQR) of {self._runs(of)}{on}"
+        tables = [table(title, left, smape, [*right, "all steps", "after transient", "escaped"], caption)]
+        title = f"{of.name}: NRMSE in % after transient, median{on}"
+        tables.append(table(title, left, nrmse, [*right, *of.model.state_names]))
+        if of.artifact.estimated_parameters:
+            with progress.phase("estimating parameters"):
+                tables.append(self._parameters(of, levels))
+        progress.console.print(*tables)
         return frames
+
+    def _parameters(self, of: Subject, levels: Sequence[Level]) -> Table:
+        """A table of errors of estimated parameters, from starts in X."""
+        inputs, rows, names = bool(of.artifact.nu), list[list[str]](), of.artifact.estimated_parameters
+        motions = of.runs(process_noise=self.motions.process_noise, seed=self.motions.seed) | {"plant": of.plant}
+        for driven in (False, True)[: 1 + inputs]:
+            for level in levels:
+                motions |= {"trajectories": self._trajectories, "measurement_noise": level, "driven": driven}
+                values = map(percent, parameter_errors(of.artifact, of.system, **motions))
+                rows.append([*[("no", "yes")[driven]] * inputs, show_level(level), *values])
+        on = f"plant {show_parameters(of.plant)}" if of.plant else "plants drawn from their ranges"
+        title = f"{of.name}: parameters, rms error in % of their values after transient, {on}"
+        return table(title, [], rows, [*["driven"] * inputs, "noise\non y", *names])
 
     def _coverage(self, of: Subject, progress: ProgressBars, left_out: list[str]) -> list["pd.DataFrame"]:
         """Print the coverage of error bars; rows of the CSV file."""
         import pandas as pd
 
         of.artifact.require_covariance()
-        levels = default_levels(of.artifact) if self.measurement_noise is None else self._levels(of, left_out)
-        rows: list[dict[str, Any]] = []
+        largest = np.multiply.outer(SHARES, of.artifact.inverse.measurement_noise_max)
+        levels: list[Level] = [tuple(one) if isinstance(one, list) else one for one in largest.tolist()]
+        if self.measurement_noise is not None:
+            levels = self._levels(of, left_out)
+        dt, rows, shown = of.artifact.filter.dt, list[dict[str, Any]](), list[list[str]]()
+        first, settled = (round(seconds * of.system.pace / dt) for seconds in (FIRST, SETTLED))
+        names = [f"{100 * region:g}" for region in REGIONS]
         cases = self._cases(f"judging the error bars of {of.name}", of, levels, progress, left_out)
         for starts, driven, trajectories, level in cases:
-            spans = judged(of.artifact, of.system, trajectories, level=level, seed=self.motions.seed, ekf=self.ekf)
-            rows += [{"map": of.name, "starts": starts, "driven": driven, **row} for row in spans]
+            late = slice(min(settled, len(trajectories.x) - 1), None)
+            spans = {f"first {first * dt:g} s": slice(0, first), f"after {settled * dt:g} s": late}
+            how: dict[str, Any] = {"measurement_noise": level, "seed": self.motions.seed, "spans": (*spans.values(),)}
+            for who, artifact in {"KKL": of.artifact, "EKF": None}.items():
+                if artifact is None and not self.ekf:
+                    continue
+                for span, one in zip(spans, coverage(artifact, of.model, trajectories, **how), strict=True):
+                    case = {"map": of.name, "starts": starts, "driven": driven, "observer": who, "span": span}
+                    cells = {"measurement_noise": as_cell(level)}
+                    for name, joint, states in zip(names, one.joint, one.states, strict=True):
+                        of_states = {
+                            f"{name} {state}": 100 * share for state, share in zip(of.model.state_names, states)
+                        }
+                        cells |= {name: 100 * joint} | of_states
+                    low, high = one.limits
+                    rows.append(case | cells | {"nees": one.nees, "nees_low": low, "nees_high": high})
+                    start = f"{starts}{', driven' if driven else ''}"
+                    regions = [f"{100 * share:.1f}" for share in one.joint]
+                    shown.append([who, start, span, show_level(level), *regions, f"{one.nees:.2f}"])
         if not rows:
             return []
+        frame = pd.DataFrame(rows)
+        limits = f"{frame.nees_low.min():.2f} to {frame.nees_high.max():.2f}"
+        caption = f"NEES lies from {limits} with probability 95 % where covariances are true"
         title = f"{of.name}: errors in regions, %, {self._runs(of)}{of.on}"
-        progress.console.print(coverage_table(title, pd.DataFrame(rows)))
-        return [pd.DataFrame(rows)]
+        right = ["noise", *(f"{name} %" for name in names), "NEES"]
+        progress.console.print(table(title, ["observer", "starts", "span"], shown, right, caption))
+        return [frame]
 
     def _faults(self, of: Subject, progress: ProgressBars, left_out: list[str]) -> list["pd.DataFrame"]:
-        """Break an observer's sensor; rows of the CSV file."""
-        from training.evaluation.faults import PARTS, simulate_faults
+        """Simulate faults of the sensor; rows of the CSV file."""
+        from training.evaluation.faults import FAULTS, simulate_faults
 
-        level = level_for(of.artifact, of.system, self.measurement_noise[0] if self.measurement_noise else None)
+        level = level_for(of.artifact, of.model, self.measurement_noise[0] if self.measurement_noise else None)
         if reason := beyond(of.artifact, level):
             left_out.append(reason)
             return []
-        with progress.phase(f"breaking the sensor of {of.name}", PARTS) as report:
-            runs = simulate_faults(
-                of.artifact,
-                of.system,
-                trajectories=self._trajectories,
-                duration=of.duration,
-                measurement_noise=level,
-                seed=self.motions.seed,
-                policy=read_policy(of.artifact, system_of(of.artifact, self.system), self.policy),
-                report=report,
-            )
+        with progress.phase(f"breaking the sensor of {of.name}", 1 + len(FAULTS)) as report:
+            motions: dict[str, Any] = {"trajectories": self._trajectories, "duration": of.duration}
+            motions |= {"seed": self.motions.seed, "policy": of.policy, "measurement_noise": level}
+            runs = simulate_faults(of.artifact, of.model, report=report, **motions)
         runs.insert(0, "observer", of.name)
         return [runs]
-
-    def _parameters(self, of: Subject, levels: Sequence[Level]) -> Table:
-        """A table of errors of estimated parameters, from starts in X."""
-        on = f"plant {show_parameters(of.plant)}" if of.plant else "plants drawn from their ranges"
-        table = Table(title=f"{of.name}: parameters, rms error in % of their values after transient, {on}")
-        for column in (*(["driven"] if of.artifact.nu else []), "noise\non y", *of.artifact.estimated_parameters):
-            table.add_column(column, justify="right")
-        for driven in (False, True)[: 2 if of.artifact.nu else 1]:
-            for level in levels:
-                found = parameter_errors(
-                    of.artifact,
-                    of.system,
-                    trajectories=self._trajectories,
-                    measurement_noise=level,
-                    **self._how(of, driven),
-                )
-                table.add_row(
-                    *(["yes" if driven else "no"] if of.artifact.nu else []), show_level(level), *map(percent, found)
-                )
-        return table
 
     def _cases(
         self, description: str, of: Subject, levels: Sequence[Level], progress: ProgressBars, left_out: list[str]
     ) -> Iterator[tuple[str, bool, UnseenTrajectories, Level]]:
-        """Yield where trajectories start, whether they are driven, the trajectories and each level of noise.
+        """Yield the starts, whether inputs drive the trajectories, these, and each level of noise.
 
         Starts without trajectories are described in ``left_out``.
         """
         cases = CASES[: 3 if of.artifact.nu else 2] if levels else ()
         bar = progress.add_task(description, total=len(cases) * len(levels))
+        motions = {"n": self._trajectories, "seed": self.motions.seed, "process_noise": self.motions.process_noise}
         for starts, domain, driven in cases:
             try:
-                trajectories = unseen_trajectories(
-                    of.system, of.artifact.filter.dt, n=self._trajectories, domain=domain, **self._how(of, driven)
-                )
-                lacking = f"each of {self._trajectories} runs left bounds = {of.system.bounds}"
+                runs = of.runs(domain=domain, driven=driven, **motions)
+                trajectories = unseen_trajectories(of.model, of.artifact.filter.dt, **runs)
+                lacking = "" if trajectories.inside.any() else f"each of {self._trajectories} runs left bounds = "
+                lacking += str(of.model.bounds) * bool(lacking)
             except NoStartsError as error:
-                trajectories, lacking = None, str(error)
-            if trajectories is None or not trajectories.inside.any():
+                lacking = str(error)
+            if lacking:
                 left_out.append(f"starts in {starts}{', driven' if driven else ''}: {lacking}")
                 progress.advance(bar, len(levels))
                 continue
@@ -316,33 +345,13 @@ class Evaluate:
                 yield starts, driven, trajectories, level
                 progress.advance(bar)
 
-    def _how(self, of: Subject, driven: bool) -> dict[str, Any]:
-        """How trajectories are simulated."""
-        return {
-            "duration": of.duration,
-            "seed": self.motions.seed,
-            "driven": driven,
-            "process_noise": self.motions.process_noise,
-            "policy": read_policy(of.artifact, system_of(of.artifact, self.system), self.policy),
-            "plant": of.plant,
-        }
-
     def _levels(self, of: Subject, left_out: list[str]) -> list[Level]:
-        """Levels of measurement noise that a map can be given; the others are described in ``left_out``."""
+        """Levels of measurement noise within a map's range; the others are described in ``left_out``."""
         if self.measurement_noise is None:
-            return list(dict.fromkeys([0.0, level_for(of.artifact, of.system)]))
-        levels = [level_for(of.artifact, of.system, level) for level in self.measurement_noise]
+            return list(dict.fromkeys([0.0, level_for(of.artifact, of.model)]))
+        levels = [level_for(of.artifact, of.model, level) for level in self.measurement_noise]
         left_out += [reason for level in levels if (reason := beyond(of.artifact, level))]
         return [level for level in levels if not beyond(of.artifact, level)]
-
-    def _table(self, title: str, artifact: Artifact) -> Table:
-        """A table with the columns that name the case of a row."""
-        table = Table(title=title)
-        for column in ("observer",) * self.ekf + ("starts",) + ("driven",) * bool(artifact.nu):
-            table.add_column(column)
-        for column in ("process\nnoise",) * bool(self.motions.process_noise) + ("noise\non y",):
-            table.add_column(column, justify="right")
-        return table
 
     @property
     def _trajectories(self) -> int:
@@ -351,6 +360,38 @@ class Evaluate:
 
     def _runs(self, of: Subject) -> str:
         return f"{self._trajectories} runs of {of.duration:g} s"
+
+
+def table(
+    title: str,
+    left: Sequence[str | Column],
+    rows: Sequence[Sequence[str]],
+    right: Sequence[str] = (),
+    caption: str | None = None,
+) -> Table:
+    """A table whose columns are aligned left, and then right."""
+    columns = [Column(name, justify="right") for name in right]
+    laid_out = Table(*left, *columns, title=title or None, caption=caption)
+    for row in rows:
+        laid_out.add_row(*row)
+    return laid_out
+
+
+def fault_rows(runs: "pd.DataFrame") -> list[list[str]]:
+    """A row for each observer and fault, of results with ``--faults``."""
+    rows = []
+    for observer, group in runs.groupby("observer", sort=False):
+        false = f"{100 * (group[group.fault == 'none'].score > 1).mean():.1f} %"
+        for fault, faulty in group[group.fault != "none"].groupby("fault", sort=False):
+            noticed = f"{100 * (faulty.score > 1).mean():.1f} %"
+            delays = (f"{delay:.2f}" for delay in np.quantile(faulty.delay, [0.5, 0.95], method="higher"))
+            rows.append([str(observer), false, str(fault), f"{faulty.deadline.iloc[0]:g} s", noticed, *delays])
+    return rows
+
+
+def show_parameters(system: System) -> str:
+    """For titles and tables: ``mu=3.3``, with spaces between several."""
+    return " ".join(f"{name}={value:g}" for name, value in system.parameters.items())
 
 
 def spread(values: np.ndarray) -> str:

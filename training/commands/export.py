@@ -2,17 +2,20 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
 
 from observers.storage import replacing
-from training.commands.options import NoiseLevel
-from training.files import write
+from training.commands.options import NoiseLevel, hint, words
 
-if TYPE_CHECKING:
-    from training.export import Exported
+
+def read_format(text: str) -> str:
+    """Read the kind of files, in small letters or capitals."""
+    if text.lower() not in ("onnx", "c"):
+        raise ValueError(f"{text!r} is no format: write onnx or c")
+    return text.lower()
 
 
 @dataclass(frozen=True)
@@ -30,17 +33,15 @@ class ExportCommand:
     observer: Annotated[
         tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP", help="A shipped map, or a .safetensors file.")
     ]
-    format: Literal["onnx", "c"]
-    """What to write."""
+    format: Annotated[str, words(read_format, "{onnx,c}", 1)]
+    """The kind of files."""
     precision: Literal["float", "double"] = "float"
     """Type of the network, of samples and of estimates. The filter and the covariance of maps that track are doubles in
     both: floats are too coarse for them."""
-    measurement_noise: Annotated[
-        NoiseLevel, tyro.conf.arg(help_behavior_hint="(default: what is usual for the map)")
-    ] = None
+    measurement_noise: Annotated[NoiseLevel, hint("the map's own")] = None
     """For --format c: standard deviation of the noise on each sample that the estimate assumes, or one for each output
     as in 0.1,0.3."""
-    process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
+    process_noise: Annotated[float | None, hint("the system's")] = None
     """For --format c: level of process noise that the estimate assumes."""
     out: Path = Path("runs/export")
     """Folder for the files."""
@@ -59,28 +60,17 @@ class ExportCommand:
             measurement_noise=self.measurement_noise,
             process_noise=self.process_noise,
         )
-        return [self._onnx(exported, console)] if self.format == "onnx" else self._c(exported, console)
+        if self.format == "onnx":
+            from training.export.onnx_graph import onnx_model
 
-    def _onnx(self, exported: "Exported", console: Console) -> Path:
-        from training.export.onnx_graph import onnx_model
+            files = {self.out / f"{exported.name}.onnx": onnx_model(exported).SerializeToString()}
+        else:
+            from training.export.c_source import c_files
 
-        content = onnx_model(exported).SerializeToString()
-        path = self.out / f"{exported.name}.onnx"
-        with replacing(path) as temporary:
-            temporary.write_bytes(content)
-        _say(console, f"wrote {path}, {len(content) / 1e3:.0f} kB")
-        return path
-
-    def _c(self, exported: "Exported", console: Console) -> list[Path]:
-        from training.export.c_source import c_files
-
-        files = {self.out / name: text for name, text in c_files(exported).items()}
-        for path, text in files.items():
-            write(path, text)
-        _say(console, f"wrote {', '.join(map(str, files))}")
+            files = {self.out / name: text.encode() for name, text in c_files(exported).items()}
+        for path, content in files.items():
+            with replacing(path) as temporary:
+                temporary.write_bytes(content)
+        written = ", ".join(f"{path} ({len(content) / 1e3:.0f} kB)" for path, content in files.items())
+        console.print(f"wrote {written}", markup=False, highlight=False, soft_wrap=True)  # whole paths, to be copied
         return list(files)
-
-
-def _say(console: Console, text: str) -> None:
-    """Print a line of which nothing is markup, and which is not broken where paths are to be copied."""
-    console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -4,22 +4,27 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 
-from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers import Artifact
 from observers.names import resolve
-from training.commands.data import DataOptions
-from training.commands.options import Parameters, RunOptions, SystemName, Unknowns, merged, system_of
-from training.commands.settings import SettingsOptions
-from training.progress import LOG, ProgressBars, duration, progress_bars
-
-if TYPE_CHECKING:
-    from training.identification import Learned
+from training.commands.options import (
+    DataOptions,
+    Parameters,
+    RunOptions,
+    SettingsOptions,
+    SystemName,
+    Unknowns,
+    hint,
+    merged,
+    set_threads,
+    system_of,
+)
+from training.progress import LOG, duration, progress_bars
 
 FARTHEST = 10.0  # factor by which a parameter without limits may move from its starting value
 
@@ -43,7 +48,7 @@ class Identify:
     Without limits a parameter stays between a tenth of the guess and ten times that. With --observer all by default,
     from the observer's values on."""
     parameters: Parameters = ()
-    observer: Annotated[str | None, tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: none)")] = None
+    observer: Annotated[str | None, hint("none", metavar="MAP")] = None
     """An observer of the plant's model to adapt: a shipped map or a .safetensors file."""
     data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
     """Records of the plant."""
@@ -54,8 +59,9 @@ class Identify:
     def run(self, console: Console) -> Path:
         """Identify, and write the observer's report."""
         began = time.monotonic()
-        self.folder.start()
+        set_threads(self.folder.threads)
         from training.evaluation.report import write_report
+        from training.identification import adapt, identify
 
         unknown, parameters = merged("--unknown", self.unknown), merged("--parameters", self.parameters)
         artifact = None if self.observer is None else Artifact.read(resolve(self.observer))
@@ -71,7 +77,13 @@ class Identify:
         model = model.replace({name: guess for name, (guess, *_) in unknown.items()})
         folder = self.folder.out or Path("runs") / f"{model.name}-{'adapted' if artifact else 'identified'}"
         with progress_bars(console, folder / LOG) as progress:
-            learned = self._learn(artifact, model, limits(unknown), folder, progress)
+            records, settings = self.data.read(progress, model), self.settings.read()
+            how: dict[str, Any] = {"resume": self.folder.resume, "console": progress}
+            if artifact is not None:
+                learned = adapt(artifact, model, records, folder, unknown=limits(unknown), settings=settings, **how)
+            else:
+                how |= {"dt": settings.pop("dt", None), "seed": settings.get("seed", 0)}
+                learned = identify(model, limits(unknown), records, folder, settings=settings, **how)
             write_report(folder / "report.png", learned.result, learned.identified.system)
             path = folder / f"{model.name}.safetensors"
             progress.say(
@@ -79,26 +91,6 @@ class Identify:
                 f"in {duration(time.monotonic() - began)}"
             )
         return path
-
-    def _learn(
-        self,
-        artifact: Artifact | None,
-        model: System,
-        unknown: Mapping[str, tuple[float, float]],
-        folder: Path,
-        progress: ProgressBars,
-    ) -> "Learned":
-        from training.identification import adapt, identify
-
-        records, settings = self.data.read(progress, model), self.settings.read()
-        resume = self.folder.resume
-        if artifact is not None:
-            return adapt(
-                artifact, model, records, folder, unknown=unknown, settings=settings, resume=resume, console=progress
-            )
-        dt, seed = settings.pop("dt", None), settings.get("seed", 0)
-        how = {"dt": dt, "settings": settings, "seed": seed, "resume": resume, "console": progress}
-        return identify(model, unknown, records, folder, **how)
 
 
 def limits(unknown: Mapping[str, tuple[float, ...]]) -> dict[str, tuple[float, float]]:

@@ -41,7 +41,7 @@ class Maps:
 
 
 def tracks_by(artifact: Artifact) -> str:
-    """By what an observer predicts its estimate: "equations", a "flow", or nothing where it does not track."""
+    """The motion by which an observer predicts: "equations", "flow", or nothing where it does not track."""
     if artifact.motion is None:
         return ""
     return "flow" if artifact.motion.equations is None else "equations"

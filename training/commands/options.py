@@ -1,9 +1,10 @@
-"""Options that several commands share: observers, their systems, levels of noise, parameters, how a run goes."""
+"""Options that several commands share: observers, systems, levels of noise, parameters, records, settings, folders."""
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_origin
 
 import numpy as np
 import tyro
@@ -13,58 +14,76 @@ from kkl_gym import ENV_IDS, OWN_ID, SYSTEMS, get_system
 from kkl_gym.system import System
 from observers import Artifact, shipped
 from observers.names import resolve
+from training.config import checked_changes, read_changes, setting_types
 from training.evaluation.levels import Level, read_level
 from training.presets import named_policy
+from training.progress import ProgressBars
+from training.records import Record, Signals, read_records
+from training.trajectories.motions import Controller
 from training.trajectories.parameters import EVERY, blind, with_bias
-from training.trajectories.policies import Controller
 
 Pairs = tuple[tuple[str, Any], ...]  # of the words NAME=VALUE behind an option
 Repeated = tuple[Pairs, ...]  # of an option that may be given several times; merged makes one mapping of them
 
 
-def words(read: Callable[[str], Any], metavar: str) -> PrimitiveConstructorSpec[Any]:
-    """An option that takes several words, of which a function reads each."""
+def words(read: Callable[[str], Any], metavar: str, nargs: Any = "*") -> PrimitiveConstructorSpec[Any]:
+    """An option that takes several words, or with ``nargs`` 1 one, each read by a function."""
     return PrimitiveConstructorSpec(
-        nargs="*",
+        nargs=nargs,
         metavar=metavar,
-        instance_from_str=lambda texts: tuple(map(read, texts)),
+        instance_from_str=lambda texts: tuple(map(read, texts)) if nargs == "*" else read(texts[0]),
         is_instance=lambda value: True,
-        str_from_instance=lambda values: list(map(str, values or ())),
+        str_from_instance=lambda value: list(map(str, (value or ()) if nargs == "*" else [value])),
     )
 
 
-def read_number(text: str) -> tuple[str, float]:
-    """Read a parameter, written as ``mu=3.3``."""
-    name, _, value = text.partition("=")
+def pair(read: Callable[[str], Any], kind: str, form: str, alone: str = "") -> Callable[[str], tuple[str, Any]]:
+    """A reader of NAME=VALUE, where a value without a name is that of ``alone``, if it is given."""
+
+    def read_pair(text: str) -> tuple[str, Any]:
+        name, equals, value = text.partition("=")
+        if alone and not equals:
+            name, value = alone, text
+        elif not (equals and name.strip()):
+            raise ValueError(f"{text!r} is no {kind}: write {form}")
+        try:
+            return name.strip(), read(value)
+        except ValueError:
+            raise ValueError(f"{text!r} is no {kind}: write {form}") from None
+
+    return read_pair
+
+
+def read_unknown(text: str) -> tuple[float, ...]:
+    """Read a first guess, or a first guess with limits."""
+    numbers = tuple(map(float, text.split(":")))
+    if len(numbers) not in (1, 3):
+        raise ValueError(text)
+    return numbers
+
+
+def read_json(text: str) -> Any:
+    """Read JSON, or else text."""
     try:
-        return name.strip(), float(value)
+        return json.loads(text)
     except ValueError:
-        raise ValueError(f"{text!r} is no parameter with its value: write NAME=VALUE, as in mu=3.3") from None
+        return text.strip()
 
 
-def read_unknown(text: str) -> tuple[str, tuple[float, ...]]:
-    """Read an unknown parameter, written as ``mu=1.5``, or with limits as ``mu=1.5:0.5:6``."""
-    name, _, values = text.partition("=")
-    try:
-        numbers = tuple(float(value) for value in values.split(":"))
-    except ValueError:
-        numbers = ()
-    if not name.strip() or len(numbers) not in (1, 3):
-        raise ValueError(
-            f"{text!r} is no unknown parameter: write NAME=VALUE, or NAME=VALUE:LOW:HIGH, as in mu=1.5:0.5:6"
-        )
-    return name.strip(), numbers
+def read_setting(text: str) -> tuple[str, Any]:
+    """Read a setting, written as ``width=64``, ``optimiser=adam`` or ``eigenvalues=-1,-2,-3``."""
+    name, value = pair(str, "setting", "NAME=VALUE, as in width=64")(text)
+    name = name.replace("-", "_")
+    listed = get_origin(setting_types().get(name)) is tuple or "," in value
+    value = read_json(value)
+    if listed and isinstance(value, str):
+        value = [read_json(word) for word in value.split(",") if word.strip()]
+    return name, [value] if listed and not isinstance(value, list) else value
 
 
-def read_half_width(text: str) -> tuple[str, float]:
-    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is for all parameters."""
-    name, _, share = text.rpartition("=")
-    try:
-        return name.strip() or EVERY, float(share)
-    except ValueError:
-        raise ValueError(
-            f"{text!r} is no uncertainty of a parameter: write NAME=SHARE, as in mu=0.1, or a number for all"
-        ) from None
+def hint(default: str = "", **named: Any) -> Any:
+    """The default of an option in words, if any, and other arguments of :func:`tyro.conf.arg`."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {default})" if default else "", **named)
 
 
 def merged(option: str, repeated: Iterable[Pairs]) -> dict[str, Any]:
@@ -76,79 +95,64 @@ def merged(option: str, repeated: Iterable[Pairs]) -> dict[str, Any]:
     return {name: value for pairs in repeated for name, value in pairs}
 
 
+def names_in(text: str) -> tuple[str, ...]:
+    """The names between commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+_PARAMETER = words(pair(float, "parameter with its value", "NAME=VALUE, as in mu=3.3"), "NAME=VALUE")
+_UNKNOWN = pair(read_unknown, "unknown parameter", "NAME=VALUE, or NAME=VALUE:LOW:HIGH, as in mu=1.5:0.5:6")
+_HALF_WIDTH = pair(float, "uncertainty of a parameter", "NAME=SHARE, as in mu=0.1, or a number for all", EVERY)
+read_argument = pair(read_json, "argument of an environment", "NAME=VALUE, as in g=9.5")
+NO_FILE = hint("no file", metavar="FILE")
 SYSTEM = "A shipped system (lorenz, Lorenz or KKLLorenz-v0), or yours: script.py, script.py:Class or module:Class."
 SystemName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SYSTEM", help=SYSTEM)]
-OneSystem = Annotated[
-    tyro.conf.Positional[str | None],
-    tyro.conf.arg(metavar="[SYSTEM]", help=SYSTEM, help_behavior_hint="(default: all four that ship)"),
-]
+OneSystem = Annotated[tyro.conf.Positional[str | None], hint("all four that ship", metavar="[SYSTEM]", help=SYSTEM)]
 OwnSystem = Annotated[
     str | None,
-    tyro.conf.arg(
+    hint(
         metavar="CLASS",
         help="The system of observers that were made for one of your own, as script.py:Class or module:Class.",
-        help_behavior_hint="",
     ),
 ]
 OneObserver = Annotated[
     str | None,
-    tyro.conf.arg(
+    hint(
+        "the newest that ships for it",
         metavar="MAP",
         help="An observer for that system: a shipped map or a .safetensors file.",
-        help_behavior_hint="(default: the newest that ships for it)",
     ),
 ]
-Observers = Annotated[
-    tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
-]
+Observers = Annotated[tyro.conf.Positional[tuple[str, ...]], hint(metavar="[MAP [MAP ...]]")]
 Parameters = Annotated[
-    tuple[Annotated[Pairs, words(read_number, "NAME=VALUE")], ...],
+    tuple[Annotated[Pairs, _PARAMETER], ...],
     tyro.conf.UseAppendAction,
-    tyro.conf.arg(
-        help="Physical parameters that differ from the system's defaults, as in rho=30.",
-        help_behavior_hint="(default: none)",
-    ),
+    hint("none", help="Physical parameters that differ from the system's defaults, as in rho=30."),
 ]
-Plant = Annotated[
-    tuple[Annotated[Pairs, words(read_number, "NAME=VALUE")], ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(help_behavior_hint="(default: the observer's own)"),
-]
+Plant = Annotated[tuple[Annotated[Pairs, _PARAMETER], ...], tyro.conf.UseAppendAction, hint("the observer's own")]
 Unknowns = Annotated[
-    tuple[Annotated[Pairs, words(read_unknown, "NAME=VALUE[:LOW:HIGH]")], ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(help_behavior_hint=""),
+    tuple[Annotated[Pairs, words(_UNKNOWN, "NAME=VALUE[:LOW:HIGH]")], ...], tyro.conf.UseAppendAction, hint()
 ]
 HalfWidths = Annotated[
-    tuple[Annotated[Pairs, words(read_half_width, "NAME=SHARE")], ...],
+    tuple[Annotated[Pairs, words(_HALF_WIDTH, "NAME=SHARE")], ...], tyro.conf.UseAppendAction, hint("none")
+]
+EnvironmentArguments = Annotated[
+    tuple[Annotated[Pairs, words(read_argument, "NAME=VALUE")], ...],
     tyro.conf.UseAppendAction,
-    tyro.conf.arg(help_behavior_hint="(default: none)"),
+    hint("none", help="Arguments of the environment; values are JSON, or text."),
 ]
 # A level is written as a number for all outputs, or as one for each with commas between them. Defaults are in words.
-NoiseLevel = Annotated[
-    Level | None,
-    PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="LEVEL",
-        instance_from_str=lambda texts: read_level(texts[0]),
-        is_instance=lambda value: True,
-        str_from_instance=lambda level: [str(level)],
-    ),
-    tyro.conf.arg(help_behavior_hint="(default: the system's own)"),
-]
+NoiseLevel = Annotated[Level | None, words(read_level, "LEVEL", 1), hint("the system's own")]
 NoiseLevels = Annotated[
-    tuple[Level, ...] | None,
-    words(read_level, "LEVEL [LEVEL ...]"),
-    tyro.conf.arg(help_behavior_hint="(default: 0 and the system's own)"),
+    tuple[Level, ...] | None, words(read_level, "LEVEL [LEVEL ...]"), hint("0 and the system's own")
 ]
-Seconds = Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the system's own)")]
+Seconds = Annotated[float | None, hint("the system's own", metavar="SECONDS")]
 OwnPolicy = Annotated[
     str | None,
-    tyro.conf.arg(
+    hint(
         metavar="FUNCTION",
         help="The policy of observers that were trained under one of your own, as script.py:function or "
         "module:function. Those that were trained under the system's own controller need no option.",
-        help_behavior_hint="",
     ),
 ]
 
@@ -157,20 +161,82 @@ OwnPolicy = Annotated[
 class RunOptions:
     """The folder of a training, and how it runs."""
 
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: runs/NAME)")] = None
+    out: Annotated[Path | None, hint("runs/NAME, of agents runs/agents/NAME-INFORMATION-SEED", metavar="FOLDER")] = None
     """Where all files are written."""
     resume: bool = False
     """Go on from the checkpoints in the folder, if there are any."""
     threads: int = 1
     """CPU threads. More than one hardly help networks of the fast preset's size."""
 
-    def start(self) -> None:
-        """Set torch's threads."""
-        import torch  # which takes longer to import than all the rest
 
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
-        torch.set_num_threads(self.threads)
+def set_threads(threads: int) -> None:
+    """Set torch's threads."""
+    import torch  # which takes longer to import than all the rest
+
+    if threads < 1:
+        raise ValueError(f"threads must be at least 1, got {threads}")
+    torch.set_num_threads(threads)
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """The recorded data of a command; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
+
+    data: Annotated[tuple[Path, ...], hint(metavar="FILE [FILE ...]")] = ()
+    """Records: .npz or .mat files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named
+    columns; rollouts in a Minari data set, minari:ID or its folder, whose signals are named as in `kkl-gym record`."""
+    time: Annotated[str, hint("t or time", metavar="COLUMN")] = ""
+    """Column of the time in seconds."""
+    measured: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
+    """Measured outputs, with commas between them; y, or y1, y2, ... if they are not named."""
+    inputs: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
+    """Known inputs, each held until the next sample; u, or u1, u2, ... if they are not named."""
+    hidden: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
+    """Recorded states; x, or x1, x2, ... if they are not named. Of an angle, cos(COLUMN) and sin(COLUMN)."""
+
+    def read(self, progress: ProgressBars, system: System | None = None) -> list[Record]:
+        """Read the files; ValueError if a column is named twice."""
+        signals = Signals(self.time, *map(names_in, (self.measured, self.inputs, self.hidden)))
+        with progress.phase("reading the records"):
+            return read_records(
+                self.data, signals=signals, system=system, warn=lambda text: progress.say(f"warning: {text}")
+            )
+
+
+@dataclass(frozen=True)
+class SettingsOptions:
+    """Changes of the preset's settings; docs/reference/commands.md lists these and their defaults."""
+
+    config: Annotated[Path | None, NO_FILE] = None
+    """TOML or JSON file of settings."""
+    set: Annotated[
+        tuple[Annotated[Pairs, words(read_setting, "NAME=VALUE")], ...], tyro.conf.UseAppendAction, hint("none")
+    ] = ()
+    """Single settings, which come before those of the file, as in --set width=64 eigenvalues=-1,-2,-3."""
+    seed: Annotated[int | None, hint("0")] = None
+    """Seed of everything random."""
+
+    def read(self) -> dict[str, Any]:
+        """The settings by name, checked."""
+        settings = read_changes(self.config) if self.config else {}
+        settings |= checked_changes(merged("--set", self.set), "--set")
+        return settings if self.seed is None else settings | {"seed": self.seed}
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """How an environment is made and for how long it is played."""
+
+    episodes: Annotated[int | None, hint("no limit")] = None
+    """Episodes to play."""
+    steps: Annotated[int | None, hint("100,000 if no episodes are given")] = None
+    """Steps to play, at most; to diagnose, 10,000 by default."""
+    env_kwargs: EnvironmentArguments = ()
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The environment's arguments by name."""
+        return merged("--env-kwargs", self.env_kwargs)
 
 
 def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[str, Artifact, System]]:
@@ -178,7 +244,7 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
     if not names:
         raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
     artifacts = [(name, Artifact.read(resolve(name))) for name in names]
-    return [(name, artifact, model_of(artifact, own_system)) for name, artifact in artifacts]
+    return [(name, artifact, system_of(artifact, own_system)) for name, artifact in artifacts]
 
 
 @dataclass(frozen=True)
@@ -203,13 +269,14 @@ def shown(system: str | None, observer: str | None) -> list[Shown]:
         if observer is not None:
             raise ValueError(f"name the system that the observer {observer} is for")
         return [Shown(env_id, env_id, {}, get_system(name), None) for name, env_id in ENV_IDS.items()]
+    options: dict[str, Any] = {}
     if observer is None:
-        found, options = get_system(system), {}
+        one = get_system(system)
     else:
         artifact = Artifact.read(resolve(observer))
-        found, options = system_of(artifact, system), {"dt": artifact.filter.dt}
-    label = ENV_IDS[found.name] if type(found) in SYSTEMS.values() else found.name
-    return [Shown(label, OWN_ID, {"system": found, **options}, found, observer)]
+        one, options = system_of(artifact, system), {"dt": artifact.filter.dt}
+    label = ENV_IDS[one.name] if type(one) in SYSTEMS.values() else one.name
+    return [Shown(label, OWN_ID, {"system": one, **options}, one, observer)]
 
 
 def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> Controller | None:
@@ -225,8 +292,8 @@ def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> C
         return None
     if not artifact.nu:
         raise ValueError(f"the policy {name!r} needs an observer that takes in inputs; this one takes none")
-    found = named_policy(system, name)
-    return blind(found, system.nx) if np.any(artifact.training.get("bias", 0.0)) else found
+    policy = named_policy(system, name)
+    return blind(policy, system.nx) if np.any(artifact.training.get("bias", 0.0)) else policy
 
 
 def system_of(artifact: Artifact, given: str | None) -> System:
@@ -241,7 +308,7 @@ def system_of(artifact: Artifact, given: str | None) -> System:
     return base
 
 
-def model_of(artifact: Artifact, given: str | None) -> System:
-    """The system of an artifact, with the biases that it estimates as further states."""
-    base, bias = system_of(artifact, given), artifact.training.get("bias", 0.0)
-    return with_bias(base, bias) if np.any(bias) else base
+def model_of(artifact: Artifact, system: System) -> System:
+    """A system with the biases that an artifact estimates as further states."""
+    bias = artifact.training.get("bias", 0.0)
+    return with_bias(system, bias) if np.any(bias) else system

@@ -1,47 +1,21 @@
 """``kkl-gym record ENV_ID``."""
 
-import json
 import re
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium as gym
 import tyro
 from rich.console import Console
-from tyro.constructors import PrimitiveConstructorSpec
 
-from training.commands.data import names_in
+from training.commands.options import PlayOptions, hint, names_in
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
     from training.rollouts.playing import Policy
 
-Argument = Annotated[
-    tuple[str, Any],
-    PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="NAME=VALUE",
-        instance_from_str=lambda words: read_argument(words[0]),
-        is_instance=lambda value: True,
-        str_from_instance=lambda argument: [f"{argument[0]}={json.dumps(argument[1])}"],
-    ),
-]
-EnvironmentArguments = Annotated[
-    tuple[Argument, ...], tyro.conf.UseAppendAction, tyro.conf.arg(help_behavior_hint="(default: none)")
-]
-_NAMES = tyro.conf.arg(metavar="SIGNALS", help_behavior_hint="")
-
-
-@dataclass(frozen=True)
-class PlayOptions:
-    """How an environment is made and for how long it is played."""
-
-    episodes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: no limit)")] = None
-    """Episodes to play."""
-    steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 100,000 if no episodes are given)")] = None
-    """Steps to play, at most; to diagnose, 10,000 by default."""
-    env_kwargs: EnvironmentArguments = ()
-    """An argument of the environment, once for each; values are JSON, or text."""
+_NAMES = hint(metavar="SIGNALS")
 
 
 @dataclass(frozen=True)
@@ -58,42 +32,38 @@ class RecordCommand:
     hidden: Annotated[str, _NAMES] = ""
     """Signals that it will estimate, likewise."""
     policy: str = "random"
-    """Who acts: random; wandering (random actions, each held for a while); a function from observation to action as
-    script.py:function or module:function; an agent.safetensors of `kkl-gym agent train ENV_ID --information state`; or
-    an agent of stable-baselines3 as ppo:FILE.zip, whose code loading may run."""
+    """Chooses the actions: random; wandering (random actions, each held for a while); a function from observation to
+    action as script.py:function or module:function; an agent.safetensors of `kkl-gym agent train ENV_ID --information
+    state`; or an agent of stable-baselines3 as ppo:FILE.zip, whose code loading may run."""
     seed: int = 0
     """Of the environment and of random actions."""
-    dataset: Annotated[
-        str, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from environment and policy)")
-    ] = ""
+    dataset: Annotated[str, hint("from environment and policy", metavar="ID")] = ""
     """Name of the data set, as in pendulum/random-v0."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
 
     def run(self, console: Console) -> str:
         """Record."""
         from training.records.episodes import dataset_folder, write_dataset
-        from training.rollouts import make, policy_of, roll_out
+        from training.rollouts import play, policy_of
 
-        episodes = self.play.episodes
-        steps = 100_000 if episodes is None and self.play.steps is None else self.play.steps
         name = self.dataset or f"{_word(self.env_id)}/{_word(self.policy)}-v0"
         dataset_folder(name)  # an error now, not at the end
-        with progress_bars(console) as progress, make(self.env_id, dict(self.play.env_kwargs)) as env:
-            policy = _player(self.policy, env) if self.policy.endswith(".safetensors") else policy_of(self.policy, env)
-            with progress.phase(f"playing {self.env_id}", steps or episodes or 1) as report:
-                rollouts = roll_out(
-                    env,
-                    policy,
-                    measured=names_in(self.measured),
-                    hidden=names_in(self.hidden),
-                    episodes=episodes,
-                    steps=steps,
-                    seed=self.seed,
-                    name=name,
-                    report=report,
-                )
+        policy_in = partial(_player if self.policy.endswith(".safetensors") else policy_of, self.policy)
+        with progress_bars(console) as progress:
+            rollouts = play(
+                self.env_id,
+                policy_in,
+                progress,
+                env_kwargs=self.play.arguments,
+                measured=names_in(self.measured),
+                hidden=names_in(self.hidden),
+                episodes=self.play.episodes,
+                steps=self.play.steps,
+                seed=self.seed,
+                name=name,
+            )
             with progress.phase("writing the data set"):
-                folder = write_dataset(rollouts, env.spec, policy=self.policy)
+                folder = write_dataset(rollouts, policy=self.policy)
             lengths = [len(episode.rewards) for episode in rollouts.episodes]
             ended = sum(episode.terminated for episode in rollouts.episodes)
             progress.say(
@@ -107,7 +77,7 @@ class RecordCommand:
 
 
 def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
-    """What an agent of this package does that is shown the whole observation."""
+    """The policy of an agent of this package that observes the whole state."""
     from training.agents.agent import Agent
 
     agent, here = Agent.read(path), env.spec.id if env.spec else ""
@@ -119,17 +89,6 @@ def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
     policy = agent.policy(env.action_space)
     flatten: Any = gym.spaces.flatten
     return lambda observation: policy(flatten(env.observation_space, observation)[None])[0]
-
-
-def read_argument(text: str) -> tuple[str, Any]:
-    """Read ``NAME=VALUE``."""
-    name, equals, value = text.partition("=")
-    if not equals or not name.isidentifier():
-        raise ValueError(f"an argument of an environment is given as NAME=VALUE, got {text!r}")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
 
 
 def _word(text: str) -> str:

@@ -13,10 +13,18 @@ from rich.console import Console
 
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, get_system
-from training.commands.data import DataOptions
 from training.commands.maps import tracks_by
-from training.commands.options import SYSTEM, HalfWidths, Parameters, RunOptions, merged
-from training.commands.settings import SettingsOptions
+from training.commands.options import (
+    SYSTEM,
+    DataOptions,
+    HalfWidths,
+    Parameters,
+    RunOptions,
+    SettingsOptions,
+    hint,
+    merged,
+    set_threads,
+)
 from training.config import Pipeline
 from training.presets import Preset, Size, preset
 from training.progress import LOG, ProgressBars, duration, progress_bars
@@ -52,11 +60,7 @@ class Train:
 
     system: Annotated[
         tyro.conf.Positional[str],
-        tyro.conf.arg(
-            metavar="SYSTEM",
-            help=f"{SYSTEM} With --data, a name of your choice for what was recorded.",
-            help_behavior_hint="",
-        ),
+        hint(metavar="SYSTEM", help=f"{SYSTEM} With --data, a name of your choice for what was recorded."),
     ] = ""
     pipeline: Pipeline = "input-aware"
     """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs, which
@@ -70,23 +74,21 @@ class Train:
     uncertain: HalfWidths = ()
     """How far a parameter may be from its value, as a part of that: mu=0.1, or 0.1 for all. Some motions in training
     then have their own (input-aware), and the observer serves every such plant. It does not track."""
-    policy: Annotated[str | None, tyro.conf.arg(metavar="FUNCTION", help_behavior_hint="(default: random inputs)")] = (
-        None
-    )
-    """What acts while motions are simulated: "controller" for the system's own, or script.py:function, from states
+    policy: Annotated[str | None, hint("random inputs", metavar="FUNCTION")] = None
+    """Policy of the simulated motions: "controller" for the system's own, or script.py:function, from states
     (n, nx) to actions (n, nu) in [-1, 1]. For plants that no random input would hold within their bounds."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks are trained; auto takes a GPU if there is one."""
     data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
     """Recorded motions, where the equations are unknown."""
     settings: tyro.conf.OmitArgPrefixes[SettingsOptions] = field(default_factory=SettingsOptions)
-    """What is to differ from the preset. docs/reference/commands.md lists the settings and their defaults."""
+    """Changes of the preset. docs/reference/commands.md lists the settings and their defaults."""
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
     def run(self, console: Console) -> Path:
         """Train."""
         began = time.monotonic()
-        self.folder.start()
+        set_threads(self.folder.threads)
         import torch
 
         from training.evaluation.report import write_report
@@ -94,7 +96,11 @@ class Train:
 
         if self.device == "cuda" and not torch.cuda.is_available():
             raise ValueError("device cuda: torch sees no GPU; leave --device out to train on the CPU")
-        changes = self._changes()
+        changes = self.settings.read()
+        if self.uncertain:
+            changes["uncertain"] = merged("--uncertain", self.uncertain)
+        if self.policy is not None:
+            changes["policy"] = self.policy
         system = None
         if not self._has_records(changes):
             system = get_system(self.system, merged("--parameters", self.parameters))
@@ -115,7 +121,10 @@ class Train:
             size, took = path.stat().st_size / 1e6, duration(time.monotonic() - began)
             progress.say(f"wrote {path} ({size:.2f} MB), report.png and {LOG} beside it, in {took}")
             if system is not None:
-                progress.say(f"{self._evaluation(path, system)} measures its errors")
+                words = ["kkl-gym", "evaluate", str(path)]
+                words += [] if type(system) in SYSTEMS.values() else ["--system", self.system]
+                words += ["--policy", self.policy] if self.policy not in (None, "controller") else []
+                progress.say(f"{shlex.join(words)} measures its errors")
         return path
 
     def _has_records(self, changes: Mapping[str, Any]) -> bool:
@@ -132,13 +141,6 @@ class Train:
         if given := given or [name for name in changes if name in SIMULATED]:
             raise ValueError(f"{', '.join(given)}: of no use with --data, where nothing is simulated")
         return True
-
-    def _changes(self) -> dict[str, Any]:
-        """The settings that are to differ from the preset's."""
-        changes = self.settings.read()
-        if self.uncertain:
-            changes["uncertain"] = merged("--uncertain", self.uncertain)
-        return changes if self.policy is None else changes | {"policy": self.policy}
 
     def _name(self, system: System | None, changes: Mapping[str, Any]) -> str:
         """The observer's name, and its file's."""
@@ -187,16 +189,9 @@ class Train:
             progress.say(f"{others:.0f} % of the trajectories have parameters of their own: {uncertain}{estimated}")
         return SimulatedSource(system, config)
 
-    def _evaluation(self, path: Path, system: System) -> str:
-        """The command that evaluates the observer."""
-        words = ["kkl-gym", "evaluate", str(path)]
-        if type(system) not in SYSTEMS.values():
-            words += ["--system", self.system]
-        return shlex.join([*words, *(["--policy", self.policy] if self.policy not in (None, "controller") else [])])
-
 
 def summary(result: "Result") -> list[str]:
-    """What a training took and made."""
+    """Lines on a training: its CPU time, and how the observer estimates."""
     artifact = result.artifact
     by, covariance = tracks_by(artifact), artifact.inverse.error_covariance
     lines = [

@@ -1,9 +1,10 @@
-"""One line of a check, and how it writes numbers."""
+"""One line of a diagnosis, and its numbers as text."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-RESOLUTION = 1e-3  # to which a network reads z, in standard deviations: what is left where there is no noise
+RESOLUTION = 1e-3  # of z in a network, in standard deviations: the error that remains without noise
 
 Verdict = Literal["ok", "note", "problem"]
 
@@ -25,15 +26,14 @@ def number(value: float) -> str:
 
 def percent(share: float) -> str:
     """Two digits, in percent."""
-    value = 100.0 * share
-    return (f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}") + " %"
+    return (f"{100 * share:.0f}" if abs(share) >= 1 else f"{100 * share:.2g}") + " %"
 
 
 def error(share: float) -> str:
-    """An error in percent, as far as a network resolves it."""
+    """An error in percent, down to the resolution of a network."""
     return percent(share) if share >= RESOLUTION else f"< {percent(RESOLUTION)}"
 
 
-def point(x: object) -> str:
+def point(x: Iterable[float]) -> str:
     """A state."""
-    return f"({', '.join(f'{value:.3g}' for value in x)})"  # type: ignore[attr-defined]
+    return f"({', '.join(f'{value:.3g}' for value in x)})"

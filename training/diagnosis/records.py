@@ -1,35 +1,34 @@
-"""What outputs and inputs determine of hidden signals, from records or rollouts: nothing is trained."""
+"""Which hidden signals outputs and inputs determine, from records or rollouts, without a training."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from scipy.spatial import cKDTree
 
-from observers import LinearFilter
 from observers.checks import integer, noise_levels, shown
 from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
 from training.evaluation.levels import Level, show_level
 from training.maps.coordinates import SETTLED, coordinates, noise_covariance, root, settling_time, spread
 from training.progress import ProgressBars, progress_bars
-from training.records import Record, check_signals, pieces, resampled
-from training.rollouts import Policy, make, policy_of, roll_out
-from training.rollouts.playing import RANDOM
+from training.records import Record, check_signals, resampled
+from training.records.record import Windows
+from training.rollouts import Policy, policy_of
+from training.rollouts.playing import RANDOM, play
 from training.seeds import Stream, generator
-from training.sources.recorded import FEW, recorded_preset, split
-from training.sources.windows import along, restarted, samples_as_old, taken
+from training.sources.recorded import FEW, evenly, recorded_preset, split
 from training.spectrum import Spectrum
 
 STEPS = 10_000  # played in an environment, by default
-ASKING, OTHERS = 500, 40_000  # samples at most
-ASKING_SHARE = 0.2  # of the records, whose samples look for neighbours among those of the others
-FEWEST_ASKING = 50  # samples, for a judgement
-FEWEST_OTHERS = 5  # times the coordinates of z
+MAX_QUERIES, MAX_OTHERS = 500, 40_000  # samples that are predicted, and those that may be their neighbours
+QUERY_SHARE = 0.2  # of the records; neighbours come from the others
+MIN_QUERIES = 50  # samples, for a judgement
+MIN_OTHERS = 5  # times the coordinates of z
 NOISE_SHARES = 0.01, 0.1  # of an output's standard deviation, where no level is named
-FALLS = 1.25  # error with half of the samples over that with all, beyond which more would tell more
-NEIGHBOURS = 32  # at least, or twice as many as z has coordinates, so that planes rest on enough of them
+MIN_NEIGHBOURS = 32  # or twice as many as z has coordinates, so that planes rest on enough of them
 ROUNDING = 1e-9  # of z, in a linear regression
 DETERMINED, UNDETERMINED = 0.05, 0.8  # of a signal's standard deviation: largest and least errors of these verdicts
 AS_GOOD = 1.1  # times the least error, up to which a window is as good as any
@@ -39,7 +38,7 @@ SEEN = 0.1  # largest error of a signal's change, in the signal's own error, for
 VERDICTS: dict[str, tuple[Verdict, str]] = {
     "determined": ("ok", ""),
     "up": ("note", "an observer follows it from a known start; measure a signal that depends on its value, too"),
-    "partly": ("note", "measure one more signal that depends on it, or live with what is left"),
+    "partly": ("note", "measure one more signal that depends on it, or accept the remaining error"),
     "not": ("problem", "measure a signal that depends on it, or leave it out"),
     "never": ("note", "leave it out"),
 }
@@ -57,7 +56,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Observability:
-    """What outputs and inputs determine of hidden signals.
+    """Which hidden signals outputs and inputs determine.
 
     Errors are root mean squares in standard deviations of the signals.
 
@@ -72,12 +71,12 @@ class Observability:
     noise : tuple of (float or tuple of float), length k
         Levels of measurement noise; the first is 0.
     errors : ndarray, shape (k, m, nx)
-        That the best estimate leaves after so many steps.
+        Of the best estimate after so many steps.
     changes : ndarray, shape (m, nx)
-        That it leaves of how much a signal has changed over the window, in standard deviations of that change, without
-        noise; NaN where nothing has, and over windows of which the filter forgets where they began.
+        Its errors of a signal's change over the window, in standard deviations of that change, without noise; NaN where
+        no signal changes, and over windows whose start the filter has forgotten.
     warnings : tuple of str
-        What the data are too few for.
+        Judgements for which the data are too few.
     """
 
     measured: tuple[str, ...]
@@ -96,27 +95,22 @@ class Observability:
         return tuple(map(self._judged, range(len(self.hidden))))
 
     def findings(self) -> Iterator[Finding]:
-        """The same as lines of a check."""
+        """The same as lines of a diagnosis."""
         known = " and ".join(", ".join(names) for names in (self.measured, self.inputs) if names)
         yield Finding("signals", "ok", f"{', '.join(self.hidden)} from {known}, in steps of {self.dt:.3g} s")
         for one in self.judgements:
             verdict, advice = VERDICTS[one.verdict.split()[0]]
-            text = f"{one.signal}: {one.verdict}{self._since(one.window)}"
+            text = f"{one.signal}: {one.verdict}"
+            if one.window is not None:
+                steps = f"{one.window} step{'s' * (one.window > 1)} ({one.window * self.dt:.3g} s) of y"
+                text += f" from {steps if one.window else 'y alone'}"
             if not np.isnan(one.errors[0]):
-                left = [f"{error(each)} at noise {show_level(level)}" for level, each in zip(self.noise, one.errors)]
-                text += f"; error {', '.join(left)}"
+                errors = [f"{error(each)} at noise {show_level(level)}" for level, each in zip(self.noise, one.errors)]
+                text += f"; error {', '.join(errors)}"
             yield Finding("observability", verdict, text, advice)
         for warning in self.warnings:
-            found, _, advice = warning.partition("; ")
-            yield Finding("data", "note", found, advice)
-
-    def csv(self) -> str:
-        """Errors by signal, level of noise and window, as the text of a file."""
-        lines = ["signal,measurement_noise,steps,seconds,error"]
-        for (k, m, i), left in np.ndenumerate(self.errors):
-            level, window = show_level(self.noise[k]).replace(", ", " "), self.windows[m]
-            lines.append(f"{self.hidden[i]},{level},{window},{window * self.dt:.6g},{left:.6g}")
-        return "\n".join(lines) + "\n"
+            text, _, advice = warning.partition("; ")
+            yield Finding("data", "note", text, advice)
 
     def _judged(self, i: int) -> Judgement:
         errors, exact = tuple(self.errors[:, :, i].min(1).tolist()), self.errors[0, :, i]
@@ -134,12 +128,6 @@ class Observability:
             verdict = "not determined"
         window = None if verdict[:2] in ("ne", "no") else self.windows[int(good.argmax())]
         return Judgement(self.hidden[i], verdict, window, errors)
-
-    def _since(self, window: int | None) -> str:
-        if window is None:
-            return ""
-        steps = f"{window} step{'s' * (window > 1)} ({window * self.dt:.3g} s)"
-        return f" from {steps} of y" if window else " from y alone"
 
 
 def observability(
@@ -162,11 +150,11 @@ def observability(
     env_id : str
         As ``gym.make`` takes it.
     measured, hidden : sequence of str or int
-        What an observer would see, and what it would estimate, as for :func:`training.learn`.
+        Signals that an observer measures, and those that it estimates, as for :func:`training.learn`.
     policy : str or callable
-        Who acts, see :func:`training.rollouts.policy_of`. What is found holds where it has been.
+        Chooses the actions, see :func:`training.rollouts.policy_of`. The result holds where it has been.
     episodes, steps : int, optional
-        How much is played, to whichever is reached first; by default 10,000 steps.
+        Length of the play, to whichever is reached first; by default 10,000 steps.
     env_kwargs : mapping of str to object, optional
         Arguments of the environment.
     measurement_noise : sequence of (float or tuple of float), optional
@@ -175,48 +163,34 @@ def observability(
     seed : int
         Of the rollouts and of the comparison.
     console : rich.console.Console or ProgressBars, optional
-        Where progress is shown; by default nowhere.
+        For the progress; by default none is printed.
 
     Returns
     -------
     Observability
-        What was found; ``judgements`` has it in words.
+        Errors of the hidden signals; ``judgements`` has verdicts in words.
 
     Raises
     ------
     ValueError
-        If an argument makes no sense, or as :func:`training.diagnosis.of_records`.
+        If an argument is invalid, or as :func:`training.diagnosis.of_records`.
     """
-    if episodes is None and steps is None:
-        steps = STEPS
     if not hidden:
-        raise ValueError("say which signals are hidden, as in hidden=[2]")
-    with (
-        progress_bars(console) as progress,
-        make(env_id, env_kwargs) as env,
-        progress.phase(f"playing {env_id}", steps or episodes or 1) as report,
-    ):
-        rollouts = roll_out(
-            env,
-            policy_of(policy, env),
-            measured=list(map(str, measured)),
-            hidden=list(map(str, hidden)),
-            episodes=episodes,
-            steps=steps,
-            seed=seed,
-            report=report,
-        )
+        raise ValueError("name the hidden signals, as in hidden=[2]")
+    with progress_bars(console) as progress:
+        signals: dict[str, Any] = {"measured": list(map(str, measured)), "hidden": list(map(str, hidden))}
+        amount: dict[str, Any] = {"episodes": episodes, "steps": steps, "default_steps": STEPS, "seed": seed}
+        rollouts = play(env_id, partial(policy_of, policy), progress, **signals, **amount, env_kwargs=env_kwargs)
     return of_records(rollouts.records(), measurement_noise=measurement_noise, seed=seed)
 
 
 def of_records(
     records: Sequence[Record], *, measurement_noise: Sequence[Level] | None = None, seed: int = 0
 ) -> Observability:
-    """Find what recorded outputs and inputs tell of recorded states.
+    """Find which recorded states the recorded outputs and inputs determine.
 
-    The filter that a training on the records would take is switched on at any sample. So many steps later its state z
-    is compared with that of like samples in other records. Noise is added to z with the covariance that it has there,
-    and coordinates of z count as far as they are signal.
+    The filter of a training on the records starts at any sample. So many steps later its state z is compared with that
+    of similar samples in other records, with noise of the covariance that z then has.
     """
     integer("seed", seed, 0)
     check_signals(records)
@@ -228,38 +202,39 @@ def of_records(
     linear = spectrum.filter(len(signals.measured), config.dt, len(signals.inputs))
     records = [resampled(record, linear.dt) for record in records]
     noise = _levels(records, measurement_noise)
-    others, asking = (Filtered(pieces(part), linear) for part in split(records, ASKING_SHARE, seed))
-    rng = generator(Stream.VALIDATION, seed, 1)
-    settled = settling_time(linear) / linear.dt
-    last, memory = int(np.ceil(np.log2(settled))), settled / SETTLED  # beyond which it forgets where a window began
-    windows, found = [0, *(2**i for i in range(last + 1))], list[Compared]()
+    others, queries = (Windows(part, linear, len(signals.hidden)) for part in split(records, QUERY_SHARE, seed))
+    rng, settled = generator(Stream.VALIDATION, seed, 1), settling_time(linear) / linear.dt
+    windows = (0, *(2**i for i in range(int(np.ceil(np.log2(settled))) + 1)))
+    errors, changes = list[np.ndarray](), list[np.ndarray]()
     for window in windows:
-        samples = asking.samples(window, ASKING), others.samples(window, OTHERS)
-        compared = compare(*samples, covariance=noise_covariance(linear, np.array([window]))[0], noise=noise, rng=rng)
+        compared = compare(queries, others, window, noise=noise, rng=rng)
         if compared is None:
             break
-        found.append(compared if window <= memory else replace(compared, change=np.full_like(compared.half, np.nan)))
-    if not found:
+        errors.append(compared[0])
+        changes.append(np.where(window <= settled / SETTLED, compared[1], np.nan))  # the filter forgets later starts
+    if not errors:
         raise ValueError(
-            f"{sum(len(record.t) for record in records)} samples in {len(records)} records are too few to say anything "
-            f"of {', '.join(signals.hidden)}: record more"
+            f"{sum(len(record.t) for record in records)} samples in {len(records)} records are too few to judge "
+            f"{', '.join(signals.hidden)}: record more"
         )
-    result = Observability(
-        signals.measured,
-        signals.inputs if linear.nu else (),
-        signals.hidden,
-        dt=linear.dt,
-        windows=tuple(windows[: len(found)]),
-        noise=noise,
-        errors=np.stack([np.stack(each.levels) for each in found], 1),
-        changes=np.stack([each.change for each in found]),
-    )
-    halves = np.stack([each.half for each in found])
-    return replace(result, warnings=tuple(_warnings(result, halves, records=len(records), windows=windows)))
+    warnings = list[str]()
+    if len(records) < FEW:
+        warnings.append(
+            f"there are fewer than {FEW} records: samples are compared with others of the same, and a constant of a "
+            "record looks determined; record more"
+        )
+    if len(errors) < len(windows):
+        warnings.append(
+            f"windows of {windows[len(errors)]} steps and more are left out, as too few samples have so many before "
+            "them; record longer episodes, or more"
+        )
+    inputs = signals.inputs if linear.nu else ()
+    known = (signals.measured, inputs, signals.hidden, linear.dt, windows[: len(errors)], noise)
+    return Observability(*known, errors=np.stack(errors, 1), changes=np.stack(changes), warnings=tuple(warnings))
 
 
 def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[Level, ...]:
-    """No noise, and the levels that are asked for."""
+    """No noise, and the given levels or shares of the outputs' standard deviations."""
     y = np.concatenate([record.y for record in records])
     if given is None:
         given = [tuple(float(f"{share * size:.3g}") for size in np.nanstd(y, 0)) for share in NOISE_SHARES]
@@ -269,106 +244,63 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
     return tuple(dict.fromkeys([0.0, *levels]))
 
 
-def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows: Sequence[int]) -> Iterator[str]:
-    """Warnings of too few data; ``halves`` (windows, nx) are the errors with half of the samples."""
-    if records < FEW:
-        yield (
-            f"there are fewer than {FEW} records: samples are compared with others of the same, and what is constant "
-            "in a record looks as if it were determined; record more"
-        )
-    if len(found.windows) < len(windows):
-        yield (
-            f"windows of {windows[len(found.windows)]} steps and more are left out, as too few samples have so many "
-            "before them; record longer episodes, or more"
-        )
-    for i, name in enumerate(found.hidden):
-        exact = found.errors[0, :, i]
-        best = int(exact.argmin())
-        if exact[best] > DETERMINED and halves[best, i] > FALLS * exact[best]:
-            yield (
-                f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * halves[best, i]:.2g} % with "
-                "half of them; record more, with which it will be less"
-            )
-
-
-class Filtered:
-    """Records with the filter along each."""
-
-    def __init__(self, records: list[Record], linear: LinearFilter) -> None:
-        self._linear, self._records = linear, records
-        self._z = [along(linear, record) for record in records]
-
-    def samples(self, window: int, most: int) -> "Samples":
-        """Filter states after so many steps and the states there, evenly spread over all with one then and before."""
-        owner, sample = samples_as_old(self._records, window)
-        if len(owner):
-            states = [record.x for record in self._records]
-            whole = ~np.isnan(taken(states, owner, sample - window)).any(-1)
-            owner, sample = owner[whole], sample[whole]
-        chosen = np.linspace(0, len(owner) - 1, min(most, len(owner))).round().astype(int)
-        owner, sample = owner[chosen], sample[chosen]
-        if not len(owner):
-            return Samples(*np.zeros((3, 0, 0)))
-        x = taken(states, owner, sample)
-        z = restarted(self._linear, self._records, self._z, owner=owner, sample=sample, age=window)
-        return Samples(z, x, x - taken(states, owner, sample - window))
-
-
 @dataclass(frozen=True)
 class Samples:
-    """Filter states (n, size), states (n, nx), and how much these have changed since the filter was switched on."""
+    """Filter states (n, size), states (n, nx), and how much these have changed since the filter's start."""
 
     z: np.ndarray
     x: np.ndarray
     change: np.ndarray
 
     def nearest(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which of these (n,) come closest to other filter states (n, size), and how close, in standard deviations."""
+        """Indices (n,) of those closest to other filter states (n, size), and the distances in standard deviations."""
         offset, scale = self.z.mean(0), spread(self.z)
         distances, near = cKDTree((self.z - offset) / scale).query((z - offset) / scale)
         return near, distances
 
 
-@dataclass(frozen=True)
-class Compared:
-    """Errors by level of noise, and without any those of changes, and those with half of the samples."""
-
-    levels: list[np.ndarray]
-    change: np.ndarray
-    half: np.ndarray
+def samples(windows: Windows, steps: int, most: int) -> Samples:
+    """Evenly spread samples with a state now and ``steps`` before, when the filter started."""
+    rows = windows.rows(steps)
+    rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
+    rows = evenly(rows, min(most, len(rows)))
+    return Samples(windows.restarted(rows, steps), windows.x[rows], windows.x[rows] - windows.x[rows - steps])
 
 
 def compare(
-    asking: Samples, others: Samples, *, covariance: np.ndarray, noise: Sequence[Level], rng: np.random.Generator
-) -> Compared | None:
-    """Compare samples at all levels of noise, with its ``covariance`` in z; None where there are too few samples."""
-    if len(asking.z) < FEWEST_ASKING or len(others.z) <= FEWEST_OTHERS * others.z.shape[1]:
+    queries: Windows, others: Windows, window: int, *, noise: Sequence[Level], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Errors at each level of noise (k, nx), and without any those of changes (nx,).
+
+    The first level is 0. Returns None where there are too few samples.
+    """
+    one, other = samples(queries, window, MAX_QUERIES), samples(others, window, MAX_OTHERS)
+    if len(one.z) < MIN_QUERIES or len(other.z) <= MIN_OTHERS * other.z.shape[1]:
         return None
-    levels = []
+    errors, covariance = [], noise_covariance(others.linear, np.array([window]))[0]
     for level in noise:
+        noisy = bool(np.any(level))
         own = np.einsum("j,jab->ab", np.broadcast_to(np.square(level), len(covariance)), covariance)
-        scaled = coordinates(others.z, own if np.any(level) else covariance.sum(0))
-        share = 1 / (1 + scaled.noise_gain**2) if np.any(level) else 1.0  # of signal in each coordinate
+        scaled = coordinates(other.z, own if noisy else covariance.sum(0))
+        signal = 1 / (1 + scaled.noise_gain**2) if noisy else 1.0  # share of it in each coordinate
         R = root(own).T
-        z, others_z = (share * scaled(each.z + rng.standard_normal(each.z.shape) @ R) for each in (asking, others))
-        if np.any(level):
-            levels.append(left_by(z, asking.x, others_z, others.x))
-            continue
-        of_both, of_others = (np.hstack([each.x, each.change]) for each in (asking, others))
-        left, change = np.split(left_by(z, of_both, others_z, of_others), 2)
-        levels.append(left)
-        half = left_by(z, asking.x, others_z[::2], others.x[::2])
-    return Compared(levels, change, half)
+        z, others_z = (signal * scaled(each.z + rng.standard_normal(each.z.shape) @ R) for each in (one, other))
+        if noisy:
+            errors.append(left_by(z, one.x, others_z, other.x))
+        else:
+            both = (np.hstack([each.x, each.change]) for each in (one, other))
+            left, change = np.split(left_by(z, next(both), others_z, next(both)), 2)
+            errors.append(left)
+    return np.array(errors), change
 
 
 def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.ndarray) -> np.ndarray:
-    """Errors (nx,) that z leaves of x, in standard deviations, from samples of both and of others.
+    """Errors (nx,) of x given z, in standard deviations, from samples of both and of others.
 
-    The nearest others of each sample are weighed so that their z, weighted, is its own: a plane through them. Their x,
-    weighted, is then off by what z does not determine, of the sample itself and of the others, and by how far x bends
-    between them, which falls with the square of their distance. The first part is divided by 1 + the sum of squared
-    weights, as which it counts the variance; it is left where neighbours come as close as one likes. With one neighbour
-    of weight 1 that is the Delta test.
+    The nearest others of each sample are weighted so that their weighted z is its own: a plane through them. Their
+    weighted x is then off by the part of x that z does not determine, of the sample itself and of the others, and by
+    the curvature of x between them, which falls with the square of their distance. The first part is divided by 1 + the
+    sum of squared weights, as which it counts the variance. With one neighbour of weight 1 that is the Delta test.
 
     Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
     """
@@ -376,13 +308,13 @@ def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.nda
     design = np.column_stack([np.ones(len(others_z)), others_z])
     gram = design.T @ design + ROUNDING * len(design) * np.eye(len(design.T))
     coefficients = np.linalg.solve(gram, design.T @ others_x)
-    others_x = others_x - design @ coefficients  # only what is bent need be found from neighbours
+    others_x = others_x - design @ coefficients  # neighbours predict what is not linear
     x = x - np.column_stack([np.ones(len(z)), z]) @ coefficients
     linear: np.ndarray = np.sqrt((x**2).mean(0)) / deviation
     n, modes = z.shape
     if not modes:
         return linear
-    k = min(len(others_z), max(NEIGHBOURS, 2 * (modes + 1)))
+    k = min(len(others_z), max(MIN_NEIGHBOURS, 2 * (modes + 1)))
     near = cKDTree(others_z).query(z, k=k)[1]
     apart = others_z[near] - z[:, None]
     # The smallest weights with the sum 1 for which neighbours cancel to RESOLUTION.

@@ -1,10 +1,10 @@
 """A system before any training: its equations, inputs, motions, sampling and outputs."""
 
+import contextlib
 import importlib.util
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, ClassVar
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -12,15 +12,14 @@ from kkl_gym import EquationError
 from kkl_gym.compiled import SamplingStep, batch_step, single_step
 from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.simulate import SubstepsError, simulate
-from kkl_gym.system import NOISE_SHARE, Box, System, rate_under
+from kkl_gym.system import NOISE_SHARE, System, rate_under
 from training.diagnosis.finding import Finding, Verdict, number, percent, point
 from training.evaluation.levels import Level
 from training.presets import named_policy
-from training.trajectories.motions import DRIVEN, random_inputs, under_policy
-from training.trajectories.policies import Controller
+from training.trajectories.motions import DRIVEN, Controller, random_inputs, under_policy
 
 COMPARED = 100  # points of X, and as many of the bounds, at which the kinds of numbers are compared
-POINTS = 1000  # of X, at which outputs, inputs and time constants are looked at
+POINTS = 1000  # of X, for outputs, inputs and time constants
 MOTIONS = 100  # half of them driven, where there are inputs
 NUMERICAL_STEP = 1e-5  # of derivatives, in half-widths of X: its cube is about double precision's rounding
 LEAST_EFFECT = 1e-11  # of an input at its bound within a sampling interval, in half-widths of X
@@ -30,7 +29,7 @@ BEYOND = 12  # of them, at most
 ROOM = 1.1  # of bounds around those motions
 TOO_LOW = 0.5  # rate(x), in the fastest eigenvalue of the Jacobian
 COARSE, JERKY, SMOOTH, IDLE = 1.0, 0.5, 0.1, 1e-4  # changes of y from sample to sample, in its standard deviations
-ZERO = 1e-4  # part of the fastest eigenvalue below which one is taken for zero
+ZERO = 1e-4  # part of the fastest eigenvalue below which one counts as zero
 LOUD = 0.25  # measurement noise in an output's range
 STILL = 1e-9  # range of an output in its size
 
@@ -59,15 +58,26 @@ def of_bounds(system: System, n: int) -> np.ndarray:
     return np.random.default_rng(2).uniform(low, high, (n, system.nx))
 
 
-@dataclass(frozen=True)
 class Subject:
-    """A system and how it is sampled, with what several checks look at. What is random is the same each time."""
+    """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
-    system: System
-    dt: float
-    duration: float
-    policy: Controller | None = None
-    noise: tuple[Level, ...] = ()
+    ``x`` (POINTS, nx) are points of X and ``half`` (nx,) its half-widths. ``motions`` are states (steps + 1, MOTIONS,
+    nx), NaN from where they leave the bounds, and inputs, in equal shares of each of the ``kinds``. Those that
+    ``stay`` (MOTIONS,) have the outputs ``y``.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        dt: float,
+        duration: float,
+        policy: Controller | None = None,
+        noise: tuple[Level, ...] = (),
+    ) -> None:
+        self.system, self.dt, self.duration, self.policy, self.noise = system, dt, duration, policy, noise
+        self.kinds = ("under the policy",) if policy else ("free", "driven") if system.nu else ("free",)
+        low, high = system.box()
+        self.half = (high - low) / 2
 
     @cached_property
     def step(self) -> SamplingStep[np.ndarray]:
@@ -76,23 +86,12 @@ class Subject:
 
     @cached_property
     def x(self) -> np.ndarray:
-        """Points of X, (POINTS, nx)."""
+        """Draw points of X."""
         return of_X(self.system, POINTS)
 
     @cached_property
-    def half(self) -> np.ndarray:
-        """Half-widths of X, (nx,)."""
-        low, high = self.system.box()
-        return np.asarray((high - low) / 2)
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """The kinds of motions, with equal shares of them."""
-        return ("under the policy",) if self.policy else ("free", "driven") if self.system.nu else ("free",)
-
-    @cached_property
     def motions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Motions from X (steps + 1, MOTIONS, nx), NaN from where they leave the bounds, and their inputs."""
+        """Simulate them when they are needed."""
         system, rng, steps = self.system, np.random.default_rng(3), max(1, round(self.duration / self.dt))
         x0 = system.draw_starts(rng, MOTIONS)
         if self.policy:
@@ -103,64 +102,120 @@ class Subject:
             u[:, MOTIONS // 2 :] = random_inputs(system, MOTIONS // 2, steps, dt=self.dt, rng=rng, kinds=DRIVEN)
         return simulate(system, x0, steps, self.dt, u=u, step=self.step), u
 
-    @cached_property
-    def stays(self) -> np.ndarray:
-        """Which motions stay within the bounds, (MOTIONS,)."""
-        return np.asarray(np.isfinite(self.motions[0][-1]).all(-1))
+    @property
+    def stay(self) -> np.ndarray:
+        """Which motions stay within the bounds."""
+        return np.isfinite(self.motions[0][-1]).all(-1)
 
-    @cached_property
+    @property
     def y(self) -> np.ndarray:
-        """Outputs along these, (steps + 1, n, ny)."""
-        return self.system.output(self.motions[0][:, self.stays])
+        """Outputs (steps + 1, n, ny) of the motions that stay."""
+        return self.system.output(self.motions[0][:, self.stay])
 
     @property
     def followed(self) -> tuple[np.ndarray, np.ndarray]:
-        """States and inputs along those of the first kind that stay within the bounds."""
-        rows = np.flatnonzero(self.stays[: MOTIONS // len(self.kinds)])
+        """States and inputs of those of the first kind that stay."""
+        rows = np.flatnonzero(self.stay[: MOTIONS // len(self.kinds)])
         return self.motions[0][:, rows], self.motions[1][:, rows]
 
 
-def declaration(system: System) -> Iterator[Finding]:
+def declaration(subject: Subject) -> Iterator[Finding]:
     """States, inputs and parameters."""
+    system = subject.system
     bounds = ", ".join(f"{u_max:g}" for u_max in system.u_max)
     values = ", ".join(f"{name} = {value:g}" for name, value in system.parameters.items())
-    found = f"{system.name}: {system.nx} state{'s' * (system.nx > 1)} ({', '.join(system.state_names)}); "
-    found += f"{system.nu} input{'s' * (system.nu > 1)} up to {bounds}; " if system.nu else "no inputs; "
-    found += f"parameters {values}" if values else "no parameters"
-    yield Finding("system", "ok", found + (f"; steps of {system.dt:g} s of its own" if system.discrete else ""))
+    text = f"{system.name}: {system.nx} state{'s' * (system.nx > 1)} ({', '.join(system.state_names)}); "
+    text += f"{system.nu} input{'s' * (system.nu > 1)} up to {bounds}; " if system.nu else "no inputs; "
+    text += f"parameters {values}" if values else "no parameters"
+    yield Finding("system", "ok", text + (f"; steps of {system.dt:g} s of its own" if system.discrete else ""))
 
 
-def equations(system: System) -> Iterator[Finding]:
+def equations(subject: Subject) -> Iterator[Finding]:
     """The equations on floats, arrays, tensors and symbols: whether they work, agree, and give finite numbers."""
+    system = subject.system
     x = np.concatenate([of_X(system, COMPARED), of_bounds(system, COMPARED)])
     values: dict[str, np.ndarray] = {}
-    for kind, evaluated in (("floats", _floats), ("arrays", _arrays), ("tensors", _tensors), ("symbols", _symbols)):
-        verdict: Verdict = "problem" if kind in ("floats", "arrays") else "note"
+    for kind, evaluated in KINDS.items():
         try:
             with np.errstate(all="ignore"):
-                found = evaluated(_everything(system), x)
+                here = evaluated(partial(_everything, system), x)
         except (EquationError, NotImplementedError) as error:
+            verdict: Verdict = "problem" if kind in ("floats", "arrays") else "note"
             yield Finding("equations", verdict, f"on {kind}: {error}", f"as it is, {COST[kind]}")
             continue
         first = next(iter(values), kind)
-        apart = _apart(values.get(first, found), found, rate=not system.discrete)
+        apart = _apart(values.get(first, here), here, rate=not system.discrete)
         if apart.any():
-            where = f"such as at x = {point(x[int(apart.argmax())])}"
+            text = f"on {kind} they differ from those on {first}, such as at x = {point(x[int(apart.argmax())])}"
             advice = "let them depend on state, input and parameters alone; replace `if` by kkl_gym.elementary.where"
-            yield Finding("equations", "problem", f"on {kind} they differ from those on {first}, {where}", advice)
-            continue
-        values[kind] = found
+            yield Finding("equations", "problem", text, advice)
+        else:
+            values[kind] = here
     if not values:
         return
     bad = ~np.isfinite(next(iter(values.values()))).all(1)
     if bad.any():
         shares = f"{percent(bad[:COMPARED].mean())} of X and {percent(bad[COMPARED:].mean())} of the bounds"
-        found_bad = f"f or h is not a finite number in {shares}, such as at x = {point(x[bad][0])}"
+        text = f"f or h is not a finite number in {shares}, such as at x = {point(x[bad][0])}"
         advice = "draw the bounds, and X, where the equations hold, or change the equations"
-        yield Finding("equations", "problem", found_bad, advice)
+        yield Finding("equations", "problem", text, advice)
     parts = "step and h" if system.discrete else "f, g, h and rate"
     agree = f" and agree at {len(x)} points" if len(values) > 1 else ""
     yield Finding("equations", "ok", f"{parts} work on {', '.join(values)}{agree}")
+
+
+def _everything(system: System, x: Any) -> list[Any]:
+    """All values of the equations at a state, one after the other."""
+    if system.discrete:
+        return [*components(system.step, x, [0.5 * u_max for u_max in system.u_max]), *components(system.h, x)]
+    g = [gij for row in input_matrix(system, x) for gij in row]
+    return [*components(system.f, x), *g, *components(system.h, x), rate_at(system, x)]
+
+
+def _on_floats(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
+    rows: list[list[float]] = []
+    for state in x.tolist():
+        try:
+            rows.append([float(value) for value in values(state)])
+        except EquationError as error:
+            if not isinstance(error.__cause__, ArithmeticError):  # 1 / 0, which is infinite in arrays
+                raise
+            rows.append([])
+    width = max(map(len, rows))
+    return np.array([row or [np.nan] * width for row in rows])
+
+
+def _on_arrays(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
+    return np.stack([np.broadcast_to(np.asarray(value, dtype=float), len(x)) for value in values(x.T)], axis=-1)
+
+
+def _on_tensors(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
+    import torch
+
+    return _on_arrays(lambda at: [torch.as_tensor(value) for value in values(torch.tensor(at).unbind(0))], x)
+
+
+def _on_symbols(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
+    import sympy
+
+    symbols = list(sympy.symbols(f"x:{x.shape[1]}", real=True))
+    evaluated = sympy.lambdify(symbols, [sympy.sympify(value) for value in values(symbols)], "numpy", cse=True)
+    return _on_arrays(lambda at: evaluated(*at), x)
+
+
+KINDS = {"floats": _on_floats, "arrays": _on_arrays, "tensors": _on_tensors, "symbols": _on_symbols}
+
+
+def _apart(expected: np.ndarray, values: np.ndarray, *, rate: bool) -> np.ndarray:
+    """At which points (n,) two kinds of numbers disagree, where both are finite; a rate, the last, to three digits."""
+    if expected.shape != values.shape:
+        return np.ones(len(expected), dtype=bool)
+    both = np.isfinite(expected) & np.isfinite(values)
+    size = np.where(both, np.abs(expected), 0.0)
+    part = np.full(expected.shape[1], 1e-6)
+    part[-1:] = 1e-3 if rate else 1e-6
+    with np.errstate(invalid="ignore"):
+        return np.asarray((both & (np.abs(expected - values) > part * size + 1e-9 * size.max(0))).any(1))
 
 
 def machine_code(subject: Subject) -> Iterator[Finding]:
@@ -198,7 +253,7 @@ def inputs(subject: Subject) -> Iterator[Finding]:
 
 def bounds(subject: Subject) -> Iterator[Finding]:
     """Whether motions from X stay within the bounds, and which bounds would hold them."""
-    (x, _), lost = subject.motions, ~subject.stays
+    (x, _), lost = subject.motions, ~subject.stay
     followed = f"{len(lost)} motions of {subject.duration:g} s from X"
     if not lost.any():
         yield Finding("bounds", "ok", f"all of {followed}, {' and '.join(subject.kinds)}, stay within them")
@@ -206,131 +261,77 @@ def bounds(subject: Subject) -> Iterator[Finding]:
     counts = np.split(lost, len(subject.kinds))
     parts = [f"{one.sum()} of {len(one)} {kind}" for one, kind in zip(counts, subject.kinds)]
     when = subject.dt * np.median(np.isfinite(x[:, lost]).all(-1).sum(0))
-    found = f"of {followed}, {' and '.join(parts)} leave them, after {number(when)} s at the median"
+    text = f"of {followed}, {' and '.join(parts)} leave them, after {number(when)} s at the median"
     unstable = max(one.mean() for one in counts) > MANY
-    yield Finding("bounds", "problem" if unstable else "note", found, _way_out(subject, unstable=unstable))
+    yield Finding("bounds", "problem" if unstable else "note", text, _way_out(subject, unstable=unstable))
 
 
 def sampling(subject: Subject) -> Iterator[Finding]:
     """The sampling interval and the duration against the system's time constants and the output's changes."""
     system, dt, duration = subject.system, subject.dt, subject.duration
-    found, advice = f"dt = {dt:g} s, motions of {duration:g} s", list[str]()
+    text, advice = f"dt = {dt:g} s, motions of {duration:g} s", list[str]()
     verdict: Verdict = "ok"
     if not system.discrete:
         fastest, slowest = time_constants(subject)
         if np.isfinite(slowest):
-            found += f"; time constants {number(fastest)} to {number(slowest)} s (medians over X), of which the "
-            found += f"fastest spans {number(fastest / dt)} samples and a motion {number(duration / slowest)} of the "
-            found += "slowest"
+            text += f"; time constants {number(fastest)} to {number(slowest)} s (medians over X), of which the "
+            text += f"fastest spans {number(fastest / dt)} samples and a motion {number(duration / slowest)} of the "
+            text += "slowest"
         if duration < slowest < np.inf:
             verdict = "note"
             advice.append(f"motions end before the slow part has moved: take a duration of {5 * slowest:.1g} s")
         with np.errstate(all="ignore"):
             own = np.median(np.broadcast_to(rate_under(system, subject.x.T, system.u_max), POINTS))
         if type(system).rate is not System.rate and own < TOO_LOW / fastest:
-            verdict, found = "problem", f"{found}; rate(x) is {number(own)}/s at the median over X"
+            verdict, text = "problem", f"{text}; rate(x) is {number(own)}/s at the median over X"
             advice.append("that is too little: leave rate(x) out, or raise it, as substeps and eigenvalues follow it")
-    change = _change(subject)
-    if np.isfinite(change):
-        found += f"; y changes by {percent(change)} of its standard deviation from sample to sample"
+    y = subject.y
+    moving = y.size > 0 and (spread := np.sqrt(y.var(0).mean(0))) > 0
+    if np.any(moving):
+        change = (np.sqrt((np.diff(y, axis=0) ** 2).mean((0, 1)))[moving] / spread[moving]).max()
+        text += f"; y changes by {percent(change)} of its standard deviation from sample to sample"
         way = "" if system.discrete else f": take dt = {dt * SMOOTH / change:.1g} s"
         if change > JERKY:
             verdict = "problem" if change > COARSE else "note"
             advice.append(("the motion between samples is lost" if change > COARSE else "samples are few") + way)
         elif change < IDLE:
             verdict = "note"
-            advice.append("samples tell hardly anything new" + way)
-    yield Finding("sampling", verdict, found, "; ".join(advice))
+            advice.append("samples hardly differ" + way)
+    yield Finding("sampling", verdict, text, "; ".join(advice))
 
 
 def outputs(subject: Subject) -> Iterator[Finding]:
     """How far each output ranges, and how noisy it is."""
-    system, y = subject.system, subject.system.output(subject.x)
+    system, y, moving = subject.system, subject.system.output(subject.x), subject.y
     noise = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
     for i, level in enumerate(noise):
-        name, size = f"y{i + 1}", float(np.ptp(y[:, i]))
+        name, size, along = f"y{i + 1}", float(np.ptp(y[:, i])), ""
         if size <= STILL * np.abs(y[:, i]).max():
             advice = "let h measure something that moves, or leave this output out"
             yield Finding("output", "problem", f"{name} is {y[0, i]:.4g} everywhere in X", advice)
             continue
-        along = f", {number(np.ptp(subject.y[..., i]))} along motions" if subject.y.size else ""
-        found = f"{name} ranges over {number(size)} in X{along}; noise {number(level)} by default, "
-        found += f"{percent(level / size)} of that in X"
+        if moving.size:
+            along = f", {number(np.ptp(moving[..., i]))} along motions"
+        text = f"{name} ranges over {number(size)} in X{along}; noise {number(level)} by default, "
+        text += f"{percent(level / size)} of that in X"
         if level > LOUD * size:
             advice = f"set measurement_noise: {NOISE_SHARE * size:.2g} is 5 % of the range"
-            yield Finding("output", "note", found, advice)
+            yield Finding("output", "note", text, advice)
         else:
-            yield Finding("output", "ok", found)
-
-
-Evaluation = Callable[[Any], list[Any]]  # from components of a state to all values of the equations there
-
-
-def _everything(system: System) -> Evaluation:
-    """All values of the equations at a state, one after the other."""
-    half = [0.5 * u_max for u_max in system.u_max]
-
-    def evaluation(x: Any) -> list[Any]:
-        if system.discrete:
-            return [*components(system.step, x, half), *components(system.h, x)]
-        rows = [gij for row in input_matrix(system, x) for gij in row]
-        return [*components(system.f, x), *rows, *components(system.h, x), rate_at(system, x)]
-
-    return evaluation
-
-
-def _floats(evaluation: Evaluation, x: np.ndarray) -> np.ndarray:
-    rows: list[list[float]] = []
-    for state in x.tolist():
-        try:
-            rows.append([float(value) for value in evaluation(state)])
-        except EquationError as error:
-            if not isinstance(error.__cause__, ArithmeticError):  # 1 / 0, which is infinite in arrays
-                raise
-            rows.append([])
-    width = max(map(len, rows))
-    return np.array([row or [np.nan] * width for row in rows])
-
-
-def _arrays(evaluation: Evaluation, x: np.ndarray) -> np.ndarray:
-    return np.stack([np.broadcast_to(value, len(x)) for value in evaluation(x.T)], axis=-1)
-
-
-def _tensors(evaluation: Evaluation, x: np.ndarray) -> np.ndarray:
-    import torch
-
-    values = evaluation(torch.tensor(x).unbind(-1))
-    return np.stack([torch.as_tensor(value, dtype=torch.float64).expand(len(x)).numpy() for value in values], axis=-1)
-
-
-def _symbols(evaluation: Evaluation, x: np.ndarray) -> np.ndarray:
-    import sympy
-
-    symbols = list(sympy.symbols(f"x:{x.shape[1]}", real=True))
-    values = sympy.lambdify(symbols, [sympy.sympify(value) for value in evaluation(symbols)], "numpy", cse=True)(*x.T)
-    return np.stack([np.broadcast_to(np.asarray(value, dtype=float), len(x)) for value in values], axis=-1)
-
-
-def _apart(expected: np.ndarray, values: np.ndarray, *, rate: bool) -> np.ndarray:
-    """At which points (n,) two kinds of numbers disagree, where both give numbers; of a rate, the last, digits do."""
-    if expected.shape != values.shape:
-        return np.ones(len(expected), dtype=bool)
-    both = np.isfinite(expected) & np.isfinite(values)
-    size = np.where(both, np.abs(expected), 0.0)
-    part = np.full(expected.shape[1], 1e-6)
-    part[-1:] = 1e-3 if rate else 1e-6
-    with np.errstate(invalid="ignore"):
-        return np.asarray((both & (np.abs(expected - values) > part * size + 1e-9 * size.max(0))).any(1))
+            yield Finding("output", "ok", text)
 
 
 def _way_out(subject: Subject, *, unstable: bool) -> str:
     """Advice for motions that leave: other bounds, if wider ones hold them, or else another X or a policy."""
-    system, (x, u), lost = subject.system, subject.motions, np.flatnonzero(~subject.stays)
+    system, (x, u), lost = subject.system, subject.motions, np.flatnonzero(~subject.stay)
     if subject.policy:
         return "let the policy hold the system from all of X, widen the bounds, shrink X, or take a smaller dt"
     lost = lost[np.linspace(0, len(lost) - 1, min(BEYOND, len(lost))).round().astype(int)]
+    low, high = np.array(system.bounds, dtype=float).T
+    ends = np.stack([WIDER * low + (1 - WIDER) * (low + high) / 2, WIDER * high + (1 - WIDER) * (low + high) / 2], 1)
+    wider = type("Wider", (type(system),), {"name": f"{system.name}-wider", "bounds": tuple(map(tuple, ends.tolist()))})
     try:
-        x = simulate(_wider(system), x[0, lost], len(u), subject.dt, u=u[:, lost], step=subject.step)
+        x = simulate(wider(**system.parameters), x[0, lost], len(u), subject.dt, u=u[:, lost], step=subject.step)
     except SubstepsError:  # too fast out there
         x = x[:, lost]
     held = np.isfinite(x[-1]).all(-1)
@@ -344,28 +345,14 @@ def _way_out(subject: Subject, *, unstable: bool) -> str:
         return "widen the bounds " + " and ".join(widened)
     way = f"they run away, also in bounds {WIDER:g} times as wide: shrink X"
     if not unstable:
-        return way + ", or let it be, as training leaves them out"
+        return way + ", or accept it, as training leaves them out"
     if not system.nu:
         return way
-    try:
-        stays = replace(subject, policy=named_policy(system, "controller")).stays
-    except ValueError:  # there is no such controller, or a motion needs too many substeps
-        stays = np.zeros(1, bool)
-    if stays.mean() > MANY:
-        return f"{way}, or train with --policy controller, under which {stays.sum()} of {len(stays)} stay"
+    with contextlib.suppress(ValueError):  # there is no such controller, or a motion needs too many substeps
+        stay = Subject(system, subject.dt, subject.duration, named_policy(system, "controller")).stay
+        if stay.mean() > MANY:
+            return f"{way}, or train with --policy controller, under which {stay.sum()} of {len(stay)} stay"
     return f"{way}, or train under a policy of yours that holds the system: --policy script.py:function"
-
-
-def _wider(system: System) -> System:
-    low, high = np.array(system.bounds, dtype=float).T
-    centre, half = (low + high) / 2, WIDER * (high - low) / 2
-    kind = type(system)
-
-    class Wider(kind):  # type: ignore[misc, valid-type]
-        name: ClassVar[str] = f"{system.name}-wider"
-        bounds: ClassVar[Box] = tuple(zip((centre - half).tolist(), (centre + half).tolist()))
-
-    return Wider(**system.parameters)
 
 
 def time_constants(subject: Subject) -> tuple[float, float]:
@@ -381,13 +368,3 @@ def time_constants(subject: Subject) -> tuple[float, float]:
         return np.inf, np.inf
     slow = np.where(sizes > ZERO * sizes.max(1, keepdims=True), sizes, np.inf).min(1)
     return float(1 / np.median(sizes.max(1))), float(1 / np.median(slow))
-
-
-def _change(subject: Subject) -> float:
-    """Root mean square change of the outputs from sample to sample, in standard deviations; NaN if none moves."""
-    y = subject.y
-    if not y.size:
-        return np.nan
-    spread, step = np.sqrt(y.var(0).mean(0)), np.sqrt((np.diff(y, axis=0) ** 2).mean((0, 1)))
-    moving = spread > 0
-    return float((step[moving] / spread[moving]).max()) if moving.any() else np.nan

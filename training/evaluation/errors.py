@@ -1,24 +1,25 @@
 """Estimation errors of an observer on trajectories that its training never saw."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.checks import noise_levels
+from observers.checks import is_finite, noise_levels, shown
 from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
+from training.maps.coordinates import root
 from training.seeds import Stream, generator
-from training.trajectories.motions import draw_process_noise, random_inputs, under_policy
-from training.trajectories.policies import Controller
+from training.sources.simulated import unknown_start
+from training.trajectories.motions import Controller, draw_process_noise, random_inputs, under_policy
+from training.trajectories.parameters import blind, with_parameters
 
-TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
-
-TRIES = 1000  # starts of which one at least should lie beyond X
+TRANSIENT = 0.2  # part of a trajectory that the errors "after the transient" leave out
+MAX_TRIES = 1000  # starts in a row within X, after which none is expected beyond it
 
 Domain = Literal["X", "1.5X", "2X"]
 
@@ -59,19 +60,19 @@ def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> 
     if domain == "X":
         return system.draw_starts(rng, n)
     low, high = system.box()
-    factor, found = float(domain.removesuffix("X")), list[np.ndarray]()
-    tries = 0
-    while len(found) < n:
-        (x,) = system.draw_starts(rng, 1, factor)
-        if ((x < low) | (x > high)).any():
-            found.append(x)
-        tries += 1
-        if tries > TRIES * (1 + len(found)):
+    factor, beyond = float(domain.removesuffix("X")), list[np.ndarray]()
+    while len(beyond) < n:
+        for _ in range(MAX_TRIES):
+            (x,) = system.draw_starts(rng, 1, factor)
+            if ((x < low) | (x > high)).any():
+                beyond.append(x)
+                break
+        else:
             raise NoStartsError(
                 f"no state of {system.name} in {domain} lies beyond X = {system.X}: bounds = {system.bounds} leave no "
-                "room there, or its draw_starts takes no notice of the factor"
+                "room there, or its draw_starts ignores the factor"
             )
-    return np.array(found)
+    return np.array(beyond)
 
 
 def unseen_trajectories(
@@ -93,8 +94,7 @@ def unseen_trajectories(
     Parameters
     ----------
     system : System
-        What observers are made for: it moves, unless a plant does, and says where starts are, and what noise, inputs
-        and pace are usual.
+        The model of the observers. It has the starts, the scale of the noise and the inputs, and moves without a plant.
     dt : float
         Sampling interval in seconds.
     n : int
@@ -114,13 +114,12 @@ def unseen_trajectories(
     policy : callable, optional
         Acts on the system, see :func:`training.trajectories.motions.under_policy`; by default nothing does.
     plant : System, optional
-        What moves in the place of the system, such as the same with other parameters
-        (:meth:`kkl_gym.System.replace`, :func:`training.evaluation.plants.off_by`).
+        Moves in the place of the system, such as the same with other parameters (:meth:`kkl_gym.System.replace`).
 
     Returns
     -------
     UnseenTrajectories
-        Those that stayed within the declared bounds of what moves, and which these are.
+        Those that stayed within the declared bounds of the plant, and which these are.
 
     Raises
     ------
@@ -174,9 +173,9 @@ def errors(
         The observer; None for an extended Kalman filter that knows the system's equations, the inputs, both levels of
         noise, and that starts are uniform in X.
     system : System
-        What it was made for.
+        Its model.
     trajectories : UnseenTrajectories
-        What it is to follow.
+        Test trajectories.
     measurement_noise : float or sequence of float, length ny
         Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int
@@ -194,48 +193,125 @@ def errors(
     ValueError
         If the level of noise is invalid, or beyond the map's range.
     """
-    x_hat = estimates(artifact, system, trajectories, measurement_noise=measurement_noise, seed=seed)
+    x_hat, _ = estimates(artifact, system, trajectories, measurement_noise=measurement_noise, seed=seed)
+    return _errors(trajectories, x_hat, skip)
+
+
+def noise_limit(
+    system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int, skip: float | None = None
+) -> Errors:
+    """Errors of an estimator that attains the posterior Cramér-Rao bound, which no unbiased causal one falls below.
+
+    Its errors are drawn from N(0, P), where P is the bound along each trajectory: it follows from the plant's exact
+    equations, its inputs, both levels of noise, and the variance of starts in X. Estimators with a bias, as of starts
+    uniform in a box, may have smaller errors in the first samples.
+
+    Parameters
+    ----------
+    system, trajectories, measurement_noise, skip
+        As for :func:`errors`. The trajectories start in X; at least 0.2 % of the system's own noise is assumed.
+    seed : int
+        Seed of the drawn errors.
+
+    Returns
+    -------
+    Errors
+        One for each trajectory.
+
+    Raises
+    ------
+    ValueError
+        If the level of noise is invalid.
+    """
+    level, dt = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt
+    intensity = np.diag((trajectories.process_noise * np.array(system.scale)) ** 2 / 3 * dt)
+    R, plant = measurement_covariance(system, level), trajectories.plant or system
+    bound = ExtendedKalmanFilter(plant, dt, Q=intensity, R=R, start=unknown_start(system))
+    P = bound.along(trajectories.x, trajectories.u)
+    drawn = generator(Stream.EVALUATION, seed, 1).standard_normal((*trajectories.x.shape, 1))
+    return _errors(trajectories, trajectories.x + (root(P) @ drawn)[..., 0], skip)
+
+
+def _errors(trajectories: UnseenTrajectories, x_hat: np.ndarray, skip: float | None) -> Errors:
     x = trajectories.x
     first = round(TRANSIENT * len(x)) if skip is None else round(skip / trajectories.dt)
     return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first), trajectories.escaped)
 
 
 def estimates(
-    artifact: Artifact | None, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
-) -> np.ndarray:
-    """Estimates along test trajectories, (steps + 1, n, nx), whose errors :func:`errors` measures."""
-    observer = observer_of(artifact, system, trajectories, measurement_noise)
-    return follow(observer, measured(system, trajectories, measurement_noise, seed), trajectories.u)[0]
-
-
-def observer_of(
-    artifact: Artifact | None, system: System, trajectories: UnseenTrajectories, measurement_noise: Level
-) -> KKLObserver | ExtendedKalmanFilter:
-    """An observer that is given both levels of noise; without an artifact a Kalman filter, as in :func:`errors`."""
-    level = noise_levels("measurement_noise", measurement_noise, system.ny)
+    artifact: Artifact | None,
+    system: System,
+    trajectories: UnseenTrajectories,
+    *,
+    measurement_noise: Level,
+    seed: int,
+    covariances: bool = False,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Estimates along test trajectories, (steps + 1, n, nx), and on request their covariances; as :func:`errors`."""
+    level, dt = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt
+    observer: KKLObserver | ExtendedKalmanFilter
     if artifact is not None:
-        return KKLObserver(artifact, level, process_noise=trajectories.process_noise)
-    Q = process_intensity(system, trajectories.process_noise, trajectories.dt)
-    return ExtendedKalmanFilter(system, trajectories.dt, Q=Q, R=measurement_covariance(system, level))
+        observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
+    else:
+        Q, R = process_intensity(system, trajectories.process_noise, dt), measurement_covariance(system, level)
+        observer = ExtendedKalmanFilter(system, dt, Q=Q, R=R)
+    return follow(observer, measured(system, trajectories, level, seed), trajectories.u, covariances=covariances)
 
 
 def follow(
     observer: KKLObserver | ExtendedKalmanFilter, y: np.ndarray, u: np.ndarray, *, covariances: bool = False
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Estimates along records (steps + 1, n, nx), and their covariances if these are asked for."""
+    """Estimates along records (steps + 1, n, nx), and on request their covariances."""
     if isinstance(observer, KKLObserver):
         inputs = u if observer.artifact.nu else None
         return observer.estimate(y, inputs), observer.estimate_covariance(y, inputs) if covariances else None
-    state, found = observer.start(y.shape[1]), []
+    state, x_hat, P = observer.start(y.shape[1]), [], []
     for k in range(len(y)):
-        state = observer.advance(state, y[k], u[k - 1])  # which ignores the input before the first sample
-        found.append((state.x, state.P) if covariances else (state.x,))
-    x_hat, *beside = map(np.array, zip(*found, strict=True))
-    return x_hat, beside[0] if covariances else None
+        state = observer.advance(state, y[k], u[k - 1])  # the filter ignores the input before the first sample
+        x_hat.append(state.x)
+        P.append(state.P if covariances else ())
+    return np.array(x_hat), np.array(P) if covariances else None
 
 
 def measured(system: System, trajectories: UnseenTrajectories, measurement_noise: Level, seed: int) -> np.ndarray:
     """Outputs of trajectories with noise, (steps + 1, n, ny)."""
-    level = noise_levels("measurement_noise", measurement_noise, system.ny)
     y = (trajectories.plant or system).output(trajectories.x)
-    return y + np.asarray(level) * generator(Stream.EVALUATION, seed, 1).standard_normal(y.shape)
+    return y + np.asarray(measurement_noise) * generator(Stream.EVALUATION, seed, 1).standard_normal(y.shape)
+
+
+def off_by(system: System, share: float) -> System:
+    """The same system with every parameter larger by a share of itself."""
+    if not is_finite(share):
+        raise ValueError(f"the error of the parameters must be a finite number, such as 0.1, got {shown(share)}")
+    if not system.parameters:
+        raise ValueError(f"{system.name} has no parameters that could be off")
+    return system.replace({name: (1.0 + share) * value for name, value in system.parameters.items()})
+
+
+def parameter_errors(
+    artifact: Artifact,
+    system: System,
+    *,
+    trajectories: int,
+    measurement_noise: Level,
+    seed: int,
+    plant: System | None = None,
+    policy: Controller | None = None,
+    **motions: Any,
+) -> np.ndarray:
+    """Errors in % of estimated parameters after the transient, on a plant or on many from the ranges of the training.
+
+    ``motions`` are further arguments of :func:`unseen_trajectories`.
+    """
+    nx, names = system.nx, artifact.estimated_parameters
+    moving = plant or with_parameters(system, {name: artifact.parameter_ranges[name] for name in names})
+    runs = unseen_trajectories(
+        moving, artifact.filter.dt, n=trajectories, seed=seed, policy=policy and blind(policy, nx), **motions
+    )
+    if not runs.inside.any():
+        raise ValueError(f"each of {trajectories} runs left bounds = {system.bounds}")
+    level = noise_levels("measurement_noise", measurement_noise, system.ny)
+    observer = KKLObserver(artifact, level, process_noise=runs.process_noise)
+    values = observer.estimate_parameters(measured(moving, runs, level, seed), runs.u if artifact.nu else None)
+    true = [plant.parameters[name] for name in names] if plant else runs.x[0, :, nx:]
+    return np.asarray(100.0 * np.sqrt(np.mean((values[round(TRANSIENT * len(values)) :] / true - 1.0) ** 2, (0, 1))))

@@ -1,4 +1,4 @@
-"""Faulty sensors, and how soon an observer's monitor notices them."""
+"""Sensor faults, and how soon an observer's monitor detects them."""
 
 from collections.abc import Callable
 from typing import Literal, get_args
@@ -11,18 +11,12 @@ from observers import Artifact, KKLObserver
 from training.evaluation.levels import Level
 from training.presets import profile
 from training.seeds import Stream, generator
-from training.sources.simulated import sound_motions
-from training.trajectories.policies import Controller
+from training.sources.simulated import SOUND
+from training.trajectories.motions import Controller, Motions
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 BIAS = 0.2  # of the output's range
-PARTS = 1 + len(FAULTS)  # of the work: simulating, and each fault
-
-
-def deadline(system: System, duration: float) -> float:
-    """Seconds within which a fault should be noticed: what the system's profile says, else a fifth of the duration."""
-    return profile(system).fault_deadline or duration / 5
 
 
 def simulate_faults(
@@ -36,57 +30,37 @@ def simulate_faults(
     policy: Controller | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> pd.DataFrame:
-    """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor."""
-    allowed = deadline(system, duration)
-    if not allowed <= duration / 2:
+    """Simulate sensors that fail in the middle of a trajectory, and the scores of an observer's monitor."""
+    deadline = profile(system).fault_deadline or duration / 5
+    if not deadline <= duration / 2:
         raise ValueError(
-            f"a fault in the middle of {duration} s leaves less than the {allowed:g} s within which it is to be noticed"
+            f"a fault in the middle of {duration} s leaves less than the {deadline:g} s within which it is to be "
+            "detected; take a longer duration"
         )
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
     steps = round(duration / dt)
-    x, u, _ = sound_motions(
-        system, n=trajectories, steps=steps, dt=dt, rng=rng, driven=bool(artifact.nu), policy=policy
-    )
+    motions = Motions(system, dt, steps, **SOUND, levels=(system.process_noise,), policy=policy)
+    x, u, *_ = motions.with_inputs(artifact.nu).drawn(trajectories, rng)
     clean = system.output(x)
     y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
-    counted = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen it
-    width = np.ptp(clean[len(clean) // 2 :, counted], axis=(0, 1))
-    at, within = len(y) // 2, round(allowed / dt)
+    free = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen the output's range
+    half, within = len(y) // 2, round(deadline / dt)
+    bias = BIAS * np.ptp(clean[half:, free], axis=(0, 1))
+    faulty = {"none": y[half:], "bias": y[half:] + bias, "drop-out": 0.0, "freeze": y[half]}
     observer = KKLObserver(artifact, measurement_noise, monitor=True, process_noise=system.process_noise)
     frames = []
-    for done, fault in enumerate(FAULTS, 1):
+    for done, (fault, late) in enumerate(faulty.items(), 1):
         report(done)
         seen = y.copy()
-        if fault == "bias":
-            seen[at:] += BIAS * width
-        elif fault == "drop-out":
-            seen[at:] = 0.0
-        elif fault == "freeze":
-            seen[at:] = seen[at]
-        score = _scores(observer, seen, u if artifact.nu else None)
-        judged = score if fault == "none" else score[at : at + within]
-        late = score if fault == "none" else score[at:]
-        alarmed = (late > 1).any(0)
-        frames.append(
-            pd.DataFrame(
-                {
-                    "system": system.name,
-                    "fault": fault,
-                    "deadline": allowed,
-                    "trajectory": np.arange(trajectories),
-                    "score": judged.max(0),
-                    "delay": np.where(alarmed, (late > 1).argmax(0) * dt, np.inf),
-                }
-            )
-        )
+        seen[half:] = late
+        score = np.zeros(y.shape[:2])
+        observer.reset(seen[0])
+        for k in range(1, len(y)):
+            observer.advance(seen[k], u[k - 1] if artifact.nu else None)
+            score[k] = observer.score
+        first = 0 if fault == "none" else half
+        alarms, judged = score[first:] > 1, score[first : None if fault == "none" else half + within]
+        columns = {"system": system.name, "fault": fault, "deadline": deadline, "trajectory": np.arange(trajectories)}
+        delay = np.where(alarms.any(0), alarms.argmax(0) * dt, np.inf)
+        frames.append(pd.DataFrame(columns | {"score": judged.max(0), "delay": delay}))
     return pd.concat(frames, ignore_index=True)
-
-
-def _scores(observer: KKLObserver, y: np.ndarray, u: np.ndarray | None) -> np.ndarray:
-    """The monitor's score at every sample, (steps + 1, n)."""
-    observer.reset(y[0])
-    out = np.zeros(y.shape[:2])
-    for k in range(1, len(y)):
-        observer.advance(y[k], None if u is None else u[k - 1])
-        out[k] = observer.score
-    return out

@@ -1,4 +1,4 @@
-"""Levels of measurement noise: as people write them, and as far as a map knows them."""
+"""Levels of measurement noise: reading, showing, and a map's range of them."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ Level = float | tuple[float, ...]  # standard deviation on each sample of y: of 
 
 
 def read_level(text: str) -> Level:
-    """Read what :func:`show_level` writes, or a user."""
+    """Read a number, or one for each output with commas between them."""
     try:
         levels = tuple(float(number) for number in text.split(","))
     except ValueError:
@@ -43,10 +43,7 @@ def multiple(system: System, factor: float) -> Level:
 
 
 def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
-    """Return the level of measurement noise that is asked for; by default the system's own, as far as a map knows it.
-
-    A map that takes one level for all outputs gets the largest of those that are the system's own.
-    """
+    """Return the given level, or the system's own within the map's range: the largest, where the map takes but one."""
     if given is not None:
         return noise_levels("measurement_noise", given, system.ny)
     own = multiple(system, 1.0)

@@ -11,14 +11,13 @@ import numpy as np
 
 from kkl_gym.systems import SYSTEMS
 from observers import Artifact, KKLObserver
-from observers.checks import choice
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError, choice
 from observers.expression import Expression
 from observers.inverse import InverseMap
 from observers.motion import Motion
 from observers.names import resolve
 from observers.storage import checksum
-from observers.supervision import INFLATION, RELINEARISATIONS, Supervision
+from observers.tracker import INFLATION, RELINEARISATIONS, Supervision
 from observers.unscented import weights as sigma_weights
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and

@@ -76,12 +76,7 @@ class _Step(nn.Module):
         self._observer, self._covariance = observer, covariance
 
     def forward(
-        self,
-        state: Tensor,
-        y: Tensor,
-        u: Tensor | None,
-        measurement_noise: Tensor | None,
-        process_noise: Tensor | None,
+        self, state: Tensor, y: Tensor, u: Tensor | None, measurement_noise: Tensor | None, process_noise: Tensor | None
     ) -> tuple[Tensor, ...]:
         state, x_hat = self._observer(state, y, u, measurement_noise, process_noise)
         if not self._covariance:

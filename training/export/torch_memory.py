@@ -51,8 +51,11 @@ class TorchMemory(Module):
         time_constants: Sequence[float] = (1.0, 2.0, 4.0, 8.0),
         input_time_constants: Sequence[float] = (1.0, 4.0),
     ) -> None:
-        pairs = np.array(angles, dtype=int).reshape(-1, 2)
-        if len({*pairs.ravel().tolist()} & {*range(ny)}) < pairs.size:
+        pairs = np.asarray(list(angles) if isinstance(angles, Sequence) else angles)
+        if not pairs.size:
+            pairs = np.empty((0, 2), dtype=int)
+        of_two = pairs.dtype.kind in "iu" and pairs.shape[1:] == (2,)
+        if not of_two or len({*pairs.ravel().tolist()} & {*range(ny)}) < pairs.size:
             raise ValueError(f"angles must be pairs of different outputs, of 0 to {ny - 1}, got {angles!r}")
         super().__init__()
         self.cosines, self.sines = pairs.T.tolist()

@@ -1,6 +1,8 @@
 """Checks of well-formed records: units, lengths, signals that do not move, steps of time."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,119 +13,106 @@ Warn = Callable[[str], object]
 
 MAX_WARNINGS = 5  # of the same kind: beyond it the first alone
 OTHER_UNITS = 100.0  # times what is expected: no motion does that, but a unit a thousand times smaller
-OTHER_SPREAD = 300.0  # times that of other records of the same signal
-OTHER_CLOCK = 30.0  # times the sampling interval of other records
+OTHER_CLOCK = 30.0  # times the steps of a record, the longest sampling interval that it is put on
 WHOLE_TURN = 0.9 * 2 * np.pi, 2 * np.pi + 0.1  # least and largest jump of a wrapped angle
+FAR_OFF = 10.0  # ranges of all other samples, between these and a value that marks missing ones
 
 
 def check_signals(records: Sequence[Record], system: System | None = None) -> None:
     """Raise ValueError unless all records have the same columns, and as many of them as a system has signals."""
     if not records:
-        raise ValueError("there is no record")
+        raise ValueError("no records are given")
     first = records[0]
+    names = {role: getattr(first.signals, role) for role in ROLES.values()}
     for record in records[1:]:
-        for role in ROLES.values():
-            here, there = (", ".join(getattr(each.signals, role)) or "none" for each in (record, first))
-            if here != there:
-                raise ValueError(f"{record.name}: {role} are columns {here}, but {there} in {first.name}")
-        if record.environment != first.environment:
-            raise ValueError(
-                f"{record.name} is of {_of(record)}, but {first.name} of {_of(first)}: one observer serves one of them"
-            )
+        check_alike(record, names, first.environment, first.name)
     if system is None:
         return
-    counts = {"measured": system.ny, "inputs": system.nu, "hidden": system.nx}
-    for role, count in counts.items():
-        names = getattr(first.signals, role)
-        if len(names) != count and (names or role == "measured"):
+    for role, count in zip(ROLES.values(), (system.ny, system.nu, system.nx)):
+        if len(names[role]) != count and (names[role] or role == "measured"):
             raise ValueError(
-                f"{first.name}: {system.name} has {count} {role}, but the columns are {', '.join(names) or 'none'}; "
-                f"name others by --{role}"
+                f"{first.name}: {system.name} has {count} {role}, but the columns are "
+                f"{', '.join(names[role]) or 'none'}; name others by --{role}"
             )
 
 
-def _of(record: Record) -> str:
-    env = record.environment
-    return "no environment that is known" if env is None else f"{env['id']} with arguments {env['kwargs']}"
-
-
-def check_between_records(records: Sequence[Record], warn: Warn) -> None:
-    """Raise ValueError, or warn, if a record seems to be in other units than the others."""
-    steps = np.array([median_step(record) for record in records])
-    for record, step in zip(records, steps):
-        if not 1 / OTHER_CLOCK < step / np.median(steps) < OTHER_CLOCK:
-            raise ValueError(
-                f"{_time(record)}: steps of {step:g} s, but {np.median(steps):g} s in the other files; is the time in "
-                "other units than seconds?"
-            )
-    for _, _, column, values in _columns(records):
-        spreads = np.array([_spread(each) for each in values])
-        usual = np.quantile(spreads[spreads > 0], 0.5, method="lower") if spreads.any() else 1.0
-        for record, ratio in zip(records, spreads / usual):
-            if ratio and not 1 / OTHER_SPREAD < ratio < OTHER_SPREAD:
-                warn(
-                    f"{record.name}: column {column} spreads over {ratio:.3g} times what it does in other files; is it "
-                    "in other units?"
-                )
+def check_alike(record: Record, names: Mapping[str, Sequence[str]], environment: Any, other: str) -> None:
+    """Raise ValueError unless a record has the signals ``names`` by role and is of an environment, as ``other`` is."""
+    for role, there in names.items():
+        if (here := getattr(record.signals, role)) != tuple(there):
+            here, there = (", ".join(each) or "none" for each in (here, there))
+            raise ValueError(f"{record.name}: {role} are columns {here}, but {there} in {other}")
+    if record.environment != environment:
+        here, there = (
+            "no known environment" if env is None else f"{env['id']} with arguments {env['kwargs']}"
+            for env in (record.environment, environment)
+        )
+        raise ValueError(f"{record.name} is of {here}, but {other} of {there}: one observer serves one of them")
 
 
 def check_motion(records: Sequence[Record], warn: Warn) -> None:
-    """Raise ValueError, or warn, if signals do not move, or if an angle jumps by whole turns."""
+    """Raise ValueError if a signal never moves; warn of wrapped angles and of values that mark missing samples."""
     least, most = WHOLE_TURN
     for letter, _, column, values in _columns(records):
         if letter == "u":
             continue
-        moving, still, wrapped = [_spread(each) > 0 for each in values], list[str](), list[str]()
+        ranges = [np.nanmax(each) - np.nanmin(each) for each in values]
         value, *others = map(np.nanmax, values)
-        if not any(moving) and all(other == value for other in others):
+        if not any(ranges) and all(other == value for other in others):
             raise ValueError(
-                f"{records[0].name}: column {column}: {value:g} in all rows, and no other file says more; there is "
-                "nothing to learn from what never moves"
+                f"{records[0].name}: column {column}: {value:g} in all rows and all files: nothing can be learned from "
+                "a signal that never moves"
             )
-        for record, each, moves in zip(records, values, moving):
-            jumps = abs(np.diff(each))
+        texts = defaultdict[str, list[str]](list)
+        for record, each, width in zip(records, values, ranges):
+            where, jumps = f"{record.name}: column {column}", abs(np.diff(each))
             turns = np.flatnonzero((jumps > least) & (jumps < most))
-            if any(moving) and not moves:
-                still.append(f"{record.name}: column {column} never moves")
-            if len(turns) and np.nanmax(each) - np.nanmin(each) < most:
-                wrapped.append(
-                    f"{record.name}: column {column}, row {turns[0] + 2}: a jump by a whole turn, as of an angle that "
-                    f"is wrapped; take cos({column}) and sin({column}), or unwrap it"
+            if any(ranges) and not width:
+                texts["still"].append(f"{where} never moves")
+            if len(turns) and width < most:
+                texts["wrapped"].append(
+                    f"{where}, row {turns[0] + 2}: a jump by a whole turn, as of an angle that is wrapped; take "
+                    f"cos({column}) and sin({column}), or unwrap it"
                 )
-        _warn_of(still, warn)
-        _warn_of(wrapped, warn)
+            for mark in (np.nanmin(each), np.nanmax(each)):
+                rest = each[~np.isnan(each) & (each != mark)]
+                if len(rest) and abs(rest - mark).min() > FAR_OFF * np.ptp(rest) > 0:
+                    texts["marked"].append(
+                        f"{where}, row {np.flatnonzero(each == mark)[0] + 1}: {mark:g} is far from all other values, "
+                        f"{rest.min():.3g} to {rest.max():.3g}; if it marks missing samples, leave their cells empty"
+                    )
+        for alike in texts.values():
+            _warn_of(alike, warn)
 
 
-def check_against_system(records: Sequence[Record], system: System, warn: Warn) -> None:
-    """Raise ValueError, or warn, if records are of sizes that a system hardly reaches."""
-    if system.nu and not records[0].signals.inputs:
+def check_units(records: Sequence[Record], system: System | None, warn: Warn) -> None:
+    """Raise ValueError, or warn, if a record seems to be in other units than a system, or than most records."""
+    if system is not None and system.nu and not records[0].signals.inputs:
         warn(f"{records[0].name}: no column of inputs, which are taken for zero")
-    for record in records:
-        step = median_step(record)
-        ratio = step / system.dt
-        text = (
-            f"{_time(record)}: steps of {step:.3g} s are {ratio:.3g} times the dt of {system.name} ({system.dt:g} s); "
-            "is the time in seconds?"
-        )
-        if ratio > OTHER_UNITS:  # nothing is left of the motion between such samples
-            raise ValueError(f"{text} If so, give the system a dt as long")
-        if ratio < 1 / OTHER_UNITS:
-            warn(text)
-    low, high = system.box()
-    sizes = {"y": system.output_range, "u": system.u_max, "x": high - low}
-    for letter, j, column, values in _columns(records):
-        expected = sizes[letter][j]
-        for record, each in zip(records, values):
-            size = np.nanpercentile(abs(each - np.nanmedian(each)), 99)  # a few outliers aside
-            ratio = size / expected
-            text = (
-                f"{record.name}: column {column} moves by {size:.3g}, {ratio:.3g} times what {system.name} declares "
-                f"({expected:.3g}); is it in other units?"
-            )
-            if ratio > OTHER_UNITS:
+    whose = "most files have" if system is None else f"{system.name} has"
+
+    def judge(what: str, sizes: Sequence[float], usual: float | None, question: str, *, fatal: bool = True) -> None:
+        usual = usual or np.quantile([size for size in sizes if size] or [1.0], 0.5, method="lower")
+        for record, size in zip(records, sizes):
+            ratio = size / usual
+            text = f"{record.name}: column {what} {size:.3g}, {ratio:.3g} times what {whose} ({usual:.3g}); {question}"
+            if ratio > OTHER_UNITS and fatal:
                 raise ValueError(text)
-            if letter != "u" and 0 < ratio < 1 / OTHER_UNITS:
+            if ratio > OTHER_UNITS or 0 < ratio < 1 / OTHER_UNITS:
                 warn(text)
+
+    steps = [median_step(record) for record in records]
+    judge(f"{records[0].signals.time}: steps of", steps, system.dt if system else None, "is the time in seconds?")
+    declared = {}
+    if system is not None:
+        declared = {"y": system.output_range, "u": system.u_max, "x": np.ptp(np.array(system.box()), axis=0)}
+    for letter, j, column, values in _columns(records):
+        # A few outliers aside.
+        sizes = [float(np.nanpercentile(abs(each - np.nanmedian(each)), 99)) for each in values]
+        usual = declared[letter][j] if declared else None
+        if letter == "u" and usual:
+            sizes = [max(size, usual / OTHER_UNITS) for size in sizes]  # inputs may be as small as one likes
+        judge(f"{column} moves by", sizes, usual, "is it in other units?", fatal=system is not None)
 
 
 def check_memory(records: Sequence[Record], seconds: float, warn: Warn) -> None:
@@ -159,11 +148,6 @@ def _columns(records: Sequence[Record]) -> Iterator[tuple[str, int, str, list[np
     for letter, role in ROLES.items():
         for j, column in enumerate(getattr(records[0].signals, role)):
             yield letter, j, column, [getattr(record, letter)[:, j] for record in records]
-
-
-def _spread(values: np.ndarray) -> float:
-    """Standard deviation of a column; exactly 0 where it never moves, which rounding may keep from that."""
-    return 0.0 if np.nanmax(values) == np.nanmin(values) else float(np.nanstd(values))
 
 
 def _warn_of(texts: Sequence[str], warn: Warn) -> None:

@@ -23,7 +23,6 @@ from training.records.record import Record, Signals
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
-    from minari import MinariDataset
 
 PREFIX = "minari:"  # of the name of a data set among names of files
 KEY = "kkl_gym"  # in the metadata, of what Minari has no place for
@@ -52,23 +51,22 @@ class Rollouts:
     action_space: gym.Space[Any]
     episodes: Sequence[Episode]
     signals: Signals = Signals()  # noqa: RUF009 - it is frozen
+    spec: "EnvSpec | None" = None
 
     def records(self, wanted: Signals | None = None) -> list[Record]:
         """Read the wanted signals of each episode, by default those of the rollouts."""
-        source = self.name if self.environment is None else self.environment["id"]
-        wanted = wanted or Signals()
+        wanted, space = wanted or Signals(), self.observation_space
         if wanted.time:
             raise ValueError(f"{self.name}: episodes have equal steps and no column of time; leave --time out")
+        source = self.name if self.environment is None else self.environment["id"]
         measured, hidden = (
-            resolved(
-                getattr(wanted, role) or getattr(self.signals, role), self.observation_space, role=role, source=source
-            )
+            resolved(getattr(wanted, role) or getattr(self.signals, role), space, role=role, source=source)
             for role in ("measured", "hidden")
         )
         if not measured:
-            raise ValueError(f"{self.name}: say which entries of the observation are measured (--measured 0,1)")
+            raise ValueError(f"{self.name}: name the measured entries of the observation (--measured 0,1)")
         signals = Signals("t", measured, wanted.inputs or acting(self.action_space), hidden)
-        readers = [Reader(self.observation_space, names, source=source) for names in (measured, hidden) if names]
+        readers = [Reader(space, names, source=source) for names in (measured, hidden) if names]
         read_u = InputReader(self.action_space, signals.inputs, source=source)
         records = []
         for i, episode in enumerate(self.episodes):
@@ -80,22 +78,14 @@ class Rollouts:
                 u = read_u(episode.actions, (n,))
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from error
-            if np.isnan(y[0]).any():
+            if missing := [column for column, value in zip(measured, y[0]) if np.isnan(value)]:
                 raise ValueError(
-                    f"{name}: {measured[int(np.isnan(y[0]).argmax())]} is not there after the reset, where an observer "
-                    "takes its first sample; measure something else"
+                    f"{name}: {missing[0]} is missing after the reset, where an observer takes its first sample; "
+                    "measure another signal"
                 )
-            record = Record(
-                name,
-                self.dt * np.arange(n + 1),
-                y,
-                np.concatenate([u, u[-1:]]) if signals.inputs else None,
-                x[0] if x else None,
-                signals,
-                source=self.name,
-                environment=self.environment,
-            )
-            records.append(record)
+            held, t = (np.concatenate([u, u[-1:]]) if signals.inputs else None), self.dt * np.arange(n + 1)
+            states = x[0] if x else None
+            records.append(Record(name, t, y, held, states, signals, self.name, self.environment))
         return records
 
 
@@ -106,10 +96,21 @@ def is_dataset(name: str | Path) -> bool:
 
 def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
     """Read a Minari data set."""
-    _require()
+    minari = _minari()
+    name = str(name)
     try:
-        dataset = _opened(str(name))
-        metadata = dataset.storage.metadata
+        if (folder := Path(name)) and name.startswith(PREFIX):
+            folder = Path(minari.storage.datasets_root_dir.get_dataset_path(name.removeprefix(PREFIX)))
+        data = next((part for part in (folder / DATA, folder) if (part / METADATA).is_file()), None)
+        if data is None:
+            raise ValueError(f"there is no data set in {folder}; `minari list local` lists all")
+        if (
+            not {"observation_space", "action_space"}
+            <= json.loads((data / METADATA).read_text(encoding="utf-8")).keys()
+        ):
+            raise ValueError("its spaces are missing")  # Minari would make the environment, whatever that runs
+        dataset = minari.MinariDataset(data)
+        metadata, spec = dataset.storage.metadata, dataset.env_spec
         own = metadata.get(KEY, {})
         signals = Signals(measured=own.get("measured", ()), hidden=own.get("hidden", ()))
         dt = check_dt(own["dt"]) if "dt" in own else None
@@ -121,31 +122,10 @@ def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
         raise ValueError(f"{name} cannot be read as a Minari data set: {error}") from error
     if not episodes:
         raise ValueError(f"{name} holds no episode")
-    spec = dataset.env_spec
     kwargs = {} if spec is None else {key: value for key, value in spec.kwargs.items() if key not in APPEARANCE}
-    return Rollouts(
-        str(name).removeprefix(PREFIX),
-        None if spec is None else {"id": spec.id, "kwargs": kwargs},
-        dt or _interval(str(name), spec, kwargs, warn),
-        metadata["observation_space"],
-        metadata["action_space"],
-        episodes,
-        signals,
-    )
-
-
-def _opened(name: str) -> "MinariDataset":
-    import minari
-    from minari.storage.datasets_root_dir import get_dataset_path
-
-    folder = Path(get_dataset_path(name.removeprefix(PREFIX)) if name.startswith(PREFIX) else name)
-    data = next((part for part in (folder / DATA, folder) if (part / METADATA).is_file()), None)
-    if data is None:
-        raise ValueError(f"there is none in {folder}; `minari list local` says which there are")
-    keys = json.loads((data / METADATA).read_text(encoding="utf-8")).keys()
-    if not {"observation_space", "action_space"} <= keys:  # Minari would make the environment, whatever it runs
-        raise ValueError("it does not say its spaces")
-    return minari.MinariDataset(data)
+    environment = None if spec is None else {"id": spec.id, "kwargs": kwargs}
+    dt, spaces = dt or _interval(name, spec, kwargs, warn), (metadata["observation_space"], metadata["action_space"])
+    return Rollouts(name.removeprefix(PREFIX), environment, dt, *spaces, episodes, signals, spec)
 
 
 def _interval(name: str, spec: Any, kwargs: Mapping[str, Any], warn: Callable[[str], object]) -> float:
@@ -157,36 +137,31 @@ def _interval(name: str, spec: Any, kwargs: Mapping[str, Any], warn: Callable[[s
                 return sampling_interval(env)
         except Exception as error:  # whatever is missing
             reason = f", and {spec.id} cannot be made ({error})"
-    warn(f"{name} says no sampling interval{reason}: a step counts as 1 s")
+    warn(f"{name} has no sampling interval{reason}: a step counts as 1 s")
     return 1.0
 
 
-def write_dataset(rollouts: Rollouts, spec: "EnvSpec | None", *, policy: str) -> Path:
+def write_dataset(rollouts: Rollouts, *, policy: str) -> Path:
     """Write a Minari data set, whole or not at all; what killed processes left beside it is removed."""
     folder = dataset_folder(rollouts.name)
-    from minari import __version__
-    from minari.data_collector.episode_buffer import EpisodeBuffer
-    from minari.dataset.minari_dataset import parse_dataset_id
-    from minari.dataset.minari_storage import MinariStorage
-    from minari.namespace import create_namespace, list_local_namespaces
-
-    namespace = parse_dataset_id(rollouts.name)[0]
-    if namespace is not None and namespace not in list_local_namespaces():
-        create_namespace(namespace)
+    minari = _minari()
+    namespace, *_ = minari.dataset.minari_dataset.parse_dataset_id(rollouts.name)
+    if namespace is not None and namespace not in minari.namespace.list_local_namespaces():
+        minari.namespace.create_namespace(namespace)
     clear_unfinished(folder.parent)
     temporary = folder.with_name(f"{UNFINISHED}{secrets.token_hex(4)}")
     temporary.mkdir(parents=True)
     try:
-        storage = MinariStorage.new(
+        storage = minari.dataset.minari_storage.MinariStorage.new(
             temporary / DATA,
             observation_space=rollouts.observation_space,
             action_space=rollouts.action_space,
-            env_spec=None if spec is None else _in_json(spec),
+            env_spec=None if rollouts.spec is None else _in_json(rollouts.spec),
             jpeg_encoding=False,
         )
         for episode in rollouts.episodes:
             going_on = [False] * (len(episode.rewards) - 1)
-            buffer = EpisodeBuffer(
+            buffer = minari.data_collector.EpisodeBuffer(
                 observations=episode.observations,
                 actions=episode.actions,
                 rewards=list(episode.rewards),
@@ -196,9 +171,8 @@ def write_dataset(rollouts: Rollouts, spec: "EnvSpec | None", *, policy: str) ->
             )
             storage.update_episodes([buffer])
         own = {"dt": rollouts.dt} | {role: list(getattr(rollouts.signals, role)) for role in ("measured", "hidden")}
-        storage.update_metadata(
-            {"dataset_id": rollouts.name, "minari_version": __version__, "algorithm_name": policy, KEY: own}
-        )
+        whose = {"dataset_id": rollouts.name, "minari_version": minari.__version__, "algorithm_name": policy}
+        storage.update_metadata(whose | {KEY: own})
         os.rename(temporary, folder)
     except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -210,15 +184,12 @@ def write_dataset(rollouts: Rollouts, spec: "EnvSpec | None", *, policy: str) ->
 
 def dataset_folder(name: str) -> Path:
     """The folder of a data set that is to be written; an error if none can be written there."""
-    _require()
-    from minari.dataset.minari_dataset import parse_dataset_id
-    from minari.storage.datasets_root_dir import get_dataset_path
-
+    minari = _minari()
     try:
-        parse_dataset_id(name)
+        minari.dataset.minari_dataset.parse_dataset_id(name)
     except (TypeError, ValueError):
         raise ValueError(f"a Minari data set is called as in pendulum/random-v0, got {name!r}") from None
-    folder = Path(get_dataset_path(name))
+    folder = Path(minari.storage.datasets_root_dir.get_dataset_path(name))
     _refuse_existing(folder, name)
     parent = next(parent for parent in folder.parents if parent.exists())
     if not os.access(parent, os.W_OK):
@@ -241,11 +212,12 @@ def _in_json(spec: "EnvSpec") -> "EnvSpec":
     return written
 
 
-def _require() -> None:
+def _minari() -> Any:
     try:
         import h5py  # noqa: F401
-        import minari  # noqa: F401
+        import minari
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             f'{error}: Minari data sets need pip install "kkl-gym[envs]"', name=error.name
         ) from None
+    return minari

@@ -1,12 +1,10 @@
-"""Records from files: NPZ, CSV and Parquet, and Minari data sets. Nothing in a file runs."""
+"""Records from NPZ, MAT, CSV and Parquet files and Minari data sets. Nothing in a file runs."""
 
 import csv
 import re
 import textwrap
 import warnings
-import zipfile
-from array import array
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +14,14 @@ import numpy as np
 from kkl_gym.named import FUNCTIONS
 from kkl_gym.system import System
 from observers.checks import shown
-from training.records.checks import check_against_system, check_between_records, check_motion, check_signals
+from training.records.checks import Warn, check_motion, check_signals, check_units
 from training.records.episodes import is_dataset, read_dataset
-from training.records.record import ROLES, Record, Signals, refuse_infinite
+from training.records.record import ROLES, Record, Signals
 
-MISSING = {"", "na", "n/a", "nan", "none", "null"}  # cells of a text file that hold no number, in small letters
+MISSING = ["na", "none", "NONE", "Null", "Nan", "Na"]  # beside what pandas takes for missing cells
 SEPARATORS = ",;\t"
 TIMES = ("t", "time")  # usual names of the column of time
-Columns = dict[str, np.ndarray]
-Choose = Callable[[tuple[str, ...]], list[str]]  # from the names of all columns to those that are wanted
+Columns = Mapping[str, Any]
 
 
 def read_records(
@@ -32,12 +29,12 @@ def read_records(
     *,
     signals: Signals | None = None,
     system: System | None = None,
-    warn: Callable[[str], object] | None = None,
+    warn: Warn | None = None,
 ) -> list[Record]:
     """Read records, one from each file or episode, and check them."""
     paths = [Path(path) for path in files]
     if not paths:
-        raise ValueError("name a file of recorded data, .npz, .csv or .parquet, or a data set, minari:ID (--data)")
+        raise ValueError(f"name a file of recorded data, {', '.join(READERS)}, or a data set, minari:ID (--data)")
     if twice := sorted({str(path) for path in paths if paths.count(path) > 1}):
         raise ValueError(f"{', '.join(twice)}: named twice, which would count each sample twice")
     warn = warn or (lambda text: warnings.warn(text, stacklevel=4))
@@ -48,57 +45,49 @@ def read_records(
         else:
             records.append(_read(path, signals or Signals()))
     check_signals(records, system)
-    if len(paths) > 1:  # episodes of one environment are in the same units
-        check_between_records(records, warn)
     check_motion(records, warn)
-    if system is not None:
-        check_against_system(records, system, warn)
+    if system is not None or len(paths) > 1:  # episodes of one environment are in the same units
+        check_units(records, system, warn)
     return records
 
 
 def _read(path: Path, wanted: Signals) -> Record:
     """Read the wanted signals of a file, and those of the usual names where none are named."""
-    readers = {".npz": _npz, ".csv": _csv, ".parquet": _parquet}
-    reader = readers.get(path.suffix.lower())
+    reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(
-            f"{path} is no record: its name must end in {', '.join(readers)}, or be minari:ID of a data set"
+            f"{path} is not a record: its name must end in {', '.join(READERS)}, or be minari:ID of a data set"
         )
     if not path.is_file():  # to read a pipe may never end
         raise ValueError(f"{path} is a folder, a pipe or a device" if path.exists() else f"there is no file {path}")
     try:
-        return _record(path, wanted, reader)
-    except (ValueError, KeyError, EOFError, MemoryError, NotImplementedError, zipfile.BadZipFile, csv.Error) as error:
+        return _record(path, wanted, reader(path))
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:  # whatever a damaged file leads to
         raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
 
 
-def _record(path: Path, wanted: Signals, reader: Callable[[Path, Choose], Columns]) -> Record:
-    names, signals = tuple[str, ...](), wanted
+def _record(path: Path, wanted: Signals, columns: Columns) -> Record:
+    signals = _named(wanted, tuple(columns))
+    t = _seconds(columns[signals.time], signals.time)
 
-    def choose(there: tuple[str, ...]) -> list[str]:
-        nonlocal names, signals
-        if twice := sorted({name for name in there if there.count(name) > 1}):
-            raise ValueError(f"more than one column {', '.join(twice)}")
-        names, signals = there, _named(wanted, there)
-        return list(dict.fromkeys([signals.time, *(_column(signal, names)[0] for signal in signals.all)]))
+    def stacked(role: tuple[str, ...], *, held: bool = False) -> np.ndarray | None:
+        values = list[np.ndarray]()
+        for signal in role:
+            name, function = _column(signal, columns)
+            column = _numbers(columns[name], name)
+            if held and len(column) == len(t) - 1 > 0:  # there is no input after the last sample
+                column = np.append(column, column[-1])
+            if len(column) != len(t):
+                raise ValueError(
+                    f"columns must be of one length; {signals.time} has {len(t)}, {name} has {len(column)} rows"
+                )
+            values.append(function(column))
+        return np.stack(values, -1) if values else None
 
-    columns = reader(path, choose)
-    t = columns[signals.time]
-    for name, values in columns.items():
-        if values.dtype.kind not in "fiu":
-            raise ValueError(f"column {name} must hold numbers, got {values.dtype}")
-        if len(values) != len(t):
-            raise ValueError(
-                f"columns must be of one length; {signals.time} has {len(t)}, {name} has {len(values)} rows"
-            )
-        refuse_infinite(str(path), name, values)
-
-    def stacked(role: tuple[str, ...]) -> Any:
-        parts = [_column(signal, names) for signal in role]
-        return np.stack([function(columns[name].astype(float)) for name, function in parts], -1) if parts else None
-
-    y, u, x = map(stacked, (signals.measured, signals.inputs, signals.hidden))
-    return Record(str(path), t, y, u, x, signals)
+    y, u, x = stacked(signals.measured), stacked(signals.inputs, held=True), stacked(signals.hidden)
+    return Record(str(path), t, y, u, x, signals)  # type: ignore[arg-type]
 
 
 def _named(wanted: Signals, columns: tuple[str, ...]) -> Signals:
@@ -121,7 +110,7 @@ def _named(wanted: Signals, columns: tuple[str, ...]) -> Signals:
     return signals
 
 
-def _column(signal: str, columns: tuple[str, ...]) -> tuple[str, Callable[..., np.ndarray]]:
+def _column(signal: str, columns: Iterable[str]) -> tuple[str, Callable[..., np.ndarray]]:
     """The column of a signal, and the function that is taken of it; a column may itself be called cos(...)."""
     match = None if signal in columns else re.fullmatch(rf"({'|'.join(FUNCTIONS)})\((.+)\)", signal)
     return (signal, np.asarray) if match is None else (match[2].strip(), FUNCTIONS[match[1]])
@@ -135,60 +124,92 @@ def _numbered(letter: str, columns: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(sorted(numbered, key=lambda name: int(name[1:])))
 
 
-def _npz(path: Path, choose: Choose) -> Columns:
+def _seconds(values: Any, column: str) -> np.ndarray:
+    """Times in seconds; dates, or their text in ISO 8601, count from the first."""
+    import pandas as pd
+
+    values = pd.Series(values)
+    if not pd.api.types.is_numeric_dtype(values):
+        dates = pd.to_datetime(values, format="ISO8601", errors="coerce", utc=True)
+        if dates.notna().all():
+            return np.asarray((dates - dates.iloc[0]).dt.total_seconds())
+    return _numbers(values, column)
+
+
+def _numbers(values: Any, column: str) -> np.ndarray:
+    import pandas as pd
+
+    values = pd.Series(values)
+    numbers = pd.to_numeric(values, errors="coerce")
+    if len(wrong := np.flatnonzero(numbers.isna() & values.notna())) or numbers.dtype.kind not in "fiu":
+        value = values.iloc[wrong[0]] if len(wrong) else values.dtype
+        hint = "; write decimals with a point" if "," in str(value) else ""
+        raise ValueError(f"column {column}, row {wrong[:1].sum() + 1}: {shown(value)} is not a number{hint}")
+    return np.asarray(numbers, dtype=float)
+
+
+def _npz(path: Path) -> Columns:
     file = np.load(path, allow_pickle=False)
     if not isinstance(file, np.lib.npyio.NpzFile):
         raise ValueError("it holds a single array; save it by numpy.savez(path, t=t, y=y)")
-    columns = Columns()
+    arrays = dict[str, np.ndarray]()
     with file:
         for name in file.files:
             try:
-                values = file[name]
+                arrays[name] = file[name]
             except ValueError:  # pickled objects, which are no error unless they are asked for
-                values = np.empty(1, dtype=object)
-            if values.ndim == 2 and values.shape[1] > 1:
-                columns |= {f"{name}{i + 1}": column for i, column in enumerate(values.T)}
-            elif values.ndim in (1, 2) and values.size:  # u may be empty where a system has no inputs
-                columns[name] = values.reshape(-1)
-    return {name: columns[name] for name in choose(tuple(columns))}
+                arrays[name] = np.array(["a pickled object"])
+    return _columns(arrays)
 
 
-def _parquet(path: Path, choose: Choose) -> Columns:
+def _mat(path: Path) -> Columns:
+    from scipy.io import loadmat
+
+    arrays = loadmat(path, squeeze_me=True)
+    return _columns({name: np.asarray(values) for name, values in arrays.items() if name[:2] != "__"})
+
+
+def _columns(arrays: Mapping[str, np.ndarray]) -> Columns:
+    """The columns of arrays, numbered where there are several in one."""
+    columns = dict[str, np.ndarray]()
+    for name, values in arrays.items():
+        if values.ndim == 2 and values.shape[1] > 1:
+            columns |= {f"{name}{i + 1}": column for i, column in enumerate(values.T)}
+        elif values.ndim in (1, 2) and values.size:  # u may be empty where a system has no inputs
+            columns[name] = values.reshape(-1)
+    return columns
+
+
+def _parquet(path: Path) -> Columns:
+    import pandas as pd
+
     try:
-        from pyarrow import parquet
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f'{path}: Parquet needs pyarrow: pip install "kkl-gym[parquet]"', name=error.name
-        ) from None
-    names = choose(tuple(parquet.read_schema(path).names))
-    table = parquet.read_table(path, columns=names)
-    return {name: table[name].to_numpy() for name in names}
+        frame = pd.read_parquet(path, engine="pyarrow")
+    except ImportError as error:
+        raise ModuleNotFoundError(f'{path}: Parquet needs pyarrow: pip install "kkl-gym[parquet]"') from error
+    if isinstance(frame.index, pd.DatetimeIndex):
+        frame = frame.reset_index(names=frame.index.name or TIMES[0])
+    return frame
 
 
-def _csv(path: Path, choose: Choose) -> Columns:
+def _csv(path: Path) -> Columns:
+    import pandas as pd
+
     with path.open(encoding="utf-8-sig", newline="") as file:
         header = file.readline()
-        layout: Any = {"delimiter": max(SEPARATORS, key=header.count), "skipinitialspace": True}
-        names = tuple(name.strip() for name in next(csv.reader([header], **layout), []))
+        separator = max(SEPARATORS, key=re.sub('"[^"]*"', "", header).count)
+        layout: Any = {"delimiter": separator, "skipinitialspace": True}
+        names = [name.strip() for name in next(csv.reader([header], **layout), [])]
         if not any(names):
             raise ValueError("its first row must hold the names of the columns")
-        columns = {name: array("d") for name in choose(names)}
-        places = {name: names.index(name) for name in columns}
+        if twice := sorted({name for name in names if name and names.count(name) > 1}):
+            raise ValueError(f"more than one column {', '.join(twice)}")
         for row, cells in enumerate(csv.reader(file, **layout), 1):
-            if not cells:  # an empty row
-                continue
-            if len(cells) != len(names):
+            if len(cells) not in (0, len(names)):  # pandas would fill or cut it
                 raise ValueError(f"row {row} has {len(cells)} cells, the header {len(names)}")
-            for name, column in columns.items():
-                column.append(_number(cells[places[name]], name, row))
-    return {name: np.array(column) for name, column in columns.items()}
+    layout |= {"header": None, "skiprows": 1, "names": range(len(names)), "na_values": MISSING}
+    frame = pd.read_csv(path, encoding="utf-8-sig", **layout)
+    return {name: frame[i] for i, name in enumerate(names)}
 
 
-def _number(cell: str, column: str, row: int) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        if cell.strip().lower() in MISSING:
-            return float("nan")
-        hint = "; write decimals with a point" if "," in cell else ""
-        raise ValueError(f"column {column}, row {row}: {shown(cell)} is no number{hint}") from None
+READERS: dict[str, Callable[[Path], Columns]] = {".npz": _npz, ".mat": _mat, ".csv": _csv, ".parquet": _parquet}

@@ -3,11 +3,13 @@
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NoReturn
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from observers import LinearFilter
 from observers.checks import real_array
 
 ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # of the arrays' columns, as Signals calls them
@@ -57,6 +59,7 @@ class Record:
     source: str = ""
     environment: Mapping[str, Any] | None = None
 
+    @np.errstate(invalid="ignore")
     def __post_init__(self) -> None:
         for letter in "tyux":
             values = getattr(self, letter)
@@ -65,20 +68,24 @@ class Record:
         if np.ndim(self.t) != 1 or len(self.t) < 2:
             raise ValueError(f"{self.name}: t must be two samples at least, got shape {np.shape(self.t)}")
         names: dict[str, Any] = {"time": self.signals.time or "t"}
+        columns = [("t", names["time"], self.t)]
         for letter, role in ROLES.items():
             if (values := getattr(self, letter)) is not None:
                 names[role] = self._names(letter, role, values)
+                columns += [(letter, name, column) for name, column in zip(names[role], values.T, strict=True)]
         object.__setattr__(self, "signals", replace(self.signals, **names))
-        self._check("t", self.signals.time, self.t)
-        if len(back := np.flatnonzero(np.diff(self.t) <= 0)):
-            row = int(back[0]) + 1
-            self._fail(
-                self.signals.time, row, f"time must increase, but {self.t[row]:g} comes after {self.t[row - 1]:g}"
-            )
-        for letter, role in ROLES.items():
-            if (values := getattr(self, letter)) is not None:
-                for name, column in zip(names[role], values.T, strict=True):
-                    self._check(letter, name, column)
+        for letter, name, column in columns:
+            missing, back = np.isnan(column), np.append(False, np.diff(self.t) <= 0)
+            for wrong, why in (
+                (abs(column) > MAX_SAMPLE, "{0:g} is not a valid sample"),
+                (missing & missing.all(), "no row holds a number"),
+                (missing & (letter in "tu"), "a number is missing, which may be in outputs and states alone"),
+                (back & (letter == "t"), "time must increase, but {0:g} comes after {1:g}"),
+            ):
+                if wrong.any():
+                    row = int(wrong.argmax())
+                    why = why.format(column[row], column[row - 1])
+                    raise ValueError(f"{self.name}: column {name}, row {row + 1}: {why}")
 
     def _names(self, letter: str, role: str, values: np.ndarray) -> tuple[str, ...]:
         """Names of an array's columns, numbered where none are given; ValueError if the array's shape is invalid."""
@@ -92,18 +99,6 @@ class Record:
         if len(names) != values.shape[1]:
             raise ValueError(f"{self.name}: {letter} has {values.shape[1]} columns, but {role} = {names}")
         return names
-
-    def _check(self, letter: str, name: str, column: np.ndarray) -> None:
-        """Raise ValueError if a sample is infinite, or missing where none may be."""
-        refuse_infinite(self.name, name, column)
-        missing = np.isnan(column)
-        if missing.all():
-            self._fail(name, 0, "no row holds a number")
-        if missing.any() and letter in "tu":
-            self._fail(name, int(missing.argmax()), "a number is missing, which may be in outputs and states alone")
-
-    def _fail(self, column: str, row: int, why: str) -> NoReturn:
-        raise ValueError(f"{self.name}: column {column}, row {row + 1}: {why}")
 
     def part(self, rows: slice) -> "Record":
         """Some rows of the record, two at least; without states where none of these rows has all of them."""
@@ -124,12 +119,6 @@ class Record:
     def duration(self) -> float:
         """Seconds from the first sample to the last."""
         return float(self.t[-1] - self.t[0])
-
-
-def refuse_infinite(name: str, column: str, values: np.ndarray) -> None:
-    """Raise ValueError if a value is infinite, or so large that its square is."""
-    if len(infinite := np.flatnonzero(abs(values) > MAX_SAMPLE)):
-        raise ValueError(f"{name}: column {column}, row {infinite[0] + 1}: {values[infinite[0]]:g} is no sample")
 
 
 def median_step(*records: Record) -> float:
@@ -204,3 +193,45 @@ def pieces(records: Iterable[Record]) -> list[Record]:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(int)))
         parts += [record.part(slice(int(a), int(b))) for a, b in zip(edges[::2], edges[1::2]) if b - a > 1]
     return parts
+
+
+class Windows:
+    """Samples of records one after the other, with a filter along each record between two gaps.
+
+    Shapes: ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx), NaN where it is unknown, ``before`` and ``after`` (n,), how
+    many samples without a gap there are on both sides, and ``z`` (n, size).
+    """
+
+    def __init__(self, records: Iterable[Record], linear: LinearFilter, nx: int) -> None:
+        parts, nu, self.linear = pieces(records), linear.nu, linear
+        counts = [np.arange(len(part.t)) for part in parts]
+        self.before = np.concatenate([np.zeros(0, int), *counts])
+        self.after = np.concatenate([np.zeros(0, int), *(count[::-1] for count in counts)])
+        u = (part.u if nu and part.u is not None else np.zeros((len(part.t), nu)) for part in parts)
+        x = (np.full((len(part.t), nx), np.nan) if part.x is None else part.x for part in parts)
+        self.y = np.concatenate([np.zeros((0, linear.B.shape[1])), *(part.y for part in parts)])
+        self.u, self.x = np.concatenate([np.zeros((0, nu)), *u]), np.concatenate([np.zeros((0, nx)), *x])
+
+    def rows(self, age: int = 0) -> np.ndarray:
+        """Samples with a state that have at least ``age`` before them."""
+        return np.flatnonzero((self.before >= age) & ~np.isnan(self.x).any(-1))
+
+    @cached_property
+    def z(self) -> np.ndarray:
+        """The filter's states."""
+        z, first, linear = np.zeros((len(self.y), self.linear.size)), np.flatnonzero(self.before == 0), self.linear
+        z[first] = linear.start(self.y[first])
+        for k in range(1, self.before.max(initial=0) + 1):
+            rows = first[self.after[first] >= k] + k
+            z[rows] = linear.advance(z[rows - 1], self.y[rows - 1], self.u[rows - 1], self.y[rows])
+        return z
+
+    def restarted(self, rows: np.ndarray, age: int) -> np.ndarray:
+        """The filter's states at ``rows`` if it had started ``age`` samples before.
+
+        The filter is linear: its state then differs by transition^age times the difference at that start, so that no
+        window is filtered by itself.
+        """
+        began = rows - age
+        power = np.linalg.matrix_power(self.linear.transition, age)
+        return np.asarray(self.z[rows] + (self.linear.start(self.y[began]) - self.z[began]) @ power.T)

@@ -4,9 +4,9 @@ import math
 import os
 import time
 import warnings
-from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -23,8 +23,10 @@ from observers.samples import check_replacement
 from training.config import Config, settings_of
 from training.lessons import train
 from training.maps.coordinates import settling_time
-from training.records import ROLES, Record, Signals, check_dt, resampled
-from training.sources.recorded import OF_THE_FILTER, RecordedSource, check_plant, recorded_errors
+from training.records import Record, Signals, check_dt, resampled
+from training.records.checks import check_alike
+from training.records.record import ROLES
+from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again
 LONGEST = 250  # steps of a piece: episodes without an end are cut, so that some of each can be held out
@@ -52,10 +54,9 @@ class KKLTrainingCallback(BaseCallback):
 
     Estimates are accurate where the rollouts have been that the observer was learned from; an agent in training goes
     elsewhere. A refit fits T_inv, and with it the covariances and the flow, to all episodes that are kept, but for a
-    share that is held out for good. An observer with a larger error on that share than the one in use is not taken. The
-    environments keep their filters and the states of these. Refits take place where an algorithm begins to collect, so
-    that an on-policy one never learns from a batch of two observers, and not while no episode is as long as the filter
-    remembers.
+    share that is held out for good; the new observer is used unless its error on that share is larger. Filters and
+    their states stay. Refits take place where an algorithm begins to collect, so that an on-policy one never learns
+    from a batch of two observers, and not before an episode is as long as the filter remembers.
 
     Logged are ``kkl/error``, the error on held-out episodes of the observer in use (root mean square over standard
     deviation), ``kkl/error_before``, that of the one before, and ``kkl/refit_seconds``.
@@ -93,19 +94,9 @@ class KKLTrainingCallback(BaseCallback):
     Raises
     ------
     ValueError
-        If an argument makes no sense. At the beginning of the training, if an environment has no KKLObservation, an
+        If an argument is invalid. At the beginning of the training, if an environment has no KKLObservation, an
         observer that was not learned from rollouts, or another one than the others, or if a record is of another plant.
         At a step, if ``info`` lacks the hidden signals, or a wrapper skips samples.
-
-    Examples
-    --------
-    >>> import gymnasium as gym
-    >>> from kkl_gym import KKLObservation
-    >>> from stable_baselines3 import PPO
-    >>> from training import KKLTrainingCallback
-    >>> def learn(path):
-    ...     env = KKLObservation(gym.make("Pendulum-v1"), path)
-    ...     return PPO("MlpPolicy", env).learn(50_000, KKLTrainingCallback(every=5000, path="newer.safetensors"))
     """
 
     artifact: Artifact
@@ -132,9 +123,7 @@ class KKLTrainingCallback(BaseCallback):
         if on_refit is not None and not callable(on_refit):
             raise ValueError(f"on_refit must be a function of a Refit, got {shown(on_refit)}")
         if fixed := [name for name in OF_THE_FILTER if name in settings]:
-            raise ValueError(
-                f"{', '.join(fixed)} cannot change: the filter in use stays; learn another observer instead"
-            )
+            raise ValueError(f"{', '.join(fixed)} cannot change, as the filter stays: learn another observer instead")
         Config("input-aware", eigenvalues=(-1.0,), **settings)  # an error now, not at the first refit
         self._every, self._keep = integer("every", every, 1), integer("keep", keep, 1)
         self._before, self._rehearsal, self._outputs = tuple(records), integer("rehearsal", rehearsal, 0), outputs
@@ -142,25 +131,22 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._every
 
     def _init_callback(self) -> None:
-        used = _observers(self.training_env)
+        used, _ = _in_use(self.training_env)
         artifact = used[0].artifact
         if artifact.environment is None or artifact.signals is None:
             raise ValueError(
-                f"the observer {artifact.system!r} in use was not learned from rollouts, and is not refitted to any; "
-                "learn one by training.learn, or by kkl-gym record and kkl-gym train"
+                f"the observer {artifact.system!r} in use was not learned from rollouts, and cannot be refitted; learn "
+                "one by training.learn, or by kkl-gym record and kkl-gym train"
             )
         config = settings_of(artifact.training, **QUICK | self._settings | {"tracking": artifact.motion is not None})
         if artifact.inverse.error_covariance is not None and not config.held_out:
-            raise ValueError(
-                "covariances are calibrated on episodes that are held out: held_out must be positive, got 0"
-            )
+            raise ValueError("covariances are calibrated on held-out episodes: held_out must be positive, got 0")
         for observer in used:
             check_replacement(artifact, observer.artifact)
-            level = observer.measurement_noise
-            if np.any(np.asarray(level) > np.asarray(config.measurement_noise_max)):
+            level, largest = observer.measurement_noise, config.measurement_noise_max
+            if np.any(np.asarray(level) > np.asarray(largest)):
                 raise ValueError(
-                    f"measurement_noise_max = {config.measurement_noise_max} is less than the noise {level} that the "
-                    "observer in use assumes"
+                    f"measurement_noise_max = {largest} is less than the noise {level} that the observer in use assumes"
                 )
         if hasattr(self, "_gathering"):
             check_replacement(self.artifact, artifact)
@@ -175,7 +161,7 @@ class KKLTrainingCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         for row in range(self.training_env.num_envs):
-            self._begin(row, goes_on=True)
+            self._gathering.begin(row, {})  # an episode may be under way
 
     def _on_step(self) -> bool:
         self._add(self.locals["infos"], self.locals["dones"])
@@ -186,17 +172,10 @@ class KKLTrainingCallback(BaseCallback):
             self._refit_where_possible()
 
     def _on_training_end(self) -> None:
-        if not self._rehearsal:
-            return
-        for infos, dones in rehearsed(self.model, self._rehearsal):
-            self._add(infos, dones)
-        self._refit_where_possible()
-
-    def _begin(self, row: int, *, goes_on: bool = False) -> None:
-        """Begin an episode with the info of its reset, or with its first step where that is not known."""
-        inside = self.training_env.unwrapped  # wrappers do not pass the infos of resets on
-        known = _vector_wrapper(self.training_env) is None
-        self._gathering.begin(row, inside.reset_infos[row] if known else {}, goes_on=goes_on)
+        if self._rehearsal:
+            for infos, dones in rehearsed(self.model, self._rehearsal):
+                self._add(infos, dones)
+            self._refit_where_possible()
 
     def _add(self, infos: Sequence[dict[str, Any]], dones: Sequence[bool] | np.ndarray) -> None:
         """Add a step of all environments; after a reset of all there are no ``infos``."""
@@ -204,7 +183,7 @@ class KKLTrainingCallback(BaseCallback):
             if infos:
                 self._gathering.add(row, infos[row])
             if done:
-                self._begin(row)
+                self._gathering.begin(row, self.training_env.unwrapped.reset_infos[row])
 
     def _refit_where_possible(self) -> None:
         self._next = self._gathering.steps + self._every
@@ -224,17 +203,11 @@ class KKLTrainingCallback(BaseCallback):
         ):
             warnings.warn("the observer in use stays: too little is held out so far to calibrate another", stacklevel=2)
             return
-        before, after = (
-            _rms(recorded_errors(each, held_out, measurement_noise=self._level).values()) for each in (old, new)
-        )
+        before, after = (_rms(recorded_errors(each, held_out, measurement_noise=self._level)) for each in (old, new))
         taken = not after > before
         if taken:
             self.artifact = new
-            vector = _vector_wrapper(self.training_env)
-            if vector is None:
-                self.training_env.env_method("replace_observer", new)
-            else:
-                vector.replace_observer(new)
+            _in_use(self.training_env)[1](new)
         if self._path is not None:
             self.artifact.save(self._path)
         seconds, error = time.monotonic() - began, after if taken else before
@@ -267,32 +240,24 @@ def rehearsed(model: BaseAlgorithm, steps: int) -> Iterator[tuple[Sequence[dict[
     model.set_env(env)  # which makes a training that goes on reset it
 
 
-def _observers(env: VecEnv) -> list[KKLObserver]:
-    """The observers in use, ValueError where there are none."""
-    vector = _vector_wrapper(env)
-    if vector is not None:
-        return [vector.observer]
+def _in_use(env: VecEnv) -> tuple[list[KKLObserver], Callable[[Artifact], object]]:
+    """The observers in use, and the function that replaces them; ValueError where there are none."""
+    inside = getattr(env.unwrapped, "env", None)  # a vector environment of Gymnasium's
+    while isinstance(inside, gym.vector.VectorWrapper):
+        if isinstance(inside, KKLVectorObservation):
+            return [inside.observer], inside.replace_observer
+        inside = inside.env
     if not all(env.env_is_wrapped(KKLObservation)):
         raise ValueError(
             "KKLTrainingCallback refits the observers of kkl_gym.KKLObservation, and the environment has none: put "
             'KKLObservation(gym.make(ID), "observer.safetensors") around each'
         )
-    return env.get_attr("observer")
+    return env.get_attr("observer"), partial(env.env_method, "replace_observer")
 
 
-def _vector_wrapper(env: VecEnv) -> KKLVectorObservation | None:
-    """The wrapper around a vector environment of Gymnasium's under one of stable-baselines3."""
-    inside = getattr(env.unwrapped, "env", None)
-    while isinstance(inside, gym.vector.VectorWrapper):
-        if isinstance(inside, KKLVectorObservation):
-            return inside
-        inside = inside.env
-    return None
-
-
-def _rms(errors: Iterable[float]) -> float:
+def _rms(errors: Mapping[str, float]) -> float:
     """Root mean square of the errors of all hidden signals that move; NaN if none does."""
-    known = [error for error in errors if not math.isnan(error)]
+    known = [error for error in errors.values() if not math.isnan(error)]
     return float(np.sqrt(np.mean(np.square(known)))) if known else math.nan
 
 
@@ -300,11 +265,12 @@ def _rms(errors: Iterable[float]) -> float:
 class _Piece:
     """Samples of one environment since its reset, or since it was cut."""
 
+    name: str
+    held_out: bool
     y: list[np.ndarray] = field(default_factory=list)
     x: list[np.ndarray] = field(default_factory=list)
     u: list[np.ndarray] = field(default_factory=list)
     sample: int = 0  # the number of the last one
-    goes_on: bool = False  # whether the episode may be further than its first sample
 
 
 class Gathering:
@@ -317,23 +283,23 @@ class Gathering:
         self._signals = Signals("t", *(tuple(names[role]) for role in ROLES.values()))
         self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
         self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
-        self._open = defaultdict[int, _Piece](_Piece)  # by environment
-        self._kept = deque[tuple[bool, Record]]()
-        self._total = self._made = self.steps = 0
+        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # the oldest first; and by environment
+        self._made = self.steps = 0
         check_dt(before, self._dt)
         for record in before:
-            check_plant(artifact, record)
-            uniform = resampled(record, self._dt)
-            uniform = replace(uniform, u=uniform.u if self._signals.inputs else None, signals=self._signals)
-            for begin in range(0, len(uniform.t) - 1, LONGEST):
-                part = uniform.part(slice(begin, begin + LONGEST + 1))
-                if part.x is not None:
-                    self._take(part, held_out=False)
+            if record.x is None:
+                raise ValueError(f"{record.name}: no hidden states were recorded; name them (--hidden)")
+            known = {role: names[role] for role in ROLES.values() if artifact.nu or role != "inputs"}
+            check_alike(record, known, self._environment, "the observer's rollouts")
+            y, x, u = (getattr(resampled(record, self._dt), letter) for letter in "yxu")
+            u = u if self._signals.inputs else np.zeros((len(y), 0))
+            for begin in range(0, len(y) - 1, LONGEST):
+                rows, steps = slice(begin, begin + LONGEST + 1), slice(begin, min(begin + LONGEST, len(y) - 1))
+                self._pieces.append(_Piece(record.name, False, [*y[rows]], [*x[rows]], [*u[steps]]))
 
-    def begin(self, row: int, info: Mapping[str, Any], *, goes_on: bool = False) -> None:
-        """Take in the first sample of an episode."""
-        self._close(row)
-        piece = self._open[row] = _Piece(goes_on=goes_on)
+    def begin(self, row: int, info: Mapping[str, Any]) -> None:
+        """Begin an episode, with its first sample where ``info`` holds it."""
+        piece = self._new(row)
         if self._outputs in info:
             piece.y, piece.x = [np.array(info[self._outputs])], [info.get("x", np.full(self._nx, np.nan))]
 
@@ -341,64 +307,51 @@ class Gathering:
         """Take in the sample after a step."""
         if missing := [key for key in (self._outputs, "u", "x", "sample") if key not in info]:
             raise ValueError(
-                f"info of environment {row} has no {', '.join(map(repr, missing))}: KKLObservation tells the true "
-                f"{', '.join(self._signals.hidden)} as 'x' where the environment inside shows them at each step; an "
-                "observer is refitted there alone; training.agents.SB3VecEnv passes on what its info_keys name, "
-                "('y', 'u', 'x', 'sample')"
+                f"info of environment {row} has no {', '.join(map(repr, missing))}: KKLObservation gives the true "
+                f"{', '.join(self._signals.hidden)} as 'x' where the environment inside shows them at each step; "
+                "training.agents.SB3VecEnv passes on its info_keys, ('y', 'u', 'x', 'sample')"
             )
         piece, sample = self._open[row], int(info["sample"])
         if piece.y and sample != piece.sample + 1:
-            if not piece.goes_on:
-                raise ValueError(
-                    f"environment {row} showed sample {sample} after {piece.sample}: put wrappers that skip steps, "
-                    "such as ActionRepeat, inside KKLObservation while observers are refitted"
-                )
-            piece = self._open[row] = _Piece()
+            raise ValueError(
+                f"environment {row} showed sample {sample} after {piece.sample}: put wrappers that skip steps, such as "
+                "ActionRepeat, inside KKLObservation while observers are refitted"
+            )
+        if len(piece.u) == LONGEST:
+            piece = self._new(row, piece.y[-1:], piece.x[-1:])
         if piece.y:
             piece.u.append(info["u"])
         piece.y.append(np.array(info[self._outputs]))
         piece.x.append(info["x"])
-        piece.sample, piece.goes_on = sample, False
+        piece.sample = sample
         self.steps += 1
-        if len(piece.u) == LONGEST:
-            self._cut(row)
 
     def records(self) -> tuple[list[Record], list[Record]]:
-        """Records to fit and records that are held out, with the episodes under way as far as they have come."""
-        for row, piece in self._open.items():
-            if piece.u:
-                self._cut(row)
-        return [record for held, record in self._kept if not held], [record for held, record in self._kept if held]
+        """Forget the oldest pieces; return records to fit and records held out, episodes under way included."""
+        total, first = 0, len(self._pieces)
+        while first and (not total or total + len(self._pieces[first - 1].u) <= self._keep):
+            first -= 1
+            total += len(self._pieces[first].u)
+        del self._pieces[:first]
+        known = [piece for piece in self._pieces if piece.u and not np.isnan(piece.x).all()]
+        kept, held_out = ([self._record(piece) for piece in known if piece.held_out == held] for held in (False, True))
+        return kept, held_out
 
-    def _cut(self, row: int) -> None:
-        """End a piece; the next one begins with its last sample."""
+    def _new(self, row: int, y: Sequence[np.ndarray] = (), x: Sequence[np.ndarray] = ()) -> _Piece:
+        """Begin a piece; one that has no step yet is begun again."""
+        if row not in self._open or self._open[row].u:
+            held_out = bool(self._every) and self._made % self._every == 1
+            self._open[row] = _Piece(f"{self._environment['id']}, piece {self._made}", held_out)
+            self._pieces.append(self._open[row])
+            self._made += 1
         piece = self._open[row]
-        self._close(row)
-        self._open[row] = _Piece(piece.y[-1:], piece.x[-1:], sample=piece.sample)
+        piece.y, piece.x = [*y], [*x]
+        return piece
 
-    def _close(self, row: int) -> None:
-        piece = self._open[row]
-        if not piece.u or np.isnan(piece.x).all():
-            return
-        env_id = self._environment["id"]
-        record = Record(
-            f"{env_id}, piece {self._made}",
-            self._dt * np.arange(len(piece.y)),
-            np.stack(piece.y),
-            np.stack([*piece.u, piece.u[-1]]) if self._signals.inputs else None,
-            np.stack(piece.x),
-            self._signals,
-            source=env_id,
-            environment=self._environment,
-        )
-        self._take(record, held_out=bool(self._every) and self._made % self._every == 1)
-        self._made += 1
-
-    def _take(self, record: Record, *, held_out: bool) -> None:
-        self._kept.append((held_out, record))
-        self._total += len(record.t) - 1
-        while self._total > self._keep and len(self._kept) > 1:
-            self._total -= len(self._kept.popleft()[1].t) - 1
+    def _record(self, piece: _Piece) -> Record:
+        t, y, x = self._dt * np.arange(len(piece.y)), np.stack(piece.y), np.stack(piece.x)
+        u, env = np.stack([*piece.u, piece.u[-1]]) if self._signals.inputs else None, self._environment
+        return Record(piece.name, t, y, u, x, self._signals, env["id"], env)
 
 
 __all__ = ["KKLTrainingCallback", "Refit", "rehearsed"]

@@ -1,9 +1,11 @@
 """Rollouts of environments: policies, played episodes, and a wrapper that records them."""
 
 import copy
+import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,9 @@ from kkl_gym.identity import identity, sampling_interval
 from kkl_gym.loading import load_function
 from kkl_gym.named import InputReader, Reader, acting, resolved
 from observers.checks import integer, shown
-from training.records import Episode, Rollouts, Signals
+from training.progress import ProgressBars
+from training.records import Signals
+from training.records.episodes import Episode, Rollouts
 
 Env = gym.Env[Any, Any]
 Policy = Callable[[Any], Any]  # from an observation to an action
@@ -39,7 +43,8 @@ def policy_of(policy: str | Policy, env: Env) -> Policy:
     if policy == RANDOM:
         return lambda observation: env.action_space.sample()
     if policy == WANDERING:
-        return _wandering(env.action_space)
+        held = _wandering(env.action_space)
+        return lambda observation: next(held)
     if not isinstance(policy, str) or ":" not in policy:
         raise ValueError(
             "a policy is random, wandering, script.py:function, module:function or an agent as in ppo:FILE.zip, "
@@ -51,41 +56,56 @@ def policy_of(policy: str | Policy, env: Env) -> Policy:
     return _agent(algorithm, Path(file), env) if file.endswith(".zip") else load_function(policy)
 
 
-def _wandering(space: gym.Space[Any]) -> Policy:
+def _wandering(space: gym.Space[Any]) -> Iterator[Any]:
     """Random actions, each held for a random number of steps, whose mean is drawn every hundred steps."""
-    calls, left, mean, action = 0, 0, 1.0, None
-
-    def act(observation: Any) -> Any:
-        nonlocal calls, left, mean, action
-        if calls % 100 == 0:
+    left, action = 0, None
+    for call in itertools.count():
+        if call % 100 == 0:
             mean = LONGEST_HOLD ** space.np_random.random()
         if left == 0:
             action, left = space.sample(), int(space.np_random.geometric(1 / mean))
-        calls, left = calls + 1, left - 1
-        return action
-
-    return act
+        left -= 1
+        yield action
 
 
 def _agent(name: str, path: Path, env: Env) -> Policy:
     import sb3_contrib
     import stable_baselines3
 
-    algorithms = {
-        each.lower(): getattr(library, each) for library in (sb3_contrib, stable_baselines3) for each in library.__all__
-    }
+    libraries = (sb3_contrib, stable_baselines3)
+    algorithms = {each.lower(): getattr(library, each) for library in libraries for each in library.__all__}
     if name.lower() not in algorithms:
-        raise ValueError(f"{name!r} is no algorithm of stable-baselines3 or sb3-contrib; name it as in ppo:FILE.zip")
+        raise ValueError(
+            f"{name!r} is not an algorithm of stable-baselines3 or sb3-contrib; name it as in ppo:FILE.zip"
+        )
     if not path.is_file():
         raise ValueError(f"there is no file {path}")
     agent = algorithms[name.lower()].load(path, device="cpu")
-    for what in ("observation_space", "action_space"):
-        here, there = getattr(env, what), getattr(agent, what)
+    for space in ("observation_space", "action_space"):
+        here, there = getattr(env, space), getattr(agent, space)
         if here != there:
-            raise ValueError(
-                f"{path} was trained on the {what.replace('_', ' ')} {there}, but the environment has {here}"
-            )
+            raise ValueError(f"{path} was trained on the {space.replace('_', ' ')} {there}, but here it is {here}")
     return lambda observation: agent.predict(observation, deterministic=True)[0]
+
+
+def play(
+    env_id: str,
+    policy_in: Callable[[Env], Policy],
+    progress: ProgressBars,
+    *,
+    env_kwargs: Mapping[str, Any] | None = None,
+    episodes: int | None = None,
+    steps: int | None = None,
+    default_steps: int = 100_000,
+    **options: Any,
+) -> Rollouts:
+    """Make an environment and play episodes in it, ``default_steps`` where neither episodes nor steps are given."""
+    steps = default_steps if episodes is None and steps is None else steps
+    with make(env_id, env_kwargs) as env:
+        policy = policy_in(env)
+        with progress.phase(f"playing {env_id}", steps or episodes or 1) as report:
+            rollouts = roll_out(env, policy, episodes=episodes, steps=steps, report=report, **options)
+    return rollouts
 
 
 def roll_out(
@@ -102,11 +122,9 @@ def roll_out(
 ) -> Rollouts:
     """Play episodes and keep observations, actions and the entries of ``info`` that are signals."""
     if episodes is None and steps is None:
-        raise ValueError("say how much to record: episodes or steps")
-    most_episodes, most_steps = (
-        math.inf if count is None else integer(what, count, 1)
-        for what, count in (("episodes", episodes), ("steps", steps))
-    )
+        raise ValueError("give the amount to record: episodes or steps")
+    most_episodes = math.inf if episodes is None else integer("episodes", episodes, 1)
+    most_steps = math.inf if steps is None else integer("steps", steps, 1)
     recorder = Recorder(env, measured=measured, hidden=hidden, name=name)
     env.action_space.seed(integer("seed", seed, 0))
     played = total = 0
@@ -139,78 +157,66 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
     ) -> None:
         super().__init__(env)
         source = env.spec.id if env.spec else ""
-        self._name, self._identity = name or source, identity(env)
-        self._signals = Signals(
-            measured=resolved(measured, env.observation_space, role="measured", source=source),
-            hidden=resolved(hidden, env.observation_space, role="hidden", source=source),
-        )
-        if not self._signals.measured:
-            raise ValueError("say which entries of the observation are measured, as in measured=[0, 1]")
-        chosen = (self._signals.measured, self._signals.hidden)
-        readers = [Reader(env.observation_space, names, source=source) for names in chosen]
+        self._name, self._identity, space = name or source, identity(env), env.observation_space
+        chosen = {
+            role: resolved(names, space, role=role, source=source)
+            for role, names in (("measured", measured), ("hidden", hidden))
+        }
+        if not chosen["measured"]:
+            raise ValueError("name the measured entries of the observation, as in measured=[0, 1]")
+        self._signals = Signals("", chosen["measured"], (), chosen["hidden"])
+        keys = (key for names in chosen.values() for key in Reader(space, names, source=source).keys)
+        self._keys = tuple(dict.fromkeys(keys))
         InputReader(env.action_space, acting(env.action_space), source=source)  # an error now, not after hours
-        self._keys = tuple(dict.fromkeys(key for reader in readers for key in reader.keys))
-        self._played, self._steps = deque[Episode](), 0
+        self._played, self._steps = deque[_Steps](), 0
+        self._under_way: _Steps | None = None
         self._to_keep = math.inf if keep is None else integer("keep", keep, 1)
-        self._begin()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment; the episode before counts as far as it got."""
-        self._end()
         observation, info = self.env.reset(seed=seed, options=options)
-        self._keep(observation, info)
+        self._under_way = _Steps([self._copied(observation, info)])
+        self._played.append(self._under_way)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the environment; raises RuntimeError before a reset, or after :meth:`rollouts` without one."""
-        if not self._observations:
+        if self._under_way is None:
             raise RuntimeError("reset the environment before its first step")
-        self._actions.append(copy.deepcopy(action))
-        observation, reward, self._terminated, truncated, info = self.env.step(action)
-        self._keep(observation, info)
-        self._rewards.append(float(reward))
-        return observation, float(reward), self._terminated, truncated, info
+        made = copy.deepcopy(action)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._under_way.seen.append(self._copied(observation, info))
+        self._under_way.done.append((made, float(reward)))
+        self._under_way.terminated, self._steps = bool(terminated), self._steps + 1
+        while self._steps - len(self._played[0].done) >= self._to_keep:
+            self._steps -= len(self._played.popleft().done)
+        return observation, float(reward), terminated, truncated, info
 
     def rollouts(self, *, going_on: bool = False) -> Rollouts:
         """The episodes played; the one under way counts as far as it got, and ends there unless ``going_on``."""
-        if not going_on:
-            self._end()
-        return Rollouts(
-            self._name,
-            self._identity,
-            sampling_interval(self.env),
-            self.env.observation_space,
-            self.env.action_space,
-            [*self._played, *([self._episode()] if self._rewards else [])],
-            self._signals,
-        )
+        self._under_way = self._under_way if going_on else None
+        env, episodes = self.env, [self._episode(steps) for steps in self._played if steps.done]
+        spaces = env.observation_space, env.action_space
+        return Rollouts(self._name, self._identity, sampling_interval(env), *spaces, episodes, self._signals, env.spec)
 
-    def _begin(self) -> None:
-        self._observations, self._actions, self._infos = list[Any](), list[Any](), list[list[Any]]()
-        self._rewards, self._terminated = list[float](), False
+    def _copied(self, observation: Any, info: Mapping[str, Any]) -> Any:
+        """An observation and entries of ``info``: environments may write into the same array at each step."""
+        return copy.deepcopy((observation, [info.get(key) for key in self._keys]))
 
-    def _keep(self, observation: Any, info: Mapping[str, Any]) -> None:
-        # Environments and policies may write into the same array at each step.
-        self._observations.append(copy.deepcopy(observation))
-        self._infos.append([copy.deepcopy(info.get(key)) for key in self._keys])
+    def _episode(self, steps: "_Steps") -> Episode:
+        (observations, infos), (actions, rewards) = zip(*steps.seen), zip(*steps.done)
+        observations, actions = _stacked(self.observation_space, observations), _stacked(self.action_space, actions)
+        signals = {key: _numbers(list(values), key) for key, values in zip(self._keys, zip(*infos))}
+        return Episode(observations, actions, np.array(rewards), steps.terminated, signals)
 
-    def _end(self) -> None:
-        if self._rewards:
-            self._played.append(self._episode())
-            self._steps += len(self._rewards)
-            while self._steps - len(self._played[0].rewards) >= self._to_keep:
-                self._steps -= len(self._played.popleft().rewards)
-        self._begin()
 
-    def _episode(self) -> Episode:
-        """The episode under way, as far as it got."""
-        return Episode(
-            _stacked(self.env.observation_space, self._observations),
-            _stacked(self.env.action_space, self._actions),
-            np.array(self._rewards),
-            bool(self._terminated),
-            {key: _numbers(list(values), key) for key, values in zip(self._keys, zip(*self._infos))},
-        )
+@dataclass
+class _Steps:
+    """Observations with entries of ``info``, and actions with rewards, of an episode."""
+
+    seen: list[Any]
+    done: list[Any] = field(default_factory=list)
+    terminated: bool = False
 
 
 def _numbers(values: list[Any], key: str) -> np.ndarray:
@@ -222,10 +228,10 @@ def _numbers(values: list[Any], key: str) -> np.ndarray:
     try:
         return np.array(values, dtype=float)
     except (TypeError, ValueError):
-        raise ValueError(f"info[{key}] holds no number at each step, or not always as many") from None
+        raise ValueError(f"info[{key}] is not a number at each step, or not of one shape") from None
 
 
-def _stacked(space: gym.Space[Any], values: list[Any]) -> Any:
+def _stacked(space: gym.Space[Any], values: Sequence[Any]) -> Any:
     """Values of a space as arrays, those of a Dict or Tuple in its structure."""
     empty: Any = create_empty_array(space, len(values), fn=np.zeros)
     return concatenate(space, values, empty)

@@ -11,25 +11,12 @@ from typing import Any
 import numpy as np
 
 from observers import Artifact, Equations, KKLObserver, LinearFilter
-from observers.checks import shown
 from training.config import Config
 from training.maps.coordinates import SETTLED, settling_time
-from training.records import (
-    ROLES,
-    Record,
-    Signals,
-    check_dt,
-    check_memory,
-    check_signals,
-    jitter,
-    median_step,
-    pieces,
-    resampled,
-    sampling_interval,
-)
+from training.records import check_dt, check_memory, check_signals, jitter, median_step, sampling_interval
+from training.records.record import ROLES, Record, Windows, pieces, resampled
 from training.seeds import Stream, generator
-from training.sources.source import OF_MEDIAN, Increments, Pairs, Report, Runs, TooFewRunsError
-from training.sources.windows import samples_as_old, windows
+from training.sources import OF_MEDIAN, Increments, Pairs, Report, Runs, TooFewRunsError
 from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
@@ -43,8 +30,7 @@ WINDOW = 10  # samples at least over which innovations are averaged
 # What C x leaves of an output is noise, unless it is nearly all, or squares of states explain a part of it.
 UNEXPLAINED, SQUARES = 0.7, 0.8  # of the output's standard deviation, and of what is left
 LITTLE = 0.1  # of that standard deviation: less is taken for noise in any case
-ROUNDING = 1e-6  # of an output's size: below it an entry of C, or what is left, is rounding
-OUTLIER = 6.0  # standard deviations of what is left, by its median
+ROUNDING, OUTLIER = 1e-6, 6.0  # of an output's size, and standard deviations of what is left, by its median
 LEAST_NOISE = 1e-4  # assumed at least, in standard deviations of the outputs: with R = 0 the gain would not fall
 MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # of records: eigenvalues for each output, in multiples of the signals' rate
 RECORD_MEMORIES = 3.0  # of the filter in a record at least, unless its slowest mode were faster than the signals
@@ -68,11 +54,11 @@ class RecordedSource:
     records : sequence of Record
         Records with hidden states, all of the same signals.
     config : Config
-        What concerns them: dt, samples, windows, held_out, inputs, arbitrary_zero, seed.
+        The settings read are dt, samples, windows, held_out, inputs, arbitrary_zero, seed.
     name : str
         Of the observer.
     held_out : sequence of Record, optional
-        What is not trained on; by default a share of the records.
+        Records that are not trained on; by default a share of ``records``.
     C : ndarray, shape (ny, nx), optional
         The output y = C x, where it is known; by default it is fitted.
     warn : callable, optional
@@ -98,42 +84,43 @@ class RecordedSource:
             raise ValueError("no hidden states were recorded; name their columns (--hidden), or give equations")
         check_signals([*records, *(held_out or ())])
         check_dt(records, config.dt)
-        self.records, self.config, self.name, self.C = records, config, name, C
-        self.signals: Signals = records[0].signals
-        if unknown := [name for name in config.arbitrary_zero if name not in self.signals.measured]:
-            raise ValueError(
-                f"arbitrary_zero names {', '.join(map(repr, unknown))}; measured are {', '.join(self.signals.measured)}"
-            )
-        self.nx, self.ny = len(self.signals.hidden), len(self.signals.measured)
-        self.nu = len(self.signals.inputs) if config.inputs else 0
-        self.dt, self.process_noise = config.dt, 0.0
+        self.records, self.config, self.name, self.C, signals = records, config, name, C, records[0].signals
+        if unknown := [name for name in config.arbitrary_zero if name not in signals.measured]:
+            measured = ", ".join(signals.measured)
+            raise ValueError(f"arbitrary_zero names {', '.join(map(repr, unknown))}; measured are {measured}")
+        self.signals, self.nx, self.ny = signals, len(signals.hidden), len(signals.measured)
+        self.nu, self.dt, self.process_noise = len(signals.inputs) * config.inputs, config.dt, 0.0
         self.linear = Spectrum(config.eigenvalues, config.pairs).filter(self.ny, config.dt, self.nu)
         check_memory(records, settling_time(self.linear), lambda text: warn(f"warning: {text}"))
-        uniform = [resampled(record, config.dt) for record in records]
+        self.kept, self.held_out = ([resampled(each, config.dt) for each in some] for some in (records, held_out or ()))
         if held_out is None:
-            self.kept, self.held_out = split(uniform, config.held_out, config.seed)
-        else:
-            self.kept, self.held_out = uniform, [resampled(record, config.dt) for record in held_out]
+            self.kept, self.held_out = split(self.kept, config.held_out, config.seed)
         self.pace = 1 / signal_rate(self.kept)
 
     def identity(self) -> dict[str, Any]:
-        """Name and fingerprints of the records."""
-        return {"name": self.name, "records": [record.fingerprint for record in self.records]}
+        """The name, and a fingerprint for each file, or for all episodes of a data set together."""
+        each = dict[str, str]()
+        for record in self.records:
+            name = record.source or Path(record.name).name
+            each[name] = each.get(name, "") + record.fingerprint
+        records = {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in each.items()}
+        return {"name": self.name, "records": records}
 
     def facts(self) -> dict[str, Any]:
         """Arguments of :class:`observers.Artifact`."""
-        signals = {role: getattr(self.signals, role) for role in ROLES.values()}
-        facts = {
-            "system": self.name,
-            "parameters": {},
-            "measurement_noise": 0.0,
-            "signals": signals | ({} if self.nu else {"inputs": ()}),
-            "environment": self.records[0].environment,
-        }
+        signals = {role: getattr(self.signals, role) for role in ROLES.values()} | ({} if self.nu else {"inputs": ()})
+        facts = {"system": self.name, "parameters": {}, "measurement_noise": 0.0, "signals": signals}
+        facts["u_max"] = self._largest_inputs()
+        facts["environment"] = self.records[0].environment
         try:
             return facts | {"C": linear_output(self.kept, self.C)[0]}
-        except ValueError:  # tracking() says why
+        except ValueError:  # tracking() raises it again, with the reason
             return facts
+
+    def _largest_inputs(self) -> tuple[float, ...] | None:
+        """Largest absolute values of the inputs in all records, None without inputs."""
+        inputs = [np.abs(each.u[:-1]).max(0, initial=0.0) for each in self.records if self.nu and each.u is not None]
+        return tuple(np.max(inputs, 0).tolist()) if inputs else None
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
         """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""
@@ -142,40 +129,35 @@ class RecordedSource:
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
         """Recorded states, and the states of a filter that was switched on some samples before."""
+        windows, n = Windows(self.kept, linear, self.nx), self.config.windows
         ages = recording_ages(math.ceil(settling_time(linear) / self.dt), self.config.samples)
-        return windows(pieces(self.kept), linear, ages=ages, n=self.config.windows)
+        chosen = [evenly(windows.rows(age), n) for age in ages]
+        if lacking := [age for age, rows in zip(ages, chosen) if not len(rows)]:
+            raise ValueError(
+                f"no recorded state is {lacking[0] * self.dt:.3g} s after the start of its record, or of a gap; record "
+                "longer runs, or take faster eigenvalues"
+            )
+        zs = [windows.restarted(rows, age) for age, rows in zip(ages, chosen)]
+        return Pairs(ages, windows.x[np.stack(chosen)], np.stack(zs), np.zeros(n))
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
         """Stretches of the records held out, side by side, from samples all over them."""
-        whole = [piece for piece in pieces(self.held_out) if piece.x is not None and len(piece.t) > 2]
-        owner = first = np.zeros(0, int)
-        if whole:
-            owner, first = samples_as_old([piece.part(slice(None, -1)) for piece in whole], 0)
-        if len(owner) < FEWEST:
+        windows = Windows(self.held_out, self.linear, self.nx)
+        first = windows.rows()
+        first = first[windows.after[first] > 0]
+        if len(first) < FEWEST:
             raise TooFewRunsError(
-                f"what was held out has {len(owner)} samples with states to begin at, too few to calibrate on "
+                f"the records held out have {len(first)} samples with states to begin at, too few to calibrate on "
                 f"({FEWEST}): record more, or hold more out (--set held_out=0.3)"
             )
-        longest = max(len(piece.t) for piece in whole) - 1
+        longest = int(windows.after[first].max())
         steps = max(2, min(round(STRETCH_MEMORIES * settling_time(self.linear) / self.dt), longest))
-        most = min(STRETCHES, max(2 * FEWEST, SAMPLES // steps))
-        if len(owner) > most:
-            chosen = np.linspace(0, len(owner) - 1, most).round().astype(int)
-            owner, first = owner[chosen], first[chosen]
-        rows = first + np.arange(steps + 1)[:, None]
-        ends = np.array([len(piece.t) for piece in whole])[owner] - 1
-
-        def side_by_side(letter: str) -> np.ndarray:
-            """A signal (steps + 1, n, size), of which the last sample stands beyond a piece's end."""
-            values = [getattr(piece, letter) for piece in whole]
-            inside = np.minimum(rows, ends)
-            return np.stack([values[i][inside[:, j]] for j, i in enumerate(owner)], axis=1)
-
-        x = side_by_side("x")
-        x[rows > ends] = np.nan
-        u = side_by_side("u")[:-1] if self.nu else np.zeros((steps, len(first), 0))
-        n = len(first)
-        return Runs(x, side_by_side("y"), u, process_noise=np.zeros(n), usual=np.ones(n, dtype=bool))
+        first = evenly(first, min(len(first), STRETCHES, max(2 * FEWEST, SAMPLES // steps)))
+        later = np.minimum(np.arange(steps + 1)[:, None], windows.after[first])
+        x = windows.x[first + later]
+        x[later < np.arange(steps + 1)[:, None]] = np.nan
+        usual = np.ones(len(first), dtype=bool)
+        return Runs(x, windows.y[first + later], windows.u[first + later[:-1]], np.zeros(len(first)), usual)
 
     def equations(self) -> Equations:
         """Records have none."""
@@ -183,33 +165,29 @@ class RecordedSource:
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
         """Changes of the state from each sample to the next, of the records to train on and of those held out."""
-        return self._both_increments
+        return self._increments
 
     @functools.cached_property
-    def _both_increments(self) -> tuple[Increments, Increments]:
-        return self._increments(self.kept), self._increments(self.held_out)
-
-    def _increments(self, records: Sequence[Record]) -> Increments:
-        parts = list[tuple[np.ndarray, ...]]()
-        for piece in pieces(records):
-            if piece.x is not None:
-                u = piece.u[:-1] if self.nu and piece.u is not None else np.zeros((len(piece.t) - 1, 0))
-                parts.append((piece.x[:-1], u, np.diff(piece.x, axis=0)))
-        x, u, change = (np.concatenate(each) for each in zip(*parts)) if parts else (np.zeros((0, 1)),) * 3
-        known = np.flatnonzero(np.isfinite(x + change).all(-1))
-        if not len(known):
-            raise ValueError(
-                "no two samples in a row have all hidden signals: record them at each sample, or take a larger dt"
-            )
-        if len(known) > INCREMENTS:
-            known = generator(Stream.CALIBRATION, self.config.seed, 11).choice(known, INCREMENTS, replace=False)
-        return Increments(x[known], u[known], change[known])
+    def _increments(self) -> tuple[Increments, Increments]:
+        both = list[Increments]()
+        for records in (self.kept, self.held_out):
+            windows = Windows(records, self.linear, self.nx)
+            rows = windows.rows(1) - 1
+            rows = rows[~np.isnan(windows.x[rows]).any(-1)]
+            if not len(rows):
+                raise ValueError(
+                    "no two samples in a row have all hidden signals: record them at each sample, or take a larger dt"
+                )
+            if len(rows) > INCREMENTS:
+                rows = generator(Stream.CALIBRATION, self.config.seed, 11).choice(rows, INCREMENTS, replace=False)
+            both.append(Increments(windows.x[rows], windows.u[rows], windows.x[rows + 1] - windows.x[rows]))
+        return both[0], both[1]
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
         """Errors on the records held out, relative to the signals' standard deviations."""
         errors = recorded_errors(artifact, self.held_out)
         return {
-            "records": fingerprints(self.records),
+            "records": self.identity()["records"],
             "held_out_errors": {name: error for name, error in errors.items() if math.isfinite(error)},
             "held_out_after": settling_time(artifact.filter),
         }
@@ -218,13 +196,13 @@ class RecordedSource:
         """Arguments of :class:`observers.Motion` beside the flow; ValueError where nothing can track."""
         if self.config.arbitrary_zero:
             raise ValueError(
-                f"a tracker compares {', '.join(self.config.arbitrary_zero)} with what it predicts, and cannot do "
-                "without the zero: train without arbitrary_zero"
+                f"a tracker compares {', '.join(self.config.arbitrary_zero)} with its prediction, and needs the zero: "
+                "train without arbitrary_zero"
             )
         if not self.held_out:
-            raise ValueError("covariances are calibrated on what is held out: held_out must be positive, got 0")
+            raise ValueError("covariances are calibrated on held-out records: held_out must be positive, got 0")
         _, least = linear_output(self.kept, self.C)
-        _ = self._both_increments  # or the reason why there are none
+        _ = self._increments  # or the reason why there are none
         x = np.concatenate([record.x for record in self.kept if record.x is not None])
         x = x[np.isfinite(x).all(-1)]
         low, high = x.min(0), x.max(0)
@@ -280,35 +258,38 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
     """
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     chosen: dict[str, Any] = {"dt": sampling_interval(*records), **RECORDED} | given
-    check_dt(records, chosen["dt"])
-    if records[0].environment is not None and not np.isclose(chosen["dt"], median_step(*records), rtol=1e-6):
+    dt, step, environment = chosen["dt"], median_step(*records), records[0].environment
+    check_dt(records, dt)
+    if environment is not None and not np.isclose(dt, step, rtol=1e-6):
         raise ValueError(
-            f"dt = {chosen['dt']:g} s: an observer for {records[0].environment['id']} takes a sample at each step, "
-            f"every {median_step(*records):g} s; leave dt out"
+            f"dt = {dt:g} s: an observer for {environment['id']} takes a sample at each step, every {step:g} s; leave "
+            "dt out"
         )
-    chosen.setdefault("duration", max(50.0, chosen["dt"]))
-    if "eigenvalues" not in given:
-        chosen["eigenvalues"] = _recorded_eigenvalues(records, chosen["dt"])
-    if "measurement_noise_max" not in given:
-        y = np.concatenate([record.y for record in records])
-        levels = tuple(float(f"{RECORDED_NOISE * size:.3g}") for size in np.nanstd(y, 0))
-        if still := [name for name, level in zip(records[0].signals.measured, levels) if not level]:
-            raise ValueError(f"{', '.join(still)} never changes: leave it out of what is measured")
-        chosen["measurement_noise_max"] = levels[0] if len(levels) == 1 else levels
-    return Config("input-aware", **chosen)
-
-
-def _recorded_eigenvalues(records: Sequence[Record], dt: float) -> tuple[float, ...]:
     if records[0].source:
-        steps = float(np.median([len(record.t) for record in records]))
-        slowest = min(max(EPISODE_SLOWEST, EPISODE_MEMORIES * SETTLED / steps), EPISODE_FASTEST / 4)
+        settled = EPISODE_MEMORIES * SETTLED / float(np.median([len(record.t) for record in records]))
+        slowest = min(max(EPISODE_SLOWEST, settled), EPISODE_FASTEST / 4)
         spaced = evenly_spaced(EPISODE_MODES, -slowest / dt, -EPISODE_FASTEST / dt)
     else:
-        rate = signal_rate(records)
-        length = np.median([record.duration for record in records])
+        rate, length = signal_rate(records), np.median([record.duration for record in records])
         slowest = min(max(SLOWEST * rate, RECORD_MEMORIES * SETTLED / length), rate)
         spaced = evenly_spaced(MODES, -slowest, -min(FASTEST * rate, FASTEST_MODE / dt))
-    return tuple(float(f"{value:.6g}") for value in spaced)
+    levels = tuple(
+        float(f"{RECORDED_NOISE * size:.3g}") for size in np.nanstd(np.concatenate([r.y for r in records]), 0)
+    )
+    still = [name for name, level in zip(records[0].signals.measured, levels) if not level]
+    if still and "measurement_noise_max" not in given:
+        raise ValueError(f"{', '.join(still)} never changes: leave it out of the measured signals")
+    defaults = {
+        "duration": max(50.0, dt),
+        "eigenvalues": tuple(float(f"{value:.6g}") for value in spaced),
+        "measurement_noise_max": levels[0] if len(levels) == 1 else levels,
+    }
+    return Config("input-aware", **defaults | chosen)
+
+
+def evenly(rows: np.ndarray, n: int) -> np.ndarray:
+    """Choose n of some rows, evenly spread over all; none of none."""
+    return rows[np.linspace(0, len(rows) - 1, n if len(rows) else 0).round().astype(int)]
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:
@@ -326,45 +307,19 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
     )
 
 
-def check_plant(artifact: Artifact, record: Record) -> None:
-    """Raise ValueError unless a record is of an observer's environment and signals, states among them."""
-    signals, names = record.signals, artifact.signals or {}
-    if record.x is None:
-        raise ValueError(f"{record.name}: no hidden states were recorded; name them (--hidden)")
-    for role in ("measured", "hidden", *(["inputs"] if artifact.nu else [])):
-        if (here := getattr(signals, role)) != (there := tuple(names[role])):
-            raise ValueError(f"{record.name}: {role} are {', '.join(here)}, but the observer's {', '.join(there)}")
-    if record.environment != artifact.environment:
-        raise ValueError(
-            f"{record.name} is of {shown(record.environment)}, the observer of {shown(artifact.environment)}"
-        )
-
-
-def fingerprints(records: Sequence[Record]) -> dict[str, str]:
-    """A fingerprint for each file, or for all episodes of a data set together, by its name."""
-    each = dict[str, list[str]]()
-    for record in records:
-        each.setdefault(record.source or Path(record.name).name, []).append(record.fingerprint)
-    return {
-        name: one[0] if len(one) == 1 else hashlib.sha256("".join(one).encode()).hexdigest()[:16]
-        for name, one in each.items()
-    }
-
-
 def signal_rate(records: Sequence[Record]) -> float:
     """How fast signals change, in 1/s: rms of the derivative over standard deviation, the median of those that move."""
     rates = list[float]()
     for letter in "yx":
-        columns = [getattr(record, letter) for record in records if getattr(record, letter) is not None]
-        if columns:
-            steps = [np.diff(values, axis=0) / np.diff(record.t)[:, None] for values, record in zip(columns, records)]
-            change = np.concatenate(steps)
-            change = np.sqrt(np.nansum(change**2, 0) / np.maximum(np.isfinite(change).sum(0), 1))
-            size = np.nanstd(np.concatenate(columns), 0)
+        signals = [(getattr(record, letter), record.t) for record in records if getattr(record, letter) is not None]
+        if signals:
+            slopes = np.concatenate([np.diff(values, axis=0) / np.diff(t)[:, None] for values, t in signals])
+            change = np.sqrt(np.nansum(slopes**2, 0) / np.maximum(np.isfinite(slopes).sum(0), 1))
+            size = np.nanstd(np.concatenate([values for values, _ in signals]), 0)
             rates += (change[size > 0] / size[size > 0]).tolist()
     moving = [rate for rate in rates if rate > 0]
     if not moving:
-        raise ValueError(f"{records[0].name}: no signal moves, nor in any other record; there is nothing to learn from")
+        raise ValueError(f"{records[0].name}: no signal moves, nor in any other record: nothing can be learned from it")
     return float(np.median(moving))
 
 
@@ -380,16 +335,14 @@ def recorded_errors(
     Those of the first ``after`` seconds are left out, by default until the filter has settled.
     """
     first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
-    errors, states = [np.zeros((0, artifact.nx))], [np.zeros((0, artifact.nx))]
-    rng = np.random.default_rng(0)
+    pairs, rng = [np.zeros((0, 2, artifact.nx))], np.random.default_rng(0)
     for record in pieces(records):
         if record.x is not None:
             y = record.y + np.asarray(measurement_noise) * rng.standard_normal(record.y.shape)
-            errors.append((estimates(artifact, replace(record, y=y), measurement_noise) - record.x)[first:])
-            states.append(record.x[first:])
-    error, x = np.concatenate(errors), np.concatenate(states)
-    known = ~np.isnan(error).any(-1)
-    error, x = error[known], x[known]
+            x_hat = estimates(artifact, replace(record, y=y), measurement_noise)
+            pairs.append(np.stack([x_hat - record.x, record.x], 1)[first:])
+    both = np.concatenate(pairs)
+    error, x = np.moveaxis(both[~np.isnan(both).any((1, 2))], 1, 0)
     names = (artifact.signals or {})["hidden"]
     if not len(error):
         return dict.fromkeys(names, math.nan)
@@ -416,13 +369,13 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
         return C, least
     i, j = np.triu_indices(x.shape[1])
     _, unexplained = _fitted(np.column_stack([x, x[:, i] * x[:, j], np.ones(len(x))]), y, size)
-    much = left > np.maximum(LITTLE * moves, ROUNDING * size)
-    wrong = much & ((left > UNEXPLAINED * moves) | (unexplained < SQUARES * left))
+    wrong = (left > UNEXPLAINED * moves) | (unexplained < SQUARES * left)
+    wrong &= left > np.maximum(LITTLE * moves, ROUNDING * size)
     signals = records[0].signals
     if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
         raise ValueError(
             f"{', '.join(other)} is no sum of {', '.join(signals.hidden)} without an offset, with which a tracker "
-            "compares its samples: train with what is measured, in the same units, among the hidden signals"
+            "compares its samples: add the measured signals, in the same units, to the hidden ones"
         )
     return C, least
 

@@ -14,26 +14,15 @@ from training.files import describe
 from training.maps.coordinates import spread
 from training.presets import named_policy
 from training.seeds import Stream, generator
-from training.sources.source import Increments, Pairs, Report, Runs
+from training.sources import Increments, Pairs, Runs
 from training.trajectories.equations import field_expression, output_expression, output_facts, output_matrix
-from training.trajectories.motions import (
-    DRIVEN,
-    FIRST,
-    KINDS,
-    Motions,
-    check_share,
-    draw_process_noise,
-    random_inputs,
-    record,
-    recording_ages,
-    trajectories,
-    under_policy,
-)
+from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, policy_fingerprint, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
-from training.trajectories.policies import Controller, policy_fingerprint
 
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned
+# Of runs for calibration: every other one is driven, or under its policy alone.
+SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # that a tracker assumes, of the usual
 LEAST_PROCESS_NOISE = 0.005  # that filters assume, at the system's pace: a tenth of the environments' default
 WINDOW, RUN = 0.5, 20.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
@@ -82,10 +71,8 @@ class SimulatedSource:
     def identity(self) -> dict[str, Any]:
         """The system, its equations included, and what else motions depend on."""
         system = self.system
-        identity = describe(system) | {
-            "process_noise": float(system.process_noise),
-            "scale": list(map(float, system.scale)),
-        }
+        noise = {"process_noise": float(system.process_noise), "scale": list(map(float, system.scale))}
+        identity = describe(system) | noise
         if self.ranges:
             identity["nominal_share"] = nominal_share(self.ranges)
         if self.policy:
@@ -99,6 +86,7 @@ class SimulatedSource:
             "system": self.name,
             "parameters": self.system.parameters,
             "measurement_noise": system.measurement_noise,
+            "u_max": tuple(map(float, system.u_max)),
             "parameter_ranges": self.ranges,
             "estimated_parameters": self.estimated,
             **output_facts(system),
@@ -114,22 +102,13 @@ class SimulatedSource:
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
         """Motions to train on with a filter beside them; free ones start in part where inputs have led."""
-        config = self.config
+        config, rng = self.config, generator(Stream.TRAINING, self.config.seed, *([1] if free else []))
+        how: dict[str, Any] = {"kinds": DRIVEN if self.has_free_map else KINDS, "policy": self.policy}
         if free:
-            motions = Motions(lead_in_share=LEAD_IN_SHARE, lead_in_input=config.lead_in_input)
-        else:
-            motions = Motions(kinds=DRIVEN if self.has_free_map else KINDS, policy=self.policy)
-        motions = replace(motions, process_noise_share=self.process_noise_share, box_factor=config.box_factor)
-        pairs = record(
-            self.plant,
-            linear,
-            n=config.trajectories,
-            steps=self.steps,
-            ages=self.ages,
-            rng=generator(Stream.TRAINING, config.seed, *([1] if free else [])),
-            motions=motions,
-            report=report,
-        )
+            how = {"lead_in_share": LEAD_IN_SHARE, "lead_in_input": config.lead_in_input}
+        how |= {"process_noise_share": self.process_noise_share, "box_factor": config.box_factor}
+        motions = Motions(self.plant, self.dt, self.steps, **how)
+        pairs = motions.beside(linear, self.ages, config.trajectories, rng, report)
         nominal = None
         if self.ranges:
             own = [self.model.parameters[name] for name in self.ranges]
@@ -139,29 +118,11 @@ class SimulatedSource:
     def runs(self, *, report: Report = lambda done: None) -> Runs:
         """Motions with the system's process noise, and as many without; of each a third from 2X, the others from X."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed), max(1, round(RUN * self.pace / self.dt))
-        plant, levels = with_parameters(self.model, self.ranges), sorted({0.0, self.process_noise})
-        parts = list[tuple[np.ndarray, ...]]()
-
-        def part(done: float) -> None:
-            report((len(parts) + done) / len(levels))
-
-        for level in levels:
-            x, u, usual = sound_motions(
-                plant,
-                n=self.config.runs // len(levels),
-                steps=steps,
-                dt=self.dt,
-                rng=rng,
-                driven=bool(self.nu),
-                policy=self.policy,
-                process_noise=level,
-                report=part,
-                box_factor=BEYOND,
-            )
-            parts.append((x, u, np.full(x.shape[1], level), usual))
-        xs, us, noise, usual = zip(*parts, strict=True)
-        x, u = np.concatenate(xs, 1), np.concatenate(us, 1)[..., : self.nu]
-        return Runs(x[..., : self.nx], plant.output(x), u, np.concatenate(noise), np.concatenate(usual), sound=True)
+        plant, n = with_parameters(self.model, self.ranges), self.config.runs
+        how: dict[str, Any] = SOUND | {"levels": (0.0, self.process_noise), "box_factor": BEYOND}
+        motions = Motions(plant, self.dt, steps, **how, policy=self.policy).with_inputs(self.nu)
+        x, u, noise, usual = motions.drawn(n, rng, lambda done: report(done / n))
+        return Runs(x[..., : self.nx], plant.output(x), u[..., : self.nu], noise, usual, sound=True)
 
     def equations(self) -> Equations:
         """The system's equations as an expression, with as many Runge-Kutta steps as its motions need."""
@@ -196,9 +157,9 @@ class SimulatedSource:
         u = np.where(rng.random((INCREMENTS, 1)) < 0.5, 0.0, u[rows]) if self.nu else np.zeros((INCREMENTS, 0))
         later = simulate(self.model, x, 1, self.dt, u=u[None] if self.nu else None)[-1]
         inside = np.isfinite(later).all(-1)
-        both = Increments(x[inside], u[inside], (later - x)[inside])
-        held = round(JUDGED * len(both.x))
-        return both.part(slice(held, None)), both.part(slice(held))
+        both = x[inside], u[inside], (later - x)[inside]
+        held = round(JUDGED * inside.sum())
+        return Increments(*(each[held:] for each in both)), Increments(*(each[:held] for each in both))
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
         """Nothing: ``kkl-gym evaluate`` measures errors."""
@@ -239,55 +200,11 @@ class SimulatedSource:
     def _states(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """States (n, nx) along short motions from X and 2X, and inputs (n, nu)."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed, 6), max(1, round(seconds * self.pace / self.dt))
-        motions = Motions(kinds=KINDS if self.nu else (), box_factor=BEYOND, policy=self.policy)
-        chunks = trajectories(self.model, n=100, steps=steps, dt=self.dt, rng=rng, motions=motions)
+        motions = Motions(self.model, self.dt, steps, KINDS, self.policy, box_factor=BEYOND).with_inputs(self.nu)
+        x, u, *_ = motions.drawn(100, rng)
         every = max(1, steps // 500)
-        xs, us = zip(*((x[:-1:every], u[::every]) for x, u, _ in chunks), strict=True)
-        x, u = np.concatenate(xs, 1).reshape(-1, self.nx), np.concatenate(us, 1)
+        x, u = x[:-1:every].reshape(-1, self.nx), u[::every]
         return x, u.reshape(-1, self.model.nu) if self.nu else np.zeros((len(x), self.model.nu))
-
-
-def sound_motions(
-    system: System,
-    *,
-    n: int,
-    steps: int,
-    dt: float,
-    rng: np.random.Generator,
-    driven: bool,
-    policy: Controller | None = None,
-    process_noise: float | None = None,
-    report: Report = lambda done: None,
-    box_factor: float = 1.0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Simulate motions with process noise, every other one under random inputs, every third from a multiple of X.
-
-    Motions that leave the system's bounds are replaced. Under a policy half of them are its own, and in the others it
-    explores. Shapes: returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu), and which start in X, (n,).
-    """
-    level = system.process_noise if process_noise is None else process_noise
-    parts, tried, stayed = list[tuple[np.ndarray, np.ndarray, np.ndarray]](), 0, 0
-    while stayed < n:
-        count = max(n - stayed, n // 4)
-        x0 = system.draw_starts(rng, count)
-        far = (np.arange(count) % 3 == 2) & (box_factor > 1)
-        if far.any():
-            x0[far] = system.draw_starts(rng, int(far.sum()), box_factor)
-        w = draw_process_noise(system, level, n=count, steps=steps, rng=rng)
-        if policy and driven:
-            x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=rng, own=np.arange(count) % 2 == 1, w=w)
-        else:
-            u = np.zeros((steps, count, system.nu))
-            if driven:
-                u[:, ::2] = random_inputs(system, len(range(0, count, 2)), steps, dt=dt, rng=rng, kinds=DRIVEN)
-            x = simulate(system, x0, steps, dt, u=u, w=w, report=lambda k: report(k / steps))
-        inside = np.isfinite(x[-1]).all(-1)
-        parts.append((x[:, inside], u[:, inside], ~far[inside]))
-        tried, stayed = tried + count, stayed + int(inside.sum())
-        if tried >= FIRST:
-            check_share(system, stayed, tried, steps * dt)
-    xs, us, usual = zip(*parts, strict=True)
-    return np.concatenate(xs, 1)[:, :n], np.concatenate(us, 1)[:, :n], np.concatenate(usual)[:n]
 
 
 def unknown_start(system: System) -> tuple[np.ndarray, np.ndarray]:

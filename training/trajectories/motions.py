@@ -4,27 +4,34 @@ Process noise enters these motions; measurement noise enters the filter's state 
 a batch.
 """
 
-import dataclasses
+import hashlib
+import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import scipy
 
 from kkl_gym.simulate import Step, simulate
 from kkl_gym.system import System
+from kkl_gym.user_lines import user_line
 from observers import LinearFilter
-from training.trajectories.filtering import filter_states
-from training.trajectories.policies import Controller
+from training.trajectories.equations import linearised
+
+Controller = Callable[[np.ndarray], np.ndarray]
+"""States (n, nx) in, actions (n, nu) in [-1, 1] out."""
+Report = Callable[[float], object]
+Chunk = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 KINDS = ("zero", "steps", "zero", "sine")
 DRIVEN = ("steps", "sine", "pulses")
 CHUNK = 500  # trajectories simulated at once
-FIRST = 100  # trajectories tried, from which on a share of them must stay within the bounds
-FEWEST_INSIDE = 0.05  # that share
+FIRST, FEWEST_INSIDE = 100, 0.05  # trajectories tried, of which at least this share must stay within the bounds
 # Seconds, at the pace of the shipped systems, for which inputs lead starts out of the training box.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
-NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
+FAR = 0.6  # share of the trajectories that start in a larger box than X where there is one
+INPUT_WEIGHT = 0.1  # of a regulator, beside a weight of 1 on the states, both in units of their typical sizes
 POLICY_KINDS = ("steps", "sine")  # of a policy's errors and explorations
 POLICY_ERROR = (0.02, 0.5)  # of the states that a policy acts on, in multiples of the system's scale
 EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in input bounds
@@ -50,14 +57,125 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Motions:
-    """How trajectories are started and driven, beside uniform starts in the training box."""
+    """Trajectories of a system from uniform starts in X, how they are driven and disturbed.
 
+    Each has one of the ``levels`` of process noise; without them, a share has levels of their own up to the system's.
+    """
+
+    system: System
+    dt: float
+    steps: int
     kinds: tuple[str, ...] = ()
+    policy: Controller | None = None
+    own: int = POLICYS_OWN
+    process_noise_share: float = 0.0
+    levels: tuple[float, ...] = ()
+    box_factor: float = 1.0
+    far: float = FAR
     lead_in_share: float = 0.0
     lead_in_input: float = 0.0
-    process_noise_share: float = 0.0
-    box_factor: float = 1.0
-    policy: Controller | None = None
+
+    def with_inputs(self, nu: int) -> "Motions":
+        """The same, or free motions where an observer takes no input."""
+        return self if nu else replace(self, kinds=(), policy=None)
+
+    def beside(
+        self,
+        linear: LinearFilter,
+        ages: np.ndarray,
+        n: int,
+        rng: np.random.Generator,
+        report: Report = lambda done: None,
+    ) -> Pairs:
+        """Simulate trajectories and run the filter beside them."""
+        chunks = self.with_inputs(linear.nu).chunks(n, rng, report)
+        x, z, level, _ = _together(
+            (x[ages], filter_states(linear, self.system.output(x), u, ages), *rest) for x, u, *rest in chunks
+        )
+        return Pairs(ages, x, z, level)
+
+    def drawn(self, n: int, rng: np.random.Generator, report: Report = lambda done: None) -> Chunk:
+        """All of :meth:`chunks` together."""
+        return _together(self.chunks(n, rng, report))
+
+    def chunks(self, n: int, rng: np.random.Generator, report: Report = lambda done: None) -> Iterator[Chunk]:
+        """Simulate in chunks; trajectories that leave the system's bounds are replaced by new ones driven alike.
+
+        Shapes: returns ``x`` (steps + 1, at most CHUNK, nx), ``u`` (steps, at most CHUNK, nu), the level of process
+        noise (at most CHUNK,), and whether a trajectory starts in X (at most CHUNK,).
+        """
+        system, steps, pending, tried = self.system, self.steps, np.arange(n), 0
+        while len(pending):
+            rows, pending = pending[:CHUNK], pending[CHUNK:]
+            count, before = len(rows), n - len(pending) - len(rows)
+            x0, near = self._starts(rows, rng)
+            part = partial(lambda before, count, k: report(before + k * count / steps), before, count)
+            u = np.zeros((steps, count, 0))
+            if self.kinds and not self.policy:
+                kinds = [self.kinds[i % len(self.kinds)] for i in rows]
+                u = random_inputs(system, count, steps, dt=self.dt, rng=rng, kinds=kinds)
+            level = self._levels(count, rng)
+            w = draw_process_noise(system, level, n=count, steps=steps, rng=rng) if level.any() else None
+            if self.policy:
+                how = {"steps": steps, "dt": self.dt, "rng": rng, "own": rows % self.own == 0}
+                x, u = under_policy(system, self.policy, x0, **how, w=w, report=part)
+            else:
+                x = simulate(system, x0, steps, self.dt, u=u if self.kinds else None, w=w, report=part)
+            inside = np.isfinite(x[-1]).all(-1)
+            pending, tried = np.concatenate([pending, rows[~inside]]), tried + count
+            stayed = n - len(pending)
+            if len(pending) and tried >= FIRST and stayed < FEWEST_INSIDE * tried:
+                raise ValueError(
+                    f"of {tried} trajectories of {steps * self.dt:g} s only {stayed} stayed within bounds = "
+                    f"{system.bounds}; widen the bounds, shrink X, shorten the trajectories, or give a policy that "
+                    "holds the system (--policy)"
+                )
+            report(stayed)
+            yield x[:, inside], u[:, inside], level[inside], near[inside]
+
+    def _levels(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        if self.levels:
+            return rng.choice(self.levels, n)
+        if not self.process_noise_share or not self.system.process_noise:
+            return np.zeros(n)
+        some = rng.random(n) < self.process_noise_share
+        return np.asarray(self.system.process_noise * np.where(some, np.sqrt(rng.random(n)), 0.0))
+
+    def _starts(self, rows: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Starts (n, nx), some from a larger box or led out of X by inputs; and which are in X."""
+        system, share = self.system, self.lead_in_share
+        x0, near = system.draw_starts(rng, len(rows)), np.ones(len(rows), dtype=bool)
+        if self.box_factor > 1:
+            near = rng.random(len(rows)) < 1 - self.far
+            x0[~near] = system.draw_starts(rng, int((~near).sum()), self.box_factor)
+        led = np.floor((rows + 1) * share) > np.floor(rows * share)
+        if system.nu and led.any():
+            constant, u_max = self.lead_in_input, np.array(system.u_max)
+            steps = round((CONSTANT_LEAD_IN if constant else RANDOM_LEAD_IN) * system.pace / self.dt)
+            kinds, bounds = (("constant",), constant * u_max) if constant else (DRIVEN, u_max)
+            u = random_inputs(system, int(led.sum()), steps, dt=self.dt, rng=rng, kinds=kinds, bounds=bounds)
+            end = simulate(system, x0[led], steps, self.dt, u=u)[-1]
+            x0[led] = np.where(np.isfinite(end).all(-1)[:, None], end, x0[led])
+        return x0, near
+
+
+def _together(chunks: Iterator[Chunk]) -> Chunk:
+    x, u, level, near = zip(*chunks, strict=True)
+    return np.concatenate(x, 1), np.concatenate(u, 1), np.concatenate(level), np.concatenate(near)
+
+
+def filter_states(linear: LinearFilter, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
+    """Return the states at samples ``ages`` (m,) of a record, counted from its start, without repetition.
+
+    Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), held after the output of its row; returns (m, n, size).
+    """
+    z = linear.start(y[0])
+    out, slots = np.empty((len(ages), *z.shape)), {int(age): i for i, age in enumerate(ages)}
+    for k in range(len(y)):
+        z = linear.advance(z, y[k - 1], u[k - 1], y[k]) if k else z
+        if k in slots:
+            out[slots[k]] = z
+    return out
 
 
 def random_inputs(
@@ -67,27 +185,26 @@ def random_inputs(
     *,
     dt: float,
     rng: np.random.Generator,
-    kinds: tuple[str, ...] = KINDS,
-    bounds: Sequence[float] | None = None,
+    kinds: Sequence[str] = KINDS,
+    bounds: Sequence[float] | np.ndarray | None = None,
 ) -> np.ndarray:
     """Draw random signals (steps, n, k) within bounds (k,), by default those of the inputs; held between samples."""
     bounds = system.u_max if bounds is None else bounds
-    out = np.zeros((steps, n, len(bounds)))
-    t = np.arange(steps) * dt
-    for row in range(n):
-        kind = kinds[row % len(kinds)]
-        for j, bound in enumerate(bounds):
-            if kind in ("steps", "pulses"):
-                hold = system.pace * np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
-                changes = rng.random(steps) < min(1.0, dt / hold)
-                levels = rng.uniform(-bound, bound, steps + 1)
-                out[:, row, j] = levels[np.cumsum(changes)]
-                if kind == "pulses":
-                    out[rng.integers(steps + 1) :, row, j] = 0.0
-            elif kind == "sine":
-                amplitude, phase = rng.uniform(0, bound), rng.uniform(0, 2 * np.pi)
-                frequency = np.exp(rng.uniform(np.log(0.2), np.log(20.0))) / system.pace
-                out[:, row, j] = amplitude * np.sin(frequency * t + phase)
+    out, t = np.zeros((steps, n, len(bounds))), np.arange(steps) * dt
+    for row, j in np.ndindex(n, len(bounds)):
+        kind, bound = kinds[row % len(kinds)], bounds[j]
+        if kind in ("steps", "pulses"):
+            hold = system.pace * np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
+            changes = rng.random(steps) < min(1.0, dt / hold)
+            out[:, row, j] = rng.uniform(-bound, bound, steps + 1)[np.cumsum(changes)]
+            if kind == "pulses":
+                out[rng.integers(steps + 1) :, row, j] = 0.0
+        elif kind == "sine":
+            amplitude, phase = rng.uniform(0, bound), rng.uniform(0, 2 * np.pi)
+            frequency = np.exp(rng.uniform(np.log(0.2), np.log(20.0))) / system.pace
+            out[:, row, j] = amplitude * np.sin(frequency * t + phase)
+        elif kind == "constant":
+            out[:, row, j] = rng.uniform(-bound, bound)
     return out
 
 
@@ -122,21 +239,17 @@ def under_policy(
     """
     n, u_max = len(x0), np.array(system.u_max)
     signals = partial(random_inputs, system, n, steps, dt=dt, rng=rng, kinds=POLICY_KINDS)
-    error = signals(bounds=system.scale)
     least, largest = np.log(POLICY_ERROR)
-    error *= np.exp(rng.uniform(least, largest, n))[:, None]
-    exploration = signals(bounds=(1.0,) * system.nu)
-    exploration *= EXPLORATION * rng.random(n)[:, None]
+    error = signals(bounds=system.scale) * np.exp(rng.uniform(least, largest, n))[:, None]
+    exploration = signals(bounds=(1.0,) * system.nu) * EXPLORATION * rng.random(n)[:, None]
     error[:, own] = exploration[:, own] = 0.0
     u = np.zeros((steps, n, system.nu))
 
     def act(k: int, x: np.ndarray) -> np.ndarray:
         seen = np.where(np.isfinite(x), x, system.X_centre) + error[k]  # what has escaped may do anything
         action = policy(seen)
-        unknown = ~np.isfinite(action).all(-1)
-        if unknown.any():
-            at = int(unknown.argmax())
-            raise ValueError(f"the policy gives the action {action[at].tolist()} at x = {seen[at].tolist()}")
+        for row in np.flatnonzero(~np.isfinite(action).all(-1)):
+            raise ValueError(f"the policy gives the action {action[row].tolist()} at x = {seen[row].tolist()}")
         u[k] = np.clip(action + exploration[k], -1.0, 1.0) * u_max
         return u[k]
 
@@ -146,126 +259,58 @@ def under_policy(
 def recording_ages(steps: int, n: int) -> np.ndarray:
     """Ages, n at most, at which to record: half of them even in the logarithm, which catches the transient."""
     late = max(2, n - n // 2)  # the first and the greatest age at least
-    even = np.linspace(0, steps, late).round()
-    early = np.geomspace(1, steps, n - late).round()
-    return np.unique(np.concatenate([early, even])).astype(int)
+    ages = np.concatenate([np.geomspace(1, steps, n - late), np.linspace(0, steps, late)])
+    return np.unique(ages.round()).astype(int)
 
 
-def record(
-    system: System,
-    linear: LinearFilter,
-    *,
-    n: int,
-    steps: int,
-    ages: np.ndarray,
-    rng: np.random.Generator,
-    motions: Motions,
-    report: Callable[[float], object] = lambda done: None,
-) -> Pairs:
-    """Simulate trajectories and run the filter beside them; ``ages`` (m,)."""
-    if not linear.nu:
-        motions = dataclasses.replace(motions, kinds=(), policy=None)
-    found, done = list[tuple[np.ndarray, np.ndarray, np.ndarray]](), 0
-    for x, u, level in trajectories(system, n=n, steps=steps, dt=linear.dt, rng=rng, motions=motions, report=report):
-        found.append((x[ages], filter_states(linear, system.output(x), u, ages), level))
-        done += len(level)
-        report(done)
-    xs, zs, levels = zip(*found, strict=True)
-    return Pairs(ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(levels))
+def linear_quadratic(system: System) -> Controller:
+    """Linear-quadratic regulator of the linearisation at the target, u = -K (x - target) cut at the input bounds.
 
-
-def trajectories(
-    system: System,
-    *,
-    n: int,
-    steps: int,
-    dt: float,
-    rng: np.random.Generator,
-    motions: Motions | None = None,
-    report: Callable[[float], object] = lambda done: None,
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Simulate trajectories from starts in the training box, in chunks.
-
-    Those that leave the system's bounds are replaced by new ones of the same kind: driven alike, and led from X or not.
-
-    Shapes: returns ``x`` (steps + 1, at most CHUNK, nx), ``u`` (steps, at most CHUNK, nu), ``level`` (at most CHUNK,).
+    Its weights are 1/scale^2 on the state and INPUT_WEIGHT/u_max^2 on the input, on each step in discrete time.
     """
-    motions = motions or Motions()
-    counts = [CHUNK] * (n // CHUNK) + [n % CHUNK]
-    pending = [(row, row < round(motions.lead_in_share * count)) for count in counts for row in range(count)]
-    tried = 0
-    while pending:
-        rows, pending = pending[:CHUNK], pending[CHUNK:]
-        before = n - len(pending) - len(rows)
-        x, u, level, inside = _simulated(
-            system, rows, steps=steps, dt=dt, rng=rng, motions=motions, before=before, report=report
-        )
-        pending += [row for row, stayed in zip(rows, inside) if not stayed]
-        tried += len(rows)
-        if pending and tried >= FIRST:
-            check_share(system, n - len(pending), tried, steps * dt)
-        yield x[:, inside], u[:, inside], level[inside]
-
-
-def _simulated(
-    system: System,
-    rows: list[tuple[int, bool]],
-    *,
-    steps: int,
-    dt: float,
-    rng: np.random.Generator,
-    motions: Motions,
-    before: int,
-    report: Callable[[float], object],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Simulate a chunk of ``rows``, each the number of its input's kind and whether inputs lead its start from X.
-
-    Returns states, inputs, levels of process noise, and which trajectories stay within the bounds.
-    """
-    count, led = len(rows), np.array([beyond for _, beyond in rows])
-    x0 = system.draw_starts(rng, count)
-    if motions.box_factor > 1:
-        far = rng.random(count) >= NEAR
-        x0[far] = system.draw_starts(rng, int(far.sum()), motions.box_factor)
-    if system.nu and led.any():
-        end = _lead_in(system, x0[led], dt=dt, rng=rng, constant=motions.lead_in_input)
-        x0[led] = np.where(np.isfinite(end).all(-1)[:, None], end, x0[led])
-    u = np.zeros((steps, count, 0))
-    if motions.kinds and not motions.policy:
-        kinds = tuple(motions.kinds[i % len(motions.kinds)] for i, _ in rows)
-        u = random_inputs(system, count, steps, dt=dt, rng=rng, kinds=kinds)
-    w, level = None, np.zeros(count)
-    if motions.process_noise_share and system.process_noise:
-        some = rng.random(count) < motions.process_noise_share
-        level = system.process_noise * np.where(some, np.sqrt(rng.random(count)), 0.0)
-        w = draw_process_noise(system, level, n=count, steps=steps, rng=rng)
-
-    def part(step: int) -> None:
-        report(before + step * count / steps)
-
-    if motions.policy:
-        own = np.array([i % POLICYS_OWN == 0 for i, _ in rows])
-        x, u = under_policy(system, motions.policy, x0, steps=steps, dt=dt, rng=rng, own=own, w=w, report=part)
+    target, u_max = np.array(system.target), np.array(system.u_max)
+    A, B, _ = linearised(system, system.target)
+    Q, R = np.diag(1.0 / np.square(system.scale)), np.diag(INPUT_WEIGHT / u_max**2)
+    if system.discrete:
+        P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     else:
-        x = simulate(system, x0, steps, dt, u=u if motions.kinds else None, w=w, report=part)
-    return x, u, level, np.isfinite(x[-1]).all(-1)
+        K = np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R))
+    return lambda x: np.clip(-(x - target) @ K.T / u_max, -1.0, 1.0)
 
 
-def check_share(system: System, stayed: int, tried: int, seconds: float) -> None:
-    """Raise ValueError if hardly any of the trajectories that were tried stayed within the bounds."""
-    if stayed < FEWEST_INSIDE * tried:
+def checked_policy(policy: Controller, system: System, name: str) -> Controller:
+    """Raise ValueError unless a policy's actions on some states are valid; the returned one checks their shape."""
+    if not system.nu:
+        raise ValueError(f"{system.name} has no inputs for the policy {name!r} to act by")
+
+    def act(x: np.ndarray) -> np.ndarray:
+        try:
+            actions = np.asarray(policy(x), dtype=float)
+        except Exception as error:  # whatever a user's function does wrong
+            where = f" ({line})" if (line := user_line(error)) else ""
+            raise ValueError(
+                f"the policy {name!r} fails on states of shape {x.shape}: {type(error).__name__}: {error}{where}"
+            ) from error
+        if actions.shape != (len(x), system.nu):
+            raise ValueError(
+                f"the policy {name!r} must turn states of shape {x.shape} into actions of shape "
+                f"{(len(x), system.nu)}, got {actions.shape}"
+            )
+        return actions
+
+    x = system.draw_starts(np.random.default_rng(0), 20)
+    actions = act(x)
+    for row in np.flatnonzero(~(np.abs(actions) <= 1.0).all(-1)):
         raise ValueError(
-            f"of {tried} trajectories of {seconds:g} s only {stayed} stayed within bounds = {system.bounds}; widen the "
-            "bounds, shrink X or shorten the trajectories, or give a policy that holds the system (--policy)"
+            f"the policy {name!r} must give actions in [-1, 1], which stand for inputs up to u_max = {system.u_max}; "
+            f"at x = {x[row].tolist()} it gives {actions[row].tolist()}"
         )
+    return act
 
 
-def _lead_in(system: System, x0: np.ndarray, *, dt: float, rng: np.random.Generator, constant: float) -> np.ndarray:
-    """Where inputs lead from starts (n, nx); NaN where that is out of bounds."""
-    steps = round((CONSTANT_LEAD_IN if constant else RANDOM_LEAD_IN) * system.pace / dt)
-    if constant:
-        values = constant * rng.uniform(-1, 1, (len(x0), system.nu)) * system.u_max
-        u = np.broadcast_to(values, (steps, len(x0), system.nu))
-    else:
-        u = random_inputs(system, len(x0), steps, dt=dt, rng=rng, kinds=DRIVEN)
-    return np.asarray(simulate(system, x0, steps, dt, u=u)[-1])
+def policy_fingerprint(policy: Controller, system: System) -> str:
+    """Hash of a policy's actions on some states."""
+    actions = policy(system.draw_starts(np.random.default_rng(0), 20))
+    rounded = np.round(np.asarray(actions, dtype=float), 6)  # the same on every machine
+    return hashlib.sha256(json.dumps(rounded.tolist()).encode()).hexdigest()[:16]

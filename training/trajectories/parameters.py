@@ -1,7 +1,6 @@
-"""A system's parameters as further states, which do not move."""
+"""A system's parameters, or biases of its outputs, as further states that stand still."""
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -9,7 +8,7 @@ import numpy as np
 from kkl_gym.equations import input_matrix
 from kkl_gym.system import Box, Components, System
 from observers.checks import shown
-from training.trajectories.policies import Controller
+from training.trajectories.motions import Controller
 
 # Of motions in training with one uncertain parameter, the share that has its own value; with more, the power of their
 # number, for it is the less likely that all are as said. Chosen on the four systems that ship: at 0.6 and a width of
@@ -17,6 +16,7 @@ from training.trajectories.policies import Controller
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
 EVERY = "all"  # in the place of a parameter's name
+MAX_BIAS = 10.0  # of an output's range in X, far more than a network of its scale resolves
 ROOM = 1e6  # half-widths of its range that a parameter may lie from the middle
 
 Ranges = Mapping[str, tuple[float, float]]
@@ -25,22 +25,18 @@ Ranges = Mapping[str, tuple[float, float]]
 def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
     """Ranges about the values that a system's parameters have; half-widths are parts of these values."""
     known = system.parameters
-    for name in half_widths:
-        if name not in known and name != EVERY:
-            raise ValueError(
-                f"{system.name} has no parameter {shown(name)} to be uncertain; it has {', '.join(known) or 'none'}"
-            )
     if half_widths and not known:
         raise ValueError(f"{system.name} has no parameters that could be uncertain")
-    widths = {name: half_widths.get(name, half_widths.get(EVERY, 0.0)) for name in known}
+    for name in half_widths:
+        if name not in known and name != EVERY:
+            raise ValueError(f"{system.name} has no parameter {shown(name)} to be uncertain; it has {', '.join(known)}")
     ranges = {}
-    for name, width in widths.items():
-        value = known[name]
-        if width and not value:
-            raise ValueError(
-                f"the parameter {name} of {system.name} is 0, which has no relative range: leave it out, {name}=0"
-            )
-        if width:
+    for name, value in known.items():
+        if width := half_widths.get(name, half_widths.get(EVERY, 0.0)):
+            if not value:
+                raise ValueError(
+                    f"the parameter {name} of {system.name} is 0, which has no relative range: leave it out, {name}=0"
+                )
             ranges[name] = (value - width * abs(value), value + width * abs(value))
     return ranges
 
@@ -54,44 +50,74 @@ def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False
     """A system whose states are x and then some of its parameters, with derivative zero.
 
     An observer of such a system estimates parameters, a motion of it has parameters of its own, and derivatives by its
-    states are derivatives by parameters as well.
-
-    In training some motions have the system's own parameters, which are the likeliest: two in three where one parameter
-    is uncertain. In the others parameters lie more often near the ends of their ranges, where plants are hardest to
-    serve.
+    states are derivatives by parameters as well. In training a share of the motions has the system's own parameters,
+    which are the likeliest; those of the others are more often near the ends of their ranges, where errors are largest.
     """
     for name, limits in ranges.items():
         if name not in system.parameters:
-            raise ValueError(
-                f"{system.name} has no parameter {shown(name)}; it has {', '.join(system.parameters) or 'none'}"
-            )
+            raise ValueError(f"{system.name} has no parameter {shown(name)}; it has {', '.join(system.parameters)}")
         if not limits[0] < limits[1]:
             raise ValueError(f"the range of {name} must go from low to high, got {shown(limits)}")
-    if not ranges:
-        return system
-    nx, names, own = system.nx, tuple(ranges), [getattr(system, name) for name in ranges]
-    limits_of = [(float(low), float(high)) for low, high in ranges.values()]
-    middles = [(low + high) / 2 for low, high in limits_of]
-    still = ((0.0,) * system.nu,) * len(names)
-    constant = bool(system.nu) and type(system).g is System.g and not system.discrete
 
     def model(x: Components) -> System:
         changed = object.__new__(type(system))  # past the class's own check, which asks for floats
-        changed.__dict__.update(system.__dict__, **dict(zip(names, x[nx:], strict=True)))
+        changed.__dict__.update(system.__dict__, **dict(zip(ranges, x[system.nx :], strict=True)))
         return changed
 
-    class WithParameters(System):
-        name = system.name
-        state_names: ClassVar[tuple[str, ...]] = (*system.state_names, *names)
-        X: ClassVar[Box] = (*system.X, *limits_of)
-        X_centre: ClassVar[tuple[float, ...]] = (*system.X_centre, *middles)
-        bounds: ClassVar[Box] = (
-            *system.bounds,
-            *((mid - ROOM * (b - a), mid + ROOM * (b - a)) for mid, (a, b) in zip(middles, limits_of)),
-        )
+    own = {name: getattr(system, name) for name in ranges}
+    return _with_constants(system, ranges, own, model, in_training=in_training) if ranges else system
+
+
+def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
+    """A system whose states are x and then a constant bias of each output that may have one, up to its half-width."""
+    given = np.atleast_1d(np.asarray(half_widths, dtype=float))
+    if len(given) not in (1, system.ny):
+        raise ValueError(f"bias must be one number, or one of each of {system.ny} outputs, got {half_widths}")
+    widths = np.broadcast_to(given, (system.ny,)).tolist()
+    for i, (width, size) in enumerate(zip(widths, system.output_range, strict=True)):
+        if width > MAX_BIAS * size:
+            raise ValueError(
+                f"a bias of up to {width:g} is more than {MAX_BIAS:g} times the range {size:.3g} of y{i + 1}"
+            )
+    biased = [i for i, width in enumerate(widths) if width]
+    ranges = {f"y{i + 1}_bias": (-widths[i], widths[i]) for i in biased}
+
+    def h(x: Components) -> Components:
+        values = list(system.h(x[: system.nx]))
+        for i, bias in zip(biased, x[system.nx :]):
+            values[i] = values[i] + bias
+        return values
+
+    own, name = dict.fromkeys(ranges, 0.0), f"{system.name} with a bias"
+    return _with_constants(system, ranges, own, lambda x: system, outputs=h, title=name)
+
+
+def _with_constants(
+    system: System,
+    ranges: Ranges,
+    own: Mapping[str, float],
+    model: Callable[[Components], System],
+    *,
+    outputs: Callable[[Components], Components] | None = None,
+    title: str = "",
+    in_training: bool = False,
+) -> System:
+    """A system with further states that stand still, and the equations of ``model(x)``."""
+    nx, limits = system.nx, [(float(low), float(high)) for low, high in ranges.values()]
+    low, high = np.transpose(limits)
+    middle, room = (low + high) / 2, ROOM * (high - low)
+    still = ((0.0,) * system.nu,) * len(ranges)
+    constant = bool(system.nu) and type(system).g is System.g and not system.discrete
+
+    class WithConstants(System):
+        name = title or system.name
+        state_names: ClassVar[tuple[str, ...]] = (*system.state_names, *ranges)
+        X: ClassVar[Box] = (*system.X, *limits)
+        X_centre: ClassVar[tuple[float, ...]] = (*system.X_centre, *middle.tolist())
+        bounds: ClassVar[Box] = (*system.bounds, *zip((middle - room).tolist(), (middle + room).tolist()))
         u_max: ClassVar[tuple[float, ...]] = system.u_max
         G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *still) if constant else ()
-        scale: ClassVar[tuple[float, ...]] = (*system.scale, *(STILL,) * len(names))
+        scale: ClassVar[tuple[float, ...]] = (*system.scale, *(STILL,) * len(ranges))
         dt = system.dt
         process_noise = system.process_noise
         measurement_noise = system.measurement_noise
@@ -100,18 +126,17 @@ def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False
             x = super().draw_starts(rng, n)  # parameters keep to their ranges, and states to what the system draws
             x[:, :nx] = system.draw_starts(rng, n, factor)
             if in_training:
-                low, high = np.transpose(limits_of)
                 along = (2 * x[:, nx:] - low - high) / (high - low)  # -1 to 1
                 x[:, nx:] = (low + high + np.sin(along * np.pi / 2) * (high - low)) / 2
-                x[rng.random(n) < nominal_share(ranges), nx:] = own
+                x[rng.random(n) < nominal_share(ranges), nx:] = [*own.values()]
             return x
 
         @property
         def target(self) -> tuple[float, ...]:
-            return (*system.target, *own)
+            return (*system.target, *own.values())
 
         def h(self, x: Components) -> Components:
-            return model(x).h(x[:nx])
+            return model(x).h(x[:nx]) if outputs is None else outputs(x)
 
         def rate(self, x: Components) -> Any:
             return system.rate(x[:nx])  # near enough, and a formula for it may decide on its parameters
@@ -131,34 +156,9 @@ def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False
                 def g(self, x: Components) -> Sequence[Components]:
                     return [*input_matrix(model(x), x[:nx]), *still]
 
-    return WithParameters()
-
-
-def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
-    """A system whose states are x and then a constant bias of each output that may have one, up to its half-width."""
-    given = np.atleast_1d(np.asarray(half_widths, dtype=float))
-    if len(given) not in (1, system.ny):
-        raise ValueError(f"bias must be one number, or one of each of {system.ny} outputs, got {half_widths}")
-    widths = np.broadcast_to(given, (system.ny,))
-    ranges = {f"y{i + 1}_bias": (-width, width) for i, width in enumerate(widths.tolist()) if width}
-
-    def h(self: System, x: Components) -> Components:
-        values = type(system).h(self, x)
-        return [value + getattr(self, f"y{i + 1}_bias", 0.0) for i, value in enumerate(values)]
-
-    biased: System = object.__new__(
-        dataclasses.make_dataclass(
-            "Biased",
-            [(name, float, 0.0) for name in ranges],
-            bases=(type(system),),
-            namespace={"name": f"{system.name} with a bias", "h": h},
-            frozen=True,
-        )
-    )
-    biased.__dict__.update(vars(system), **dict.fromkeys(ranges, 0.0))
-    return with_parameters(biased, ranges)
+    return WithConstants()
 
 
 def blind(policy: Controller, nx: int) -> Controller:
-    """A policy for a system of :func:`with_parameters` that sees the nx states alone."""
+    """A policy for a system with further states that sees the nx states alone."""
     return lambda x: policy(x[:, :nx])

@@ -17,7 +17,7 @@ from observers.names import resolve
 from training.agents.agent import fingerprint
 from training.agents.information import OBSERVED, observer_of
 from training.agents.tasks import TASKS, Task
-from training.commands.agent_task import TaskOptions
+from training.commands.agent import TaskOptions
 from training.commands.options import NoiseLevels
 from training.evaluation.levels import Level
 from training.files import write
@@ -30,7 +30,7 @@ class Compare:
 
     Writes OUT/results.csv (a row for each agent), OUT/table.md, OUT/scores.png, and the learning curves as
     OUT/curves.csv and OUT/curves.png. Each agent is a job with a folder of its own. An interrupted run goes on where it
-    stopped, and reports what is there and how much is missing.
+    stopped, and reports on the agents that are done.
     """
 
     names: Annotated[
@@ -41,7 +41,7 @@ class Compare:
     information: Annotated[
         tuple[Kind, ...] | None, tyro.conf.arg(help_behavior_hint="(default: those of the published tables)")
     ] = None
-    """What agents see (docs/guides/agents.md); ekf is for systems alone, stacked_x_hat for environments."""
+    """What agents see (docs/guides/agents.md); ekf is for systems alone."""
     seeds: int = comparison.SEEDS
     """Agents of each kind. On systems at most 3 of the recurrent ones, which take longest, and 1 at the further noise
     levels."""
@@ -52,7 +52,7 @@ class Compare:
     measurement_noise: Annotated[
         NoiseLevels, tyro.conf.arg(help_behavior_hint="(default: the task's own, on Van der Pol also 0.2, on Lorenz 2)")
     ] = None
-    """Standard deviations of the noise on what is measured; each level is a task of its own."""
+    """Standard deviations of the measurement noise; each level is a task of its own."""
     observers: tuple[str, ...] = ()
     """Observers for agents on systems: a .safetensors file for each system of yours, or shipped maps."""
     aggregate: int = 0
@@ -62,10 +62,6 @@ class Compare:
         Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/comparison, or runs/agents/environments)")
     ] = None
     """Folder of results."""
-    beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
-    """Folder with results.csv and curves.csv of an earlier comparison in environments. Its rows of other environments
-    and of other agents are taken over, so that new ones stand beside them without training those again. Give it each
-    time: tables are written again. Both must have been made with the same settings, which is not checked."""
     options: tyro.conf.OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
     def run(self, console: Console) -> None:
@@ -80,10 +76,8 @@ class Compare:
         if len(systems) > 1:
             raise ValueError("compare agents on systems or in environments, each in a folder of its own")
         (on_systems,) = systems
-        amiss = {"stacked_x_hat"} if on_systems else {"ekf", "x_hat_std"}
-        if amiss & set(self.information or ()):
-            where = "on systems" if on_systems else "in environments"
-            raise ValueError(f"agents {where} are not compared by {', '.join(sorted(amiss))}")
+        if not on_systems and {"ekf", "x_hat_std"} & set(self.information or ()):
+            raise ValueError("agents in environments are not compared by ekf, x_hat_std")
         out = self.out or Path("runs/agents") / ("comparison" if on_systems else "environments")
         kinds = self.information
         how: dict[str, Any] = {
@@ -93,21 +87,17 @@ class Compare:
             "observers": self._observers(tasks),
         }
         agents = comparison.planned(tasks, out, kinds=kinds, seeds=self.seeds, **how)
-        earlier = {name: comparison.read_results(self.beside, name) for name in comparison.COLUMNS}
 
         def report(progress: ProgressBars) -> None:
             """Report all agents of these tasks in the folder, whichever run trained them."""
             everyone = comparison.planned(tasks, out, kinds=comparison.KINDS, seeds=comparison.seeds_in(out), **how)
             there = [agent for agent in everyone if (agent.folder / agent.result).exists() and agent.done]
-            own = comparison.collect(there)
-            results = comparison.beside(earlier["results.csv"], own, own)
+            results = comparison.collect(there)
             if not set(results.shown) - {"state", comparison.IDLE}:
                 return
             missing = sum(not agent.done for agent in agents)
             partial = f" Partial: {missing} of {len(agents)} agents are missing." if missing else ""
-            learned = comparison.beside(earlier["curves.csv"], curves(there), own)
-            if self.beside is not None:
-                progress.say(f"beside these {len(own)} agents, {len(results) - len(own)} from {self.beside}")
+            learned = curves(there)
             write(out / "results.csv", results.dropna(axis=1, how="all").to_csv(index=False))
             write(out / "curves.csv", learned.to_csv(index=False))
             write_table(out / "table.md", results, partial, comparison.unusual_settings(tasks))

@@ -33,7 +33,6 @@ Kind = Literal[
     "ekf",
     "x_hat",
     "x_hat_std",
-    "stacked_x_hat",
     "z",
     "traces",
     "stacked",
@@ -43,17 +42,15 @@ Kind = Literal[
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 ON_SYSTEMS: tuple[Kind, ...] = ("state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state")
-IN_ENVIRONMENTS: tuple[Kind, ...] = ("state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y")
+IN_ENVIRONMENTS: tuple[Kind, ...] = ("state", "x_hat", "z", "stacked", "recurrent", "y")
 IDLE: Literal["random"] = "random"  # no action on systems, random ones elsewhere: the normalised score 0
 SEEN: dict[str, Information] = {
     "ekf": "x_hat",
-    "stacked_x_hat": "x_hat",
     "recurrent-state": "state",
 }  # where a kind is not an information set
-REFITTED = ("x_hat", "stacked_x_hat")  # whose estimates are learned from the hidden signals of environments
 CONCERNED = {  # by settings of a task that matter to some agents alone
     "time_constants": ("z", "traces"),
-    "frames": ("stacked", "stacked_x_hat"),
+    "frames": ("stacked",),
     "past_actions": ("z", "traces", "stacked"),
     "angles": ("z",),
 }
@@ -108,7 +105,7 @@ class ComparedAgent(Job):
         }
         if self._observer is not None:
             described["observer"] = [self._observer, fingerprint(self._observer)]
-        elif self.kind in REFITTED:
+        elif self.kind == "x_hat":
             begins = WANDERED if self.task.measurement_noise else PRIVILEGED
             described |= {"aggregate": self.aggregate, "begins": begins, "rehearsal": REHEARSAL}
         elif self.kind == "z":
@@ -142,12 +139,12 @@ class ComparedAgent(Job):
             env = make(task, "state", self.episodes)
             policy = _still(env) if task.system is not None else _random(env)
         else:
-            from examples.research.agents.filtered import EKF
-            from examples.research.agents.window import STACKED
+            from examples.research.agents.filtered import show_filtered
             from training.agents.learning import learn
-            from training.agents.observing import KKL, OBSERVER
+            from training.agents.observing import OBSERVER
 
-            estimation = {"ekf": EKF, "stacked_x_hat": STACKED}.get(self.kind, KKL)
+            show = show_filtered if self.kind == "ekf" else make
+            fitted = task.system is None and self.kind == "x_hat"  # an observer, from hidden signals
             agent = learn(
                 task,
                 self._information,
@@ -156,11 +153,11 @@ class ComparedAgent(Job):
                 timesteps=self.timesteps,
                 seed=self.seed,
                 observer=self._observer,
-                aggregate=self.aggregate if task.system is None and self.kind in REFITTED else 0,
-                estimation=estimation,
+                aggregate=self.aggregate if fitted else 0,
+                show=show,
             )
-            learned = str(self.folder / OBSERVER) if task.system is None and self.kind in REFITTED else self._observer
-            env = estimation.show(task, self._information, self.episodes, learned)
+            observer = str(self.folder / OBSERVER) if fitted else self._observer
+            env = show(task, self._information, self.episodes, observer=observer)
             policy = agent.policy(env.single_action_space)
         seconds = time.process_time() - began
         with closing(env):
@@ -232,35 +229,11 @@ def collect(agents: Sequence[ComparedAgent]) -> "pd.DataFrame":
     return pd.DataFrame(rows, columns=COLUMNS["results.csv"])
 
 
-def read_results(folder: Path | None, name: str = "results.csv") -> "pd.DataFrame":
-    """Rows of an earlier comparison, none without one; raises ValueError or OSError if they cannot be used."""
+def read_results(folder: Path) -> "pd.DataFrame":
+    """Rows of a comparison's results.csv."""
     import pandas as pd
 
-    columns = COLUMNS[name]
-    if folder is None:
-        return pd.DataFrame(columns=columns)
-    with explained(folder / name, ValueError):
-        rows = pd.read_csv(folder / name, index_col=False)
-        needed = [column for column in columns if column != "success"]  # which only systems have
-        if [column for column in rows.columns if column != "success"] != needed:
-            raise ValueError(f"its columns are {', '.join(rows.columns)}, not {', '.join(columns)}")
-        if rows[needed].isna().any(axis=None):
-            raise ValueError(f"row {rows.index[rows[needed].isna().any(axis=1)][0] + 2} lacks a value")
-        if unknown := set(rows.shown) - {*KINDS, IDLE}:
-            raise ValueError(f"unknown agents {', '.join(sorted(unknown))}; there are {', '.join(KINDS)}")
-    return rows.reindex(columns=columns)
-
-
-def beside(earlier: "pd.DataFrame", rows: "pd.DataFrame", here: "pd.DataFrame") -> "pd.DataFrame":
-    """Put rows below earlier ones, without those of the environments, levels of noise and kinds in ``here``."""
-    import pandas as pd
-
-    task = ["environment", "noise", "shown"]
-    others = earlier[~pd.MultiIndex.from_frame(earlier[task]).isin(pd.MultiIndex.from_frame(here[task]))]
-    if others.empty:
-        return rows
-    joined = pd.concat([others, rows])
-    return joined.iloc[np.argsort(pd.factorize(joined.environment)[0], kind="stable")]
+    return pd.read_csv(folder / "results.csv", index_col=False).reindex(columns=COLUMNS["results.csv"])
 
 
 def unusual_settings(tasks: Sequence[Task]) -> str:

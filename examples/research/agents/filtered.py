@@ -7,7 +7,6 @@ from kkl_gym.wrappers.estimator import Estimates
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, plant_of
 from training.agents.environments import vector
 from training.agents.information import FeatureObservation, Information
-from training.agents.observing import Estimation
 from training.agents.tasks import Task, deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 
@@ -23,12 +22,9 @@ def kalman_filters(env: VectorEnv) -> Estimates:
     return Estimates(ExtendedKalmanFilter(system, plant.dt, Q=Q, R=R), plant.state_space)
 
 
-def show_filtered(task: Task, information: Information, rows: int, observer: str | None) -> VectorEnv:
+def show_filtered(task: Task, information: Information, rows: int, *, observer: str | None = None) -> VectorEnv:
     """Make a system's task in which the agent sees the estimates of extended Kalman filters."""
     assert task.system is not None
     system = get_system(task.system)
     env = vector(task, rows, lambda env: VectorEstimate(env, kalman_filters(env)))
     return FeatureObservation(env, lambda at: deviation(system, at["x_hat"]), system.nx, ["x_hat"])
-
-
-EKF = Estimation(show=show_filtered)

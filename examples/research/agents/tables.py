@@ -33,7 +33,6 @@ LABELS = {
 }
 LABELS_IN_ENVIRONMENTS = LABELS | {
     "x_hat": "y and x̂",
-    "stacked_x_hat": "y and estimates of stacks",
     "z": "y and z",
     "stacked": "stacked y and actions",
 }

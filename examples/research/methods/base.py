@@ -19,7 +19,7 @@ from training.files import describe
 from training.progress import progress_bars
 from training.run import Loss, Stage, optimise
 from training.seeds import Stream, generator
-from training.trajectories.motions import recording_ages, trajectories
+from training.trajectories.motions import Motions, recording_ages
 
 _KEY = "kkl-gym-method"
 
@@ -63,7 +63,7 @@ def simulated(system: System, n: int, *, duration: float, samples: int, dt: floa
     steps = max(1, round(duration / dt))
     ages = recording_ages(steps, samples)
     xs, ys = [], []
-    for x, *_ in trajectories(system, n=n, steps=steps, dt=dt, rng=rng):
+    for x, *_ in Motions(system, dt, steps).chunks(n, rng):
         xs.append(x[ages])
         ys.append(system.output(x).astype(np.float32))
     return Data(ages, np.concatenate(xs, 1), np.concatenate(ys, 1))

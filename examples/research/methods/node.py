@@ -16,7 +16,7 @@ from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
 from training.spectrum import Spectrum
 from training.trajectories.equations import output_matrix
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 TRAJECTORIES_PER_BATCH = 128
 AGES_PER_BATCH = 32

@@ -2,10 +2,13 @@
 
 import time
 from collections.abc import Callable, Hashable, Mapping
+from contextlib import suppress
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
+from examples.research.derivatives import jacobian
 from kkl_gym.simulate import advance, simulate
 from kkl_gym.system import System
 from observers import Artifact, InverseMap, KKLObserver
@@ -13,7 +16,6 @@ from observers.estimator import Running
 from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
-from training.trajectories.equations import jacobian
 
 BATCHES = 10  # of one step each, by filters that take one sample at a time
 FEWER = 10  # times as few samples, where Python takes a single one
@@ -80,6 +82,71 @@ def observer_tasks(
         return (time.process_time() - began) / count
 
     return {**tasks, "EKF of filterpy": filterpy}
+
+
+def record_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
+    """What estimates along records, in seconds for a sample of a row: the observer and, where installed, dynamax's EKF.
+
+    Both run on the equations of the observer's tracker. The first run, in which dynamax compiles, is not to be counted.
+    """
+    rng, motion = np.random.default_rng(0), artifact.motion
+    low, high = np.transpose(system.X)
+    starts = rng.uniform(low, high, (rows, system.nx))
+    y = system.output(simulate(system, starts, steps, artifact.filter.dt))
+    y = np.nan_to_num(y) + np.asarray(artifact.measurement_noise) * rng.standard_normal(y.shape)
+    observer = KKLObserver(artifact)
+    estimates: dict[str, Callable[[], object]] = {"KKL": lambda: observer.estimate(y if rows > 1 else y[:, 0])}
+    if motion is not None and motion.equations is not None and motion.equations.substeps:
+        with suppress(ImportError):
+            of_dynamax = _dynamax(artifact)
+            estimates["EKF of dynamax"] = lambda: of_dynamax(y.swapaxes(0, 1) if rows > 1 else y[:, 0])
+    return {name: partial(_seconds_of, estimate, y.shape[0] * rows) for name, estimate in estimates.items()}
+
+
+def _seconds_of(estimate: Callable[[], object], count: int) -> float:
+    began = time.process_time()
+    estimate()
+    return (time.process_time() - began) / count
+
+
+def _dynamax(artifact: Artifact) -> Callable[[np.ndarray], np.ndarray]:
+    """The estimates of dynamax's jitted EKF along a record (steps, ny), or along each of several."""
+    import jax
+    from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
+
+    jax.config.update("jax_enable_x64", True)
+    jnp, motion, space = jax.numpy, artifact.require_motion(), dict[str, Any]()
+    equations = motion.equations
+    assert equations is not None
+    exec(equations.field.python("f", artifact.nx, artifact.nu), {"np": jnp}, space)
+    if artifact.h is not None:
+        exec(artifact.h.python("h", artifact.nx, 0), {"np": jnp}, space)
+    u, substeps = [0.0] * artifact.nu, equations.substeps
+    h = artifact.filter.dt / substeps
+
+    def f(x: Any) -> Any:
+        return jnp.stack(space["f"](*x, *u))
+
+    def move(x: Any) -> Any:
+        for _ in range(substeps):
+            k1 = f(x)
+            k2 = f(x + h / 2 * k1)
+            k3 = f(x + h / 2 * k2)
+            x = x + h / 6 * (k1 + 2 * (k2 + k3) + f(x + h * k3))
+        return x
+
+    def measure(x: Any) -> Any:
+        return jnp.array(artifact.C) @ x if artifact.h is None else jnp.stack(space["h"](*x))
+
+    q, r = motion.variances(artifact.measurement_noise, artifact.process_noise_max or 0.0)
+    Q = np.diag(q * motion.x_scale**2)
+    params = ParamsNLGSSM(motion.mean, motion.covariance, move, Q, measure, np.diag(r))
+
+    def along(y: Any) -> Any:
+        return extended_kalman_filter(params, y, output_fields=["filtered_means"]).filtered_means
+
+    one, several = jax.jit(along), jax.jit(jax.vmap(along))
+    return lambda y: np.asarray((several if y.ndim == 3 else one)(y))
 
 
 def limit(inverse: InverseMap, rows: int) -> tuple[Callable[[], float], float]:

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 import kkl_gym
-from examples.research.speed.observers import in_turns, limit, observer_tasks, table_rows
+from examples.research.speed.observers import in_turns, limit, observer_tasks, record_tasks, table_rows
 from kkl_gym.compiled import batch_step
 from observers import Artifact, KKLObserver
 from observers import shipped as shipped_maps
@@ -61,6 +61,7 @@ class Speed:
         with progress_bars(console) as progress:
             ratios = self._single(environments, progress) | self._vector(environments, progress)
             self._observers(environments, progress)
+            self._records(environments, progress)
             if self.system is None:
                 self._memory(progress)
         return ratios
@@ -120,6 +121,25 @@ class Speed:
                 )
                 for first, *others in rows:
                     table.add_row(f"{name}, {first}", *others)
+        if table.row_count:
+            progress.console.print(table)
+
+    def _records(self, environments: Sequence[Shown], progress: ProgressBars) -> None:
+        """Time `estimate` along whole records: of one observer, an hour at 100 Hz by default, and of many."""
+        steps, n = 72 * self.steps, self.num_envs
+        title = Column("records", no_wrap=True)
+        sizes = {1: steps, n: steps // n}
+        table = Table(title, *(f"µs a sample, {rows} of {count:,} samples" for rows, count in sizes.items()))
+        for one in filter(lambda one: one.observed, environments):
+            artifact = Artifact.read(resolve(one.observer or one.system.name))
+            medians: list[dict[str, float]] = []
+            for rows, count in sizes.items():
+                tasks = record_tasks(artifact, one.system, rows=rows, steps=count)
+                report = progress.bar(f"timing records of {rows}", len(tasks) * 4)
+                seconds = in_turns(tasks, 3, report)
+                medians.append({name: 1e6 * float(np.median(times)) for name, times in seconds.items()})
+            for name in medians[0]:
+                table.add_row(f"{one.label}, {name}", *(f"{each[name]:.2f}" for each in medians))
         if table.row_count:
             progress.console.print(table)
 

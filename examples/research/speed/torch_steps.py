@@ -13,7 +13,6 @@ from examples.research.speed.observers import in_turns
 from kkl_gym.memory import Memory
 from kkl_gym.simulate import simulate
 from observers import KKLObserver, load
-from observers.machine import MANY_ROWS
 from training import TorchMemory, TorchObserver
 from training.files import table
 
@@ -27,8 +26,7 @@ Task = Callable[[], float]
 class TorchSpeed:
     """Time a step of the default observers and of the memory as modules of Torch, beside NumPy and Numba.
 
-    Prints microseconds a row, of one thread on a CPU: medians of turns, in each of which all are timed. NumPy takes
-    batches of 127 rows, because larger ones go through Numba.
+    Prints microseconds a row, of one thread on a CPU: medians of turns, in each of which all are timed.
     """
 
     rows: tuple[int, ...] = (1024, 65_536)
@@ -42,8 +40,8 @@ class TorchSpeed:
 
     def run(self, console: Console) -> list[list[str]]:
         """Measure and print."""
-        if self.turns < 1 or not self.rows or min(self.rows) < MANY_ROWS:
-            raise ValueError(f"turns must be positive, rows at least {MANY_ROWS}, got {self.turns} and {self.rows}")
+        if self.turns < 1 or not self.rows or min(self.rows) < 1:
+            raise ValueError(f"turns must be positive, rows positive, got {self.turns} and {self.rows}")
         torch.set_num_threads(1)
         lines, columns = [], ["NumPy", "Numba", "Torch", *["Torch, compiled"] * self.compile]
         for name in (*kkl_gym.SYSTEMS, "memory"):
@@ -68,14 +66,14 @@ class TorchSpeed:
         y = y + 0.5 * rng.standard_normal(y.shape)
         u, module = np.zeros((rows, artifact.nu)), TorchObserver(artifact).to(self.device)
 
-        def of(n: int) -> Task:
-            observer = KKLObserver(artifact)
-            observer.reset(y[0, :n])
+        def of(compiled: bool) -> Task:
+            observer = KKLObserver(artifact, compiled=compiled)
+            observer.reset(y[0])
             for k in range(1, SETTLED):
-                observer.step(y[k, :n], u[:n])
-            return self._timed(lambda k: observer.step(y[SETTLED + k, :n], u[:n]))
+                observer.step(y[k], u)
+            return self._timed(lambda k: observer.step(y[SETTLED + k], u))
 
-        return {"NumPy": (of(MANY_ROWS - 1), MANY_ROWS - 1), "Numba": (of(rows), rows)} | self._modules(module, y, u)
+        return {"NumPy": (of(False), rows), "Numba": (of(True), rows)} | self._modules(module, y, u)
 
     def _memories(self, rows: int) -> dict[str, tuple[Task, int]]:
         y, u = np.random.default_rng(0).normal(size=(SETTLED + STEPS, rows, NY)), np.zeros((rows, NU))

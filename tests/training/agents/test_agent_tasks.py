@@ -196,7 +196,7 @@ def test_what_is_not_there_is_named():
             make(PENDULUM, *wrong, 1)
     with pytest.raises(ValueError, match="no use for the observer"):
         make(PENDULUM, "y", 1, observer="van_der_pol")
-    with pytest.raises(ValueError, match="say what is measured of Acrobot-v1"):
+    with pytest.raises(ValueError, match="name the measured entries of Acrobot-v1"):
         get_task("Acrobot-v1")
     with pytest.raises(ValueError, match="measured: of the system lorenz y is measured"):
         get_task("lorenz", measured=(0,))

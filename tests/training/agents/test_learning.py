@@ -12,7 +12,7 @@ from training.agents import learning, observing
 from training.agents.agent import Agent
 from training.agents.information import make
 from training.agents.learning import hyperparameters, learn, settings_of
-from training.agents.observing import KKL, Privileged, learn_observer
+from training.agents.observing import Privileged, learn_observer
 from training.agents.play import play
 from training.agents.policy import ALGORITHMS
 from training.agents.seeds import AGENT_EVALUATION_SEED
@@ -128,16 +128,18 @@ def test_an_agent_on_estimates_sees_hidden_signals_until_there_are_estimates(tmp
         (NOISY_CART, "ppo", 320, 1, 32),
     ],
 )
-def test_from_how_many_steps_an_observer_is_learned(tmp_path, small, task, algorithm, timesteps, aggregate, first):
+def test_from_how_many_steps_an_observer_is_learned(
+    tmp_path, small, monkeypatch, task, algorithm, timesteps, aggregate, first
+):
     fitted = []
 
     def noted(task, records, **options):
         fitted.extend(records)
         raise StopIteration
 
-    options = {"algorithm": algorithm, "timesteps": timesteps, "aggregate": aggregate}
+    monkeypatch.setattr(learning, "learn_observer", noted)
     with pytest.raises(StopIteration):
-        learn(task, "x_hat", tmp_path, **options, estimation=replace(KKL, learn=noted))
+        learn(task, "x_hat", tmp_path, algorithm=algorithm, timesteps=timesteps, aggregate=aggregate)
     assert steps_of(fitted) == first
 
 
@@ -181,16 +183,17 @@ def test_short_episodes_are_no_error(tmp_path, small, task):
     assert agent.make().reset(seed=0)[0].shape == (1, 4)
 
 
-def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small):
+def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, monkeypatch):
     task, first = replace(PENDULUM, measurement_noise=0.1), []
 
     def noted(*arguments, **options):
-        path = KKL.learn(*arguments, **options)
+        path = learn_observer(*arguments, **options)
         first.append(Artifact.read(path))
         return path
 
     options = {"algorithm": "ppo", "timesteps": 1200, "observer_steps": 400, "aggregate": 1, "seed": 1}
-    learn(task, "x_hat", tmp_path, **options, estimation=replace(KKL, learn=noted))
+    monkeypatch.setattr(learning, "learn_observer", noted)
+    learn(task, "x_hat", tmp_path, **options)
     path = tmp_path / "observer.safetensors"
     artifact = Artifact.read(path)
     assert artifact.training["held_out_errors"] != first[0].training["held_out_errors"]  # a refit was taken

@@ -24,7 +24,7 @@ SHORT = control_task("van_der_pol", 0.2, duration=0.5)
 
 @pytest.fixture
 def saves(monkeypatch):
-    """Checkpoints, due at each rollout's beginning; the training is interrupted after number ``saves.stop``."""
+    """Checkpoints of an agent, due at each rollout's beginning; ``saves.stop`` of them, and it is interrupted."""
 
     class Saves(list):
         stop = None
@@ -33,6 +33,8 @@ def saves(monkeypatch):
 
     def noted(path, state, **options):
         save(path, state, **options)
+        if path.name != "agent.checkpoint.pt":  # an observer's
+            return
         saved.append(checkpoints.load(path))
         if len(saved) == saved.stop:
             raise KeyboardInterrupt

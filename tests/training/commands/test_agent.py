@@ -15,10 +15,10 @@ from training.agents.agent import Agent
 from training.agents.learning import learn
 from training.agents.seeds import AGENT_EVALUATION_SEED, agent_evaluation_seed
 from training.agents.tasks import HIDDEN_VELOCITIES
-from training.cli import main
-from training.commands.agent import Evaluate
-from training.commands.agent_task import TaskOptions
-from training.commands.record import PlayOptions, RecordCommand
+from training.cli import main, read
+from training.commands.agent import Evaluate, TaskOptions
+from training.commands.options import PlayOptions
+from training.commands.record import RecordCommand
 from training.records import read_records
 
 OWN = f"{linear_system.__file__}:Oscillator"
@@ -74,34 +74,35 @@ def test_an_agent_in_any_environment(information, capsys):
         main(["agent", "train", "CartPole-v1", "--information", information])
 
 
-@pytest.mark.parametrize(
-    ("command", "says"),
-    [
-        ("CartPole-v1 --measurement-noise 0.1,0.2", "one number"),
-        ("Acrobot-v1", "say what is measured of Acrobot-v1"),
-        ("lorenz --measured 0", "of the system lorenz y is measured"),
-        ("lorenz --aggregate 2", "no observer to fit again"),
-    ],
-)
-def test_commands_that_make_no_sense(command, says):
-    with pytest.raises(SystemExit, match=says):
-        main(["agent", "train", *command.split()])
-
-
-def test_options_become_a_task():
-    options = {"time_constants": "1,2", "frames": 4, "no_past_actions": True, "angles": ("3,1", "4,2")}
-    task = TaskOptions(**options).task("InvertedDoublePendulum-v5")
+def test_options_become_a_task(capsys):
+    words = [
+        "--time-constants",
+        "1,2",
+        "--frames",
+        "4",
+        "--no-past-actions",
+        "--angles",
+        "3,1",
+        "--angles",
+        "4,2",
+        "--env-kwargs",
+        "a=1",
+        "b=x",
+    ]
+    options = read(["agent", "train", "InvertedDoublePendulum-v5", *words]).command.options
+    task = options.task("InvertedDoublePendulum-v5")
     assert (task.time_constants, task.frames, task.past_actions) == ((1.0, 2.0), 4, False)
-    assert task.angles == ((3, 1), (4, 2))
-    for wrong, says in (
-        ({"measured": "x"}, "takes indices"),
-        ({"time_constants": "1;2"}, "--time-constants takes numbers of steps"),
-        ({"angles": ("cos",)}, "--angles takes indices"),
-        ({"angles": ("0,1,2",)}, r"--angles takes the cosine's entry and the sine's, .* got '0,1,2'"),
-        ({"angles": ("0,1",)}, r"angles must name entries of CartPole-v1 that are measured, \(0, 2\)"),
+    assert (task.angles, task.env_kwargs) == (((3, 1), (4, 2)), {"a": 1, "b": "x"})
+    for wrong, message in (
+        ("--measured x", "got 'x', not indices in the flattened observation, as in 0,1"),
+        ("--time-constants 1;2", "got '1;2', not numbers of steps"),
+        ("--angles 0,1,2", "got '0,1,2', not the cosine's entry and the sine's"),
     ):
-        with pytest.raises(ValueError, match=says):
-            TaskOptions(**wrong).task("CartPole-v1")
+        with pytest.raises(SystemExit):
+            read(["agent", "train", "CartPole-v1", *wrong.split()])
+        assert message in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"angles must name entries of CartPole-v1 that are measured, \(0, 2\)"):
+        TaskOptions(angles=((0, 1),)).task("CartPole-v1")
 
 
 def test_an_agent_on_the_state_is_recorded_as_a_policy(tmp_path, monkeypatch):

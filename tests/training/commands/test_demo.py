@@ -12,7 +12,7 @@ from random_artifacts import random_artifact
 
 from kkl_gym import KKLObservation, get_system
 from training.cli import main
-from training.commands import portraits
+from training.commands import demo
 from training.commands.demo import play
 from training.commands.options import model_of, read_policy, shown, system_of
 
@@ -46,7 +46,9 @@ def test_an_observer_of_a_bias(capsys):
     main(["demo", "van_der_pol", "--observer", "biased.safetensors", "--out", ".", "--duration", "1"])
     assert "KKLVanDerPol-v0" in capsys.readouterr().out
     assert system_of(artifact, None) == system
-    assert model_of(artifact, None).nx == 3
+    main(["evaluate", "biased.safetensors", "--plant", "mu=3.3", "--trajectories", "2", "--duration", "1"])
+    assert "plant mu=3.3, model mu=3" in " ".join(capsys.readouterr().out.split())
+    assert model_of(artifact, system).nx == 3
     policy, x = read_policy(artifact, system, None), np.array([[0.3, -0.2, 0.9]])
     np.testing.assert_array_equal(policy(x), policy(x[:, :2]))
     env = gym.make("KKLVanDerPol-v0")
@@ -57,7 +59,7 @@ def test_an_observer_of_a_bias(capsys):
 
 
 def test_a_moving_picture(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(portraits, "FRAMES", 4)
+    monkeypatch.setattr(demo, "FRAMES", 4)
     main(["demo", "lorenz", "--gif", "--out", ".", "--duration", "2"])
     assert "wrote estimates-lorenz.gif" in capsys.readouterr().out.replace("\n", "")
     with Image.open(tmp_path / "estimates-lorenz.gif") as gif:
@@ -85,9 +87,3 @@ def test_the_policy_of_its_training_acts(tmp_path):
     assert late[pushed].mean(0) == pytest.approx([0.5, 0.0], abs=0.1)
     with pytest.raises(ValueError, match=r"was trained under the policy .*, which acts"):
         play(environment, 2000, 0.1, seed=0)
-
-
-def test_spinn_is_shown_where_nothing_acts_as_it_knows_no_inputs():
-    (environment,) = shown("reverse_duffing", None)
-    assert play(environment, 5, 0.1, seed=0).spinn is not None
-    assert play(environment, 5, 0.1, seed=0, policy=f"{__file__}:push").spinn is None

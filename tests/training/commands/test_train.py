@@ -78,15 +78,6 @@ def test_other_kinds_have_names_of_their_own(options, name, capsys):
     assert any(line.startswith(said) for line in lines(capsys))
 
 
-def test_an_output_that_no_expression_holds_is_named(capsys):
-    main(["train", f"{__file__}:OnFloats", *SIZES])
-    (line,) = [line for line in lines(capsys) if line.startswith("the observer does not track: ")]
-    assert "cannot hold h(x) as an expression" in line
-    assert "test_train.py, line" in line
-    artifact = Artifact.read("runs/on-floats/on-floats.safetensors")
-    assert (artifact.motion, artifact.h, artifact.C) == (None, None, None)
-
-
 def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(capsys):
     main(["train", FALLING, "--policy", f"{__file__}:hold", *SIZES])
     assert lines(capsys)[-1].endswith(f"--system {FALLING} --policy {__file__}:hold measures its errors")

@@ -1,4 +1,4 @@
-"""Systems that are deliberately wrong, each with what is said of it; and systems of which nothing is to be said."""
+"""Systems that are deliberately wrong, each with its finding; and systems without problems."""
 
 import importlib.util
 import json
@@ -20,7 +20,7 @@ from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import SubstepsError
 from kkl_gym.systems import Lorenz
 from training.cli import main
-from training.diagnosis import FIRST, THEN, check
+from training.diagnosis import CHECKS, check
 from training.diagnosis.system import Subject
 from training.presets import controller
 
@@ -36,9 +36,7 @@ def findings(system, name=None, *, dt=None, duration=2.0, policy=None):
     """Of one check alone, or of all."""
     if name is None:
         return list(check(system, dt=dt, duration=duration, policy=policy))
-    if name in FIRST:
-        return list(FIRST[name](system))
-    return list(THEN[name](Subject(system, dt or system.dt, duration, policy, (system.measurement_noise,))))
+    return list(CHECKS[name](Subject(system, dt or system.dt, duration, policy, (system.measurement_noise,))))
 
 
 def one(system, name, verdict="problem", **options):
@@ -53,14 +51,14 @@ def problems(system, **options):
 def test_a_system_that_ships():
     found = findings(get_system("van_der_pol"))
     assert "problem" not in {one.verdict for one in found}
-    assert {one.check for one in found} == {*FIRST, *THEN}
+    assert {one.check for one in found} == set(CHECKS)
     assert all(bool(one.advice) == (one.verdict != "ok") for one in found)
     assert found[0].found == "van_der_pol: 2 states (x1, x2); 1 input up to 5; parameters mu = 3"
 
 
 def test_the_page_explains_every_line_of_its_example():
     page = (EXAMPLES.parent / "docs" / "guides" / "diagnose.md").read_text(encoding="utf-8")
-    for name in (*FIRST, *THEN):
+    for name in CHECKS:
         assert f"\n| {name} |" in page
 
 
@@ -75,18 +73,6 @@ def test_the_page_explains_every_line_of_its_example():
 )
 def test_neither_do_others_have_problems(name, duration):
     assert not problems(get_system(name), duration=duration)
-
-
-def test_a_linear_system_has_its_numbers():
-    subject = Subject(Oscillator(), 0.01, 20.0)
-    found = {name: next(THEN[name](subject)).found for name in ("sampling", "inputs", "bounds")}
-    assert (
-        "time constants 1 to 1 s (medians over X), of which the fastest spans 100 samples and a motion 20 of"
-        in found["sampling"]
-    )
-    assert "y changes by 1 % of its standard deviation" in found["sampling"]
-    assert found["inputs"] == "input 1 at its bound 0.5 moves x2 by 0.5 per second"
-    assert found["bounds"] == "all of 100 motions of 20 s from X, free and driven, stay within them"
 
 
 def test_the_command_prints_a_table_of_findings(capsys, tmp_path, monkeypatch):
@@ -204,10 +190,10 @@ BLIND = NO_INPUT | {
          "let h measure something that moves, or leave this output out"),
         ("output", "note", {"measurement_noise": 1.0}, {}, "noise 1 by default",
          "set measurement_noise: 0.1 is 5 % of the range"),
-        ("observability", "problem", BLIND, {}, "y tells nothing of bias", "let h measure bias too, or"),
+        ("observability", "problem", BLIND, {}, "y does not determine bias", "let h measure bias too, or"),
         ("observability", "problem", BLIND | {"f": lambda self, x: (x[1] + x[2], 0.0 * x[0], 0.0 * x[0])}, {},
-         "y tells nothing of a combination of x2 and bias", "let h measure x2 or bias too"),
-        ("observability", "note", BLIND | {"h": lambda self, x: (x[0] + 1e-3 * x[2],)}, {}, "y tells little of bias",
+         "y does not determine a combination of x2 and bias", "let h measure x2 or bias too"),
+        ("observability", "note", BLIND | {"h": lambda self, x: (x[0] + 1e-3 * x[2],)}, {}, "y hardly determines bias",
          "let h measure bias too"),
     ],
 )  # fmt: skip
@@ -256,23 +242,6 @@ def test_motions_that_need_too_many_substeps(monkeypatch):
     assert found.advice == "take a smaller dt"
 
 
-def test_a_state_of_which_y_tells_nothing_but_which_the_motion_forgets():
-    forgotten = made(**BLIND | {"f": lambda self, x: (x[1], -x[0], -2.0 * x[2])})
-    assert not problems(forgotten, duration=4.0)
-
-
-def test_the_least_errors_of_states_at_levels_of_noise():
-    """A position and its speed, of uniform starts: against a Kalman filter they are in test_least_errors.py."""
-    found = [
-        one for one in check(Oscillator(), duration=6.0, measurement_noise=[0.1, 0.3]) if one.check == "observability"
-    ]
-    assert [one.found.partition(":")[0] for one in found] == ["x1", "x2"]
-    assert all("without noise (seen 0" in one.found for one in found)
-    assert all(" % at noise 0.1, " in one.found and " % at noise 0.3, in its standard" in one.found for one in found)
-    with pytest.raises(ValueError, match="measurement_noise must"):
-        list(check(Oscillator(), measurement_noise=[float("inf")]))
-
-
 @dataclass(frozen=True)
 class ThroughThird(Lorenz):
     """Seen through x3, which (x1, x2) -> (-x1, -x2) leaves as it is."""
@@ -283,8 +252,8 @@ class ThroughThird(Lorenz):
         return (x[2],)
 
 
-def test_a_symmetry_is_told_from_what_is_hard_to_see():
+def test_a_symmetry_is_no_poor_observability():
     found = findings(ThroughThird(), "observability", duration=6.0)
     assert [one.verdict for one in found] == ["problem", "ok"]
-    assert found[0].found.startswith("x1, x2: y tells them near each state, but not which of several states it is: (")
+    assert found[0].found.startswith("x1, x2: y determines them near each state, but not globally: (")
     assert not any("near each state" in one.found for one in findings(Lorenz(), "observability", duration=6.0))

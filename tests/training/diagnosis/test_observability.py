@@ -1,10 +1,9 @@
-"""What is said of signals of which physics says what y tells."""
+"""Verdicts on signals whose observability follows from physics."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 import scipy
 from recorded_runs import as_csv, swing
@@ -35,13 +34,6 @@ def test_pendulums_rate_is_determined_by_its_angle():
     assert found.errors[0, 0, 0] > 0.9  # the angle alone says nothing of it
     of_differences = 0.05 * np.sqrt(2) / 0.05 / 3  # of angles, over a rate of 3 rad/s or so
     assert 2 * rate.errors[0] < rate.errors[1] < of_differences
-
-
-def test_pendulums_angle_is_determined_by_its_rate_but_for_which_side_is_up():
-    found = verdicts(looked("Pendulum-v1", [2], [0, 1], steps=5000))
-    assert found["obs[1]"].verdict == "determined"  # gravity turns it
-    assert found["obs[0]"].errors[0] > 2 * found["obs[1]"].errors[0]  # a cosine is flat where the sine is steep
-    assert found["obs[0]"].verdict.startswith("partly")
 
 
 def test_cart_poles_place_is_seen_up_to_a_constant_by_its_velocities():
@@ -90,13 +82,6 @@ def test_too_little_data_is_warned_of():
     )
     few = [replace(record, t=0.1 * record.t, source="") for record in wandering(3, 2000)]
     assert "fewer than 5 records" in of_records(few, measurement_noise=[]).warnings[0]
-    bent = [
-        Record(f"{i}", np.arange(60.0), y, x=np.sin(9 * y).prod(1, keepdims=True), source="bent")
-        for i, y in enumerate(np.random.default_rng(0).uniform(0, 1, (20, 60, 2)))
-    ]
-    found = of_records(bent, measurement_noise=[])
-    assert found.judgements[0].verdict.startswith("partly")
-    assert any("with half of them" in text for text in found.warnings)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +89,7 @@ def test_too_little_data_is_warned_of():
     [
         ({"measurement_noise": [(0.1, 0.2)]}, "one for each of 1 outputs"),
         ({"measurement_noise": 0.1}, r"must be a list of levels, as in \[0.1, 0.3\], got 0.1"),
-        ({"records": []}, "there is no record"),
+        ({"records": []}, "no records are given"),
         ({"records": wandering(2, 8)}, "16 samples in 2 records are too few"),
         ({"records": [replace(wandering(1)[0], x=None, signals=Signals())]}, "no hidden states were recorded"),
     ],
@@ -149,18 +134,12 @@ def shown(arguments, capsys, monkeypatch):
     return capsys.readouterr().out
 
 
-def test_the_command_on_an_environment(capsys, tmp_path, monkeypatch):
-    words = "Pendulum-v1 --measured 0,1 --hidden 2 --steps 2000 --measurement-noise 0.05,0.1 --csv"
-    text = shown([*words.split(), str(tmp_path / "errors.csv")], capsys, monkeypatch)
+def test_the_command_on_an_environment(capsys, monkeypatch):
+    words = "Pendulum-v1 --measured 0,1 --hidden 2 --steps 2000 --measurement-noise 0.05,0.1"
+    text = shown(words.split(), capsys, monkeypatch)
     assert "obs[2] from obs[0], obs[1] and action[0], in steps of 0.05 s" in text
     assert "obs[2]: determined from 1 step (0.05 s) of y" in text
     assert " % at noise 0.05, 0.1" in text
-    written = pd.read_csv(tmp_path / "errors.csv", dtype={"measurement_noise": str})
-    assert list(written) == ["signal", "measurement_noise", "steps", "seconds", "error"]
-    assert set(written.measurement_noise) == {"0", "0.05 0.1"}
-    np.testing.assert_allclose(written.seconds, 0.05 * written.steps)
-    exact = written[written.measurement_noise == "0"].set_index("steps")
-    assert exact.error[0] > 0.9 > 0.05 > exact.error[8]
 
 
 def test_the_command_on_records(capsys, tmp_path, monkeypatch):
@@ -189,13 +168,3 @@ def test_what_is_left_is_the_part_of_x_that_does_not_follow_from_z():
     assert left[0] < 0.05
     np.testing.assert_allclose(left[1:4] * size[1:4], [0.3, 1.0, 1.0], rtol=0.1)
     assert np.isnan(left[4])
-
-
-def test_directions_below_the_resolution_tell_nothing():
-    z, others = samples(300, 2, 0) * [1, 1e-6], samples(4000, 2, 1) * [1, 1e-6]
-    assert left_by(z, (1e6 * z[:, 1:]) ** 2, others, (1e6 * others[:, 1:]) ** 2)[0] > 0.8
-
-
-def test_without_any_z_all_is_left():
-    x, others = samples(100, 1, 0), samples(1000, 1, 1)
-    assert left_by(np.zeros((100, 0)), x, np.zeros((1000, 0)), others)[0] == pytest.approx(1.0, abs=0.02)

@@ -1,5 +1,7 @@
 """Errors on unseen trajectories, of the model and of other plants."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from discrete_systems import Turning
@@ -9,9 +11,10 @@ import training.evaluation.errors
 from kkl_gym import VanDerPol, get_system
 from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
-from training import errors, unseen_trajectories
-from training.evaluation.errors import measured
-from training.evaluation.plants import off_by, show_parameters
+from training import errors, noise_limit, unseen_trajectories
+from training.commands.evaluate import show_parameters
+from training.evaluation.errors import estimates, measured, off_by
+from training.kalman import ExtendedKalmanFilter, measurement_covariance, unknown_start
 from training.maps.coordinates import stationary_covariance
 
 
@@ -103,6 +106,39 @@ def test_an_exact_kalman_filter_follows_the_same_runs():
     assert np.median(found.late) < np.median(found.full)
     assert np.median(longer.nrmse) < np.median(found.nrmse)
     assert (louder.nrmse.mean(0) > 1.5 * found.nrmse.mean(0)).all()
+
+
+def test_the_limit_of_a_linear_system_is_the_error_of_its_kalman_filter():
+    system, how = Oscillator(), {"measurement_noise": 0.3, "seed": 0, "skip": 2.0}
+    for process_noise in (0.0, 0.1):  # without any, the filter assumes a little
+        runs = unseen_trajectories(system, 0.05, n=60, duration=10.0, seed=0, driven=True, process_noise=process_noise)
+        limit, exact = noise_limit(system, runs, **how), errors(None, system, runs, **how)
+        squares = [(one.nrmse**2).mean(0) for one in (limit, exact)]
+        np.testing.assert_allclose(*np.sqrt(squares), rtol=0.12)
+        assert limit.full.mean() == pytest.approx(exact.full.mean(), rel=0.12)
+    _, P = estimates(None, system, runs, measurement_noise=0.3, seed=0, covariances=True)
+    Q = np.diag((0.1 * np.array(system.scale)) ** 2 / 3 * 0.05)
+    bound = ExtendedKalmanFilter(system, 0.05, Q=Q, R=measurement_covariance(system, 0.3))
+    np.testing.assert_allclose(bound.along(runs.x, runs.u), P, rtol=1e-6, atol=1e-9)
+
+
+def test_the_limit_follows_tichavskys_recursion_on_the_plant():
+    """J' = F^-T J F^-1 + H^T R^-1 H, where nothing disturbs the motion; and the figure of Lorenz's."""
+    model, plant, how = Turning(), Turning(omega=2.0), {"measurement_noise": 0.3, "seed": 0}
+    runs = unseen_trajectories(model, 0.05, n=3, duration=1.0, seed=0, plant=plant)
+    bound = ExtendedKalmanFilter(plant, 0.05, Q=np.zeros((2, 2)), R=np.array([[0.09]])).along(runs.x, runs.u)
+    c, s = np.cos(0.1), np.sin(0.1)
+    J, back = np.linalg.inv(unknown_start(model)[1]) + np.diag([1, 0]) / 0.09, np.array([[c, -s], [s, c]])
+    for P in bound[1:]:
+        J = back.T @ J @ back + np.diag([1, 0]) / 0.09
+        np.testing.assert_allclose(P, np.broadcast_to(np.linalg.inv(J), P.shape), rtol=1e-6, atol=1e-12)
+    alone = noise_limit(plant, dataclasses.replace(runs, plant=None), **how)
+    np.testing.assert_array_equal(noise_limit(model, runs, **how).full, alone.full)
+    runs = unseen_trajectories(get_system("lorenz"), 0.01, n=20, duration=20.0, seed=0)
+    lorenz = noise_limit(get_system("lorenz"), runs, measurement_noise=0.5, seed=0, skip=10.0)
+    assert np.median(lorenz.late) == pytest.approx(0.30, rel=0.1)
+    with pytest.raises(ValueError, match="measurement_noise"):
+        noise_limit(model, runs, measurement_noise=-1.0, seed=0)
 
 
 def test_every_parameter_is_off_by_a_share():

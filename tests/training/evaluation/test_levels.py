@@ -5,19 +5,10 @@ import dataclasses
 import linear_system
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from linear_system import TwoOutputs
 
 from kkl_gym import VanDerPol
 from training.evaluation.levels import beyond, level_for, multiple, read_level, show_level
-
-LEVELS = st.integers(0, 999_999).map(lambda n: n / 1000)
-
-
-@given(st.one_of(LEVELS, st.lists(LEVELS, min_size=2, max_size=4).map(tuple)))
-def test_a_level_that_is_shown_can_be_read(level):
-    assert read_level(show_level(level)) == level
 
 
 def test_levels_as_people_write_them():

@@ -6,17 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compiled_c import compiled, estimates, fed, microseconds, needs_cc
-from exported_steps import (
-    MAPS,
-    apart,
-    apart_at_all_levels,
-    exported_of,
-    in_doubles,
-    in_python,
-    mapped,
-    motion,
-    noise,
-)
+from exported_steps import MAPS, apart, apart_at_all_levels, exported_of, in_doubles, in_python, mapped, motion, noise
 from random_artifacts import random_artifact
 from rollout_observers import observer_of
 

@@ -9,7 +9,7 @@ import torch
 from exported_steps import apart, exported_of, mapped, motion, tracked
 from rollout_observers import observer_of
 
-from observers.errors import ArtifactError
+from observers.checks import ArtifactError
 from observers.names import resolve
 from observers.storage import checksum
 from training import TorchObserver

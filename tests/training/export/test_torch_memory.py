@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from kkl_gym.memory import Memory
-from kkl_gym.turning import TurningMemory
 from training import TorchMemory
 
 CONSTANTS = {"time_constants": (1.0, 2.5, 8.0), "input_time_constants": (1.0, 4.0)}
@@ -14,7 +13,7 @@ CONSTANTS = {"time_constants": (1.0, 2.5, 8.0), "input_time_constants": (1.0, 4.
 @pytest.mark.parametrize("angles", [[], [(2, 0)]])
 def test_it_shows_what_the_wrapper_shows(angles):
     rng, n, again = np.random.default_rng(0), 3, np.array([True, False, False])
-    memory = TurningMemory(4, 2, angles, **CONSTANTS) if angles else Memory(4, 2, **CONSTANTS)
+    memory = Memory(4, 2, angles, **CONSTANTS)
     module = TorchMemory(4, 2, angles=angles, **CONSTANTS)
     state, y = module.start(n), rng.normal(size=(n, 4))
     for k in range(250):
@@ -53,6 +52,6 @@ def test_gradients_are_those_of_finite_differences():
 
 
 def test_angles_that_are_no_outputs_are_refused():
-    for angles in ([(0, 3)], [(1, 1)], [(0, 1), (1, 2)]):
+    for angles in ([(0, 3)], [(1, 1)], [(0, 1), (1, 2)], [(0, 0.5)], (0, 1), 3, 0.5):
         with pytest.raises(ValueError, match="angles must be pairs of different outputs, of 0 to 2"):
             TorchMemory(3, 1, angles=angles)

@@ -123,7 +123,7 @@ def test_what_makes_no_sense():
         ({"mass": (0.0, 1.0)}, [free], "no parameter 'mass'"),
         ({"stiffness": (5.0, 6.0)}, [free], "between finite limits, got 4 in 5.0 to 6.0"),
         ({"stiffness": (0.0, float("inf"))}, [free], "between finite limits, got 4 in 0.0 to inf"),
-        (stiffness, [], "there is no record"),
+        (stiffness, [], "no records are given"),
         (stiffness, [doubled], "spring has 1 measured, but the columns are y1, y2"),
         (stiffness, [free, driven], "inputs are columns u1, but none in"),
     ):

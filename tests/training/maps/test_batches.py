@@ -13,7 +13,7 @@ from observers.decoder import Decoder
 from training.maps.coordinates import noise_covariance
 from training.maps.inverse import TrajectorySampler
 from training.spectrum import Spectrum
-from training.trajectories.motions import KINDS, Motions, record, recording_ages
+from training.trajectories.motions import KINDS, Motions, recording_ages
 
 
 def batches_of(data, linear, measurement_noise=0.5, **settings):
@@ -59,8 +59,8 @@ def of_two_outputs():
     """Batches along trajectories of a system whose outputs have units of their own, and what they are made of."""
     system = TwoUnits()
     linear = Spectrum((-0.5, -2.0, -8.0)).filter(2, 0.01, 1)
-    motions, ages = Motions(KINDS), recording_ages(300, 20)
-    data = record(system, linear, n=30, steps=300, ages=ages, rng=np.random.default_rng(0), motions=motions)
+    motions = Motions(system, linear.dt, 300, KINDS)
+    data = motions.beside(linear, recording_ages(300, 20), 30, np.random.default_rng(0))
     sampler = batches_of(data, linear, system.measurement_noise, measurement_noise_max=(200.0, 0.2))
     return sampler, data, linear
 

@@ -12,7 +12,7 @@ from training.maps.coordinates import (
     spread,
     stationary_covariance,
 )
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 
 def test_coordinates_make_the_signal_white_and_the_noise_diagonal():

@@ -12,6 +12,7 @@ from quadrature import backward_quadrature
 from small_runs import CPU, toy
 from wrong_systems import Branching, Late
 
+from examples.research.derivatives import evaluate, jacobian
 from kkl_gym import EquationError, ReverseDuffing, get_system
 from kkl_gym.simulate import simulate
 from kkl_gym.system import on_states
@@ -20,8 +21,7 @@ from observers.names import resolve
 from training.maps.forward import ForwardProblem, along, on_tensors, residual, transients, truncation_step
 from training.maps.networks import Network, from_mlp
 from training.spectrum import Spectrum
-from training.trajectories.equations import evaluate, jacobian
-from training.trajectories.filtering import filter_states
+from training.trajectories.motions import filter_states
 
 
 def test_truncation_leaves_epsilon_of_any_start():

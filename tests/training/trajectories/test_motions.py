@@ -1,8 +1,5 @@
 """Training trajectories, and a filter beside them."""
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 import pytest
 from linear_system import Oscillator
@@ -16,100 +13,65 @@ from training.trajectories.motions import (
     KINDS,
     Motions,
     random_inputs,
-    record,
     recording_ages,
-    trajectories,
 )
 
 
 def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     system, n = ReverseDuffing(), 400
-    (x, u, level), *rest = trajectories(
-        system, n=n, steps=10, dt=0.01, rng=np.random.default_rng(0), motions=Motions(lead_in_share=0.5)
-    )
+    x, u, level, _ = Motions(system, 0.01, 10, lead_in_share=0.5).drawn(n, np.random.default_rng(0))
     low, high = system.box()
     inside = ((x[0] >= low) & (x[0] <= high)).all(-1)
-    assert not rest
     assert not level.any()
     assert u.shape == (10, n, 0)
-    assert inside[200:].all()
-    assert 5 < (~inside[:200]).sum() < 150
+    assert inside[::2].all()
+    assert 5 < (~inside[1::2]).sum() < 150
 
 
 def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
-    system, n, seen = VanDerPol(), 400, []
+    system, seen = VanDerPol(), []
 
     def spy(*arguments, w, **named):
         seen.append(w)
         return simulate(*arguments, w=w, **named)
 
     monkeypatch.setattr(training.trajectories.motions, "simulate", spy)
-    (x, u, level), *_ = trajectories(
-        system,
-        n=n,
-        steps=50,
-        dt=0.01,
-        rng=np.random.default_rng(0),
-        motions=Motions(kinds=("steps",), process_noise_share=0.25),
-    )
+    motions = Motions(system, 0.01, 50, ("steps",), process_noise_share=0.25)
+    x, u, level, _ = motions.drawn(400, np.random.default_rng(0))
     (w,) = seen
     assert np.array_equal(x, simulate(system, x[0], 50, 0.01, u=u, w=w))
-    relative = w / (system.process_noise * np.array(system.scale))
+    relative, level = w / (system.process_noise * np.array(system.scale)), level / system.process_noise
     largest = np.abs(relative).max((0, 2))  # of 100 numbers, all but the level of a run
     assert (largest > 0).mean() == pytest.approx(0.25, abs=0.06)
-    assert np.allclose(largest, level / system.process_noise, atol=0.12)
-    assert ((largest > 0) == (level > 0)).all()
-    quantiles = np.quantile(level[level > 0] / system.process_noise, [0.1, 0.5, 0.9])
+    assert np.allclose(largest, level, atol=0.12)
+    quantiles = np.quantile(level[largest > 0], [0.1, 0.5, 0.9])
     assert quantiles == pytest.approx(np.sqrt([0.1, 0.5, 0.9]), abs=0.12)
-    assert largest.max() <= 1.0
     assert np.abs(relative.mean((0, 1))).max() < 0.01
     assert relative.std((0, 1)) == pytest.approx(relative.std(), rel=0.03)  # each component by its own scale
 
 
 def test_recording_ages_cover_start_transient_and_end():
     ages = recording_ages(5000, 200)
-    assert ages[0] == 0
-    assert ages[-1] == 5000
     assert (np.diff(ages) > 0).all()
     assert (ages < 50).sum() > 20
-    assert recording_ages(5000, 2).tolist() == [0, 5000]
-    assert recording_ages(5000, 3).tolist() == [0, 1, 5000]
+    for n, expected in ((2, [0, 5000]), (3, [0, 1, 5000]), (200, ages[[0, -1]])):
+        assert recording_ages(5000, n)[[0, -1] if n == 200 else slice(None)].tolist() == list(expected)
 
 
 def test_most_motions_start_in_a_larger_box_where_one_is_asked_for():
     system = VanDerPol()
-    motions = Motions(box_factor=2.0)
-    rng = np.random.default_rng(0)
-    x = np.concatenate(
-        [part[0] for part, *_ in trajectories(system, n=2000, steps=1, dt=0.01, rng=rng, motions=motions)]
-    )
-    relative = np.abs(x) / np.array(system.X)[:, 1]
+    x, _, _, near = Motions(system, 0.01, 1, box_factor=2.0).drawn(2000, np.random.default_rng(0))
+    relative = np.abs(x[0]) / np.array(system.X)[:, 1]
     assert relative.max() == pytest.approx(2.0, abs=0.02)
     assert (relative <= 1).all(1).mean() == pytest.approx(0.4 + 0.6 / 4, abs=0.04)
+    assert near.mean() == pytest.approx(0.4, abs=0.04)
+    assert (relative[near] <= 1).all()
 
 
-def test_recording_gives_up_on_a_system_that_always_escapes():
-    @dataclass(frozen=True)
-    class Runaway(Oscillator):
-        name: ClassVar[str] = "runaway"
-
-        def f(self, x):
-            return 50.0 * x[0], 50.0 * x[1]
-
-    linear = LinearFilter(np.diag([-1.0]), np.ones((1, 1)), 0.01)
-    with pytest.raises(ValueError, match="stayed within bounds"):
-        record(Runaway(), linear, n=5, steps=200, ages=np.array([0]), rng=np.random.default_rng(0), motions=Motions())
-
-
-@dataclass(frozen=True)
 class Integrator(System):
     """x' = u: free motion stays where it is, and most driven motion escapes."""
 
-    name: ClassVar[str] = "integrator"
-    X: ClassVar = ((-0.5, 0.5),)
-    bounds: ClassVar = ((-0.6, 0.6),)
-    u_max: ClassVar = (1.0,)
-    G: ClassVar = ((1.0,),)
+    name, X, bounds, u_max, G = "integrator", ((-0.5, 0.5),), ((-0.6, 0.6),), (1.0,), ((1.0,),)
 
     def f(self, x):
         return (0.0 * x[0],)
@@ -117,36 +79,26 @@ class Integrator(System):
     def h(self, x):
         return (x[0],)
 
-    def rate(self, x):
-        return 0.0
-
-
-def together(chunks):
-    """States, inputs and levels of all chunks, trajectories first."""
-    x, u, level = zip(*chunks, strict=True)
-    return np.concatenate(x, 1).swapaxes(0, 1), np.concatenate(u, 1).swapaxes(0, 1), np.concatenate(level)
-
 
 def test_what_escapes_is_replaced_by_its_like(monkeypatch):
     n = 57
     monkeypatch.setattr(training.trajectories.motions, "CHUNK", 24)
-    motions, tried = Motions(kinds=KINDS), []
+    tried = []
 
     def spy(system, x0, *arguments, **named):
         tried.append(len(x0))
         return simulate(system, x0, *arguments, **named)
 
     monkeypatch.setattr(training.trajectories.motions, "simulate", spy)
-    x, u, level = together(
-        trajectories(Integrator(), n=n, steps=200, dt=0.01, rng=np.random.default_rng(0), motions=motions)
-    )
+    x, u, level, _ = Motions(Integrator(), 0.01, 200, KINDS).drawn(n, np.random.default_rng(0))
+    u = u.swapaxes(0, 1)
     assert sum(tried) > 1.2 * n  # so many escaped that the kinds of those that stayed are others
-    assert x.shape == (n, 201, 1)
+    assert x.shape == (201, n, 1)
     assert (np.abs(x) <= 0.6).all()
     assert not level.any()
     different = np.array([len(np.unique(row)) for row in u[..., 0]])
     kinds = np.where((u == 0).all((1, 2)), "zero", np.where(different > 100, "sine", "steps"))
-    expected = [KINDS[row % 4] for chunk in range(0, n, 24) for row in range(min(24, n - chunk))]
+    expected = [KINDS[row % 4] for row in range(n)]
     for kind in ("zero", "steps", "sine"):
         assert (kinds == kind).sum() == expected.count(kind)
 
@@ -154,23 +106,18 @@ def test_what_escapes_is_replaced_by_its_like(monkeypatch):
 def test_parts_of_a_chunk_are_told(monkeypatch):
     monkeypatch.setattr(training.trajectories.motions, "CHUNK", 10)
     linear, told = LinearFilter(np.diag([-1.0, -2.0]), np.ones((2, 1)), 0.01), []
-    rng, ages = np.random.default_rng(0), recording_ages(100, 10)
-    record(Oscillator(), linear, n=15, steps=100, ages=ages, rng=rng, motions=Motions(), report=told.append)
+    motions = Motions(Oscillator(), 0.01, 100)
+    motions.beside(linear, recording_ages(100, 10), 15, np.random.default_rng(0), told.append)
     assert told == [0, 5, 10, 10, 12.5, 15]
 
 
-def test_signals_are_bounded_and_of_three_kinds():
+def test_signals_are_bounded_and_of_four_kinds():
     u = random_inputs(VanDerPol(), 8, 1000, dt=0.01, rng=np.random.default_rng(0))
-    assert u.shape == (1000, 8, 1)
     assert np.abs(u).max() <= 5.0
-    assert not u[:, [0, 2, 4, 6]].any()
-    assert all(len(np.unique(u[:, i])) < 1000 / 4 for i in (1, 5))
-    assert all(len(np.unique(u[:, i])) > 1000 / 4 for i in (3, 7))
-
-
-def test_pulses_end_and_leave_free_motion_behind():
-    u = random_inputs(VanDerPol(), 200, 500, dt=0.01, rng=np.random.default_rng(0), kinds=("pulses",))
-    last = np.array([np.flatnonzero(row).max(initial=-1) for row in u[..., 0].T])
+    assert not u[:, ::2].any()
+    assert [len(np.unique(u[:, i])) < 1000 / 4 for i in (1, 3, 5, 7)] == [True, False, True, False]
+    pulses = random_inputs(VanDerPol(), 200, 500, dt=0.01, rng=np.random.default_rng(0), kinds=("pulses",))
+    last = np.array([np.flatnonzero(row).max(initial=-1) for row in pulses[..., 0].T])
     assert last.min() < 50
     assert 450 < last.max() < 500
     assert abs(last.mean() - 250) < 40

@@ -1,7 +1,6 @@
 """A system whose parameters are states."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -20,10 +19,7 @@ class Motor(System):
 
     gain: float = 2.0
     offset: float = 0.5
-    name: ClassVar[str] = "motor"
-    X: ClassVar = ((-1.0, 1.0),)
-    bounds: ClassVar = ((-9.0, 9.0),)
-    u_max: ClassVar = (1.0,)
+    name, X, bounds, u_max = "motor", ((-1.0, 1.0),), ((-9.0, 9.0),), (1.0,)
 
     def f(self, x):
         return (-x[0],)

@@ -1,5 +1,7 @@
 """Motions under a policy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from linear_system import Autonomous
@@ -7,7 +9,7 @@ from unstable_system import Falling
 
 from kkl_gym.simulate import simulate
 from training.presets import controller, named_policy
-from training.trajectories.motions import POLICYS_OWN, Motions, trajectories, under_policy
+from training.trajectories.motions import POLICYS_OWN, Motions, under_policy
 
 SYSTEM = Falling()
 
@@ -37,59 +39,46 @@ def test_actions_that_are_no_numbers_are_an_error():
 
 def test_a_policy_that_fails_on_the_way_says_where(tmp_path):
     script = tmp_path / "mine.py"
-    script.write_text("def hold(x):\n    gain = [1.0] if len(x) < 30 else []\n    return gain[0] * x[:, :1]\n")
-    policy, own = named_policy(SYSTEM, f"{script}:hold"), np.ones(40, dtype=bool)
-    with pytest.raises(ValueError, match=r"hold' fails on states of shape \(40, 2\): IndexError: .*line 3 \(`return"):
-        under_policy(SYSTEM, policy, np.full((40, 2), 0.3), steps=3, dt=SYSTEM.dt, rng=np.random.default_rng(0),
-                     own=own)  # fmt: skip
-    script = tmp_path / "other.py"
-    script.write_text("def hold(x):\n    return x[:, :1] if len(x) < 30 else x\n")
+    script.write_text("def hold(x):\n    return x[:, :1] if len(x) < 30 else x.gain if len(x) == 30 else x\n")
     policy = named_policy(SYSTEM, f"{script}:hold")
-    with pytest.raises(ValueError, match=r"into actions of shape \(40, 1\), got \(40, 2\)"):
-        policy(np.zeros((40, 2)))
+    for n, message in ((30, r"\(30, 2\): AttributeError: .*line 2 \(`return"), (40, r"shape \(40, 1\), got \(40, 2\)")):
+        with pytest.raises(ValueError, match=message):
+            policy(np.full((n, 2), 0.3))
 
 
 def test_an_unstable_plant_is_held_by_a_policy_alone():
-    sizes = {"n": 30, "steps": 1000, "dt": SYSTEM.dt}
+    free, rng = Motions(SYSTEM, SYSTEM.dt, 1000, ("steps",), process_noise_share=0.5), np.random.default_rng(0)
     with pytest.raises(ValueError, match="--policy"):
-        list(trajectories(SYSTEM, **{**sizes, "n": 120}, rng=np.random.default_rng(0), motions=Motions(("steps",))))
-    motions = Motions(("steps",), process_noise_share=0.5, policy=controller(SYSTEM))
-    found = list(trajectories(SYSTEM, **sizes, rng=np.random.default_rng(0), motions=motions))
-    assert sum(x.shape[1] for x, _, _ in found) == 30
-    (x, u, level), *_ = found
+        free.drawn(120, rng)
+    x, u, level, _ = replace(free, policy=controller(SYSTEM)).drawn(30, rng)
+    assert x.shape[1] == 30
     np.testing.assert_array_equal((u == exact(x)).all((0, 2)), np.arange(x.shape[1]) % POLICYS_OWN == 0)
     assert level.any()
 
 
-@pytest.mark.parametrize(
-    ("system", "name", "message"),
-    [
-        (SYSTEM, "{}/bad.py:loud", r"\[-1, 1\]"),
-        (SYSTEM, "{}/bad.py:wrong", "AttributeError"),
+def test_what_is_no_policy(tmp_path):
+    (tmp_path / "bad.py").write_text(
+        "def loud(x):\n    return 3.0 * (x[:, :1] > 0)\n\ndef wrong(x):\n    return x.nothing\n"
+    )
+    for system, name, message in (
+        (SYSTEM, f"{tmp_path}/bad.py:loud", r"\[-1, 1\]"),
+        (SYSTEM, f"{tmp_path}/bad.py:wrong", "AttributeError"),
         (SYSTEM, "nothing", "nothing"),
         (SYSTEM, "nowhere.py:act", "act"),
         (SYSTEM, "math:pi", "pi"),
         (Autonomous(), "controller", "no inputs"),
         (Autonomous(), "numpy:zeros_like", "no inputs"),
-    ],
-)
-def test_what_is_no_policy(tmp_path, system, name, message):
-    (tmp_path / "bad.py").write_text(
-        "def loud(x):\n    return 3.0 * (x[:, :1] > 0)\n\ndef wrong(x):\n    return x.nothing\n"
-    )
-    with pytest.raises(ValueError, match=message):
-        named_policy(system, name.format(tmp_path))
+    ):
+        with pytest.raises(ValueError, match=message):
+            named_policy(system, name)
 
 
 def test_a_system_that_no_regulator_holds():
-    class Uncontrolled(Falling):
-        name = "uncontrolled"
-        X = ((-0.3, 0.3), (-0.5, 0.5), (-1, 1))
-        bounds = ((-2, 2), (-5, 5), (-3, 3))
-        G = ((0.0,), (1.0,), (0.0,))
-
-        def f(self, x):
-            return *super().f(x[:2]), x[2]
-
+    sizes = {
+        "X": ((-0.3, 0.3), (-0.5, 0.5), (-1, 1)),
+        "bounds": ((-2, 2), (-5, 5), (-3, 3)),
+        "G": ((0.0,), (1.0,), (0.0,)),
+    }
+    equations = {"name": "uncontrolled", "f": lambda self, x: (*Falling.f(self, x[:2]), x[2])}
     with pytest.raises(ValueError, match="policy of your own"):
-        named_policy(Uncontrolled(), "controller")
+        named_policy(type("Uncontrolled", (Falling,), sizes | equations)(), "controller")

@@ -1,43 +1,13 @@
 """What differentiating a system's equations gives."""
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 import pytest
 import sympy
 from kinked_systems import SYSTEMS as KINKED
-from linear_system import Oscillator
 
-from kkl_gym import elementary, get_system
+from examples.research.derivatives import evaluate, jacobian
+from kkl_gym import elementary
 from kkl_gym.system import on_states
-from training.trajectories.equations import evaluate, jacobian, output_matrix
-
-
-def test_output_matrix_of_linear_and_other_outputs():
-    @dataclass(frozen=True)
-    class Squared(Oscillator):
-        name: ClassVar[str] = "squared"
-
-        def h(self, x):
-            return (x[0] * x[0],)
-
-    @dataclass(frozen=True)
-    class Small(Squared):
-        name: ClassVar[str] = "small"
-        X: ClassVar = ((-1e-13, 1e-13), (-1e-13, 1e-13))
-
-    @dataclass(frozen=True)
-    class Ratio(Squared):
-        name: ClassVar[str] = "ratio"
-        X: ClassVar = ((1, 2), (1, 2))
-
-        def h(self, x):
-            return (x[0] / x[1],)
-
-    np.testing.assert_array_equal(output_matrix(get_system("rossler")), [[0.0, 1.0, 0.0]])
-    for system in (Squared(), Small(), Ratio()):
-        assert output_matrix(system) is None
 
 
 @pytest.mark.parametrize("system", KINKED, ids=str)

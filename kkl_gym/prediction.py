@@ -1,0 +1,88 @@
+"""A memory under noise: of the filters it keeps what predicts the next outputs, by least squares on random steps."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from kkl_gym.memory import Memory
+from observers.checks import real_array
+
+CHANCE = 3.0  # variance of a prediction that is kept, in multiples of what as many features predict of mere noise
+SAMPLES = 10  # that the fit needs for each feature
+
+
+class PredictiveMemory(Memory):
+    """Shows the outputs as expected in the next step, and combinations of the filters that predict later ones.
+
+    The filters are those of :class:`Memory`, over all outputs and angles: cosine and sine stand for a torque
+    that depends on the angle. ``weights``, (features, width), multiply the features [signals, w, v, 1]. The first
+    columns give the expected change of each output or angle, the others are shown as they are.
+    """
+
+    def __init__(
+        self, ny: int, nu: int, angles: Sequence[tuple[int, int]], weights: Any, **time_constants: Sequence[float]
+    ) -> None:
+        super().__init__(ny, nu, angles, **time_constants)
+        self._plain, self._others = self._others, np.arange(ny)
+        self._targets = np.r_[self._plain, ny : ny + len(angles)]  # among the signals
+        features = (ny + len(angles)) * (1 + len(self.decay)) + nu * len(self.input_decay) + 1
+        self.weights = real_array("weights", weights) if len(weights) else np.zeros((features, len(self._targets)))
+        if self.weights.ndim != 2 or len(self.weights) != features or self.weights.shape[1] < len(self._targets):
+            raise ValueError(
+                f"weights must be {features} rows of {len(self._targets)} numbers or more, got the shape "
+                f"{self.weights.shape}: take what learn_weights() of KKLMemory with the same other arguments returns"
+            )
+        self.size = ny + self.weights.shape[1] - len(self._targets)
+
+    def features(self) -> np.ndarray:
+        """Signals, filters and a one. Shapes: returns (..., features)."""
+        return np.concatenate([self._signals, *self._w, *self._v, np.ones((*self._ages.shape, 1))], axis=-1)
+
+    def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """The expected outputs and further predictions, (..., size), of all rows or some."""
+        self._check_begun()
+        predicted = self.features() @ self.weights
+        n, plain = len(self._targets), len(self._plain)
+        expected, further = self._signals[..., self._targets] + predicted[..., :n], predicted[..., n:]
+        y = np.empty((*self._ages.shape, self._ny))
+        y[..., self._plain], angles = expected[..., :plain], expected[..., plain:]
+        y[..., self._cosines], y[..., self._sines] = np.cos(angles), np.sin(angles)
+        out = np.concatenate([y, further], axis=-1, dtype=np.float32)
+        return out if rows is None else out[rows]
+
+    def fit(self, episodes: Sequence[np.ndarray]) -> np.ndarray:
+        """Fit the weights by least squares; shapes of each episode: (samples, features).
+
+        Of predictions beyond the next step those directions are kept that stand out of their errors, at unit variance.
+        """
+        horizons = sorted({1, 2, *np.ceil(self.time_constants).astype(int).tolist()})  # in steps
+        last = horizons[-1]
+        x = np.concatenate([episode[:-last] for episode in episodes])
+        n, features = x.shape
+        if n < SAMPLES * features:
+            raise ValueError(
+                f"{n} samples have {last} more after them in their episode, {SAMPLES * features} are needed: take more "
+                "steps or shorter time constants"
+            )
+        signals = [episode[:, self._targets] for episode in episodes]
+        following = [np.concatenate([s[h : len(s) - last + h] for s in signals if len(s) > last]) for h in horizons]
+        later = np.hstack([y - following[0] for y in following[1:]])
+        size = np.maximum(np.abs(x).max(0), 1e-12)
+        change = np.hstack([following[0] - x[:, self._targets], later])
+        weights = np.linalg.lstsq(x / size, change, rcond=1e-9)[0] / size[:, None]
+        to_next, to_later = weights[:, : len(self._targets)], weights[:, len(self._targets) :]
+        predicted = x @ to_later
+        floor = np.maximum(1e-9 * later.var(0), 1e-12)  # of errors, in a signal that is predicted exactly
+        error = np.atleast_2d(np.cov((later - predicted).T, bias=True)) + np.diag(floor)
+        to_white = to_later @ np.linalg.inv(np.linalg.cholesky(error)).T
+        mean = (x @ to_white).mean(0)
+        _, values, directions = np.linalg.svd(x @ to_white - mean, full_matrices=False)
+        kept = values**2 > CHANCE * features
+        scaled = directions[kept].T * (np.sqrt(n) / values[kept])
+        further = to_white @ scaled
+        further[-1] -= mean @ scaled
+        return np.hstack([to_next, further])
+
+
+__all__ = ["PredictiveMemory"]
