@@ -56,9 +56,9 @@ def test_maps_of_several_outputs_that_are_told_one_level(make_artifact):
     )
     artifact = dataclasses.replace(now, inverse=inverse)
     assert KKLObserver(artifact, 0.3).measurement_noise == KKLObserver(artifact, (0.3, 0.3)).measurement_noise == 0.3
-    with pytest.raises(ValueError, match=r"told one level of measurement noise for all outputs, got \(0\.1, 0\.3\)"):
+    with pytest.raises(ValueError, match=r"takes one level of measurement noise for all outputs, got \(0\.1, 0\.3\)"):
         KKLObserver(artifact, (0.1, 0.3))
-    with pytest.raises(ValueError, match="told one level"):
+    with pytest.raises(ValueError, match="takes one level"):
         dataclasses.replace(artifact, measurement_noise=(0.1, 0.3))
     papers = exact_observer(C=np.eye(2))  # to which noise is nothing
     assert KKLObserver(papers, (0.1, 7.0)).measurement_noise == (0.1, 7.0)
