@@ -83,6 +83,5 @@ def test_inputs_are_scaled_or_one_hot():
     assert InputReader(box, ["action[1]"], source="Env-v0")(np.array([1.0, 3.0])).tolist() == [0.5]
     one_of = InputReader(spaces.Discrete(3), acting(spaces.Discrete(3)), source="Env-v0")
     np.testing.assert_array_equal(one_of(np.array([2, 0]), (2,)), [[0, 0, 1], [1, 0, 0]])
-    assert one_of.largest.tolist() == [1.0, 1.0, 1.0]
     with pytest.raises(ValueError, match=r"inputs names 'action\[3\]'"):
         InputReader(spaces.Discrete(3), ["action[3]"], source="Env-v0")
