@@ -1,14 +1,9 @@
 """``examples/live.py``: what its window shows, on a canvas in memory."""
 
-import time
-
 import linear_system
-import matplotlib.animation
-import matplotlib.pyplot as plt
+import matplotlib
 import numpy as np
 import pytest
-from matplotlib.animation import FuncAnimation
-from matplotlib.backend_bases import KeyEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -94,44 +89,7 @@ def test_slow_systems_of_ones_own_move_at_the_pace_of_those_that_ship(saved):
     assert drawn(live, figure)[1] == ""
 
 
-def test_the_script(monkeypatch):
-    asked = []
-    monkeypatch.setattr(module, "show", lambda one, level, *, seed: asked.append((one.system.name, level, seed)))
-    module.main()
-    module.main("lorenz", measurement_noise=0.2, seed=3)
-    assert asked == [("van_der_pol", None, 0), ("lorenz", 0.2, 3)]
-    with pytest.raises(ValueError, match="no observer ships for 'slow': name a file"):
-        module.main(f"{__file__}:Slow")
-
-
 def test_a_window_needs_a_display():
-    plt.switch_backend("agg")
+    matplotlib.use("agg")
     with pytest.raises(ValueError, match="this needs a window, and matplotlib's backend here is 'agg'"):
         module.show(shown("van_der_pol", None)[0], None, seed=0)
-
-
-def test_time_passes_in_a_window_unless_it_is_paused(monkeypatch):
-    opened, frames = [], []
-
-    def animated(figure, frame, **options):
-        frames.append(frame)
-        return FuncAnimation(figure, frame, **options)
-
-    monkeypatch.setattr(module, "Live", lambda *args, **options: opened.append(Live(*args, **options)) or opened[-1])
-    monkeypatch.setattr(matplotlib.animation, "FuncAnimation", animated)
-    plt.switch_backend("agg")
-    monkeypatch.setattr(plt, "get_backend", lambda: "TkAgg")  # which would open a window
-    animation = module.show(shown("rossler", None)[0], None, seed=0)
-    (live,), (frame,), canvas = opened, frames, plt.gcf().canvas
-    canvas.draw()  # starts it
-    before = len(live.history)
-    while len(live.history) < before + 5:
-        frame(0)
-    canvas.callbacks.process("key_press_event", KeyEvent("key_press_event", canvas, " "))
-    before = len(live.history)
-    time.sleep(0.05)
-    frame(0)
-    assert live.paused
-    assert len(live.history) == before
-    plt.close("all")
-    del animation

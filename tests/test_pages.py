@@ -251,13 +251,3 @@ def test_no_sentence_has_more_than_35_words():
             for sentence in sentences(Page(page).text):
                 words = [word for word in sentence.split() if any(map(str.isalnum, word))]
                 assert len(words) <= 35, f"{name(page)}: {sentence}"
-
-
-def test_the_page_on_the_paper_has_its_numbered_equations_theorems_and_assumptions():
-    rows = [line for line in Page(ROOT / "docs/background/paper.md").text.splitlines() if line.startswith("|")]
-    assert {len(re.split(r"(?<!\\)\|", row)) for row in rows} == {4}  # two columns
-    cells = " ".join(row.split("|")[1] for row in rows)
-    inside_proofs = {32, 33, 34, 35}
-    assert set(range(1, 41)) - inside_proofs == {int(number) for number in re.findall(r"(?<!T)\((\d+)\)", cells)}
-    for kind, last in (("theorem", 4), ("lemma", 6), ("assumption", 5), ("definition", 4)):
-        assert set(range(1, last + 1)) == {int(number) for number in re.findall(rf"{kind} (\d)", cells)}, kind

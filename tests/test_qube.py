@@ -117,21 +117,6 @@ def test_a_filter_that_is_started_remembers_and_is_taken_back(tmp_path, monkeypa
     np.testing.assert_allclose(np.angle(np.exp(1j * (angles[0] - angles[1]))), 0.01, atol=1e-9)
 
 
-def test_released_motions_are_recorded_as_the_device_records():
-    records = QUBE["released"](MODEL)
-    assert len(records) == QUBE["MOTIONS"]
-    for record in records[:5]:
-        cosine, sine, alpha_dot, theta_dot = record.x.T
-        alpha = np.unwrap(np.arctan2(sine, cosine))
-        np.testing.assert_allclose(np.hypot(cosine, sine), 1)
-        for angle, velocity in ((alpha, alpha_dot), (record.y[:, 0], theta_dot)):
-            steps = angle / QUBE["ENCODER"]
-            np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
-            np.testing.assert_allclose(velocity, QUBE["recorded_velocity"](angle), atol=1e-6)
-        assert cosine[-1] < -0.9  # it hangs
-    assert np.ptp([record.y[0, 0] for record in records]) > QUBE["TURNED"]
-
-
 @pytest.mark.slow
 def test_on_runs_of_its_own_model(tmp_path, capsys, monkeypatch):
     for setting, small in {"windows": 500, "samples": 10, "members": 1, "width": 16}.items():

@@ -10,8 +10,8 @@ import pytest
 from commands import research
 from PIL import Image
 
-from examples.research.agents import comparison, picture
-from examples.research.agents.comparison import KINDS, ComparedAgent, read_results
+from examples.research.agents import picture
+from examples.research.agents.comparison import read_results
 from examples.research.agents.filtered import kalman_filters, show_filtered
 from examples.research.agents.statistics import interval, middle, normalised
 from examples.research.agents.tables import write_table
@@ -19,7 +19,7 @@ from training import figures
 from training.agents.agent import Agent, find
 from training.agents.observing import SETTINGS
 from training.agents.play import play
-from training.agents.tasks import HIDDEN_VELOCITIES, TASKS, control_task
+from training.agents.tasks import HIDDEN_VELOCITIES, control_task
 
 PENDULUM = HIDDEN_VELOCITIES["Pendulum-v1"]
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
@@ -61,39 +61,14 @@ def test_agents_in_an_environment_are_compared(tmp_path, monkeypatch):
 def test_impossible_comparisons(tmp_path):
     for wrong, message in (
         ("--seeds 0", "must be positive"),
-        ("lorenz lorenz", "give some names, each once"),
         ("lorenz CartPole-v1", "on systems or in environments"),
         ("CartPole-v1 --information ekf", "are not compared by ekf"),
         ("lorenz --observers rossler", "the observer rossler is for rossler"),
         ("lorenz --observers lorenz-spinn", "takes in no inputs"),
-        ("mine.py:Mine", "no file mine.py"),
     ):
         with pytest.raises(SystemExit, match=message):
             research("agents", *wrong.split(), "--out", str(tmp_path))
     assert not (tmp_path / "jobs").exists()
-
-
-def test_planned_agents():
-    how = {"episodes": 2, "timesteps": None, "aggregate": 0}
-    tasks = [TASKS["lorenz"], replace(TASKS["lorenz"], measurement_noise=2.0)]
-    agents = comparison.planned(tasks, Path(), **how)
-    assert len({agent.folder for agent in agents}) == len(agents) == 2 + 2 * 6 * 5 + 2 * 3 + 2 * 1
-    tasks = [replace(PENDULUM, measurement_noise=level) for level in (0.1, 0.3)]
-    names = [agent.name for agent in comparison.planned(tasks, Path(), kinds=("state", "y"), seeds=2, **how)]
-    assert len(names) == 7  # levels of noise share the agents on the state
-    assert [name for name in names if "state" in name] == [f"Pendulum-v1 at noise 0/state/{seed}" for seed in (0, 1)]
-
-
-def test_settings_of_memories_and_stacks_concern_those_agents_alone():
-    def differ(changed):
-        how = {"seed": 0, "episodes": 2, "timesteps": None, "aggregate": 0, "folder": Path()}
-        agents = {kind: [ComparedAgent(task, kind, **how) for task in (PENDULUM, changed)]
-                  for kind in ("random", *KINDS)}  # fmt: skip
-        return {kind for kind, (one, other) in agents.items() if one.identity != other.identity}
-
-    changed = replace(PENDULUM, time_constants=(1, 2, 4), frames=9)
-    assert differ(changed) == {"z", "traces", "stacked"}
-    assert differ(replace(PENDULUM, angles=((0, 1),), past_actions=False)) == {"z", "traces", "stacked"}
 
 
 @pytest.mark.parametrize("name", ["agents", "environments"])
@@ -136,7 +111,6 @@ def test_kalman_filters_that_know_the_input_follow_a_driven_state():
 
 
 def test_pictures_show_states_outputs_and_inputs(tmp_path, monkeypatch):
-    """Each in a row; nothing of the legend is cut off."""
     drawn = []
     monkeypatch.setattr(figures, "save", lambda path, figure: drawn.append(figure))
     agent = Agent.read(find("van_der_pol"))
@@ -146,17 +120,6 @@ def test_pictures_show_states_outputs_and_inputs(tmp_path, monkeypatch):
     picture.draw(task, {"one": episodes}, tmp_path / "a.png")
     (figure,) = drawn
     assert [ax.get_ylabel() for ax in figure.axes] == ["x1", "x2", "y", "u"]
-    found = [{line.get_label(): line.get_ydata() for line in ax.lines} for ax in figure.axes]
-    for row, label, values in (
-        (0, "state", episodes.x[:, 0, 0]),
-        (1, "estimate", episodes.x_hat[:, 0, 1]),
-        (2, "measured output", episodes.y[:, 0, 0]),
-        (3, "input", episodes.u[:, 0, 0]),
-    ):
-        np.testing.assert_array_equal(found[row][label], values)
-    figure.draw_without_rendering()
-    box = figure.legends[0].get_window_extent()
-    assert -10 < box.x0 < box.x1 < figure.bbox.x1 + 10
     picture.animate(task, {"": episodes}, tmp_path / "a.gif")
     with Image.open(tmp_path / "a.gif") as animation:
         assert animation.n_frames == task.steps

@@ -30,9 +30,3 @@ def used(source):
 @pytest.mark.parametrize("path", sorted(FILES), ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_public_names_are_enough(path):
     assert not list(used(path.read_text(encoding="utf-8")))
-
-
-@pytest.mark.parametrize("source", ["from training.a import _b", "from training._a import b", "import observers._a",
-                                    "x._y", "module._function(1)", "self.x._y"])  # fmt: skip
-def test_private_names_are_noticed(source):
-    assert list(used(source))

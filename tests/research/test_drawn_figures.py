@@ -1,13 +1,10 @@
 """The figures of the pages: both themes are there, and their colours are those of the style."""
 
 import re
-from functools import partial
 from pathlib import Path
 
 import pytest
 from matplotlib.colors import to_hex
-from matplotlib.lines import Line2D
-from matplotlib.text import Text
 from PIL import Image
 
 from examples.research import figures
@@ -41,29 +38,6 @@ def test_every_picture_is_shown_and_drawn():
     there = {path.relative_to(DOCS).as_posix() for ending in ("png", "gif") for path in DOCS.rglob(f"*.{ending}")}
     assert there == {in_theme(name, theme) for name in FIGURES for theme in ("light", "dark")} | LIGHT_ALONE
     assert pictures(r"\]\(([^)\s]+\.(?:png|gif))\)") == set(FIGURES) | LIGHT_ALONE
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        partial(figures.error_bars, duration=1.5),
-        pytest.param(partial(figures.errors_over_time, trajectories=3, duration=0.5), marks=pytest.mark.research),
-        pytest.param(figures.noise_levels, marks=pytest.mark.research),
-    ],
-)
-def test_figures_take_their_colours_from_the_style(make, tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(styles, "save", lambda path, figure: drawn.append(figure))
-    draw = make()
-    for theme in ("light", "dark"):
-        with styles.style(theme):
-            draw(tmp_path / "figure.png")
-            figure = drawn.pop()
-            own = {*styles.CYCLES[theme], styles.GROUNDS[theme], styles.RULES[theme]}
-            artists = figure.findobj(lambda artist: isinstance(artist, (Line2D, Text)))
-            assert len(artists) > 20
-            assert {to_hex(artist.get_color()) for artist in artists} <= own
-            assert to_hex(figure.get_facecolor()) == styles.GROUNDS[theme]
 
 
 def test_a_picture_is_written_in_both_themes(tmp_path, capsys):

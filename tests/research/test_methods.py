@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from linear_system import Oscillator, sylvester
+from linear_system import Oscillator
 
 from examples.research.methods import ABLATION, METHODS, Budget, Task, get_method
 from examples.research.methods.node import rollout
@@ -55,14 +55,6 @@ def test_each_method_trains_and_its_file_observes(name, tmp_path):
     assert before.shape == (51, 3, 2)
     assert np.isfinite(before).all()
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.research
-def test_the_forward_map_of_a_linear_system_is_the_sylvester_solution(tmp_path):
-    _, system, artifact, _ = trained_on_oscillator("spinn", tmp_path, steps=1000)
-    x = np.random.default_rng(1).uniform(*system.box(), (1000, 2))
-    z = x @ sylvester(artifact.filter.A, artifact.filter.B).T
-    assert np.sqrt(((artifact.forward(x) - z) ** 2).mean() / (z**2).mean()) < 0.1
 
 
 @pytest.mark.research
@@ -128,32 +120,10 @@ def test_a_sequence_at_once_is_the_observer_sample_by_sample(cell):
     assert np.isfinite(x_hat).all()
 
 
-def test_a_transformer_forgets_beyond_its_windows():
-    torch.manual_seed(0)
-    model, noise = Model(TransformerCell, 8, 1, 2), torch.tensor([0.0])
-    y = torch.randn(230, 1, 1)
-    other = y.clone()
-    other[:20] += 1.0
-    with torch.no_grad():
-        (x_hat, _), (changed, _) = (model(one, noise, model.cell.start(1)) for one in (y, other))
-    different = (x_hat - changed).abs().amax((1, 2)) > 1e-7
-    assert different[:20].all()
-    assert different[110:210].any()  # what one block takes in reaches the next one's window
-    assert not different[19 + 2 * TransformerCell.window + 1 :].any()
-
-
-@pytest.mark.parametrize(
-    ("body", "message"),
-    [
-        ("name = label = 'mine'", "must define observer, train"),
-        ("label = 'mine'\n    train = observer = None", "class variables name and label"),
-        ("name = label = 'ekf'\n    train = observer = None", "takes the name 'ekf' of another"),
-    ],
-)
-def test_methods_and_files_that_are_no_methods(body, message, tmp_path):
+def test_methods_and_files_that_are_no_methods(tmp_path):
     script, path = tmp_path / "mine.py", tmp_path / "one.safetensors"
-    script.write_text(f"from examples.research.methods import Method\n\n\nclass Mine(Method):\n    {body}\n")
-    with pytest.raises(ValueError, match=message):
+    script.write_text("from examples.research.methods import Method\n\n\nclass Mine(Method):\n    name = 'mine'\n")
+    with pytest.raises(ValueError, match="must define observer, train"):
         get_method(f"{script}:Mine")
     get_method("ekf").save({"diffusion": np.ones(1)}, path)
     with pytest.raises(ValueError, match="'ekf', not 'gru'"):

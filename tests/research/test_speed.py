@@ -6,8 +6,6 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-import observers
-from examples.research.speed.observers import limit, table_rows
 from examples.research.speed.sizes import Sizes
 from examples.research.speed.speed import Speed
 from examples.research.speed.torch_steps import TorchSpeed
@@ -44,18 +42,6 @@ def test_the_table_of_torch_has_a_row_for_each_observer_and_the_memory(capsys):
     assert capsys.readouterr().out.count("| lorenz | 128 |") == 1
     with pytest.raises(ValueError, match="rows positive, got 3 and"):
         TorchSpeed(rows=(0,)).run(Console())
-
-
-def test_the_table_has_the_share_of_the_products_speed_that_a_network_reaches():
-    seconds = {"KKL, NumPy": 20e-6, "KKL": 10e-6, "EKF": 400e-6}
-    rows = table_rows(seconds, {"KKL": 2e-3, "EKF": 3e-3}, network=2e-3, products=1e-3, operations=1e8)
-    assert rows == [
-        ["KKL, NumPy", "20.0", "", "", "", ""],
-        ["KKL", "10.0", "2,000", "50", "100", "50 %"],
-        ["EKF", "400.0", "3,000", "", "", ""],
-    ]
-    _, operations = limit(observers.load("lorenz-large").artifact.inverse, 7)
-    assert operations == 2 * 7 * (28 * 128 + 2 * 128 * 128 + 128 * 3)
 
 
 def test_sizes_trains_each_width_once(tmp_path):

@@ -23,20 +23,8 @@ from training.files import (
     clear_unfinished,
     describe,
     require_writable,
-    table,
     write,
 )
-
-
-def test_a_table():
-    assert table(["", "one"], [["first", ""], ("second", "–")]) == [
-        "| | one |",
-        "|---|---|",
-        "| first | |",
-        "| second | – |",
-    ]
-    with pytest.raises(ValueError, match=r"the row \['a'\] has 1 cells under the 2 titles \['x', 'y'\]"):
-        table(["x", "y"], [["a"]])
 
 
 def test_a_folder_that_one_may_not_write_to(tmp_path, monkeypatch):

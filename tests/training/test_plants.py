@@ -1,25 +1,20 @@
 """Plants of Gymnasium's classic control: an unstable one, and one on a circle."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
-import pandas as pd
 import pytest
 
 import kkl_gym
 from kkl_gym.simulate import simulate
 from observers.estimator import Running
-from training.cli import main
-from training.evaluation.errors import NoStartsError, starts
+from training.evaluation.errors import starts
 from training.kalman import ExtendedKalmanFilter, unknown_start
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CART_POLE = f"{EXAMPLES / 'cart_pole.py'}:CartPole"
 PENDULUM = f"{EXAMPLES / 'circle_pendulum.py'}:CirclePendulum"
-SMALL = "--set trajectories=20 duration=5 samples=20 width=4 depth=1 batch=64 inverse_steps=9 runs=100"
 
 
 @pytest.fixture
@@ -67,26 +62,6 @@ def test_starts_beyond_x_are_on_the_circle_too(pendulum):
     assert (np.abs(x[:, 2]) > 8).all()
 
 
-def test_starts_beyond_a_whole_circle_are_an_error(pendulum):
-    @dataclass(frozen=True)
-    class Rotor(kkl_gym.System):
-        name: ClassVar[str] = "rotor"
-        X: ClassVar = ((-1, 1), (-1, 1))
-        bounds: ClassVar = ((-1.5, 1.5), (-1.5, 1.5))
-
-        def draw_starts(self, rng, n, factor=1.0):
-            return pendulum.draw_starts(rng, n, factor)[:, :2]
-
-        def f(self, x):
-            return -x[1], x[0]
-
-        def h(self, x):
-            return (x[0],)
-
-    with pytest.raises(NoStartsError, match="rotor in 2X"):
-        starts(Rotor(), "2X", 1, np.random.default_rng(0))
-
-
 def test_what_is_known_of_a_start_on_the_circle(pendulum):
     mean, covariance = unknown_start(pendulum)
     np.testing.assert_allclose(mean, 0.0, atol=0.2)
@@ -96,14 +71,3 @@ def test_what_is_known_of_a_start_on_the_circle(pendulum):
     kalman = ExtendedKalmanFilter(pendulum, pendulum.dt, Q=1e-6 * np.eye(3), R=0.05**2 * np.eye(2))
     x_hat = Running(kalman).along(y)
     assert np.sqrt(np.square(x_hat - x)[150:].mean((0, 1))) == pytest.approx(0, abs=0.2)
-
-
-@pytest.mark.slow
-def test_every_command_takes_a_system_on_the_circle(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    main(["train", PENDULUM, *SMALL.split()])
-    assert "does not track" not in capsys.readouterr().out
-    path = "runs/circle_pendulum/circle_pendulum.safetensors"
-    for small in ("--measurement-noise 0 --csv errors.csv", "--measurement-noise 0.1 --faults"):
-        main(["evaluate", path, "--system", PENDULUM, "--trajectories", "4", "--duration", "6", *small.split()])
-    assert set(pd.read_csv("errors.csv").starts) == {"X", "2X \\ X"}

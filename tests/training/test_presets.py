@@ -54,14 +54,6 @@ def test_maps_are_trained_for_twice_what_is_usual_on_each_output():
     assert preset(Exact(), "input-aware", "fast").measurement_noise_max == pytest.approx((0.2, 0.6), rel=0.01)
 
 
-@pytest.mark.parametrize("pipeline", ["input-aware", "spinn"])
-def test_what_is_wrong_with_a_setting_is_told_by_its_name(pipeline):
-    with pytest.raises(ValueError, match=r"eigenvalues\.1"):
-        preset(Oscillator(), pipeline, "fast", changes={"eigenvalues": (-1.0, 2.0)})
-    with pytest.raises(ValueError, match="uncertain"):
-        preset(Oscillator(), pipeline, "fast", changes={"eigenvalues": (-1.0, -2.0), "uncertain": 0.1})
-
-
 @pytest.mark.parametrize("name", ["fast", "paper"])
 def test_uncertain_parameters_add_what_the_systems_profile_says(name):
     def of(**changes):

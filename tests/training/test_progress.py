@@ -73,18 +73,6 @@ def test_a_phase_that_says_nothing_of_itself_is_not_silent(monkeypatch):
         assert console.file.getvalue() == "bounding T_inv: 0 of 1, 0:00:00 passed\n"
 
 
-def test_a_phase_that_fails_is_gone(clock):
-    console = console_of(terminal=False)
-    with ProgressBars(console, get_time=clock) as progress:
-        with pytest.raises(ValueError, match="too few"), progress.phase("finding limits", 7):
-            raise ValueError("too few")
-        clock.now += 60.0
-        with progress.phase("drawing"):
-            clock.now += 60.0
-            progress.tell()
-    assert console.file.getvalue() == "drawing: 0 of 1, 0:01:00 passed\ndrawing: 1 of 1, 0:01:00 passed\n"
-
-
 def test_what_is_refused_leaves_no_log(tmp_path):
     with suppress(ValueError), progress_bars(None, tmp_path / "run" / "log.txt"):
         raise ValueError("x")
@@ -114,8 +102,3 @@ def test_a_terminal_has_bars_instead(clock):
     work(ProgressBars(console, get_time=clock), clock)
     assert "100/100" in console.file.getvalue()
     assert "passed" not in console.file.getvalue()
-
-
-def test_bars_of_a_caller_are_taken():
-    with progress_bars(None) as mine, progress_bars(mine) as theirs:
-        assert theirs is mine

@@ -1,8 +1,5 @@
 """The optimisation loop."""
 
-import contextlib
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -19,7 +16,6 @@ from training.maps.forward import ForwardProblem
 from training.maps.inverse import ForwardMapSampler, InverseProblem
 from training.maps.networks import Network
 from training.progress import progress_bars
-from training.run import Captured
 from training.spectrum import Spectrum
 
 
@@ -115,42 +111,6 @@ def test_batches_in_place_are_those_of_a_plain_loop(optimiser, tmp_path):
         total += float(value.detach())
     assert torch.equal(module.weight, plain.weight)
     assert history == [(40, pytest.approx(total / 40))]
-
-
-class Graph:
-    """A CUDA graph's order of events, where there is no GPU."""
-
-    def __init__(self, events):
-        self.events = events
-
-    def register_generator_state(self, generator):
-        self.events.append("generator")
-
-    def replay(self):
-        self.events.append("replay")
-
-
-def test_the_first_batches_run_and_the_others_replay_a_graph(monkeypatch):
-    events, precision = [], torch.get_float32_matmul_precision()
-    stream = SimpleNamespace(wait_stream=lambda other: None)
-    monkeypatch.setattr(torch.cuda, "Stream", lambda: stream)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda: stream)
-    monkeypatch.setattr(torch.cuda, "stream", lambda stream: contextlib.nullcontext())
-    monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: Graph(events))
-    monkeypatch.setattr(torch.cuda, "graph", lambda graph: contextlib.nullcontext(events.append("capture")))
-    run = Captured(lambda: events.append(torch.get_float32_matmul_precision()), torch.Generator())
-    for _ in range(6):
-        run()
-    assert events == ["high"] * 3 + ["generator", "capture", "high"] + ["replay"] * 3
-    assert torch.get_float32_matmul_precision() == precision
-
-    def reads():
-        raise RuntimeError("operation not permitted when stream is capturing")
-
-    run = Captured(reads, torch.Generator())
-    run.WARM_UP = 0
-    with pytest.raises(RuntimeError, match=r"cannot be captured as a CUDA graph.*stream is capturing.*--device cpu"):
-        run()
 
 
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])

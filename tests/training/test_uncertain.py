@@ -9,40 +9,28 @@ import numpy as np
 import pytest
 from rich.console import Console
 from small_runs import CPU, toy
+from spring import Spring
 
 from kkl_gym import VanDerPol
-from kkl_gym.system import System
 from training import SimulatedSource, errors, train, unseen_trajectories
 from training.evaluation.errors import parameter_errors
 from training.spectrum import Spectrum
 
 
 @dataclass(frozen=True)
-class Spring(System):
-    """x1' = x2, x2' = -stiffness x1 + u: its frequency is the root of the stiffness."""
+class Undamped(Spring):
+    """Its frequency is the root of the stiffness."""
 
-    stiffness: float = 4.0
+    damping: float = 0.0
 
-    name: ClassVar[str] = "spring"
-    X: ClassVar = ((-1.0, 1.0), (-2.0, 2.0))
-    bounds: ClassVar = ((-9.0, 9.0), (-18.0, 18.0))
-    u_max: ClassVar = (0.5,)
-    G: ClassVar = ((0.0,), (1.0,))
-    dt: ClassVar = 0.05
     process_noise: ClassVar = 0.0
     measurement_noise: ClassVar = 0.02
-
-    def f(self, x):
-        return x[1], -self.stiffness * x[0]
-
-    def h(self, x):
-        return (x[0],)
 
 
 @cache
 def trained(**uncertain):
     """An observer of free motion, for one plant or many."""
-    system = Spring()
+    system = Undamped()
     own = {"inputs": False, "trajectories": 200, "duration": 15.0, "inverse_steps": 1200, "width": 24}
     own |= {"uncertain": uncertain, "estimate_parameters": True} if uncertain else {}
     config = toy(system, eigenvalues=(-0.4, -0.8, -1.6, -3.2, -6.4), **own)
@@ -50,7 +38,7 @@ def trained(**uncertain):
 
 
 def test_an_observer_for_uncertain_plants_holds_on_another():
-    system = Spring()
+    system = Undamped()
     plant = system.replace({"stiffness": 4.8})
     late = {}
     for name, artifact in {"one": replace(trained(), motion=None), "many": trained(stiffness=0.3)}.items():
@@ -63,7 +51,7 @@ def test_an_observer_for_uncertain_plants_holds_on_another():
 
 
 def test_it_identifies_the_plant_while_it_runs():
-    system, artifact = Spring(), trained(stiffness=0.3)
+    system, artifact = Undamped(), trained(stiffness=0.3)
     assert artifact.estimated_parameters == ("stiffness",)
     assert artifact.parameter_ranges == {"stiffness": (2.8, 5.2)}
     drawn = 30.0 / np.sqrt(3)  # in percent, of who only knows the range
@@ -90,8 +78,8 @@ def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate():
 
 def test_it_does_not_track_and_says_why():
     said = Console(file=io.StringIO(), width=200)
-    config = toy(Spring(), uncertain={"stiffness": 0.3}, duration=1.0, inverse_steps=2, inputs=False)
-    artifact = train(Spring(), config, device=CPU, console=said).artifact
+    config = toy(Undamped(), uncertain={"stiffness": 0.3}, duration=1.0, inverse_steps=2, inputs=False)
+    artifact = train(Undamped(), config, device=CPU, console=said).artifact
     assert "does not track: a motion is of one plant, not of a range of stiffness" in said.file.getvalue()
     assert artifact.motion is None
     assert artifact.inverse.error_covariance.nx == 2

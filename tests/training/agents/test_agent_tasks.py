@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import gymnasium as gym
 import linear_system
 import numpy as np
 import pytest
@@ -115,13 +114,6 @@ def test_stacks_and_traces_by_hand(task):
         np.testing.assert_allclose(traced, np.concatenate([*trace, seen[-1]], axis=1), rtol=1e-5, atol=1e-6)
 
 
-def test_a_task_says_what_memories_hold():
-    task = replace(PENDULUM, time_constants=(1, 2))
-    assert make(task, "z", 1).single_observation_space.shape == (2 + 2 * 2 + 2,)
-    assert make(replace(task, angles=((0, 1),)), "z", 1).single_observation_space.shape == (2 + 2 + 2,)
-    assert make(replace(CART, past_actions=False), "z", 1).single_observation_space.shape == (2 + 2 * 4,)
-
-
 def test_noise_lies_on_what_is_measured_and_leaves_episodes_as_they_are():
     clean, noisy = single(PENDULUM), single(NOISY)
     apart = []
@@ -162,18 +154,12 @@ def test_a_system_is_named_in_three_ways():
     [
         ({"measured": ()}, "measured must name"),
         ({"measured": (0, 0)}, "each once"),
-        ({"measured": (0.5,)}, "entry of measured"),
         ({"measurement_noise": np.nan}, "from 0 on"),
-        ({"measurement_noise": (0.1, 0.2)}, "one number"),
         ({"time_constants": (2.0, 1.0)}, "must rise"),
-        ({"past_actions": "no"}, "past_actions must be"),
         ({"angles": ((0, 1),)}, r"of Pendulum-v1 that are measured, \(0,\), each once, got \(\(0, 1\),\)"),
-        ({"measured": (0, 1), "angles": ((0, -1),)}, "a sine must be an integer, not negative, got -1"),
         ({"measured": (0, 1), "angles": (0, 1)}, "angles must be pairs of entries"),
-        ({"frames": 10**9}, "frames must be"),
         ({"repeat": 2}, "only environments of systems repeat actions"),
         ({"env_kwargs": {"g": PENDULUM}}, "env_kwargs must be JSON"),
-        ({"env_id": "KKLLorenz-v0", "measured": ()}, "max_episode_steps must be"),
     ],
 )
 def test_a_task_that_makes_no_sense_is_refused(arguments, says):
@@ -182,18 +168,10 @@ def test_a_task_that_makes_no_sense_is_refused(arguments, says):
 
 
 def test_what_is_not_there_is_named():
-    for task, says in (
-        (Task("Pendulum-v1", (7,)), r"no entry 7 .* 0 to 2"),
-        (Task("Pendulam-v1", (0,)), "cannot make 'Pendulam-v1'"),
-    ):
-        with pytest.raises(ValueError, match=says):
-            single(task)
-    for wrong, says in (
-        (("nothing",), "unknown information 'nothing'"),
-        (("x_hat",), "needs an observer"),
-    ):
-        with pytest.raises(ValueError, match=says):
-            make(PENDULUM, *wrong, 1)
+    with pytest.raises(ValueError, match=r"no entry 7 .* 0 to 2"):
+        single(Task("Pendulum-v1", (7,)))
+    with pytest.raises(ValueError, match="needs an observer"):
+        make(PENDULUM, "x_hat", 1)
     with pytest.raises(ValueError, match="no use for the observer"):
         make(PENDULUM, "y", 1, observer="van_der_pol")
     with pytest.raises(ValueError, match="name the measured entries of Acrobot-v1"):
@@ -202,4 +180,3 @@ def test_what_is_not_there_is_named():
         get_task("lorenz", measured=(0,))
     with pytest.raises(ValueError, match="no observer ships for 'oscillator'"):
         observer_of(Oscillator())
-    assert "Pendulum-v1" in gym.registry

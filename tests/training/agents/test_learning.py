@@ -8,7 +8,7 @@ import pytest
 
 from kkl_gym import KKLVectorEnv, get_system
 from observers import Artifact
-from training.agents import learning, observing
+from training.agents import learning
 from training.agents.agent import Agent
 from training.agents.information import make
 from training.agents.learning import hyperparameters, learn, settings_of
@@ -143,21 +143,6 @@ def test_from_how_many_steps_an_observer_is_learned(
     assert steps_of(fitted) == first
 
 
-def test_an_observer_is_learned_from_the_latest_steps(monkeypatch):
-    def played():
-        privileged = Privileged(CART, 2)
-        play_at_random(privileged.make(), 200)
-        records = privileged.records()
-        return [record.fingerprint for record in records], steps_of(records)
-
-    everything, steps = played()
-    monkeypatch.setattr(observing, "KEPT", 100)
-    latest, fewer = played()
-    assert steps == 400
-    assert 100 <= fewer < 200
-    assert latest == everything[-len(latest) :]
-
-
 @pytest.mark.parametrize("task", [CART, PENDULUM], ids=["no bounds", "bounds"])
 def test_hidden_signals_stand_where_estimates_will(tmp_path, small, task):
     privileged = Privileged(task, 1)
@@ -210,22 +195,12 @@ def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, mon
     [
         ({"information": "y", "observer": "a.safetensors"}, "no use for the observer"),
         ({"information": "z", "aggregate": 2}, "no observer to fit again"),
-        ({"task": SHORT, "information": "x_hat", "aggregate": 2}, "no observer to fit again"),
         ({"information": "recurrent", "algorithm": "ppo"}, "recurrent agents learn by ppo_lstm"),
         ({"information": "x_hat_std"}, "error bars first"),
-        ({"information": "x_hat", "observer_steps": 10**9}, "fewer than all"),
         ({"information": "x_hat", "timesteps": 4}, r"4 steps are too few .*--timesteps"),
-        ({"information": "z", "observer_steps": 10}, "for agents on x_hat that are given no observer"),
-        ({"information": "z", "timesteps": 0}, "must be positive"),
         ({"information": "z", "algorithm": "reinforce"}, "unknown algorithm"),
         ({"information": "y", "algorithm": "dqn"}, "take ppo, a2c, sac"),
-        ({"task": CART, "information": "y", "algorithm": "sac"}, "take ppo, a2c or dqn"),
-        ({"task": Task("FrozenLake-v1", (0,)), "information": "y", "algorithm": "td3"}, "take ppo"),
         ({"task": replace(CART, measured=(0, 1, 2, 3)), "information": "x_hat"}, "nothing is left to estimate"),
-        (
-            {"task": CART, "information": "x_hat", "timesteps": 34, "observer_steps": 6},
-            r"ppo collects 34 steps before it goes on; give it more than 34 .--timesteps",
-        ),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path, small, options, says):

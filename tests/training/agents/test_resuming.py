@@ -1,11 +1,7 @@
 """Trainings of agents that were cut off and go on."""
 
-import errno
-import os
-import re
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -16,7 +12,6 @@ from training import checkpoints
 from training.agents.agent import Agent
 from training.agents.learning import learn
 from training.agents.tasks import HIDDEN_VELOCITIES, control_task
-from training.cli import main
 
 PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
 SHORT = control_task("van_der_pol", 0.2, duration=0.5)
@@ -110,36 +105,3 @@ def test_what_is_resumed_must_be_the_same_training_and_whole(tmp_path, small):
         learn(CART, "y", tmp_path, resume=True)
     learn(CART, "y", tmp_path)  # from the beginning
     assert same(Agent.read(tmp_path / "agent.safetensors"), agent)
-
-
-@pytest.mark.parametrize("name", ["van_der_pol", "CartPole-v1"])
-def test_the_command_goes_on(name, tmp_path, capsys, small, saves):
-    out = tmp_path / "out"
-    command = ["agent", "train", name, "--information", "y", "--timesteps", "128", "--out", str(out)]
-    saves.stop = 2
-    with pytest.raises(SystemExit):
-        main(command)
-    assert "kkl-gym: interrupted; --resume goes on from the last checkpoint" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="holds the checkpoint of a training"):
-        main(command)
-    main([*command, "--resume"])
-    counts = [state["counters"]["num_timesteps"] for state in saves[1:]]
-    assert counts == [32, 32, 64, 96, 128]
-    whole = (out / "agent.safetensors").read_bytes()
-    main([*command, "--resume"])
-    assert (out / "agent.safetensors").read_bytes() == whole
-    with pytest.raises(SystemExit, match="holds an agent already"):
-        main(command)
-    files = ["agent.checkpoint.pt", "agent.safetensors", "curve.csv", "log.txt"]
-    assert sorted(path.name for path in out.glob("[!.]*")) == files
-
-
-def test_the_error_of_a_full_disk_names_the_file(tmp_path, small, monkeypatch):
-    def full(self, *arguments):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    says = re.escape(f"No space left on device: '{tmp_path / 'agent.checkpoint.pt'}'")
-    with pytest.raises(OSError, match=says):
-        learn(CART, "y", tmp_path)
-    assert os.listdir(tmp_path) == ["curve.csv"]

@@ -9,7 +9,6 @@ import time
 import tomllib
 from importlib.metadata import packages_distributions, version
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -17,8 +16,6 @@ import training.cli
 from kkl_gym import Lorenz, get_system
 from observers.names import resolve
 from training.cli import COMMANDS, EXTRAS, main, read
-from training.config import setting_types
-from training.presets import preset
 
 ROOT = Path(__file__).parents[3]
 PAGE = runpy.run_path(str(ROOT / "docs" / "site" / "commands.py"))
@@ -60,21 +57,6 @@ def test_a_dozen_commands_with_at_most_seventy_options():
     options = {"/".join(one.option_strings) for parser in parsers.values() for one in PAGE["options"](parser)} - {""}
     assert len(commands) <= 12, commands
     assert len(options) <= 70, sorted(options)
-
-
-def test_the_page_has_every_setting_with_the_presets_values():
-    defaults = PAGE["defaults"]()
-    for setting, default in (
-        ("width", "fast 20, paper 512; spinn: fast 128, paper 512; records: 96"),
-        ("eigenvalues", "from the system, or from the records"),
-        ("noise_free_share", "0.2 (van_der_pol 0.05); spinn: "),
-        ("cpu_seconds", "none"),
-    ):
-        assert defaults[setting].startswith(default), setting
-    assert set(defaults) == set(setting_types())
-    for name in ("fast", "paper"):
-        config = vars(preset(Lorenz(), "input-aware", name))
-        assert all(str(config[setting]) in defaults[setting] for setting in ("width", "depth", "batch", "activation"))
 
 
 def test_the_version_is_that_of_the_package(capsys):
@@ -120,16 +102,11 @@ def test_a_script_with_one_system_needs_no_class(tmp_path):
     ("arguments", "said"),
     [
         ("demo lorenz --seed 1.5", "Error parsing --seed: invalid literal for int() with base 10: '1.5'"),
-        ("train lorenz --preset slow",
-         "invalid choice 'slow' for argument '--preset'. Expected one of ('fast', 'paper')."),
         ("train lorenz --set width",
          "Error parsing --set: 'width' is no setting: write NAME=VALUE, as in width=64"),
-        ("evaluate lorenz --nope 3", "Unrecognized options: --nope, 3"),
         ("evaluate lorenz --trajectorys 3", "Unrecognized options: --trajectorys, 3; did you mean --trajectories?"),
         ("trian lorenz", f"unknown command 'trian', did you mean 'train'?: {', '.join(COMMANDS)}"),
-        ("agent foo", "Unrecognized options: foo; Available subcommands: train, evaluate, export, import"),
         ("agent", "Expected one of {train, evaluate, export, import}."),
-        ("demo --duration", "Missing value for argument '--duration'. Expected 1 values."),
     ],
 )  # fmt: skip
 def test_options_that_cannot_be_read_are_said_in_one_line(arguments, said, capsys):
@@ -164,8 +141,6 @@ def raising(error):
     [
         ("tyro", ': pip install "kkl-gym[train]"'),
         ("stable_baselines3.common", ': pip install "kkl-gym[agents]"'),
-        ("PIL", ': pip install "kkl-gym[plots]"'),
-        ("onnx", ': pip install "kkl-gym[onnx]"'),
         ("mine", ""),
     ],
 )
@@ -243,19 +218,3 @@ def test_commands_run_in_threads_too(capsys):
     thread.start()
     thread.join()
     assert "van_der_pol" in capsys.readouterr().out
-
-
-def test_figures_leave_the_users_matplotlib_alone():
-    for path in (ROOT / "training").rglob("*.py"):
-        assert "pyplot" not in path.read_text(), path
-        assert "matplotlib.use" not in path.read_text(), path
-
-
-@pytest.mark.parametrize(("columns", "width"), [(None, 140), ("100", 100)])
-def test_tables_in_files_are_not_cut_at_80_columns(columns, width, monkeypatch):
-    widths = []
-    command = SimpleNamespace(run=lambda console: widths.append(console.width))
-    monkeypatch.setattr(training.cli, "read", lambda arguments, **options: command)
-    monkeypatch.setenv("COLUMNS", columns) if columns else monkeypatch.delenv("COLUMNS", raising=False)
-    main(["maps"])
-    assert widths == [width]

@@ -17,7 +17,6 @@ import kkl_gym.compiled
 import training.diagnosis.system
 from kkl_gym import SYSTEMS, get_system
 from kkl_gym.elementary import sqrt
-from kkl_gym.simulate import SubstepsError
 from kkl_gym.systems import Lorenz
 from training.cli import main
 from training.diagnosis import CHECKS, check
@@ -230,16 +229,9 @@ def test_starts_of_another_shape_end_the_check():
     assert left_out.found == "all other checks are left out"
 
 
-def test_motions_that_need_too_many_substeps(monkeypatch):
-    def fails(*args, **options):
-        raise SubstepsError("stiff changes at a rate of 1e+09/s; take a smaller dt")
-
+def test_motions_that_need_too_many_substeps():
     (found,) = (one for one in findings(Oscillator(), dt=1e6) if one.verdict == "problem")
     assert (found.check, "would need more than" in found.found) == ("sampling", True)
-    monkeypatch.setattr("training.diagnosis.system.simulate", fails)
-    found = findings(Oscillator())[-1]
-    assert (found.check, found.found) == ("sampling", "stiff changes at a rate of 1e+09/s")
-    assert found.advice == "take a smaller dt"
 
 
 @dataclass(frozen=True)

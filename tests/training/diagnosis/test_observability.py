@@ -134,14 +134,6 @@ def shown(arguments, capsys, monkeypatch):
     return capsys.readouterr().out
 
 
-def test_the_command_on_an_environment(capsys, monkeypatch):
-    words = "Pendulum-v1 --measured 0,1 --hidden 2 --steps 2000 --measurement-noise 0.05,0.1"
-    text = shown(words.split(), capsys, monkeypatch)
-    assert "obs[2] from obs[0], obs[1] and action[0], in steps of 0.05 s" in text
-    assert "obs[2]: determined from 1 step (0.05 s) of y" in text
-    assert " % at noise 0.05, 0.1" in text
-
-
 def test_the_command_on_records(capsys, tmp_path, monkeypatch):
     files = [as_csv(tmp_path / f"{i}.csv", swing(i, n=200)) for i in range(6)]
     options = ["--measured", "position", "--inputs", "force", "--hidden", "speed", "--measurement-noise", "0.5"]

@@ -1,12 +1,11 @@
 """The step in C99, compiled, against the same in Python."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from compiled_c import compiled, estimates, fed, microseconds, needs_cc
-from exported_steps import MAPS, apart, apart_at_all_levels, exported_of, in_doubles, in_python, mapped, motion, noise
+from compiled_c import compiled, estimates, fed, needs_cc
+from exported_steps import MAPS, apart, apart_at_all_levels, exported_of, in_doubles, mapped, noise
 from random_artifacts import random_artifact
 from rollout_observers import observer_of
 
@@ -45,19 +44,6 @@ def test_many_steps_of_what_ships(name, precision, steps, tmp_path):
 
 
 @needs_cc
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SHIPPED)
-def test_how_long_a_step_takes(name, tmp_path):
-    """Printed for docs/guides/speed.md."""
-    exported = Exported.read(name)
-    y, u = motion(exported.artifact, 5000)
-    taken, total = microseconds(exported, tmp_path, y, u)
-    print(f"{name}: {taken:.3g} µs a step")
-    assert taken > 0
-    assert total == pytest.approx(in_python(exported, y, u)[1:, 0].sum(), rel=1e-4, abs=1e-2)
-
-
-@needs_cc
 def test_other_levels_of_noise(tmp_path):
     exported, y, u, expected = mapped(1)
     other = replace(exported, measurement_noise=(0.9, 2.0), process_noise=7.0)  # of which training ended at 0.2
@@ -85,19 +71,6 @@ def test_a_line_without_all_its_numbers_is_an_error(make_artifact, tmp_path):
         assert done.returncode == 1
         assert done.stderr == "there is a line without all its numbers\n"
     assert fed(program, "").returncode == 0
-
-
-def test_numbers_are_read_back_as_the_same(make_artifact, tmp_path):
-    exported = exported_of(make_artifact(), tmp_path, precision="double")
-    inverse, text = exported.artifact.inverse, c_files(exported)["made.c"]
-
-    def numbers(name):
-        found = re.search(rf" {name}[\[\]0-9]+ = {{(.*?)}};", text, re.DOTALL)
-        return [word.rstrip("f") for word in re.findall(r"[^\s,{}]+", found[1])]
-
-    assert np.array_equal(np.array(numbers("driven_z_offset"), float), inverse.z_offset)
-    assert np.array_equal(np.array(numbers("driven_weights0"), np.float32), inverse.mlp.weights[0].ravel())
-    assert all({".", "e", "inf"} & set(word) for word in numbers("driven_weights0"))  # 1f is no number of C
 
 
 def test_names():

@@ -10,7 +10,6 @@ import pytest
 from observers import Artifact
 from observers.storage import UNFINISHED
 from training.cli import main
-from training.commands.options import read_argument
 from training.records import Signals, read_records
 from training.records.episodes import is_dataset, read_dataset, write_dataset
 from training.rollouts import make, policy_of, roll_out
@@ -169,10 +168,3 @@ def test_record_and_train(tmp_path, capsys, monkeypatch):
     main([*train.split(), "windows=99", "batch=64", "--out", str(tmp_path / "run")])
     artifact = Artifact.read(tmp_path / "run" / "swing.safetensors")
     assert artifact.environment == {"id": "Pendulum-v1", "kwargs": {"g": 9}}
-
-
-def test_arguments_of_environments():
-    for text, value in (("g=9.5", 9.5), ("g=plain text", "plain text"), ("g=[1, 2]", [1, 2])):
-        assert read_argument(text) == ("g", value)
-    with pytest.raises(ValueError, match="NAME=VALUE"):
-        read_argument("g")

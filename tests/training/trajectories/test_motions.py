@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from linear_system import Oscillator
 
 import training.trajectories.motions
 from kkl_gym import ReverseDuffing, VanDerPol
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
-from observers import LinearFilter
 from training.trajectories.motions import (
     KINDS,
     Motions,
@@ -101,14 +99,6 @@ def test_what_escapes_is_replaced_by_its_like(monkeypatch):
     expected = [KINDS[row % 4] for row in range(n)]
     for kind in ("zero", "steps", "sine"):
         assert (kinds == kind).sum() == expected.count(kind)
-
-
-def test_parts_of_a_chunk_are_told(monkeypatch):
-    monkeypatch.setattr(training.trajectories.motions, "CHUNK", 10)
-    linear, told = LinearFilter(np.diag([-1.0, -2.0]), np.ones((2, 1)), 0.01), []
-    motions = Motions(Oscillator(), 0.01, 100)
-    motions.beside(linear, recording_ages(100, 10), 15, np.random.default_rng(0), told.append)
-    assert told == [0, 5, 10, 10, 12.5, 15]
 
 
 def test_signals_are_bounded_and_of_four_kinds():
