@@ -228,7 +228,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
-        """White innovations, by which V moves the state: x + V white and P - V V^T are what is known then."""
+        """White innovations, by which V moves the state: x + V white and P - V V^T are mean and covariance after it."""
         for k in range(ny):
             white[k] = choose(finite(y[k]), 0.0, y[k] - expected[k], 0.0)
         for k in range(ny):
@@ -347,19 +347,11 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         return acted
 
     @_part
-    def invert(z: Any, age: float, nz: int, maps: Any, scratch: Any, x: Any) -> None:
-        """T_inv, of free motion where no input has acted."""
-        driven, free, _, _ = maps
-        if is_driven(z, nz):
-            decode(z, age, driven, scratch, x)
-        else:
-            decode(z[:nz], age, free, scratch, x)
-
-    @_part
     def supervise(now: Any, z: Any, age: float, nz: int, dt: float, window: float, lost: bool, states: Any, maps: Any,
                   scratch: Any, x_hat: Any) -> None:  # fmt: skip
         """Take T_inv's estimate where it is surer within the first window, or where the tracker diverged."""
-        ages, table = maps[2] if is_driven(z, nz) else maps[3]
+        driven = is_driven(z, nz)  # else T_inv is that of free motion
+        ages, table = maps[2] if driven else maps[3]
         seen, at = min(now[nis + 2], window) * dt, 0
         while at < len(ages) - 2 and seen > ages[at + 1]:
             at += 1
@@ -376,7 +368,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         for i in range(nx):
             larger += math.log(inverse[i])
         if lost or larger < 0.0:
-            invert(z, age, nz, maps, scratch, x_hat)
+            decode(z if driven else z[:nz], age, maps[0] if driven else maps[1], scratch, x_hat)
             for i in range(nx):
                 now[i] = clipped(states, x_hat[i], i)
             for i in range(square):

@@ -72,6 +72,7 @@ class KKL(Estimator[np.ndarray]):
         self.z, self.y, self.age = slice(size), slice(size, size + ny), size + ny
         end = self.age + 1 + (0 if self.tracker is None else self.tracker.width)
         self.tracked, self.watched = slice(self.age + 1, end), slice(end, None)
+        self._x = slice(self.age + 1, self.age + 1 + artifact.nx)  # of a tracker
         self.width = end + (0 if self.monitor is None else self.monitor.width)
 
     def start(self, n: int) -> np.ndarray:
@@ -183,7 +184,7 @@ class KKL(Estimator[np.ndarray]):
     def decode(self, state: np.ndarray) -> np.ndarray:
         """Return the estimates, (n, nx)."""
         if self.tracker is not None:
-            return state[:, self.tracked][:, self.tracker.x].copy()
+            return state[:, self._x].copy()
         if len(state) == 1:  # the machine code of a batch begins with matrix products
             return self.decoders(state[0, self.z], state[0, self.age] * self.artifact.filter.dt)[None]
         return self.decoders(state[:, self.z], state[:, self.age] * self.artifact.filter.dt)
