@@ -1,4 +1,4 @@
-"""What is taken from outside: real numbers, and nothing that Python or NumPy would quietly turn into one."""
+"""Checks of values from outside: real numbers, and nothing that Python or NumPy would quietly turn into one."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -131,7 +131,7 @@ def real_array(name: str, values: Any) -> np.ndarray:
             if array.dtype is _FLOAT:
                 return array
             if array.dtype.kind in "fiu":
-                with np.errstate(over="ignore"):  # what is too large is infinite, which those who ask refuse
+                with np.errstate(over="ignore"):  # numbers that are too large become infinite, which callers refuse
                     return array.astype(float)
     except Exception as error:  # ragged lists, and whatever an object of a stranger raises when it is to be an array
         raise ValueError(f"{name} must hold real numbers in the shape of an array, got {shown(values)}") from error

@@ -69,21 +69,15 @@ class CompiledStep:
         return (*self._flags, substeps), (h, samples, *self._numbers), *self._model, of_filter, *self._parts
 
     def __call__(
-        self,
-        rows: np.ndarray,
-        y: np.ndarray,
-        u: np.ndarray,
-        record: np.ndarray | None = None,
-        *,
-        linear: LinearFilter | None = None,
+        self, linear: LinearFilter, rows: np.ndarray, y: np.ndarray, u: np.ndarray, record: Any = None
     ) -> None:
-        """Take samples and inputs into rows, which a record keeps at each sample.
+        """Take samples and inputs, at the interval of a filter, into rows, which a record keeps at each sample.
 
         Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu), ``record`` (steps, n, width).
         """
         # Numba would compile again for arrays that are read-only or have gaps.
         y, u = (each if each.flags.carray else np.array(each, order="C") for each in (y, u))
-        model = self._usual if linear is None or linear is self._linear else self._at(linear)
+        model = self._usual if linear is self._linear else self._at(linear)
         given = rows, y, u, self._no_record if record is None else record
         few = self._first if len(rows) == 1 else np.arange(len(rows))
         if len(rows) >= _LANES and self._motion.equations is not None:

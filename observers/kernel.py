@@ -257,14 +257,6 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 for k in range(ny):
                     P[i * nx + j] += sign * V[i * ny + k] * W[j * ny + k]
 
-    @_part
-    def is_sound(x: Any, P: Any, L: Any, inverse: Any) -> bool:
-        total = 0.0
-        factorise(P, L, inverse)
-        for i in range(nx):
-            total += x[i] + inverse[i]
-        return np.isfinite(total)
-
     @_inlined
     def track(now: Any, y: Any, u: Any, model: Any, h: Any, r: Any, watched: Any, scratch: Any, expected: Any) -> None:
         """Predict and correct the state of a row's tracker; outputs that are rejected become NaN."""
@@ -288,7 +280,11 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 shift(again, -1.0, D, white)
                 add(again_moved, 1.0, D, D)
                 add(again_across, 1.0, G, D)
-                if not is_sound(again, again_moved, L, inverse):
+                factorise(again_moved, L, inverse)
+                total = 0.0
+                for i in range(nx):
+                    total += again[i] + inverse[i]
+                if not np.isfinite(total):
                     break
             for i in range(nx):
                 mean[i] = again[i]
@@ -340,7 +336,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_part
     def is_driven(z: Any, nz: int) -> bool:
-        """Whether an input has acted, or there is none."""
+        """Whether an input has acted, or there are no inputs."""
         acted = len(z) == nz
         for i in range(nz, len(z)):
             acted = acted or z[i] != 0.0

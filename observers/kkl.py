@@ -116,7 +116,7 @@ class KKL(Estimator[np.ndarray]):
             new = self._stepped(state, y, u, dt)
         else:
             new = state.copy()
-            self._machine(new, y[None], u[None], linear=self._filter(dt))
+            self._machine(self._filter(dt), new, y[None], u[None])
         if self.monitor is not None:  # outputs that are rejected count too
             residual = self.artifact.residual(np.where(np.isnan(y), new[:, self.y], y), self.decode(new))
             new[:, self.watched] = self.monitor.update(new[:, self.watched], residual, ~np.isnan(y))
@@ -227,7 +227,7 @@ class KKL(Estimator[np.ndarray]):
             record = np.empty((len(samples), *state.shape))
             if dts is None and self._machine is not None:
                 state = state.copy()
-                self._machine(state, samples, inputs, record)
+                self._machine(self.artifact.filter, state, samples, inputs, record)
             else:
                 for k in range(len(samples)):
                     dt = None if dts is None else float(dts[first - 1 + k])
@@ -254,5 +254,5 @@ class KKL(Estimator[np.ndarray]):
 
 
 def _filled(y: np.ndarray, gaps: np.ndarray, predicted: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Samples with gaps filled by what is predicted, or by the outputs before where that is undefined."""
+    """Samples with gaps filled by predictions, or by the outputs before where these are undefined."""
     return np.where(gaps, np.where(np.isfinite(predicted), predicted, before), y)

@@ -40,7 +40,7 @@ class KKLObserver(RecordEstimates):
     Parameters
     ----------
     artifact : Artifact
-        What was learned.
+        The learned maps and their filter.
     measurement_noise : float or sequence of float, length ny, optional
         Standard deviation of the noise on each sample, of all outputs or each, for maps that ask for it. None is what
         is usual, :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
@@ -219,7 +219,7 @@ class KKLObserver(RecordEstimates):
             If a shape is wrong, an entry is not a finite real number, or x0 is given and the artifact holds neither T
             nor a motion; the observer is then as it was.
         """
-        y0, x0 = real_array("y", y0).copy(), None if x0 is None else real_array("x0", x0)  # callers reuse arrays
+        y0 = real_array("y", y0).copy()  # callers reuse arrays
         check_output(self.artifact, y0, y0.shape[:-1])
         self._state, self._batch = self._begin(y0, x0), y0.shape[:-1]
         n = len(self._state)
@@ -230,7 +230,7 @@ class KKLObserver(RecordEstimates):
         """Rows at first samples (..., ny), or at known states (..., nx)."""
         z0, age = first_state(self.artifact, y0, x0)
         n = math.prod(y0.shape[:-1])
-        x0 = None if x0 is None else x0.reshape(n, self.artifact.nx)
+        x0 = None if x0 is None else real_array("x0", x0).reshape(n, self.artifact.nx)
         return self._kkl.begin(y0.reshape(n, self.artifact.ny), z0.reshape(n, self.artifact.filter.size), age, x0)
 
     @property
@@ -284,7 +284,7 @@ class KKLObserver(RecordEstimates):
         """
         state = self._begun()
         rows = bool_array("rows", rows, self._batch)
-        y0, x0 = real_array("y", y0), None if x0 is None else real_array("x0", x0)
+        y0 = real_array("y", y0)
         check_output(self.artifact, y0, (int(rows.sum()),))
         begun = self._begin(y0, x0)
         self._state, self._pending = state.copy(), self._pending.restarted(rows.ravel())

@@ -74,7 +74,6 @@ class RecordEstimates:
         check_output(self.artifact, y[:1], y[:1].shape[:-1])
         dts = None if t is None else intervals(t, len(y))
         u = held_input(self.artifact, recorded_inputs(u, len(y)), (len(y) - 1, *y.shape[1:-1]), self._warn)
-        x0 = None if x0 is None else real_array("x0", x0)
         state = self._begin(y[0], x0)
         samples, inputs = (each.reshape(len(each), len(state), each.shape[-1]) for each in (y, u))
         values = self._kkl.along(state, samples, inputs, of, dts)

@@ -31,7 +31,7 @@ _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype
 
 @contextmanager
 def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Put the name of what is written into errors that name no file, as that of a full disk."""
+    """Put the name of the file into errors that name none, as that of a full disk."""
     try:
         yield
     except OSError as problem:
