@@ -122,7 +122,7 @@ class InverseMap:
             for end in self._each(f"{name}_max"):
                 if name in self.features and (not is_finite(end) or end <= 0):
                     raise ArtifactError(
-                        f"{name}_max must be a positive, finite number for a map that takes the level, got {end!r}"
+                        f"{name}_max must be a positive, finite number for a map that takes it, got {end!r}"
                     )
                 if end != math.inf and (not is_finite(end) or end < 0):
                     raise ArtifactError(f"{name}_max must be a number, not negative, got {end!r}")
@@ -184,12 +184,12 @@ class InverseMap:
 
     def noise_features(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> list[float]:
         """Return the network's inputs for levels of noise, in the order of the features."""
-        inputs = []
+        features = []
         if "measurement_noise" in self.features:
-            inputs += np.atleast_1d(np.log1p(np.divide(measurement_noise, self.measurement_noise_unit))).tolist()
+            features += np.atleast_1d(np.log1p(np.divide(measurement_noise, self.measurement_noise_unit))).tolist()
         if "process_noise" in self.features:
-            inputs.append(math.log1p(min(process_noise, self.process_noise_max) / self.process_noise_unit))
-        return inputs
+            features.append(math.log1p(min(process_noise, self.process_noise_max) / self.process_noise_unit))
+        return features
 
     def age_feature(self, age: Any) -> Any:
         """The network's input for a time since reset, in seconds; for an array, as many inputs."""

@@ -254,5 +254,5 @@ class KKL(Estimator[np.ndarray]):
 
 
 def _filled(y: np.ndarray, gaps: np.ndarray, predicted: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Samples with gaps filled by predictions, or by the outputs before where these are undefined."""
+    """Samples with gaps filled by predicted outputs, or by the outputs before where those are undefined."""
     return np.where(gaps, np.where(np.isfinite(predicted), predicted, before), y)
