@@ -10,7 +10,7 @@ from typing import Any, NoReturn, get_args
 import numpy as np
 
 from observers import storage
-from observers.checks import ArtifactError, is_finite, noise_levels, shown
+from observers.checks import LARGEST, ArtifactError, is_finite, noise_levels, shown
 from observers.expression import Expression
 from observers.filter import LinearFilter
 from observers.inverse import ForwardMap, InverseMap
@@ -19,6 +19,7 @@ from observers.motion import Motion
 from observers.network import MLP
 
 FORMAT = 1
+FAR = 10.0  # multiples of the largest input in training beyond which observers warn
 USUAL_NOISE = 0.5  # standard deviation of the measurement noise where no other is given
 _KEY = "kkl-gym"
 
@@ -211,12 +212,12 @@ class Artifact:
                 f"{len(self.estimated_parameters)} parameters"
             )
 
-    @property
+    @functools.cached_property  # which every step asks for
     def nx(self) -> int:
         """Number of states estimated."""
         return len(self.inverse.x_offset) - len(self.estimated_parameters)
 
-    @functools.cached_property  # which every step asks for
+    @functools.cached_property
     def ny(self) -> int:
         """Number of outputs."""
         return int(self.filter.B.shape[1])
@@ -225,6 +226,11 @@ class Artifact:
     def nu(self) -> int:
         """Number of inputs that the observer takes into account."""
         return self.filter.nu
+
+    @functools.cached_property
+    def usual_input(self) -> float:
+        """Largest absolute value of an input that is not far beyond those of training, whichever input it is."""
+        return min([LARGEST, *(FAR * each for each in self.u_max or ())])
 
     @property
     def knows_output(self) -> bool:

@@ -43,16 +43,16 @@ def is_finite(value: object) -> bool:
         return False
 
 
-def all_finite(values: np.ndarray) -> bool:
-    """Whether outputs or inputs are numbers, none of them beyond 1e15."""
+def all_finite(values: np.ndarray, largest: float = LARGEST) -> bool:
+    """Whether outputs or inputs are numbers, none of them beyond the largest."""
     if values.ndim == 1:  # a single sample: numpy's own overhead would be felt
         for value in values.tolist():  # noqa: SIM110 - and a generator's too
-            if not -LARGEST <= value <= LARGEST:  # false for NaN too
+            if not -largest <= value <= largest:  # false for NaN too
                 return False
         return True
-    if np.vdot(values, values) <= LARGEST**2:  # one pass; false for NaN too
+    if np.vdot(values, values) <= largest**2:  # one pass; false for NaN too
         return True
-    return bool((np.abs(values) <= LARGEST).all())
+    return bool((np.abs(values) <= largest).all())
 
 
 def noise_level(name: str, level: Any) -> float:

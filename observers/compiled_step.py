@@ -28,11 +28,8 @@ class CompiledStep:
             if expression is not None and expression.operations > MOST_OPERATIONS:
                 raise ValueError("the expression takes too long to compile")
         maps = [_of_map(each) for each in (decoders.driven, decoders.free or decoders.driven)]
-        scaling, affine, network = (
-            np.zeros((4, nx + nu)),
-            np.zeros((nx, 1)),
-            (np.zeros(0, np.float32), np.zeros(1, int)),
-        )
+        scaling, affine = np.zeros((4, nx + nu)), np.zeros((nx, 1))
+        network = np.zeros(0, np.float32), np.zeros(1, int)
         if (flow := motion.flow) is not None:
             scaling[0, :nx], scaling[1, :nx], scaling[2, :nx] = motion.x_offset, motion.x_scale, flow.gain
             scaling[3, :nu], affine, network = 1.0 / flow.u_scale, np.array(flow.linear, order="C"), flow.mlp.packed()
@@ -45,11 +42,8 @@ class CompiledStep:
             *(watch.trend_square_share, watch.trend_gain, watch.trend_limit, tracker.gate),
         )
         self._parts = tuple(of for each in zip(*maps, strict=True) for of in each), (scaling, affine, *network)
-        self._window, self._seen = (
-            watch.window,
-            linear.size + ny + 1 + tracker.nis + 2,
-        )  # where a row has the number of samples seen
-        self._usual, self._first = self._at(linear), np.zeros(1, int)
+        self._window, self._seen = watch.window, linear.size + ny + 1 + tracker.nis + 2  # the place of samples seen
+        self._usual, self._first, self._no_record = self._at(linear), np.zeros(1, int), np.empty((1, 0, 0))
         self._one, self._many = self._code(1), cast(Any, None)
 
     def _code(self, W: int) -> Any:
@@ -75,21 +69,16 @@ class CompiledStep:
         return (*self._flags, substeps), (h, samples, *self._numbers), *self._model, of_filter, *self._parts
 
     def __call__(
-        self,
-        rows: np.ndarray,
-        y: np.ndarray,
-        u: np.ndarray,
-        record: np.ndarray | None = None,
-        *,
-        linear: LinearFilter | None = None,
+        self, linear: LinearFilter, rows: np.ndarray, y: np.ndarray, u: np.ndarray, record: Any = None
     ) -> None:
-        """Take samples and inputs into rows, which a record keeps at each sample.
+        """Take samples and inputs, at the interval of a filter, into rows, which a record keeps at each sample.
 
         Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu), ``record`` (steps, n, width).
         """
-        y, u = np.array(y, order="C"), np.array(u, order="C")  # Numba would compile again for read-only arrays
-        model = self._usual if linear is None or linear is self._linear else self._at(linear)
-        given = rows, y, u, np.empty((1, 0, 0)) if record is None else record
+        # Numba would compile again for arrays that are read-only or have gaps.
+        y, u = (each if each.flags.carray else np.array(each, order="C") for each in (y, u))
+        model = self._usual if linear is self._linear else self._at(linear)
+        given = rows, y, u, self._no_record if record is None else record
         few = self._first if len(rows) == 1 else np.arange(len(rows))
         if len(rows) >= _LANES and self._motion.equations is not None:
             if self._many is None:

@@ -23,18 +23,15 @@ class Estimator(Protocol[State]):
 
     def start(self, n: int) -> State:
         """Return the state of n rows before their first sample."""
-        ...
 
     def advance(self, state: State, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> State:
         """Return the state after samples y (n, ny), NaN where missing, and inputs u (n, nu) held for dt before them.
 
         The first sample of a row, which must be whole, begins it; the input before it is ignored.
         """
-        ...
 
     def estimate(self, state: State) -> Estimate:
         """Return the estimates at the last samples."""
-        ...
 
 
 class Running:

@@ -2,7 +2,7 @@
 
 import functools
 import reprlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -73,9 +73,7 @@ class Expression:
         """Evaluate it. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., number of components)."""
         x = np.asarray(x, dtype=float)
         rows = [x[..., i] for i in range(self.states)]
-        if self.inputs:
-            u = np.asarray(u, dtype=float)
-            rows += [u[..., j] for j in range(self.inputs)]
+        rows += [np.asarray(u, dtype=float)[..., j] for j in range(self.inputs)]
         out = np.empty((*x.shape[:-1], len(self.components)))
         with np.errstate(all="ignore"):
             for i, value in enumerate(self._function(*rows)):
@@ -83,11 +81,10 @@ class Expression:
         return out
 
     @functools.cached_property
-    def _function(self) -> Callable[..., tuple[Any, ...]]:
+    def _function(self) -> Any:
         namespace: dict[str, Any] = {"np": np}
         exec(self.python("function", self.states, self.inputs), namespace)
-        function: Callable[..., tuple[Any, ...]] = namespace["function"]
-        return function
+        return namespace["function"]
 
     def __getstate__(self) -> dict[str, Any]:
         return {"components": self.components}  # functions by source cannot be pickled

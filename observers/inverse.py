@@ -108,10 +108,8 @@ class InverseMap:
     error_covariance: ErrorCovariance | None = None
 
     def __post_init__(self) -> None:
-        if self.features != tuple(name for name in FEATURES if name in self.features) or not self.features:
-            raise ArtifactError(f"inverse features {self.features} are not an ordered selection of {FEATURES}")
-        if self.features[0] != "z_y":
-            raise ArtifactError(f"the first inverse feature must be z_y, got {self.features}")
+        if self.features != ("z_y", *(name for name in FEATURES[1:] if name in self.features)):
+            raise ArtifactError(f"inverse features must be z_y and then some of {FEATURES[1:]}, got {self.features}")
         if self.whiten.ndim != 2:
             raise ArtifactError(f"whiten must have shape (modes, size), got {self.whiten.shape}")
         modes, size = self.whiten.shape
@@ -136,8 +134,6 @@ class InverseMap:
                 f"a network of {self.mlp.inputs} inputs does not fit {modes} modes and {conditions} conditions"
             )
         nx = self.mlp.outputs
-        if not nx:
-            raise ArtifactError("a map must estimate one state at least, its network has no outputs")
         check_shapes(self, {"z_offset": (size,), "x_offset": (nx,), "x_scale": (nx,)})
         if self.error_covariance is not None and "measurement_noise" not in self.features:
             raise ArtifactError("a covariance by level of noise needs a map that depends on the level")

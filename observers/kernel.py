@@ -257,14 +257,6 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 for k in range(ny):
                     P[i * nx + j] += sign * V[i * ny + k] * W[j * ny + k]
 
-    @_part
-    def is_sound(x: Any, P: Any, L: Any, inverse: Any) -> bool:
-        total = 0.0
-        factorise(P, L, inverse)
-        for i in range(nx):
-            total += x[i] + inverse[i]
-        return np.isfinite(total)
-
     @_inlined
     def track(now: Any, y: Any, u: Any, model: Any, h: Any, r: Any, watched: Any, scratch: Any, expected: Any) -> None:
         """Predict and correct the state of a row's tracker; outputs that are rejected become NaN."""
@@ -288,7 +280,11 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 shift(again, -1.0, D, white)
                 add(again_moved, 1.0, D, D)
                 add(again_across, 1.0, G, D)
-                if not is_sound(again, again_moved, L, inverse):
+                factorise(again_moved, L, inverse)
+                total = 0.0
+                for i in range(nx):
+                    total += again[i] + inverse[i]
+                if not np.isfinite(total):
                     break
             for i in range(nx):
                 mean[i] = again[i]
@@ -347,19 +343,11 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         return acted
 
     @_part
-    def invert(z: Any, age: float, nz: int, maps: Any, scratch: Any, x: Any) -> None:
-        """T_inv, of free motion where no input has acted."""
-        driven, free, _, _ = maps
-        if is_driven(z, nz):
-            decode(z, age, driven, scratch, x)
-        else:
-            decode(z[:nz], age, free, scratch, x)
-
-    @_part
     def supervise(now: Any, z: Any, age: float, nz: int, dt: float, window: float, lost: bool, states: Any, maps: Any,
                   scratch: Any, x_hat: Any) -> None:  # fmt: skip
         """Take T_inv's estimate where it is surer within the first window, or where the tracker diverged."""
-        ages, table = maps[2] if is_driven(z, nz) else maps[3]
+        driven = is_driven(z, nz)  # else T_inv is that of free motion
+        ages, table = maps[2] if driven else maps[3]
         seen, at = min(now[nis + 2], window) * dt, 0
         while at < len(ages) - 2 and seen > ages[at + 1]:
             at += 1
@@ -376,7 +364,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         for i in range(nx):
             larger += math.log(inverse[i])
         if lost or larger < 0.0:
-            invert(z, age, nz, maps, scratch, x_hat)
+            decode(z if driven else z[:nz], age, maps[0] if driven else maps[1], scratch, x_hat)
             for i in range(nx):
                 now[i] = clipped(states, x_hat[i], i)
             for i in range(square):

@@ -72,6 +72,7 @@ class KKL(Estimator[np.ndarray]):
         self.z, self.y, self.age = slice(size), slice(size, size + ny), size + ny
         end = self.age + 1 + (0 if self.tracker is None else self.tracker.width)
         self.tracked, self.watched = slice(self.age + 1, end), slice(end, None)
+        self._x = slice(self.age + 1, self.age + 1 + artifact.nx)  # of a tracker
         self.width = end + (0 if self.monitor is None else self.monitor.width)
 
     def start(self, n: int) -> np.ndarray:
@@ -115,7 +116,7 @@ class KKL(Estimator[np.ndarray]):
             new = self._stepped(state, y, u, dt)
         else:
             new = state.copy()
-            self._machine(new, y[None], u[None], linear=self._filter(dt))
+            self._machine(self._filter(dt), new, y[None], u[None])
         if self.monitor is not None:  # outputs that are rejected count too
             residual = self.artifact.residual(np.where(np.isnan(y), new[:, self.y], y), self.decode(new))
             new[:, self.watched] = self.monitor.update(new[:, self.watched], residual, ~np.isnan(y))
@@ -183,7 +184,7 @@ class KKL(Estimator[np.ndarray]):
     def decode(self, state: np.ndarray) -> np.ndarray:
         """Return the estimates, (n, nx)."""
         if self.tracker is not None:
-            return state[:, self.tracked][:, self.tracker.x].copy()
+            return state[:, self._x].copy()
         if len(state) == 1:  # the machine code of a batch begins with matrix products
             return self.decoders(state[0, self.z], state[0, self.age] * self.artifact.filter.dt)[None]
         return self.decoders(state[:, self.z], state[:, self.age] * self.artifact.filter.dt)
@@ -226,7 +227,7 @@ class KKL(Estimator[np.ndarray]):
             record = np.empty((len(samples), *state.shape))
             if dts is None and self._machine is not None:
                 state = state.copy()
-                self._machine(state, samples, inputs, record)
+                self._machine(self.artifact.filter, state, samples, inputs, record)
             else:
                 for k in range(len(samples)):
                     dt = None if dts is None else float(dts[first - 1 + k])

@@ -16,7 +16,7 @@ _OPERATIONS = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "d
 _IN_PLACE = {"add": operator.iadd, "sub": operator.isub, "mul": operator.imul}
 
 
-class Lanes(types.Type):
+class _Lanes(types.Type):
     """A vector of doubles, one of each row; numbers become one of equal doubles."""
 
     def __init__(self, count: int) -> None:
@@ -30,7 +30,7 @@ class Lanes(types.Type):
         return self if isinstance(other, types.Float) else None
 
 
-@register_model(Lanes)
+@register_model(_Lanes)
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, ir.VectorType(ir.DoubleType(), kind.count))
@@ -39,10 +39,10 @@ class _Model(models.PrimitiveModel):
 class _Operation(AbstractTemplate):
     def generic(self, args: Any, keywords: Any) -> Any:
         kind = _common(*args)
-        return signature(kind, *(kind for _ in args)) if isinstance(kind, Lanes) else None
+        return signature(kind, *(kind for _ in args)) if isinstance(kind, _Lanes) else None
 
 
-@lower_cast(types.Float, Lanes)
+@lower_cast(types.Float, _Lanes)
 def _spread(context: Any, builder: Any, given: Any, kind: Any, value: Any) -> Any:
     value, vector = context.cast(builder, value, given, types.float64), context.get_value_type(kind)
     zero = ir.Constant(ir.IntType(32), 0)
@@ -51,7 +51,7 @@ def _spread(context: Any, builder: Any, given: Any, kind: Any, value: Any) -> An
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), places)
 
 
-@lower_builtin(math.sqrt, Lanes)
+@lower_builtin(math.sqrt, _Lanes)
 def _root(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     kind = arguments[0].type
     name = f"llvm.sqrt.v{kind.count}f64"
@@ -66,12 +66,12 @@ def _define() -> None:
         def code(context: Any, builder: Any, signature: Any, arguments: Any, name: str = name) -> Any:
             return getattr(builder, f"f{name}")(*arguments)
 
-        lower_builtin(operation, Lanes, Lanes)(code)
+        lower_builtin(operation, _Lanes, _Lanes)(code)
 
 
 def _common(*kinds: Any) -> Any:
     """The type of a result: of doubles, or of lanes if there are any."""
-    return next((kind for kind in kinds if isinstance(kind, Lanes)), types.float64)
+    return next((kind for kind in kinds if isinstance(kind, _Lanes)), types.float64)
 
 
 @_intrinsic
@@ -88,7 +88,7 @@ def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 @_intrinsic(prefer_literal=True)
 def stack(typing: Any, count: Any, rows: Any) -> Any:
     """Memory of a constant number of doubles or of lanes, which the compiler may keep in registers."""
-    kind = Lanes(rows.literal_value) if rows.literal_value > 1 else types.float64
+    kind = _Lanes(rows.literal_value) if rows.literal_value > 1 else types.float64
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         size = ir.Constant(ir.IntType(64), count.literal_value)
@@ -108,5 +108,3 @@ def doubles(typing: Any, memory: Any) -> Any:
 
 
 _define()
-
-__all__ = ["choose", "doubles", "stack"]

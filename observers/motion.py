@@ -143,13 +143,9 @@ class Motion:
         nx = len(self.x_offset) if self.x_offset.ndim == 1 else 0
         if (self.equations is None) == (self.flow is None):
             raise ArtifactError("a motion is by equations or by a flow: it has one of the two")
-        if self.equations is not None:
-            field = self.equations.field
-            sizes = len(field.components), field.states <= nx
-        else:
-            assert self.flow is not None
-            sizes = self.flow.mlp.outputs, True
-        if not nx or sizes != (nx, True):
+        field = None if self.equations is None else self.equations.field
+        fits = self.flow is not None if field is None else len(field.components) == nx and field.states <= nx
+        if not nx or not fits or (self.flow is not None and self.flow.mlp.outputs != nx):
             raise ArtifactError(f"a motion of {nx} states does not fit its equations or its flow")
         check_shapes(self, dict.fromkeys(("x_scale", "low", "high", "mean", "error", "process_noise"), (nx,)))
         check_shapes(self, {"covariance": (nx, nx)})

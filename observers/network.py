@@ -54,7 +54,8 @@ class MLP:
             arrays = getattr(self, name)
             if not isinstance(arrays, Sequence) or isinstance(arrays, str | bytes):
                 raise ValueError(f"{name} must be a sequence of arrays, got {shown(arrays)}")
-            object.__setattr__(self, name, [_layer(name, values) for values in arrays])
+            with np.errstate(over="ignore"):  # numbers that are too large become infinite, and are refused below
+                object.__setattr__(self, name, [real_array(name, each).astype(np.float32) for each in arrays])
         if not self.weights or len(self.weights) != len(self.biases):
             raise ValueError(f"{len(self.weights)} weights and {len(self.biases)} biases do not make a network")
         width, layers = None, []
@@ -65,8 +66,7 @@ class MLP:
                 )
             if width not in (None, weight.shape[1]):
                 raise ValueError(f"weights of shape {weight.shape} cannot follow {width} values")
-            with np.errstate(over="ignore"):  # larger values become infinite, and are rejected
-                layers.append((np.ascontiguousarray(weight.T, dtype=np.float32), np.asarray(bias, dtype=np.float32)))
+            layers.append((np.ascontiguousarray(weight.T), bias))
             if not all(np.isfinite(values).all() for values in layers[-1]):
                 raise ValueError("the network holds weights or biases that are not finite")
             width = len(bias)
@@ -123,9 +123,3 @@ class MLP:
         shape = [list(ACTIVATIONS).index(self.activation), outputs if first else inputs]
         packed = np.concatenate([np.zeros(0, np.float32), *parts])
         return packed, np.array(shape + [len(bias) for _, bias in layers])
-
-
-def _layer(name: str, values: np.ndarray) -> np.ndarray:
-    """The weights or biases of a layer, as they are if they are an array of real numbers."""
-    array = real_array(name, values)
-    return values if type(values) is np.ndarray else array

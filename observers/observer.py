@@ -18,7 +18,6 @@ from observers.samples import (
     check_gate,
     check_output,
     check_replacement,
-    far_input,
     first_state,
     held_input,
 )
@@ -220,8 +219,8 @@ class KKLObserver(RecordEstimates):
             If a shape is wrong, an entry is not a finite real number, or x0 is given and the artifact holds neither T
             nor a motion; the observer is then as it was.
         """
-        y0, x0 = real_array("y", y0).copy(), None if x0 is None else real_array("x0", x0)  # callers reuse arrays
-        check_output(self.artifact, y0, y0.shape[:-1], first=True)
+        y0 = real_array("y", y0).copy()  # callers reuse arrays
+        check_output(self.artifact, y0, y0.shape[:-1])
         self._state, self._batch = self._begin(y0, x0), y0.shape[:-1]
         n = len(self._state)
         self._pending = Pending(np.zeros((n, self._delay, self.artifact.nu)), np.zeros(n, dtype=int))
@@ -231,7 +230,7 @@ class KKLObserver(RecordEstimates):
         """Rows at first samples (..., ny), or at known states (..., nx)."""
         z0, age = first_state(self.artifact, y0, x0)
         n = math.prod(y0.shape[:-1])
-        x0 = None if x0 is None else x0.reshape(n, self.artifact.nx)
+        x0 = None if x0 is None else real_array("x0", x0).reshape(n, self.artifact.nx)
         return self._kkl.begin(y0.reshape(n, self.artifact.ny), z0.reshape(n, self.artifact.filter.size), age, x0)
 
     @property
@@ -285,8 +284,8 @@ class KKLObserver(RecordEstimates):
         """
         state = self._begun()
         rows = bool_array("rows", rows, self._batch)
-        y0, x0 = real_array("y", y0), None if x0 is None else real_array("x0", x0)
-        check_output(self.artifact, y0, (int(rows.sum()),), first=True)
+        y0 = real_array("y", y0)
+        check_output(self.artifact, y0, (int(rows.sum()),))
         begun = self._begin(y0, x0)
         self._state, self._pending = state.copy(), self._pending.restarted(rows.ravel())
         self._state[rows.ravel()] = begun
@@ -348,17 +347,10 @@ class KKLObserver(RecordEstimates):
             raise RuntimeError("call reset(y0) before step(y)")
         if rows is not None:
             rows = bool_array("rows", rows, batch).ravel()
-        u = held_input(self.artifact, u, batch)
-        self._warn_of_input(u)
-        u = u.reshape(len(state), self.artifact.nu)
-        if y is None:
-            y = np.full((len(state), self.artifact.ny), np.nan)
-            self._warn_of_gaps()
-        else:
-            y = real_array("y", y)
-            if check_output(self.artifact, y, batch) is not None:
-                self._warn_of_gaps()
-            y = y.reshape(len(state), self.artifact.ny)
+        u = held_input(self.artifact, u, batch, self._warn).reshape(len(state), self.artifact.nu)
+        y = np.full((*batch, self.artifact.ny), np.nan) if y is None else real_array("y", y)
+        check_output(self.artifact, y, batch, self._warn)
+        y = y.reshape(len(state), self.artifact.ny)
         dt = None if dt is None else check_dt(dt)
         if self._delay:
             if dt is not None:
@@ -370,19 +362,6 @@ class KKLObserver(RecordEstimates):
         elif rows.any():
             self._state = state.copy()
             self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows], dt)
-
-    def _warn_of_gaps(self) -> None:
-        if not self.artifact.knows_output:
-            self._warn(
-                f"the map for {self.artifact.system!r} holds no output h(x) by which to predict missing outputs: it "
-                "holds the last value of a missing output"
-            )
-
-    def _warn_of_input(self, u: np.ndarray) -> None:
-        """Warn of inputs (..., nu) far beyond those of training."""
-        if (far := far_input(self.artifact, u)) is not None:
-            most = ", ".join(f"{each:g}" for each in self.artifact.u_max or ())
-            self._warn(f"an input of {far:g} is far beyond those in training, at most {most}: estimates may be wrong")
 
     def _warn(self, text: str) -> None:
         """Warn once, by the first words."""

@@ -7,7 +7,7 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.checks import real_array
 from observers.kkl import KKL
-from observers.samples import checked_record, held_inputs, intervals
+from observers.samples import check_output, held_input, intervals, recorded_inputs
 
 
 class RecordEstimates:
@@ -16,8 +16,7 @@ class RecordEstimates:
     artifact: Artifact
     _kkl: KKL
     _delay: int
-    _warn_of_gaps: Any
-    _warn_of_input: Any
+    _warn: Any
     _begin: Any
 
     def estimate(
@@ -68,13 +67,13 @@ class RecordEstimates:
         """What a function of the state's rows returns at each sample."""
         if self._delay:
             raise ValueError("a record has no delay: shift its outputs to their times, and make an observer without")
-        y = checked_record(self.artifact, y)
-        if np.isnan(y).any():
-            self._warn_of_gaps()
+        y = real_array("y", y)
+        if y.ndim < 2 or not len(y):
+            raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
+        check_output(self.artifact, y, y.shape[:-1], self._warn)
+        check_output(self.artifact, y[:1], y[:1].shape[:-1])
         dts = None if t is None else intervals(t, len(y))
-        u = held_inputs(self.artifact, u, y.shape[:-1])
-        self._warn_of_input(u)
-        x0 = None if x0 is None else real_array("x0", x0)
+        u = held_input(self.artifact, recorded_inputs(u, len(y)), (len(y) - 1, *y.shape[1:-1]), self._warn)
         state = self._begin(y[0], x0)
         samples, inputs = (each.reshape(len(each), len(state), each.shape[-1]) for each in (y, u))
         values = self._kkl.along(state, samples, inputs, of, dts)

@@ -1,16 +1,16 @@
 """What an observer takes in, checked at its boundary: arguments, other maps, samples, inputs, records and states."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from observers.artifact import Artifact
+from observers.artifact import FAR, Artifact
 from observers.checks import LARGEST, ArtifactError, all_finite, flag, integer, is_finite, real_array, shown
 from observers.machine import available
 
 MAX_DELAY = 1000  # samples
-FAR = 10.0  # in multiples of the largest input in training, from where on one warns
 
 
 def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tracking: bool | None) -> None:
@@ -91,22 +91,27 @@ def _serves(artifact: Artifact) -> dict[str, Any]:
 
 
 def check_output(
-    artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], *, first: bool = False
-) -> np.ndarray | None:
-    """Return which outputs are missing, (..., ny), or None."""
+    artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], warn: Callable[[str], None] | None = None
+) -> None:
+    """Check outputs (..., ny), of which none may be missing at the first sample, where there is no ``warn``."""
     if y.shape != (*batch, artifact.ny):
         raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
     if all_finite(y):
-        return None
-    if first:
+        return
+    if warn is None:
         _check_finite("y", y, hint="; outputs may be missing later, but the first sample must be whole")
-    gaps = np.isnan(y)
-    _check_finite("y", np.where(gaps, 0.0, y), hint="; NaN marks a missing output")
-    return gaps
+    elif not artifact.knows_output:
+        warn(
+            f"the map for {artifact.system!r} holds no output h(x) to predict a missing output by: it holds its last "
+            "value"
+        )
+    _check_finite("y", np.where(np.isnan(y), 0.0, y), hint="; NaN marks a missing output")
 
 
-def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
-    """Return inputs as floats, zeros for None. Shapes: ``u`` (..., nu), or None; returns (..., nu)."""
+def held_input(
+    artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...], warn: Callable[[str], None]
+) -> np.ndarray:
+    """Return inputs (..., nu) as floats, zeros for None; warns of those far beyond training."""
     nu = artifact.nu
     if u is None:
         return np.zeros((*batch, nu))
@@ -118,7 +123,12 @@ def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...])
             f"this map for {artifact.system} knows no inputs, but u = {u}; take one that does, "
             "or pass u=None to ignore the input"
         )
-    _check_finite("u", u)
+    if not all_finite(u, artifact.usual_input):  # one pass for both checks, which a step would feel
+        _check_finite("u", u)
+        most = np.array(artifact.u_max)
+        if (far := np.abs(u) > FAR * most).any():
+            text = ", ".join(f"{each:g}" for each in most)
+            warn(f"an input of {u[far][0]:g} is far beyond those in training, at most {text}: estimates may be wrong")
     return u if nu else u[..., :0]
 
 
@@ -138,25 +148,14 @@ def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tu
     return z0, math.inf  # which every map takes for its age_max
 
 
-def checked_record(artifact: Artifact, y: np.ndarray) -> np.ndarray:
-    """Return a record of outputs (steps, ..., ny) as floats."""
-    y = real_array("y", y)
-    if y.ndim < 2 or not len(y):
-        raise ValueError(f"y must be a record of shape (steps, ..., {artifact.ny}), got {y.shape}")
-    if check_output(artifact, y, y.shape[:-1]) is not None:
-        check_output(artifact, y[:1], y[:1].shape[:-1], first=True)
-    return y
-
-
-def held_inputs(artifact: Artifact, u: np.ndarray | None, samples: tuple[int, ...]) -> np.ndarray:
-    """Return inputs (steps - 1, ..., nu) beside outputs of a shape (steps, ...); the last row may be one too many."""
-    steps, *batch = samples
-    if u is not None:
-        u = real_array("u", u)
-        if u.ndim < 1 or len(u) not in (steps - 1, steps):
-            raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got shape {u.shape}")
-        u = u[: steps - 1]
-    return held_input(artifact, u, (steps - 1, *batch))
+def recorded_inputs(u: np.ndarray | None, steps: int) -> np.ndarray | None:
+    """Return the inputs (steps - 1, ..., nu) of so many samples; there may be one more, after the last."""
+    if u is None:
+        return None
+    u = real_array("u", u)
+    if u.ndim < 1 or len(u) not in (steps - 1, steps):
+        raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got shape {u.shape}")
+    return u[: steps - 1]
 
 
 def intervals(t: np.ndarray, steps: int) -> np.ndarray:
@@ -165,19 +164,6 @@ def intervals(t: np.ndarray, steps: int) -> np.ndarray:
     if t.shape != (steps,) or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
         raise ValueError(f"t must be {steps} times in seconds, which rise, got {shown(t)}")
     return np.diff(t)
-
-
-def far_input(artifact: Artifact, u: np.ndarray) -> float | None:
-    """Return the first of inputs (..., nu) that is far beyond those of training, or None."""
-    if not artifact.u_max:
-        return None
-    if u.ndim == 1:  # fast path for one sample
-        for value, most in zip(u.tolist(), artifact.u_max):
-            if abs(value) > FAR * most:
-                return float(value)
-        return None
-    far = np.abs(u) > FAR * np.array(artifact.u_max)
-    return float(u[far][0]) if far.any() else None
 
 
 def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:

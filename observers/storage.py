@@ -191,10 +191,9 @@ def explained(path: str | os.PathLike[str], error: type[ValueError]) -> Iterator
 
 
 def put_mlp(tensors: MutableMapping[str, np.ndarray], prefix: str, mlp: MLP) -> None:
-    """Add a network's weights and biases to the arrays of a file, as float32."""
+    """Add a network's weights and biases to the arrays of a file."""
     for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
-        tensors[f"{prefix}{i}.weight"] = np.asarray(weight, dtype=np.float32)
-        tensors[f"{prefix}{i}.bias"] = np.asarray(bias, dtype=np.float32)
+        tensors[f"{prefix}{i}.weight"], tensors[f"{prefix}{i}.bias"] = weight, bias
 
 
 def get_mlp(tensors: Mapping[str, np.ndarray], prefix: str, activation: str) -> MLP:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -232,24 +232,17 @@ class Tracker:
         if not len(where):
             return rows
         seconds = np.minimum(seen[where], watch.window) * self._dt
-        P = self._decoded(Decoders.covariances, z[where], seconds, where)
+        P = self._decoders.covariances(z[where], seconds)
         with np.errstate(invalid="ignore"):
             surer = np.linalg.slogdet(P)[1] < np.linalg.slogdet(self._covariances(rows)[where])[1]
         taken = surer | lost[where]
-        where, P = where[taken], P[taken]
-        if not len(where):
-            return rows
-        rows = rows.copy()
-        rows[where, self.x] = self._within(self._decoded(Decoders.__call__, z[where], age[where] * self._dt, where))
-        rows[where, self.P] = P.reshape(len(where), -1)
+        where, P, rows = where[taken], P[taken], rows.copy()
+        rows[where, self.x] = self._within(self._decoders(z[where], age[where] * self._dt))
+        rows[where, self.P] = P.reshape(len(where), self.motion.nx**2)
         rows[lost, self.nis : self.nis + 2] = 1.0
         rows[lost, self.nis + 4 : self.trends] = watch.window
         rows[lost, self.trends :] = 0.0
         return rows
-
-    def _decoded(self, of: Any, z: np.ndarray, age: np.ndarray, where: np.ndarray) -> np.ndarray:
-        """What a method of :class:`Decoders` returns for some rows, at ages in seconds."""
-        return np.asarray(of(self._decoders, z, age))
 
     def _covariances(self, rows: np.ndarray) -> np.ndarray:
         return rows[:, self.P].reshape(len(rows), self.motion.nx, self.motion.nx)

@@ -187,7 +187,7 @@ def nothing_estimated(tensors, meta):
     *((lambda t, m, h=h: (m.update(h={"components": h}), t.pop("C"), m.pop("limits")), "")
       for h in ([], [["x", 0], ["x", 1]], [["x", 2]], [["__import__", "os"]])),
     (lambda t, m: m.update(h={"components": [["x", 0]]}), "there is a C beside it"),
-    (nothing_estimated, "must estimate one state at least"),
+    (nothing_estimated, "has no room for a state"),
     (lambda t, m: t.update({"inverse.0.weight": t["inverse.0.weight"].astype(np.int64)}), "weight is of type I64"),
     (lambda t, m: m.update(system=3), "name must be a string"),
     (lambda t, m: m.update(inverse=[]), "lacks"),
