@@ -4,7 +4,7 @@ import functools
 import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -61,6 +61,7 @@ class Expression:
     """
 
     components: Sequence[Any]
+    _numpy: ClassVar[Any] = np
 
     def __post_init__(self) -> None:
         if not isinstance(self.components, list | tuple) or not self.components:
@@ -84,7 +85,7 @@ class Expression:
 
     @functools.cached_property
     def _function(self) -> Callable[..., tuple[Any, ...]]:
-        namespace: dict[str, Any] = {"np": np}
+        namespace: dict[str, Any] = {"np": self._numpy}
         exec(self.python("function", self.states, self.inputs), namespace)
         function: Callable[..., tuple[Any, ...]] = namespace["function"]
         return function

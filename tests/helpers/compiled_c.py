@@ -63,7 +63,13 @@ int main(void)
 def microseconds(exported, folder, y, u, turns=20):
     """The processor time of a step in C, along a record and many times over, and the sum of the first estimates."""
     nu = u.shape[-1]
-    sizes = {"STEPS": len(y), "TURNS": turns, "OUTPUTS": y.shape[-1], "INPUTS": nu, "WIDTH": len(exported.estimates)}
+    sizes = {
+        "STEPS": len(y),
+        "TURNS": turns,
+        "OUTPUTS": y.shape[-1],
+        "INPUTS": nu,
+        "WIDTH": len(exported.signals["x_hat"]),
+    }
     text = TIMED.replace("NAME", exported.name).replace("GIVEN", "u[k]," if nu else "")
     (folder / "timed.c").write_text(text, encoding="utf-8")
     told = [f"-D{name}={size}" for name, size in sizes.items()]

@@ -104,7 +104,7 @@ def test_names():
     assert [identifier(name) for name in ("lorenz-spinn", "Pendulum-v1", "3d", "模", "_a b_")] == [
         "lorenz_spinn", "Pendulum_v1", "observer_3d", "observer", "a_b"
     ]  # fmt: skip
-    assert Exported.read("lorenz-spinn").estimates == ["x1", "x2", "x3"]
+    assert Exported.read("lorenz-spinn").signals["x_hat"] == ["x1", "x2", "x3"]
 
 
 def test_biases_are_estimates_too(tmp_path):
@@ -114,7 +114,7 @@ def test_biases_are_estimates_too(tmp_path):
         tmp_path / "b.safetensors"
     )
     exported = Exported.read(tmp_path / "b.safetensors")
-    assert exported.estimates == ["x1", "x2", "y1_bias"]
+    assert exported.signals["x_hat"] == ["x1", "x2", "y1_bias"]
     assert "_NX 3 /*" in "".join(c_files(exported).values())
 
 

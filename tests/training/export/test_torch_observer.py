@@ -115,8 +115,9 @@ def test_a_row_whose_covariance_breaks_down_is_lost():
 
 def test_parameters_follow_the_states(tmp_path):
     exported, y, u, _ = mapped(2)
-    assert exported.estimates[-1] == "mu"
-    assert along(module_of(exported), y[:2], u[:2]).shape[-1] == len(exported.estimates)
+    names = exported.signals["x_hat"]
+    assert names[-1] == "mu"
+    assert along(module_of(exported), y[:2], u[:2]).shape[-1] == len(names)
 
 
 @pytest.mark.parametrize("kind", [{"by": "flow"}, {"outputs": 2, "nonlinear": True}])
