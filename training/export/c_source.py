@@ -15,7 +15,6 @@ import numpy as np
 import kkl_gym
 from observers.expression import Expression
 from observers.inverse import InverseMap
-from observers.motion import Motion
 from observers.network import MLP
 from training.export.exported import Exported, output_expression, tracker_arrays, tracker_numbers
 
@@ -45,14 +44,14 @@ def c_files(exported: Exported) -> dict[str, str]:
     parts = {"inputs" if artifact.nu else "autonomous", "static" if motion is None else "tracks", *exported.maps}
     parts |= {"levels"} if exported.levels else set()
     parts |= {"process"} if exported.needs_process_noise else set()
-    words: dict[str, object] = {"NAME": name, "MACRO": name.upper(), "VERSION": kkl_gym.__version__}
-    words |= {"SOURCE": comment(exported.source), "CHECKSUM": exported.checksum, "SYSTEM": comment(artifact.system)}
-    words |= {"SECONDS": number(artifact.filter.dt), "LEVELS": ", ".join(map(number, exported.levels))}
-    words |= {"PROCESS": number(exported.process_noise), "PRECISION": exported.precision}
-    words |= {"TANH": "tanhf" if single else "tanh", "DIGITS": 9 if single else 17}
+    texts = {"SOURCE": exported.source, "SYSTEM": artifact.system, "OUTPUTS": ", ".join(signals["y"])}
+    texts |= {"INPUTS": ", ".join(signals["u"]), "ESTIMATES": ", ".join(signals["x_hat"])}
+    words: dict[str, object] = {key: comment(text) for key, text in texts.items()}
+    words |= {"NAME": name, "MACRO": name.upper(), "VERSION": kkl_gym.__version__, "CHECKSUM": exported.checksum}
+    words |= {"LEVELS": ", ".join(map(str, exported.levels)), "PROCESS": exported.process_noise}
+    words |= {"TANH": "tanhf" if single else "tanh", "DIGITS": 9 if single else 17, "PRECISION": exported.precision}
     words |= {"COUNT_X": len(signals["x_hat"]), "COUNT_Y": artifact.ny, "COUNT_U": artifact.nu}
-    words |= {"COUNT_Z": artifact.filter.size, "OUTPUTS": comment(", ".join(signals["y"]))}
-    words |= {"INPUTS": comment(", ".join(signals["u"])), "ESTIMATES": comment(", ".join(signals["x_hat"]))}
+    words |= {"COUNT_Z": artifact.filter.size, "SECONDS": artifact.filter.dt}
     if motion is not None and (h := output_expression(artifact)):
         moved = ""
         if motion.equations is not None:
@@ -89,9 +88,20 @@ def _constants(exported: Exported, networks: Mapping[str, MLP]) -> str:
     if motion is not None:
         numbers = tracker_numbers(motion, dt)
         macros |= {name.upper(): value for name, value in numbers.items()} | {"FAR": (2 * numbers["other"]) ** -0.5}
-        arrays |= _tracker_arrays(exported, motion, numbers["window"])
+        levels = exported.measurement_noise, exported.process_noise
+        arrays |= tracker_arrays(motion) | dict(zip("QR", motion.variances(*levels), strict=True))
         if motion.equations is not None and (substeps := motion.equations.substeps):
             macros |= {"SUBSTEPS": substeps, "H": dt / substeps}
+        if motion.flow is not None:
+            names = ("linear", "gain", "u_scale") if linear.nu else ("linear", "gain")
+            arrays |= {f"flow_{name}": getattr(motion.flow, name) for name in names}
+        for label, inverse in exported.maps.items():
+            assert inverse.error_covariance is not None
+            ages = inverse.error_covariance.ages / dt  # in samples, up to the window
+            ages = np.append(ages[ages < numbers["window"]], numbers["window"])
+            by_age = inverse.error_covariance.at_level(inverse.shares(levels[0])[0])
+            covariance = by_age(ages * dt) / np.outer(motion.x_scale, motion.x_scale)
+            arrays |= {f"{label}_ages": ages, f"{label}_covariance": covariance.ravel()}
     layers = {
         f"{label}_{kind}{i}": np.asarray(values, np.float32).reshape(-1)
         for label, mlp in networks.items()
@@ -102,30 +112,14 @@ def _constants(exported: Exported, networks: Mapping[str, MLP]) -> str:
     return "".join(defined + [array(name, values) for name, values in (arrays | layers).items()])
 
 
-def _tracker_arrays(exported: Exported, motion: Motion, window: int) -> dict[str, np.ndarray]:
-    """Motion, Kalman filter, and T_inv's covariance at ages in samples up to the window."""
-    dt, levels = exported.artifact.filter.dt, (exported.measurement_noise, exported.process_noise)
-    arrays = tracker_arrays(motion) | dict(zip("QR", motion.variances(*levels), strict=True))
-    if motion.flow is not None:
-        names = ("linear", "gain", "u_scale")[: 2 + bool(exported.artifact.nu)]
-        arrays |= {f"flow_{name}": getattr(motion.flow, name) for name in names}
-    for label, inverse in exported.maps.items():
-        assert inverse.error_covariance is not None
-        ages = np.append((ages := inverse.error_covariance.ages / dt)[ages < window], window)
-        by_age = inverse.error_covariance.at_level(inverse.shares(exported.measurement_noise)[0])
-        covariance = by_age(ages * dt) / np.outer(motion.x_scale, motion.x_scale)
-        arrays |= {f"{label}_ages": ages, f"{label}_covariance": covariance.ravel()}
-    return arrays
-
-
 def _map(exported: Exported, label: str, inverse: InverseMap) -> str:
     """T_inv as a function; the levels of noise are constants."""
     modes, size = inverse.whiten.shape
     words: dict[str, Any] = network_calls(label, inverse.mlp, "WIDTH", "OUT")
     levels = inverse.noise_features(exported.measurement_noise, exported.process_noise)
-    given = "".join(f"    a[{modes + i}] = (real){number(level)};\n" for i, level in enumerate(levels))
+    given = "".join(f"    a[{modes + i}] = (real){level};\n" for i, level in enumerate(levels))
     words |= {"NAME": exported.name, "MAP": label, "MODES": modes, "COORDINATES": size, "/* LEVELS */\n": given}
-    words |= {"AGE": modes + len(levels), "END": number(inverse.age_max), "UNIT": number(inverse.age_unit)}
+    words |= {"AGE": modes + len(levels), "END": inverse.age_max, "UNIT": inverse.age_unit}
     return template("map.c", words, inverse.features)
 
 
@@ -138,21 +132,12 @@ def template(name: str, words: Mapping[str, object], parts: Collection[str]) -> 
     return re.sub("|".join(sorted(map(re.escape, words), key=len, reverse=True)), lambda m: str(words[m[0]]), text)
 
 
-def number(value: float) -> str:
-    """The shortest decimals that are read back as the same double."""
-    return repr(float(value))
-
-
 def array(name: str, values: np.ndarray) -> str:
     """A constant array; numbers are the shortest that are read back as the same, and integers unsigned short."""
     kind = {"float32": "float", "float64": "double"}.get(values.dtype.name, "unsigned short")
-    words = (
-        [f"{word}f" for word in values.astype(str).flat]
-        if kind == "float"
-        else list(map(repr, values.ravel().tolist()))
-    )
+    words = [f"{word}f" if kind == "float" else word for word in values.astype(str).flat]
     if values.ndim == 2:
-        words = ["{" + ", ".join(map(repr, row)) + "}" for row in values.tolist()]
+        words = ["{" + ", ".join(row) + "}" for row in np.reshape(words, values.shape)]
     shape = "".join(f"[{length}]" for length in values.shape)
     lines = fill(", ".join(words), 118, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False)
     return f"static const {kind} {name}{shape} = {{\n{lines}\n}};\n"

@@ -14,9 +14,8 @@ from training.export.torch_parts import Module
 class TorchMemory(Module):
     """The memory of :class:`kkl_gym.KKLMemory` as a module of Torch: batched, differentiable, on any device.
 
-    ``state, shown = memory(state, y, u)`` takes in a step of n rows. ``shown`` is the wrapper's observation: y, the
-    memory of y and the memory of u. A row of zeros has seen nothing, and begins with the outputs that it is given:
-    :meth:`start` returns such rows, and ``state * ~done[:, None]`` restarts some.
+    A row of zeros has seen nothing, and begins with the outputs that it is given: :meth:`start` returns such rows, and
+    ``state * ~done[:, None]`` restarts some.
 
     Parameters
     ----------
@@ -85,7 +84,7 @@ class TorchMemory(Module):
         state : Tensor, shape (n, width)
             The next state.
         shown : Tensor, shape (n, size)
-            As the wrapper's observation, float32 unless ``y`` is float64.
+            The wrapper's observation: y, its memory, and that of u; float32 unless ``y`` is float64.
         """
         begins = state[:, :1] == 0
         age, before, w, v = torch.split(torch.where(begins, 0.0, state), self.widths, 1)

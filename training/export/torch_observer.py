@@ -133,10 +133,8 @@ class TorchObserver(Module):
             The samples, NaN where missing.
         u : Tensor, shape (n, nu), optional
             The inputs held since the samples before, by default zero.
-        measurement_noise : Tensor, shape (n or 1, 1 or ny), optional
-            Levels for each row in place of those of the observer: one, or one for each output if T_inv takes several.
-        process_noise : Tensor, shape (n or 1, 1), optional
-            Likewise.
+        measurement_noise, process_noise : Tensor, shapes (n or 1, 1 or ny) and (n or 1, 1), optional
+            Levels for each row in place of those of the observer; of measurement noise one, or one for each output.
 
         Returns
         -------
