@@ -1,7 +1,4 @@
-"""The step as C99: a header, a source without dependencies but math.h, and a program around them.
-
-A tracker's estimates and covariances are doubles whatever the precision is: P loses its definiteness in floats.
-"""
+"""The step as C99, with no dependency but math.h. A tracker is in doubles at either precision, or P breaks down."""
 
 import math
 import re
@@ -19,7 +16,6 @@ from observers.network import MLP
 from training.export.exported import Exported, output_expression, tracker_arrays, tracker_numbers
 
 _POWERS = 8  # up to which an exponent becomes products
-_MAX_SAMPLES = 2**32 - 1  # C's unsigned long counts so far everywhere
 _CONDITIONS = {**{name: f"{{0}} {name} {{1}}" for name in ("<", "<=", ">", ">=")}, "not": "!{0}"}
 _CONDITIONS |= {"and": "{0} && {1}", "or": "{0} || {1}"}
 _OPERATIONS = _CONDITIONS | {  # of values in variables, as NumPy defines them
@@ -42,8 +38,8 @@ def c_files(exported: Exported) -> dict[str, str]:
     networks = {label: inverse.mlp for label, inverse in exported.maps.items()}
     single, signals = exported.precision == "float", exported.signals
     parts = {"inputs" if artifact.nu else "autonomous", "static" if motion is None else "tracks", *exported.maps}
-    parts |= {"levels"} if exported.levels else set()
-    parts |= {"process"} if exported.needs_process_noise else set()
+    assumed = {"levels": exported.levels, "process": exported.needs_process_noise}
+    parts |= {level for level, present in assumed.items() if present}
     texts = {"SOURCE": exported.source, "SYSTEM": artifact.system, "OUTPUTS": ", ".join(signals["y"])}
     texts |= {"INPUTS": ", ".join(signals["u"]), "ESTIMATES": ", ".join(signals["x_hat"])}
     words: dict[str, object] = {key: comment(text) for key, text in texts.items()}
@@ -77,7 +73,7 @@ def _constants(exported: Exported, networks: Mapping[str, MLP]) -> str:
     last = max((inverse.age_max for inverse in exported.maps.values() if "age" in inverse.features), default=0.0)
     macros: dict[str, Any] = {name: f"{exported.name.upper()}_{name}" for name in ("NX", "NY", "NU", "DT")}
     macros |= {"NZ": nz, "SIZE": linear.size, "TRANSITIONS": len(rows)}
-    macros["LAST_AGE"] = f"{min(math.ceil(last / dt), _MAX_SAMPLES)}ul"  # after which the age no longer matters
+    macros["LAST_AGE"] = f"{min(math.ceil(last / dt), 2**32 - 1)}ul"  # C's unsigned long counts so far everywhere
     arrays = {"transition": block[rows, columns], "transition_row": rows, "transition_column": columns}
     arrays |= {name: getattr(linear, name)[:nz] for name in ("early_y", "late_y", "equilibrium")}
     if linear.nu:

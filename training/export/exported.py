@@ -1,9 +1,8 @@
 """An observer to export: its levels of noise, the names of its signals, and its metadata."""
 
-import dataclasses
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -22,11 +21,7 @@ from observers.unscented import weights as sigma_weights
 
 @dataclass(frozen=True)
 class Exported:
-    """An observer to export, and the levels of noise that it assumes.
-
-    The precision is that of the network, of samples and of estimates. The filter's state is in doubles in both: its
-    modes are nearly dependent, and floats would lose their differences.
-    """
+    """An observer to export, the precision of its network and signals, and the levels of noise that it assumes."""
 
     artifact: Artifact
     name: str
@@ -61,10 +56,9 @@ class Exported:
     @property
     def levels(self) -> tuple[float, ...]:
         """Levels of measurement noise that T_inv takes: none, one for all outputs, or one for each."""
-        maps = self.maps.values()
         if self.artifact.inverse.noise_gain.ndim == 2:
             return tuple(np.broadcast_to(self.measurement_noise, self.artifact.ny).tolist())
-        takes = any("measurement_noise" in inverse.features or inverse.noise_gain.any() for inverse in maps)
+        takes = any("measurement_noise" in each.features or each.noise_gain.any() for each in self.maps.values())
         return (float(np.max(self.measurement_noise)),) * takes
 
     @property
@@ -109,7 +103,7 @@ def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
     watch = Supervision.of(motion, dt)
     weights = dict(zip(("middle", "middle_squares", "other"), sigma_weights(motion.nx), strict=True))
     others = {"trend_gain": watch.trend_gain, "inflation": INFLATION, "relinearisations": RELINEARISATIONS}
-    return weights | others | dataclasses.asdict(watch)
+    return weights | others | asdict(watch)
 
 
 def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:

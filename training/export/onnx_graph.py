@@ -6,7 +6,7 @@ import warnings
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 import kkl_gym
 from training.export.exported import Exported
@@ -16,11 +16,7 @@ OPSET = 18
 
 
 def onnx_model(exported: Exported) -> Any:
-    """Export the graph, with metadata that describe the observer.
-
-    Inputs and outputs have a row for each observer of a batch: those of :meth:`TorchObserver.forward`, of which
-    ``u`` and levels are inputs as far as the observer depends on them, and the calibrated ``covariance``.
-    """
+    """Export the graph, with metadata; levels and ``u`` are inputs as far as the observer depends on them."""
     import onnx_ir
     from onnx import checker, helper
     from onnxscript import opset18
@@ -32,23 +28,21 @@ def onnx_model(exported: Exported) -> Any:
 
     artifact, dtype = exported.artifact, {"float": torch.float32, "double": torch.float64}[exported.precision]
     measurement_noise, process_noise = exported.measurement_noise, exported.process_noise
-    observer = TorchObserver(artifact, measurement_noise, process_noise=process_noise, dtype=dtype)
-    n = 2  # rows of an example; the graph takes any number
+    step = _Step(artifact, measurement_noise, process_noise=process_noise, dtype=dtype).requires_grad_(False).eval()
     widths = {"y": artifact.ny, "u": artifact.nu, "measurement_noise": len(exported.levels)}
     widths["process_noise"] = int(exported.needs_process_noise)
-    example: dict[str, Tensor | None] = {"state": observer.start(n)}
-    example |= {name: torch.zeros(n, width, dtype=dtype) if width else None for name, width in widths.items()}
-    step = _Step(observer.requires_grad_(False), artifact.inverse.error_covariance is not None)
+    example: dict[str, Tensor | None] = {"state": step.start(2)}
+    example |= {name: torch.zeros(2, width, dtype=dtype) if width else None for name, width in widths.items()}
     batch = torch.export.Dim("batch")
     # Torch warns that it lacks torchvision, and of itself.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            step.eval(),
+            step,
             tuple(example.values()),
             input_names=[name for name, value in example.items() if value is not None],
-            output_names=["state_next", "x_hat", *["covariance"] * step.covariance],
+            output_names=["state_next", "x_hat", *["covariance"] * hasattr(step.driven, "error")],
             opset_version=OPSET,
             dynamic_shapes=[None if value is None else {0: batch} for value in example.values()],
             custom_translation_table={torch.ops.aten.scalar_tensor.default: scalar},
@@ -69,17 +63,13 @@ def onnx_model(exported: Exported) -> Any:
     return model
 
 
-class _Step(nn.Module):
+class _Step(TorchObserver):
     """A step, and the covariances after it."""
 
-    def __init__(self, observer: TorchObserver, covariance: bool) -> None:
-        super().__init__()
-        self.observer, self.covariance = observer, covariance
-
-    def forward(
+    def forward(  # type: ignore[override]
         self, state: Tensor, y: Tensor, u: Tensor | None, measurement_noise: Tensor | None, process_noise: Tensor | None
     ) -> tuple[Tensor, ...]:
-        state, x_hat = self.observer(state, y, u, measurement_noise, process_noise)
-        if not self.covariance:
+        state, x_hat = super().forward(state, y, u, measurement_noise, process_noise)
+        if not hasattr(self.driven, "error"):
             return state, x_hat
-        return state, x_hat, self.observer.covariance(state, measurement_noise, process_noise).to(x_hat.dtype)
+        return state, x_hat, self.covariance(state, measurement_noise, process_noise).to(x_hat.dtype)

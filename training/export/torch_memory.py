@@ -89,15 +89,15 @@ class TorchMemory(Module):
         begins = state[:, :1] == 0
         age, before, w, v = torch.split(torch.where(begins, 0.0, state), self.widths, 1)
         signals = self._signals(y.to(state.dtype), before)
-        change = torch.where(begins, 0.0, signals - before)
         u = torch.where(begins, 0.0, y.new_zeros(1, self.nu) if u is None else u.to(state.dtype))
-        w = self.decay * w.reshape(-1, len(self.decay), signals.shape[1]) + self.rise * change[:, None]
+        w = self.decay * w.reshape(-1, len(self.decay), signals.shape[1])
+        w = w + self.rise * torch.where(begins, 0.0, signals - before)[:, None]
         v = v.reshape(-1, len(self.input_decay), self.nu)
         v = (v + (1.0 - self.input_decay) * (u[:, None] - v)).flatten(1)
         steps = age[..., None].clamp(min=1.0)  # at the start w is 0
         with_past = torch.expm1(-(steps + IMAGINED) / self.time_constants) / torch.expm1(-steps / self.time_constants)
-        kind = torch.promote_types(y.dtype, torch.float32)
-        shown = torch.cat([y.to(kind), (self.mixing @ (w * with_past)).flatten(1).to(kind), v.to(kind)], 1)
+        shown = torch.cat([y, (self.mixing @ (w * with_past)).flatten(1), v], 1)
+        shown = shown.to(torch.promote_types(y.dtype, torch.float32))
         return torch.cat([age + 1.0, signals, w.flatten(1), v], 1), shown
 
     def _signals(self, y: Tensor, before: Tensor) -> Tensor:

@@ -21,20 +21,15 @@ class TorchObserver(Module):
     begins with the sample that it is given, which must be whole: :meth:`start` returns such rows, and
     ``state * ~done[:, None]`` restarts some. A NaN in later ``y`` is a missing sample.
 
-    Nothing waits for the device, and the step is one graph. Gradients lead through all of it, and to the weights. The
-    filter's state and the tracker's covariance are float64 whatever ``dtype`` is; ``observer.float()`` makes them
-    float32, with which T_inv's estimates are inaccurate.
+    Gradients lead through the whole step, and to the weights. The filter's state and the tracker's covariance are
+    float64 whatever ``dtype`` is; after ``observer.float()``, T_inv's estimates are inaccurate.
 
     Parameters
     ----------
     artifact : Artifact
         The observer.
-    measurement_noise : float or sequence of float, length ny, optional
-        Standard deviation of the noise on each sample, as for :class:`observers.KKLObserver`.
-    process_noise : float, optional
-        Level of process noise, likewise.
-    tracking : bool, optional
-        Whether to track, likewise.
+    measurement_noise, process_noise, tracking : optional
+        As for :class:`observers.KKLObserver`.
     dtype : torch.dtype, default torch.float32
         Type of the networks and of the estimates; float32 as in NumPy, or float64.
 
@@ -165,9 +160,9 @@ class TorchObserver(Module):
         z = filtered(y)
         rest = self._of_map(z, TorchMap.__call__, age, *levels)
         if self.tracker is not None:
-            learned = tracked.seen.clamp(max=self.tracker.window)[:, None] * self.dt  # z depends on so much for certain
-            P = self._of_map(z, TorchMap.covariance, learned, levels[0])
-            rest = self.tracker.supervise(tracked, rest.T, P.T).T
+            rest = self.tracker.supervise(
+                tracked, rest.T, lambda age: self._of_map(z, TorchMap.covariance, age, levels[0]).T
+            ).T
         state = torch.cat([samples + 1.0, y, z, rest], 1)
         return state, self.estimate(state)
 

@@ -27,9 +27,9 @@ def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 # NumPy's names, which the source of expressions holds.
 _SAME = ["sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "abs", "sign", "floor", "minimum", "maximum", "where"]
-_LOGICAL = ["logical_and", "logical_or", "logical_not"]
-_OTHER = {"power": torch.pow, "mod": torch.remainder, "arctan2": torch.atan2}
-_FUNCTIONS = {name: getattr(torch, name) for name in _SAME + _LOGICAL} | _OTHER
+_OTHER = {name: getattr(torch, name) for name in ("logical_and", "logical_or", "logical_not")}
+_OTHER |= {"power": torch.pow, "mod": torch.remainder, "arctan2": torch.atan2}
+_FUNCTIONS = {name: getattr(torch, name) for name in _SAME} | _OTHER
 _NUMPY = SimpleNamespace(**{name: _of_tensors(function) for name, function in _FUNCTIONS.items()})
 
 

@@ -1,12 +1,9 @@
-"""The tracker's recursion (:mod:`observers.tracker`) in Torch; the rows of a batch are the last axis here.
-
-Every row takes the same way through it, and torch.where decides what counts.
-"""
+"""The tracker's recursion (:mod:`observers.tracker`) in Torch, for all rows alike; they are the last axis here."""
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,18 +13,8 @@ from observers.artifact import Artifact
 from training.export.exported import tracker_arrays, tracker_numbers
 from training.export.torch_parts import Module, Network, TorchExpression, between, eliminated, product
 
-
-class Tracked(NamedTuple):
-    """The tracker's state: scaled states, covariance, NIS, mean square of the trend, samples seen, trend (ny, n)."""
-
-    x: Tensor
-    P: Tensor
-    nis: Tensor
-    trend_square: Tensor
-    seen: Tensor
-    trend: Tensor
-
-
+Tracked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Scaled states, covariance, NIS, mean square of the trend, number of samples seen, trend (ny, n)."""
 Prediction = tuple[Tensor, Tensor, Tensor, Tensor]
 """Means (nx, n), covariances (nx, nx, n), those with the states before (nx, nx, n), and where they are sound (n,)."""
 
@@ -53,7 +40,7 @@ class TorchTracker(Module):
         }
         columns |= {"square_weights": np.array([numbers["middle_squares"], *others])}
         if motion.equations is not None:
-            self.equations = replace(motion.equations, field=TorchExpression(motion.equations.field.components))
+            self.equations: Any = replace(motion.equations, field=TorchExpression(motion.equations.field.components))
         if (flow := motion.flow) is not None:
             self.flow = Network(flow.mlp, dtype)
             columns |= {"gain": flow.gain, "u_scale": flow.u_scale, "affine": flow.linear[:, 0]}
@@ -67,7 +54,7 @@ class TorchTracker(Module):
         """Calibrated covariances (n, nx^2) at ages (n, 1), and at levels (n, 1) in multiples of the largest."""
         table = self.factors + process_share.clamp(max=1.0)[..., None] * (self.most - self.factors)
         factor = between(age, self.ages, between(share, self.levels, table).log()[..., None]).exp()
-        return factor * (self._unpacked(state).P * self.units).flatten(0, 1).T
+        return factor * (self._unpacked(state)[1] * self.units).flatten(0, 1).T
 
     def states(self, s: Tensor) -> Tensor:
         """Scaled states (nx, n) in their units."""
@@ -76,15 +63,12 @@ class TorchTracker(Module):
     def advance(
         self, state: Tensor, y: Tensor, u: Tensor, begins: Tensor, measurement_noise: Tensor, process_noise: Tensor
     ) -> tuple[Tracked, Tensor]:
-        """Predict, and correct by samples y (ny, n), of which NaN is missing; returns also predicted outputs.
-
-        The state stays, and the NIS is infinite, where that leaves no estimate.
-        """
+        """Predict, and correct by y (ny, n), NaN where missing; also returns predicted outputs. NIS is inf if lost."""
         Q = self.eye * ((process_noise.clamp(min=self.least_process_noise) * self.process_noise) ** 2 + self.error**2)
         R = self.eye_y * torch.maximum(measurement_noise, self.least_measurement_noise) ** 2
-        before, numbers = self._unpacked(state), self.numbers
-        x0, P0 = torch.where(begins, self.start_mean, before.x), torch.where(begins, self.start_covariance, before.P)
-        new = (before.seen < self.window) & ~begins
+        numbers, (x0, P0, nis, square, seen, trend) = self.numbers, self._unpacked(state)
+        x0, P0 = torch.where(begins, self.start_mean, x0), torch.where(begins, self.start_covariance, P0)
+        new = (seen < self.window) & ~begins
         prediction = self._predicted(x0, P0, u, Q, x0.new_zeros(self.nx, 0, 1), x0.new_zeros(0, 1))
         for _ in range(numbers["relinearisations"]):
             prediction = self._relinearised(x0, P0, prediction, new, y, u, Q, R)
@@ -95,36 +79,35 @@ class TorchTracker(Module):
         sound = sound & known & (x.sum(0) + P.sum((0, 1))).isfinite() & (eliminated(P)[1] | ~begins)
         there = (~y.isnan()).to(x.dtype)
         count = there.sum(0)
-        trend = before.trend + numbers["trend_share"] * there * (white - before.trend)
-        nis = before.nis + numbers["share"] / self.ny * ((white**2).sum(0) - count * before.nis)
-        square = numbers["trend_gain"] * (there * trend**2).sum(0) - count * before.trend_square
-        square = before.trend_square + numbers["trend_square_share"] / self.ny * square
-        coloured, going = (square > numbers["trend_limit"]) & (count > 0) & ~begins, sound & ~begins
-        square = torch.where(going, torch.where(coloured, 1.0, square), before.trend_square)
-        return Tracked(
+        moved = trend + numbers["trend_share"] * there * (white - trend)
+        nis = nis + numbers["share"] / self.ny * ((white**2).sum(0) - count * nis)
+        change = numbers["trend_gain"] * (there * moved**2).sum(0) - count * square
+        raised = square + numbers["trend_square_share"] / self.ny * change
+        coloured, going = (raised > numbers["trend_limit"]) & (count > 0) & ~begins, sound & ~begins
+        raised = torch.where(going, torch.where(coloured, 1.0, raised), square)
+        return (
             torch.where(sound, self._within(x), x0),
             torch.where(sound, torch.where(coloured, numbers["inflation"] * P, P), P0),
             torch.where(begins, 1.0, torch.where(sound, nis, math.inf)),
-            torch.where(begins, 1.0, square),
-            torch.where(going, before.seen + count.clamp(max=1.0), before.seen),
-            torch.where(going, torch.where(coloured, 0.0, trend), before.trend),
+            torch.where(begins, 1.0, raised),
+            torch.where(going, seen + count.clamp(max=1.0), seen),
+            torch.where(going, torch.where(coloured, 0.0, moved), trend),
         ), expected
 
-    def supervise(self, tracked: Tracked, x: Tensor, P: Tensor) -> Tensor:
-        """Take T_inv's estimates (nx, n) and covariances (nx^2, n) where these are surer, or the filter diverged.
-
-        Returns the state (width, n).
-        """
-        lost, P = ~(tracked.nis <= self.numbers["limit"]), P.reshape(self.nx, self.nx, -1) / self.units
-        taken = lost | ((tracked.seen < self.window) & (self._log_det(P) < self._log_det(tracked.P)))
-        x = torch.where(taken, self._within((x - self.x_offset) / self.x_scale), tracked.x)
-        P = torch.where(taken, P, tracked.P).flatten(0, 1)
-        nis, trend_square = (torch.where(lost, 1.0, each) for each in (tracked.nis, tracked.trend_square))
-        return torch.cat([x, P, torch.stack([nis, trend_square, tracked.seen]), torch.where(lost, 0.0, tracked.trend)])
+    def supervise(self, tracked: Tracked, x_hat: Tensor, covariance: Callable[[Tensor], Tensor]) -> Tensor:
+        """Take T_inv's estimates (nx, n) where its covariances, given ages, are smaller, or the filter diverged."""
+        x, P, nis, square, seen, trend = tracked
+        learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)  # z depends on so much for certain
+        lost, learned = ~(nis <= self.numbers["limit"]), learned.reshape(P.shape) / self.units
+        taken = lost | ((seen < self.window) & (self._log_det(learned) < self._log_det(P)))
+        x = torch.where(taken, self._within((x_hat - self.x_offset) / self.x_scale), x)
+        P = torch.where(taken, learned, P).flatten(0, 1)
+        nis, square = torch.where(lost, 1.0, nis), torch.where(lost, 1.0, square)
+        return torch.cat([x, P, torch.stack([nis, square, seen]), torch.where(lost, 0.0, trend)])
 
     def _unpacked(self, state: Tensor) -> Tracked:
-        x, P, watched, trend = torch.split(state, [self.nx, self.nx**2, 3, self.ny])
-        return Tracked(x, P.reshape(self.nx, self.nx, -1), watched[0], watched[1], watched[2], trend)
+        x, P, statistics, trend = torch.split(state, [self.nx, self.nx**2, 3, self.ny])
+        return x, P.reshape(self.nx, self.nx, -1), statistics[0], statistics[1], statistics[2], trend
 
     def _predicted(self, x: Tensor, P: Tensor, u: Tensor, Q: Tensor, G: Tensor, white: Tensor) -> Prediction:
         """Predict x and P, with the motion linearised about x + G white and P - G G^T."""
@@ -180,8 +163,7 @@ class TorchTracker(Module):
         if hasattr(self, "flow"):
             q = torch.cat([s, u / self.u_scale])
             return s + self.affine + self.linear @ q + self.gain * self.flow(q.T).T
-        equations: Any = self.equations
-        moved: Tensor = equations(self.states(s), u, self.dt)
+        moved: Tensor = self.equations(self.states(s), u, self.dt)
         return (moved - self.x_offset) / self.x_scale
 
     def _output(self, s: Tensor, _: Tensor) -> Tensor:
@@ -195,5 +177,4 @@ class TorchTracker(Module):
 
     def _log_det(self, P: Tensor) -> Tensor:
         """Half the logarithm of the determinants of covariances."""
-        L, _ = eliminated(P)
-        return torch.stack([L[i, i] for i in range(self.nx)]).log().sum(0)
+        return eliminated(P)[0].diagonal().log().sum(1)
