@@ -55,7 +55,7 @@ def onnx_model(exported: Exported) -> Any:
     for node in model.graph.node:
         del node.metadata_props[:]  # the source in Torch, most of the file
     model.graph.name = exported.name
-    model.graph.doc_string = f"One step of the KKL observer {exported.source}; a row whose state is zeros begins."
+    model.graph.doc_string = f"One step of the KKL observer {exported.source}; a row whose state is zeros starts again."
     model.producer_name, model.producer_version = "kkl-gym", kkl_gym.__version__
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in exported.metadata.items()}
     helper.set_model_props(model, texts)
