@@ -71,7 +71,7 @@ class TorchExpression(Expression):
     def __call__(self, x: Tensor, u: Tensor | None = None) -> Tensor:  # type: ignore[override]
         """Evaluate it."""
         rows = [*x[: self.states], *(() if u is None else u[: self.inputs])]
-        return torch.stack([torch.zeros_like(x[0]) + value for value in self._function(*rows)])
+        return torch.stack([(torch.zeros_like(x[0]) + value).to(x.dtype) for value in self._function(*rows)])
 
 
 def between(at: Tensor, points: Tensor, values: Tensor) -> Tensor:
