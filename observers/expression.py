@@ -2,9 +2,9 @@
 
 import functools
 import reprlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -61,6 +61,7 @@ class Expression:
     """
 
     components: Sequence[Any]
+    _numpy: ClassVar[Any] = np
 
     def __post_init__(self) -> None:
         if not isinstance(self.components, list | tuple) or not self.components:
@@ -81,8 +82,8 @@ class Expression:
         return out
 
     @functools.cached_property
-    def _function(self) -> Any:
-        namespace: dict[str, Any] = {"np": np}
+    def _function(self) -> Callable[..., Any]:
+        namespace: dict[str, Any] = {"np": self._numpy}
         exec(self.python("function", self.states, self.inputs), namespace)
         return namespace["function"]
 

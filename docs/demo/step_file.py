@@ -27,7 +27,7 @@ def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
     tensors |= {name: getattr(linear, name)[:nz] for name in ("early_y", "late_y", "equilibrium")}
     if linear.nu:
         tensors["held_u"] = linear.held_u[nz : 2 * nz, 0]
-    described = exported.described | {"maps": {}}
+    described = exported.metadata | {"maps": {}}
     for label, inverse in exported.maps.items():
         described["maps"][label] = _described_map(tensors, f"{label}.", inverse, artifact.ny)
         if (error := inverse.error_covariance) is not None:

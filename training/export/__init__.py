@@ -1,9 +1,5 @@
-"""An observer's step outside NumPy: as a module of Torch, which exports to ONNX, and as C99.
+"""An observer's step outside NumPy, without known starts and monitor: as a module of Torch, as ONNX, and as C99."""
 
-Both hold what :meth:`observers.KKLObserver.reset` and :meth:`observers.KKLObserver.step` do, but for known starts and
-the monitor. Gaps are filled in C only by observers that track.
-"""
+from training.export.exported import Exported
 
-from training.export.exported import PRECISIONS, Exported
-
-__all__ = ["PRECISIONS", "Exported"]
+__all__ = ["Exported"]

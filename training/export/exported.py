@@ -1,10 +1,8 @@
-"""An observer to export: its artifact, the levels of noise that it assumes, and its origin."""
+"""An observer to export: its levels of noise, the names of its signals, and its metadata."""
 
-import dataclasses
-import math
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -20,15 +18,10 @@ from observers.storage import checksum
 from observers.tracker import INFLATION, RELINEARISATIONS, Supervision
 from observers.unscented import weights as sigma_weights
 
-# Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
-# what distinguishes them would be lost in the last digits of floats.
-PRECISIONS = ("float", "double")
-_MOST_SAMPLES = 2**32 - 1  # that C's unsigned long can count everywhere
-
 
 @dataclass(frozen=True)
 class Exported:
-    """An observer as it leaves this package."""
+    """An observer to export, the precision of its network and signals, and the levels of noise that it assumes."""
 
     artifact: Artifact
     name: str
@@ -47,37 +40,26 @@ class Exported:
         measurement_noise: float | tuple[float, ...] | None = None,
         process_noise: float | None = None,
     ) -> "Exported":
-        """Read an observer that is to be exported."""
-        choice("precision", precision, PRECISIONS)
-        text, path = os.fspath(name_or_path), resolve(name_or_path)
-        artifact = Artifact.read(path)
+        """Read an observer by its name or from its file; levels of noise as for :class:`observers.KKLObserver`."""
+        choice("precision", precision, ("float", "double"))
+        artifact = Artifact.read(path := resolve(name_or_path))
         observer = KKLObserver(artifact, measurement_noise, process_noise=process_noise)
-        return cls(
-            artifact,
-            name=identifier(path.stem if text.endswith(path.suffix) else text),
-            source=path.name,
-            checksum=checksum(path, ArtifactError),
-            precision=precision,
-            measurement_noise=observer.measurement_noise,
-            process_noise=observer.process_noise,
-        )
+        levels = observer.measurement_noise, observer.process_noise
+        return cls(artifact, identifier(path.stem), path.name, checksum(path, ArtifactError), precision, *levels)
 
     @property
     def maps(self) -> dict[str, InverseMap]:
         """The inverse maps by their names: "driven", and where there is one "free", of motion without input."""
-        free = self.artifact.free_inverse
-        return {"driven": self.artifact.inverse} | ({} if free is None else {"free": free})
+        maps = {"driven": self.artifact.inverse, "free": self.artifact.free_inverse}
+        return {name: inverse for name, inverse in maps.items() if inverse is not None}
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """Assumed levels of measurement noise: none, one for all outputs, or one for each of several."""
-        rows = {inverse.noise_gain.ndim == 2 for inverse in self.maps.values()}
-        if True in rows:
+        """Levels of measurement noise that T_inv takes: none, one for all outputs, or one for each."""
+        if self.artifact.inverse.noise_gain.ndim == 2:
             return tuple(np.broadcast_to(self.measurement_noise, self.artifact.ny).tolist())
-        takes_level = any(
-            "measurement_noise" in inverse.features or inverse.noise_gain.any() for inverse in self.maps.values()
-        )
-        return (float(np.max(self.measurement_noise)),) if takes_level else ()
+        takes = any("measurement_noise" in each.features or each.noise_gain.any() for each in self.maps.values())
+        return (float(np.max(self.measurement_noise)),) * takes
 
     @property
     def needs_process_noise(self) -> bool:
@@ -85,76 +67,48 @@ class Exported:
         return self.artifact.process_noise_max is not None or self.artifact.motion is not None
 
     @property
-    def last_age(self) -> int:
-        """Samples since the first after which the age no longer matters; 0 if it never does."""
-        ends = [inverse.age_max for inverse in self.maps.values() if "age" in inverse.features]
-        return min(math.ceil(max(ends, default=0.0) / self.artifact.filter.dt), _MOST_SAMPLES)
-
-    @property
-    def estimates(self) -> list[str]:
-        """Names of the estimates: states, biases of outputs, then parameters."""
+    def signals(self) -> dict[str, list[str]]:
+        """Names of the outputs y, the inputs u, and of x_hat: states, biases of outputs, then parameters."""
         artifact, system = self.artifact, SYSTEMS.get(self.artifact.system)
-        bias = np.broadcast_to(artifact.training.get("bias", 0.0), artifact.ny)
-        biases = [f"y{i + 1}_bias" for i in np.flatnonzero(bias)]
+        biases = np.flatnonzero(np.broadcast_to(artifact.training.get("bias", 0.0), artifact.ny))
         states = list(system.state_names) if system else _numbered("x", artifact.nx - len(biases))
-        return [*self._signals("hidden", [*states, *biases]), *artifact.estimated_parameters]
-
-    @property
-    def outputs(self) -> list[str]:
-        """Names of the measured outputs."""
-        return self._signals("measured", _numbered("y", self.artifact.ny))
-
-    @property
-    def inputs(self) -> list[str]:
-        """Names of the known inputs."""
-        return self._signals("inputs", _numbered("u", self.artifact.nu))
-
-    def _signals(self, role: str, others: list[str]) -> list[str]:
-        return others if self.artifact.signals is None else list(self.artifact.signals[role])
-
-    @property
-    def described(self) -> dict[str, Any]:
-        """Metadata of exported files beside the numbers of a step, as JSON can hold them."""
-        described: dict[str, Any] = {
-            "name": self.name,
-            "artifact": self.source,
-            "sha256": self.checksum,
-            "system": self.artifact.system,
-            "parameters": dict(self.artifact.parameters),
-            "dt": self.artifact.filter.dt,
-            "y": self.outputs,
-            "u": self.inputs,
-            "x_hat": self.estimates,
+        names = artifact.signals or {
+            "measured": _numbered("y", artifact.ny),
+            "inputs": _numbered("u", artifact.nu),
+            "hidden": [*states, *(f"y{i + 1}_bias" for i in biases)],
         }
-        if self.levels:
-            described["measurement_noise"] = list(self.levels)
-        if self.needs_process_noise:
-            described["process_noise"] = self.process_noise
-        return described
+        y, u, x = (list(names[role]) for role in ("measured", "inputs", "hidden"))
+        return {"y": y, "u": u, "x_hat": [*x, *artifact.estimated_parameters]}
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """A description for the exported file, which JSON can hold."""
+        artifact = self.artifact
+        metadata: dict[str, Any] = {"name": self.name, "artifact": self.source, "sha256": self.checksum}
+        metadata |= {"system": artifact.system, "parameters": dict(artifact.parameters), "dt": artifact.filter.dt}
+        metadata |= self.signals | ({"measurement_noise": list(self.levels)} if self.levels else {})
+        return metadata | ({"process_noise": self.process_noise} if self.needs_process_noise else {})
 
 
-def output_expression(artifact: Artifact) -> Expression:
-    """h(x)."""
-    if artifact.h is not None:
+def output_expression(artifact: Artifact) -> Expression | None:
+    """h(x), or None if the artifact does not hold it."""
+    if artifact.C is None:
         return artifact.h
-    assert artifact.C is not None
-    return Expression(
-        [["+", 0.0, 0.0, *(["*", c, ["x", i]] for i, c in enumerate(row) if c)] for row in artifact.C.tolist()]
-    )
+    rows = artifact.C.tolist()
+    return Expression([["+", 0.0, 0.0, *(["*", c, ["x", i]] for i, c in enumerate(row) if c)] for row in rows])
 
 
 def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
-    """Weights of sigma points, and divergence detection."""
+    """Weights of sigma points, and constants of divergence detection."""
     watch = Supervision.of(motion, dt)
     weights = dict(zip(("middle", "middle_squares", "other"), sigma_weights(motion.nx), strict=True))
     others = {"trend_gain": watch.trend_gain, "inflation": INFLATION, "relinearisations": RELINEARISATIONS}
-    return weights | others | dataclasses.asdict(watch)
+    return weights | others | asdict(watch)
 
 
 def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
     """Scaling of the states; bounds, and mean and covariance of where motions start, of scaled states."""
-    low, high = ((bound - motion.x_offset) / motion.x_scale for bound in (motion.low, motion.high))
-    mean = (motion.mean - motion.x_offset) / motion.x_scale
+    low, high, mean = ((x - motion.x_offset) / motion.x_scale for x in (motion.low, motion.high, motion.mean))
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}
     return scaling | {"low": low, "high": high, "start_mean": mean, "start_covariance": covariance}

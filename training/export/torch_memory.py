@@ -14,9 +14,8 @@ from training.export.torch_parts import Module
 class TorchMemory(Module):
     """The memory of :class:`kkl_gym.KKLMemory` as a module of Torch: batched, differentiable, on any device.
 
-    ``state, shown = memory(state, y, u)`` takes in a step of n rows. ``shown`` is what the wrapper shows: y, the memory
-    of y and the memory of u. A row of zeros has seen nothing, and begins with the outputs that it is given:
-    :meth:`start` returns such rows, and ``state * ~done[:, None]`` restarts some.
+    A row of zeros has seen nothing, and begins with the outputs that it is given: :meth:`start` returns such rows, and
+    ``state * ~done[:, None]`` restarts some.
 
     Parameters
     ----------
@@ -52,10 +51,8 @@ class TorchMemory(Module):
         input_time_constants: Sequence[float] = (1.0, 4.0),
     ) -> None:
         pairs = np.asarray(list(angles) if isinstance(angles, Sequence) else angles)
-        if not pairs.size:
-            pairs = np.empty((0, 2), dtype=int)
-        of_two = pairs.dtype.kind in "iu" and pairs.shape[1:] == (2,)
-        if not of_two or len({*pairs.ravel().tolist()} & {*range(ny)}) < pairs.size:
+        pairs = pairs if pairs.size else np.empty((0, 2), dtype=int)
+        if pairs.dtype.kind not in "iu" or pairs.shape[1:] != (2,) or len({*pairs.flat} & {*range(ny)}) < pairs.size:
             raise ValueError(f"angles must be pairs of different outputs, of 0 to {ny - 1}, got {angles!r}")
         super().__init__()
         self.cosines, self.sines = pairs.T.tolist()
@@ -76,7 +73,7 @@ class TorchMemory(Module):
         Parameters
         ----------
         state : Tensor, shape (n, width)
-            What the last step returned, or :meth:`start`.
+            The state that the last step returned, or :meth:`start`.
         y : Tensor, shape (n, ny)
             The outputs.
         u : Tensor, shape (n, nu), optional
@@ -87,28 +84,24 @@ class TorchMemory(Module):
         state : Tensor, shape (n, width)
             The next state.
         shown : Tensor, shape (n, size)
-            As the wrapper's observation, float32 unless ``y`` is float64.
+            The wrapper's observation: y, its memory, and that of u; float32 unless ``y`` is float64.
         """
         begins = state[:, :1] == 0
         age, before, w, v = torch.split(torch.where(begins, 0.0, state), self.widths, 1)
         signals = self._signals(y.to(state.dtype), before)
-        change = torch.where(begins, 0.0, signals - before)
-        u = y.new_zeros(y.shape[0], self.nu) if u is None else u
-        acted = torch.where(begins, 0.0, u.to(state.dtype))
-        w = self.decay * w.reshape(w.shape[0], len(self.decay), -1) + self.rise * change[:, None]
-        v = v.reshape(v.shape[0], len(self.input_decay), self.nu)
-        v = (v + (1.0 - self.input_decay) * (acted[:, None] - v)).flatten(1)
+        u = torch.where(begins, 0.0, y.new_zeros(1, self.nu) if u is None else u.to(state.dtype))
+        w = self.decay * w.reshape(-1, len(self.decay), signals.shape[1])
+        w = w + self.rise * torch.where(begins, 0.0, signals - before)[:, None]
+        v = v.reshape(-1, len(self.input_decay), self.nu)
+        v = (v + (1.0 - self.input_decay) * (u[:, None] - v)).flatten(1)
         steps = age[..., None].clamp(min=1.0)  # at the start w is 0
         with_past = torch.expm1(-(steps + IMAGINED) / self.time_constants) / torch.expm1(-steps / self.time_constants)
-        parts = [y, (self.mixing @ (w * with_past)).flatten(1), v]
-        kind = torch.promote_types(y.dtype, torch.float32)
-        shown = torch.cat([each.to(kind) for each in parts], 1)
+        shown = torch.cat([y, (self.mixing @ (w * with_past)).flatten(1), v], 1)
+        shown = shown.to(torch.promote_types(y.dtype, torch.float32))
         return torch.cat([age + 1.0, signals, w.flatten(1), v], 1), shown
 
     def _signals(self, y: Tensor, before: Tensor) -> Tensor:
         """The signals to filter: the other outputs, then angles, which turn by less than half a turn in a step."""
-        if not self.cosines:
-            return y
         cosine, sine, before = y[:, self.cosines], y[:, self.sines], before[:, len(self.others) :]
         known = cosine**2 + sine**2 > 0
         angle = torch.atan2(sine, torch.where(known, cosine, 1.0))

@@ -1,14 +1,15 @@
 """An observer's whole step as a module of Torch."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from observers import Artifact, KKLObserver
-from observers.inverse import InverseMap
-from training.export.torch_parts import Module, Network, between, evaluated
+from observers.inverse import FEATURES, InverseMap
+from training.export.exported import output_expression
+from training.export.torch_parts import Module, Network, TorchExpression, between
 from training.export.torch_tracker import TorchTracker
 
 
@@ -16,29 +17,19 @@ class TorchObserver(Module):
     """An observer's step as a module of Torch: batched, differentiable, on any device.
 
     The state is explicit: ``state, x_hat = observer(state, y, u)`` does for n rows what
-    :meth:`observers.KKLObserver.step` does. A row of zeros has seen nothing, and begins with the sample that it is
-    given: :meth:`start` returns such rows, and ``state * ~done[:, None]`` restarts some. A NaN in ``y`` is a missing
-    sample; only the first of a row must be whole. There is no monitor and no known start.
+    :meth:`observers.KKLObserver.step` does, without monitor and known starts. A row of zeros has seen nothing, and
+    begins with the sample that it is given, which must be whole: :meth:`start` returns such rows, and
+    ``state * ~done[:, None]`` restarts some. A NaN in later ``y`` is a missing sample.
 
-    Every row takes the same way through the step: T_inv and the relinearised steps of the first window are evaluated
-    for all rows, and each takes what it needs. So nothing waits for the device, and ``torch.compile`` and
-    ``torch.onnx.export`` see one graph. Gradients lead through filter, T_inv and tracker, to the weights as well;
-    ``requires_grad_(False)`` freezes these.
-
-    The filter's state and the tracker's covariance are float64 whatever ``dtype`` is: the filter's modes are nearly
-    dependent. ``observer.float()`` makes all of it float32, for devices without float64. T_inv's estimates are then
-    inaccurate.
+    Gradients lead through the whole step, and to the weights. The filter's state and the tracker's covariance are
+    float64 whatever ``dtype`` is; after ``observer.float()``, T_inv's estimates are inaccurate.
 
     Parameters
     ----------
     artifact : Artifact
         The observer.
-    measurement_noise : float or sequence of float, length ny, optional
-        Standard deviation of the noise on each sample, as for :class:`observers.KKLObserver`.
-    process_noise : float, optional
-        Level of process noise, likewise.
-    tracking : bool, optional
-        Whether to track, likewise.
+    measurement_noise, process_noise, tracking : optional
+        As for :class:`observers.KKLObserver`.
     dtype : torch.dtype, default torch.float32
         Type of the networks and of the estimates; float32 as in NumPy, or float64.
 
@@ -54,7 +45,6 @@ class TorchObserver(Module):
     >>> from training import TorchObserver
     >>> observer = TorchObserver(observers.load("lorenz").artifact)
     >>> state, x_hat = observer(observer.start(1024), torch.zeros(1024, 1))
-    >>> state, x_hat = observer(state, torch.full((1024, 1), 0.1), u=torch.zeros(1024, 1))
     >>> x_hat.shape
     torch.Size([1024, 3])
     """
@@ -72,18 +62,16 @@ class TorchObserver(Module):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
         checked = KKLObserver(artifact, measurement_noise, process_noise=process_noise, tracking=tracking)
         super().__init__()
-        linear, self.nx, self.nu, self.ny = artifact.filter, artifact.nx, artifact.nu, artifact.ny
-        self.dt, self.nz = linear.dt, len(linear.A)
-        self.driven = TorchMap(artifact.inverse, dtype)
+        linear, inverse, h = artifact.filter, artifact.inverse, output_expression(artifact)
+        self.nx, self.nu, self.ny, self.nz, self.dt = artifact.nx, artifact.nu, artifact.ny, len(linear.A), linear.dt
+        self.h = None if h is None else TorchExpression(h.components)
+        self.driven = TorchMap(inverse, dtype)
         self.free = None if artifact.free_inverse is None else TorchMap(artifact.free_inverse, dtype)
         self.tracker = TorchTracker(artifact, dtype) if checked.tracking else None
-        rest = len(artifact.inverse.x_offset) if self.tracker is None else self.tracker.width
-        self.widths = [1, self.ny, linear.size, rest]
-        self.h, several = artifact.h, artifact.inverse.noise_gain.ndim == 2
-        level = np.broadcast_to(checked.measurement_noise, self.ny if several else 1)
+        self.widths = [1, self.ny, linear.size, self.tracker.width if self.tracker else len(inverse.x_offset)]
+        level = np.broadcast_to(checked.measurement_noise, self.ny if inverse.noise_gain.ndim == 2 else 1)
         self.put(update=np.vstack([linear.transition.T, linear.drive]), equilibrium=linear.equilibrium.T)
-        self.put(measurement_noise=np.reshape(level, (1, -1)), process_noise=np.reshape(checked.process_noise, (1, 1)))
-        self.put(**({} if artifact.C is None else {"C": artifact.C.T}))
+        self.put(measurement_noise=level[None], process_noise=np.array([[checked.process_noise]]))
 
     def start(self, n: int) -> Tensor:
         """Return the state of n rows that have seen nothing: zeros, (n, width)."""
@@ -114,11 +102,11 @@ class TorchObserver(Module):
             The covariances.
         """
         samples, _, z, rest = torch.split(state, self.widths, 1)
-        age, (levels, process_noise) = (samples - 1.0) * self.dt, self._levels(measurement_noise, process_noise)
+        age, (level, process_level) = (samples - 1.0) * self.dt, self._levels(measurement_noise, process_noise)
         if self.tracker is None:
-            P = self._of_map(z, [each.covariance(age, levels) for each in self._maps]).expand(z.shape[0], -1)
+            P = self._of_map(z, TorchMap.covariance, age, level).expand(z.shape[0], -1)
         else:
-            shares = self.driven.share(levels), process_noise / self.driven.process_noise_max
+            shares = self.driven.share(level), process_level / self.driven.process_noise_max
             P = self.tracker.covariance(rest.T, age, *shares)
         return P.reshape(-1, self.nx, self.nx)
 
@@ -135,15 +123,13 @@ class TorchObserver(Module):
         Parameters
         ----------
         state : Tensor, shape (n, width)
-            What the last step returned, or :meth:`start`.
+            The state that the last step returned, or :meth:`start`.
         y : Tensor, shape (n, ny)
             The samples, NaN where missing.
         u : Tensor, shape (n, nu), optional
             The inputs held since the samples before, by default zero.
-        measurement_noise : Tensor, shape (n or 1, 1 or ny), optional
-            Levels for each row in place of those of the observer: one, or one for each output if T_inv takes several.
-        process_noise : Tensor, shape (n or 1, 1), optional
-            Likewise.
+        measurement_noise, process_noise : Tensor, shapes (n or 1, 1 or ny) and (n or 1, 1), optional
+            Levels for each row in place of those of the observer; of measurement noise one, or one for each output.
 
         Returns
         -------
@@ -154,58 +140,44 @@ class TorchObserver(Module):
         """
         begins = state[:, :1] == 0
         samples, before, z, rest = torch.split(torch.where(begins, 0.0, state), self.widths, 1)
-        y, u = y.to(state.dtype), y.new_zeros(y.shape[0], self.nu) if u is None else u
-        u, missing, age = u[:, : self.nu].to(state.dtype), y.isnan(), samples * self.dt
-        levels = self._levels(measurement_noise, process_noise)
-        if self.tracker is None:
-            whole = self._filled(rest, y, before, missing)
-            if self.h is not None or hasattr(self, "C"):  # once more, from T_inv of what the guess leads to
-                x = self._inverted(self._filtered(z, before, u, whole, begins), age, *levels)
-                whole = self._filled(x, y, before, missing)
-        else:
-            tracked, h = self.tracker.advance(rest.T, y.T, u.T, begins[:, 0], levels[0].T, levels[1].T)
-            whole = torch.where(missing & ~begins, torch.where(h.T.isfinite(), h.T, before), y)
-        z = self._filtered(z, before, u, whole, begins)
-        rest = self._inverted(z, age, *levels)
+        u = (y.new_zeros(y.shape[0], self.nu) if u is None else u[:, : self.nu]).to(state.dtype)
+        y, age, levels = y.to(state.dtype), samples * self.dt, self._levels(measurement_noise, process_noise)
+
+        def filled(h: Tensor) -> Tensor:
+            return torch.where(y.isnan() & ~begins, torch.where(h.isfinite(), h, before), y)
+
+        def filtered(y: Tensor) -> Tensor:
+            return torch.where(begins, y @ self.equilibrium, torch.cat([z, before, u, y], 1) @ self.update)
+
         if self.tracker is not None:
-            learned = tracked.seen.clamp(max=self.tracker.window)[:, None] * self.dt  # so much z knows for certain
-            P = self._of_map(z, [each.covariance(learned, levels[0]) for each in self._maps])
-            rest = self.tracker.supervise(tracked, rest.T, P.T).T
-        state = torch.cat([samples + 1.0, whole, z, rest], 1)
+            tracked, expected = self.tracker.advance(rest.T, y.T, u.T, begins[:, 0], levels[0].T, levels[1].T)
+            y = filled(expected.T)
+        elif self.h is not None:  # once more, from T_inv of what the guess leads to
+            guess = filtered(filled(self.h(rest.T).T))
+            y = filled(self.h(self._of_map(guess, TorchMap.__call__, age, *levels).T).T)
+        else:
+            y = filled(before)
+        z = filtered(y)
+        rest = self._of_map(z, TorchMap.__call__, age, *levels)
+        if self.tracker is not None:
+            rest = self.tracker.supervise(
+                tracked, rest.T, lambda age: self._of_map(z, TorchMap.covariance, age, levels[0]).T
+            ).T
+        state = torch.cat([samples + 1.0, y, z, rest], 1)
         return state, self.estimate(state)
 
-    @property
-    def _maps(self) -> list["TorchMap"]:
-        return [self.driven] if self.free is None else [self.driven, self.free]
-
     def _levels(self, measurement_noise: Tensor | None, process_noise: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Levels of noise, those of the observer where none are given; the first is cut at the largest in training."""
-        levels = self.measurement_noise if measurement_noise is None else measurement_noise.to(self.update.dtype)
-        process_noise = self.process_noise if process_noise is None else process_noise.to(self.update.dtype)
-        return torch.minimum(levels, self.driven.measurement_noise_max), process_noise
+        """Levels of noise, by default those of the observer; the first is cut at the largest in training."""
+        level = self.measurement_noise if measurement_noise is None else measurement_noise.to(self.update.dtype)
+        process_level = self.process_noise if process_noise is None else process_noise.to(self.update.dtype)
+        return torch.minimum(level, self.driven.measurement_noise_max), process_level
 
-    def _filtered(self, z: Tensor, y: Tensor, u: Tensor, y_next: Tensor, begins: Tensor) -> Tensor:
-        """The filter's next state, (n, size)."""
-        return torch.where(begins, y_next @ self.equilibrium, torch.cat([z, y, u, y_next], 1) @ self.update)
-
-    def _filled(self, x: Tensor, y: Tensor, before: Tensor, missing: Tensor) -> Tensor:
-        """Samples, and h(x) where these are missing; the samples before where h is unknown or undefined."""
-        if self.h is None:
-            h = x[:, : self.nx] @ self.C if hasattr(self, "C") else before
-        else:
-            h = evaluated(self.h, x=x.unbind(1)).T
-        return torch.where(missing, torch.where(h.isfinite(), h, before), y)
-
-    def _inverted(self, z: Tensor, age: Tensor, measurement_noise: Tensor, process_noise: Tensor) -> Tensor:
-        """T_inv(z), (n, nx)."""
-        free = z[:, : self.nz] if self.free is not None else z
-        each = [m(z_of, age, measurement_noise, process_noise) for m, z_of in zip(self._maps, (z, free), strict=False)]
-        return self._of_map(z, each)
-
-    def _of_map(self, z: Tensor, values: list[Tensor]) -> Tensor:
-        """In each row the value of the map that it is for: that of free motion until an input has acted."""
-        driven, *free = values
-        return torch.where((z[:, self.nz :] == 0).all(1, keepdim=True), free[0], driven) if free else driven
+    def _of_map(self, z: Tensor, method: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
+        """Values (n, m) of a map's method: in each row of that of free motion until an input has acted."""
+        driven = method(self.driven, z, *arguments)
+        if self.free is None:
+            return driven
+        return torch.where((z[:, self.nz :] == 0).all(1, True), method(self.free, z[:, : self.nz], *arguments), driven)
 
 
 class TorchMap(Module):
@@ -214,39 +186,30 @@ class TorchMap(Module):
     def __init__(self, inverse: InverseMap, dtype: torch.dtype) -> None:
         super().__init__()
         self.features, self.network = inverse.features, Network(inverse.mlp, dtype)
-        self.process_noise_unit, self.process_noise_max = inverse.process_noise_unit, inverse.process_noise_max
-        self.age_unit, self.age_max = inverse.age_unit, inverse.age_max
-        takes_level = "measurement_noise" in inverse.features
-        self.put(
-            whiten=inverse.whiten.T,
-            offset=inverse.z_offset @ inverse.whiten.T,
-            squared_gain=np.atleast_2d(inverse.noise_gain) ** 2,
-            measurement_noise_unit=np.atleast_1d(inverse.measurement_noise_unit),
-            measurement_noise_max=np.atleast_1d(inverse.measurement_noise_max if takes_level else np.inf),
-            x_offset=inverse.x_offset,
-            x_scale=inverse.x_scale,
-        )
+        self.put(whiten=inverse.whiten.T, offset=inverse.z_offset @ inverse.whiten.T, x_offset=inverse.x_offset)
+        self.put(x_scale=inverse.x_scale, squared_gain=np.atleast_2d(inverse.noise_gain) ** 2)
+        for name in (f"{condition}_{end}" for condition in FEATURES[2:] for end in ("unit", "max")):
+            self.put(**{name: np.atleast_1d(getattr(inverse, name))})
+        if "measurement_noise" not in inverse.features:
+            self.put(measurement_noise_max=np.array([np.inf]))
         if (error := inverse.error_covariance) is not None:
             table = error.covariance.reshape(len(error.levels), -1)
             self.put(levels=error.levels, ages=error.ages, error=table)
 
-    def forward(self, z: Tensor, age: Tensor, measurement_noise: Tensor, process_noise: Tensor) -> Tensor:
+    def forward(self, z: Tensor, age: Tensor, level: Tensor, process_level: Tensor) -> Tensor:
         """The estimates (n, nx), of filter states (n, size) at ages (n, 1) in seconds."""
-        modes = (z @ self.whiten - self.offset) / (1.0 + measurement_noise**2 @ self.squared_gain)
-        inputs = [modes]
-        if "measurement_noise" in self.features:
-            inputs.append(torch.log1p(measurement_noise / self.measurement_noise_unit))
-        if "process_noise" in self.features:
-            inputs.append(torch.log1p(process_noise.clamp(max=self.process_noise_max) / self.process_noise_unit))
-        if "age" in self.features:
-            inputs.append(torch.log1p(age.clamp(max=self.age_max) / self.age_unit))
-        return self.x_offset + self.x_scale * self.network(torch.cat([one.expand(z.shape[0], -1) for one in inputs], 1))
+        inputs = [(z @ self.whiten - self.offset) / (1.0 + level**2 @ self.squared_gain)]
+        for name, value in zip(FEATURES[2:], (level, process_level, age), strict=True):
+            if name in self.features:
+                value = torch.minimum(value, getattr(self, f"{name}_max"))
+                inputs.append(torch.log1p(value / getattr(self, f"{name}_unit")).expand(z.shape[0], -1))
+        return self.x_offset + self.x_scale * self.network(torch.cat(inputs, 1))
 
-    def share(self, measurement_noise: Tensor) -> Tensor:
+    def share(self, level: Tensor) -> Tensor:
         """Levels (n, 1) in multiples of the largest in training, of the noisiest output."""
-        return (measurement_noise / self.measurement_noise_max).amax(1, keepdim=True)
+        return (level / self.measurement_noise_max).amax(1, keepdim=True)
 
-    def covariance(self, age: Tensor, measurement_noise: Tensor) -> Tensor:
+    def covariance(self, _: Tensor, age: Tensor, level: Tensor) -> Tensor:
         """The covariances of its error, (n, nx^2), at ages (n, 1) in seconds."""
-        by_age = between(self.share(measurement_noise), self.levels, self.error)
+        by_age = between(self.share(level), self.levels, self.error)
         return between(age, self.ages, by_age.reshape(by_age.shape[0], len(self.ages), -1))

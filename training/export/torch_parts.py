@@ -1,8 +1,7 @@
 """Networks, expressions, tables and factors as functions of Torch that export, compile and differentiate."""
 
-import functools
-import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,14 +14,23 @@ from observers.network import MLP
 
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"tanh": torch.tanh, "silu": functional.silu, "relu": torch.relu}
 LEAST_PIVOT = 1e-30  # a variance of scaled states
-# Those that take numbers beside tensors as they are; the others get tensors in their place.
-_OPERATORS = {"+": operator.add, "*": operator.mul, "**": operator.pow, "%": operator.mod}
-_OPERATORS |= {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
-_FUNCTIONS: dict[str, Callable[..., Tensor]] = {
-    **{name: getattr(torch, name) for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "abs", "sign")},
-    **{name: getattr(torch, name) for name in ("floor", "atan2", "minimum", "maximum", "where")},
-    **{name: getattr(torch, f"logical_{name}") for name in ("and", "or", "not")},
-}
+
+
+def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """A function of tensors that also takes numbers, as doubles, and conditions."""
+
+    def tensor(value: Any) -> Tensor:
+        return torch.tensor(value, dtype=torch.bool if isinstance(value, bool) else torch.float64)
+
+    return lambda *arguments: function(*(each if isinstance(each, Tensor) else tensor(each) for each in arguments))
+
+
+# NumPy's names, which the source of expressions holds.
+_SAME = ["sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "abs", "sign", "floor", "minimum", "maximum", "where"]
+_OTHER = {name: getattr(torch, name) for name in ("logical_and", "logical_or", "logical_not")}
+_OTHER |= {"power": torch.pow, "mod": torch.remainder, "arctan2": torch.atan2}
+_FUNCTIONS = {name: getattr(torch, name) for name in _SAME} | _OTHER
+_NUMPY = SimpleNamespace(**{name: _of_tensors(function) for name, function in _FUNCTIONS.items()})
 
 
 class Module(nn.Module):
@@ -55,29 +63,15 @@ class Network(Module):
         return h.to(kind)
 
 
-def evaluated(expression: Expression, **columns: Sequence[Tensor]) -> Tensor:
-    """The components (k, ...) of states "x" and inputs "u", which are sequences of tensors (...)."""
-    like = columns["x"][0]
-    values: dict[Any, Any] = {}
+class TorchExpression(Expression):
+    """An expression of tensors: states (nx, ...) and inputs (nu, ...) to components (k, ...)."""
 
-    def value(part: Any) -> Any:
-        if not isinstance(part, tuple):
-            return part
-        if part not in values:
-            name, *arguments = part
-            values[part] = columns[name][arguments[0]] if name in columns else operated(name, *map(value, arguments))
-        return values[part]
+    _numpy = _NUMPY
 
-    def operated(name: str, *given: Any) -> Any:
-        if name not in _OPERATORS or not any(isinstance(each, Tensor) for each in given):
-            given = tuple(map(tensor, given))
-        function = _OPERATORS.get(name) or _FUNCTIONS[name]
-        return function(*given) if name == "where" or len(given) == 1 else functools.reduce(function, given)
-
-    def tensor(given: Any) -> Tensor:
-        return given if isinstance(given, Tensor) else torch.zeros_like(like) + given
-
-    return torch.stack([tensor(value(part)).expand_as(like) for part in expression.components])
+    def __call__(self, x: Tensor, u: Tensor | None = None) -> Tensor:  # type: ignore[override]
+        """Evaluate it."""
+        rows = [*x[: self.states], *(() if u is None else u[: self.inputs])]
+        return torch.stack([(torch.zeros_like(x[0]) + value).to(x.dtype) for value in self._function(*rows)])
 
 
 def between(at: Tensor, points: Tensor, values: Tensor) -> Tensor:
@@ -93,22 +87,15 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     return (a[:, None] * b[None]).sum(2)
 
 
-def eliminated(P: Tensor, *rows: Tensor, skipped: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def eliminated(P: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
     """L and B L^-T, one above the other, of covariances P = L L^T (m, m, n) and matrices B (k, m, n) of more rows.
 
-    Columns are 0 where they are skipped, (m, n). Returns also where P is positive definite, (n,). Where it is not,
-    pivots are replaced by small ones, so that gradients stay finite. Above its diagonal L holds rounding errors.
+    Returns also where P is positive definite, (n,). Where it is not, pivots are replaced by small ones, so that
+    gradients stay finite. Above its diagonal L holds rounding errors.
     """
-    rest = torch.cat([P, *rows]) if rows else P
-    columns: list[Tensor] = []
-    pivots: list[Tensor] = []
+    rest, columns, pivots = torch.cat([P, *rows]), [], []
     for j in range(len(P)):
-        pivot = rest[j, j]
-        column = rest[:, j] / pivot.clamp(min=LEAST_PIVOT).sqrt()
-        if skipped is not None:
-            column, pivot = torch.where(skipped[j], 0.0, column), torch.where(skipped[j], 1.0, pivot)
-        columns.append(column)
-        pivots.append(pivot)
-        if j + 1 < len(P):
-            rest = rest - column[:, None] * column[: len(P)]
+        pivots.append(rest[j, 0])
+        columns.append(rest[:, 0] / rest[j, 0].clamp(min=LEAST_PIVOT).sqrt())
+        rest = rest[:, 1:] - columns[j][:, None] * columns[j][j + 1 : len(P)]
     return torch.stack(columns, 1), torch.stack(pivots).amin(0) > 0

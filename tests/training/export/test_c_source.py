@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compiled_c import compiled, estimates, fed, needs_cc
-from exported_steps import MAPS, apart, apart_at_all_levels, exported_of, in_doubles, mapped, noise
+from exported_steps import MAPS, apart, apart_at_all_levels, exported_of, in_doubles, mapped, noise, tracked
 from random_artifacts import random_artifact
 from rollout_observers import observer_of
 
@@ -16,7 +16,6 @@ from training.export.c_source import c_files
 from training.export.exported import identifier
 
 TOLERANCES = {"float": 1e-5, "double": 1e-9}
-SHIPPED = shipped()
 
 
 @needs_cc
@@ -32,7 +31,7 @@ def test_every_kind_of_map(index, precision, tmp_path):
     ("name", "precision", "steps"),
     [
         ("lorenz-spinn", "float", 6000),
-        *(pytest.param(name, each, 100_000, marks=pytest.mark.slow) for name in SHIPPED for each in TOLERANCES),
+        *(pytest.param(name, each, 100_000, marks=pytest.mark.slow) for name in shipped() for each in TOLERANCES),
     ],
 )
 def test_many_steps_of_what_ships(name, precision, steps, tmp_path):
@@ -44,12 +43,14 @@ def test_many_steps_of_what_ships(name, precision, steps, tmp_path):
 
 
 @needs_cc
-def test_other_levels_of_noise(tmp_path):
-    exported, y, u, expected = mapped(1)
-    other = replace(exported, measurement_noise=(0.9, 2.0), process_noise=7.0)  # of which training ended at 0.2
-    x_hat = estimates(compiled(other, tmp_path), y[:, 1], u[:, 1])
-    np.testing.assert_allclose(x_hat, in_doubles(other, y[:, 1], u[:, 1]), rtol=0, atol=1e-9)
-    assert abs(x_hat - expected[:, 1]).max() > 1e-3
+@pytest.mark.parametrize("tracks", [False, True])
+def test_other_levels_of_noise(tracks, tmp_path):
+    exported, *record = tracked(5) if tracks else mapped(1)
+    y, u, usual = (each[:200] if tracks else each[:, 1] for each in record)
+    other = replace(exported, measurement_noise=(0.9, 2.0), process_noise=7.0)  # T_inv's training ends at 0.2
+    x_hat = estimates(compiled(other, tmp_path), y, u)
+    np.testing.assert_allclose(x_hat, in_doubles(other, y, u), rtol=0, atol=1e-9)
+    assert abs(x_hat - usual).max() > 1e-3
     assert "process noise of level 7.0." in (tmp_path / "made.h").read_text()
 
 
@@ -73,22 +74,33 @@ def test_a_line_without_all_its_numbers_is_an_error(make_artifact, tmp_path):
     assert fed(program, "").returncode == 0
 
 
-def test_names():
-    assert [identifier(name) for name in ("lorenz-spinn", "Pendulum-v1", "3d", "模", "_a b_")] == [
-        "lorenz_spinn", "Pendulum_v1", "observer_3d", "observer", "a_b"
-    ]  # fmt: skip
-    assert Exported.read("lorenz-spinn").estimates == ["x1", "x2", "x3"]
+def test_numbers_are_read_back_as_the_same(make_artifact, tmp_path):
+    exported = exported_of(make_artifact(), tmp_path, precision="double")
+    inverse, text = exported.artifact.inverse, c_files(exported)["made.c"]
+
+    def numbers(name):
+        digits = re.search(rf" {name}[\[\]0-9]+ = {{(.*?)}};", text, re.DOTALL)[1]
+        return [word.rstrip("f") for word in re.findall(r"[^\s,{}]+", digits)]
+
+    assert np.array_equal(np.array(numbers("driven_z_offset"), float), inverse.z_offset)
+    assert np.array_equal(np.array(numbers("driven_weights0"), np.float32), inverse.mlp.weights[0].ravel())
+    assert all({".", "e", "inf"} & set(word) for word in numbers("driven_weights0"))  # C does not know 1f
 
 
-def test_biases_are_estimates_too(tmp_path):
+def test_identifiers():
+    names = ["lorenz-spinn", "Pendulum-v1", "3d", "模", "_a b_"]
+    assert [*map(identifier, names)] == ["lorenz_spinn", "Pendulum_v1", "observer_3d", "observer", "a_b"]
+
+
+def test_names_of_signals(tmp_path):
+    assert mapped(2)[0].signals["x_hat"][-1] == "mu"
+    rollouts = exported_of(observer_of("Pendulum-v1", ["obs[0]", "obs[1]"], ["obs[2]"], ["action[0]"]), tmp_path)
+    assert rollouts.signals == {"y": ["obs[0]", "obs[1]"], "u": ["action[0]"], "x_hat": ["obs[2]"]}
     artifact, system = random_artifact(system="lorenz"), get_system("van_der_pol")
     training = artifact.training | {"bias": 1.0}
-    replace(artifact, system=system.name, parameters=system.parameters, training=training).save(
-        tmp_path / "b.safetensors"
-    )
-    exported = Exported.read(tmp_path / "b.safetensors")
-    assert exported.estimates == ["x1", "x2", "y1_bias"]
-    assert "_NX 3 /*" in "".join(c_files(exported).values())
+    artifact = replace(artifact, system=system.name, parameters=system.parameters, training=training)
+    assert (exported := exported_of(artifact, tmp_path)).signals["x_hat"] == ["x1", "x2", "y1_bias"]
+    assert "_NX 3 /*" in c_files(exported)["made.h"]
 
 
 def test_an_unknown_precision():

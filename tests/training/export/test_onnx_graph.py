@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from exported_steps import apart, exported_of, mapped, motion, tracked
-from rollout_observers import observer_of
+from exported_steps import apart, mapped, motion, tracked
 
 from observers.checks import ArtifactError
 from observers.names import resolve
@@ -100,21 +99,13 @@ def test_what_ships():
             P = module.covariance(own, *given[2:]).numpy()
         assert np.abs((found["x_hat"] - x_hat.numpy()) / exported.artifact.inverse.x_scale).max() < 1e-5
         assert np.abs(found["covariance"] - P).max() < 1e-4 * np.abs(P).max()
-    said = {entry.key: entry.value for entry in model.metadata_props}
-    assert (said["name"], said["system"]) == ("van_der_pol", "van_der_pol")
-    assert said["artifact"] == resolve("van_der_pol").name
-    assert said["sha256"] == checksum(resolve("van_der_pol"), ArtifactError)
-    names = ("parameters", "dt", "y", "u", "x_hat", "measurement_noise", "process_noise")
-    assert {name: json.loads(said[name]) for name in names} == {
-        "parameters": {"mu": 3.0}, "dt": 0.01, "y": ["y"], "u": ["u"], "x_hat": ["x1", "x2"],
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    assert metadata["sha256"] == checksum(resolve("van_der_pol"), ArtifactError)
+    texts = ("name", "artifact", "sha256", "system")
+    assert {name: value if name in texts else json.loads(value) for name, value in metadata.items()} == {
+        "name": "van_der_pol", "artifact": resolve("van_der_pol").name, "sha256": metadata["sha256"],
+        "system": "van_der_pol", "parameters": {"mu": 3.0}, "dt": 0.01, "y": ["y"], "u": ["u"], "x_hat": ["x1", "x2"],
         "measurement_noise": [0.5], "process_noise": 0.05,
     }  # fmt: skip
     assert [(one.domain, one.version) for one in model.opset_import] == [("", OPSET)]
     assert {value.type.tensor_type.shape.dim[0].dim_param for value in model.graph.input} == {"batch"}
-
-
-def test_observers_from_rollouts_name_their_signals(tmp_path):
-    artifact = observer_of("Pendulum-v1", ["obs[0]", "obs[1]"], ["obs[2]"], ["action[0]"])
-    model = onnx_model(exported_of(artifact, tmp_path, precision="double"))
-    said = {entry.key: entry.value for entry in model.metadata_props}
-    assert [json.loads(said[name]) for name in ("y", "u", "x_hat")] == [["obs[0]", "obs[1]"], ["action[0]"], ["obs[2]"]]

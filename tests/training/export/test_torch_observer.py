@@ -25,7 +25,6 @@ import observers
 from observers import KKLObserver
 from training import TorchObserver
 
-TOLERANCES = {"float": 1e-5, "double": 1e-9}
 DTYPES = {"float": torch.float32, "double": torch.float64}
 
 
@@ -46,23 +45,24 @@ def along(module, y, u, **levels):
     return np.array(x_hat)
 
 
-@pytest.mark.parametrize(("index", "precision"), [*((i, "double") for i in range(len(MAPS))), (1, "float")])
-def test_every_kind_of_map(index, precision):
-    exported, y, u, expected = mapped(index)
-    x_hat = along(module_of(replace(exported, precision=precision)), y, u)
-    assert apart(exported, x_hat, expected) < TOLERANCES[precision]
+def check(exported, *record):
+    y, u, expected = (each if each.ndim > 2 else each[:, None] for each in record)
+    x_hat = along(module_of(exported), y, u)
+    assert apart(exported, x_hat, expected) < {"float": 1e-5, "double": 1e-9}[exported.precision]
 
 
-@pytest.mark.parametrize(("index", "precision"), [*((i, "double") for i in (1, 4, 5, 7)), (5, "float")])
-def test_maps_that_track(index, precision):
-    exported, y, u, expected = tracked(index)
-    x_hat = along(module_of(replace(exported, precision=precision)), y[:, None], u[:, None])[:, 0]
-    assert apart(exported, x_hat, expected) < TOLERANCES[precision]
+@pytest.mark.parametrize(
+    ("kind", "index", "precision"),
+    [*((mapped, i, "double") for i in range(len(MAPS))), *((tracked, i, "double") for i in (1, 4, 5, 7)),
+     (mapped, 1, "float"), (tracked, 5, "float")],
+)  # fmt: skip
+def test_every_kind_of_map(kind, index, precision):
+    exported, *record = kind(index)
+    check(replace(exported, precision=precision), *record)
 
 
 def test_equations_of_all_operations():
-    exported, y, u, expected = operated(["atan2", ["u", 0], ["x", 1]])
-    assert apart(exported, along(module_of(exported), y[:, None], u[:, None])[:, 0], expected) < 1e-9
+    check(*operated(["atan2", ["u", 0], ["x", 1]]))
 
 
 @pytest.mark.parametrize("name", [*kkl_gym.SYSTEMS, "lorenz-spinn"])
@@ -97,7 +97,7 @@ def test_gaps_of_maps_that_do_not_track(knows_output, tmp_path):
         exported = exported_of(replace(exported.artifact, C=C), tmp_path, precision="double")
     y, u = y[:120].copy(), u[:120]
     y[50:60, 0] = y[70:90, 1, 1] = np.nan
-    assert apart(exported, along(module_of(exported), y, u), in_doubles(exported, y, u)) < 1e-9
+    check(exported, y, u, in_doubles(exported, y, u))
 
 
 @pytest.mark.parametrize("tracks", [False, True])

@@ -22,8 +22,31 @@ static void layer(const real *in, int inputs, const float *weights, const float 
     }
 }
 
-/* FUNCTIONS */
+// if silu
+static void activate_silu(real *h, int n)
+{
+    for (int i = 0; i < n; i++)
+        h[i] = (real)0.5 * h[i] + (real)0.5 * h[i] * TANH((real)0.5 * h[i]);
+}
 
+// end silu
+// if tanh
+static void activate_tanh(real *h, int n)
+{
+    for (int i = 0; i < n; i++)
+        h[i] = TANH(h[i]);
+}
+
+// end tanh
+// if relu
+static void activate_relu(real *h, int n)
+{
+    for (int i = 0; i < n; i++)
+        h[i] = h[i] > 0 ? h[i] : 0;
+}
+
+// end relu
+/* MAPS */
 // if free
 /* Whether no input has acted since reset. */
 static int untouched(const NAME_observer *observer)

@@ -10,7 +10,21 @@
 // end inputs
  * x_hat: ESTIMATES
  *
-PARAGRAPH
+ * NAME_reset takes in the first sample, NAME_step every later one.
+// if static
+ * Samples and inputs must be finite: a NaN stays until the next reset.
+// end static
+// if tracks
+ * Where an output is missing, pass NaN: it is predicted. The first sample and inputs must be finite, and the compiler
+ * must know NaN, as it does without -ffast-math.
+// end tracks
+ * Nothing is allocated, and observers share constants alone.
+// if levels
+ * It assumes measurement noise of standard deviation LEVELS.
+// end levels
+// if process
+ * It assumes process noise of level PROCESS.
+// end process
  */
 #ifndef MACRO_H
 #define MACRO_H
