@@ -7,7 +7,7 @@ SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 LARGE := $(SYSTEMS:%=%-large)
 
 .PHONY: demo install test test-coverage guard test-slow test-research test-long test-browser lint format maps results figures benchmark ablation \
-	faults agents environments speed sizes clients docs clean help
+	faults agents environments speed clients docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -126,11 +126,6 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/python -m examples.research speed
-
-sizes: $(VENV)/ready  ## errors of wider and narrower maps against their time, an hour on two cores; resumable
-	mkdir -p docs/results/sizes
-	for system in $(SYSTEMS); do OMP_NUM_THREADS=1 $(BIN)/python -m examples.research sizes $$system || exit 1; \
-		cp runs/sizes/$$system/sizes.csv docs/results/sizes/$$system.csv || exit 1; done
 
 # RLlib pins Gymnasium, and Tianshou what tyro needs: each has an environment of its own.
 CLIENTS_zoo := --editable ".[agents]" rl-zoo3 torchrl "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard

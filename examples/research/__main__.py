@@ -10,11 +10,8 @@ COMMANDS = {
     "kinds": ("examples.research.agents.kinds", "Kinds"),
     "speed": ("examples.research.speed.speed", "Speed"),
     "torch": ("examples.research.speed.torch_steps", "TorchSpeed"),
-    "sizes": ("examples.research.speed.sizes", "Sizes"),
 }
-GOES_ON: dict[tuple[str, ...], str] = {
-    (name,): "the same command goes on" for name in ("benchmark", "agents", "kinds", "sizes")
-}
+GOES_ON: dict[tuple[str, ...], str] = {(name,): "the same command goes on" for name in ("benchmark", "agents", "kinds")}
 
 if __name__ == "__main__":
     main(prog="python -m examples.research", commands=COMMANDS, after_interruption=GOES_ON)

@@ -22,7 +22,6 @@ from examples.research.agents import picture
 from examples.research.agents.comparison import read_results
 from examples.research.agents.tables import draw_curves, draw_scores
 from examples.research.benchmark.results import draw_results as draw_benchmark
-from examples.research.speed import sizes
 from kkl_gym import SYSTEMS
 from observers import Artifact, load
 from observers.factors import standard_deviations
@@ -254,9 +253,6 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
         draw_curves, learned=pd.read_csv(RESULTS / "environments" / "curves.csv")
     ),
     "results/faults/scores.png": lambda: partial(draw_faults, runs=pd.read_csv(RESULTS / "faults" / "faults.csv")),
-    "results/sizes/sizes.png": lambda: (
-        lambda path: sizes.draw(path, *map(pd.read_csv, sorted((RESULTS / "sizes").glob("*.csv"))))
-    ),
 }
 
 

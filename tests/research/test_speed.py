@@ -1,12 +1,8 @@
-"""``python -m examples.research speed`` and ``sizes`` with tiny steps."""
+"""``python -m examples.research speed`` and ``torch`` with tiny steps."""
 
-import json
-
-import pandas as pd
 import pytest
 from rich.console import Console
 
-from examples.research.speed.sizes import Sizes
 from examples.research.speed.speed import Speed
 from examples.research.speed.torch_steps import TorchSpeed
 
@@ -22,13 +18,20 @@ TINY = {"steps": 5, "turns": 1, "num_envs": 4, "vector_steps": 3}
 )
 def test_speed_of_a_shipped_system(observer, wrapped, observers, capsys):
     ratios = Speed("van_der_pol", observer, **TINY).run(Console(width=200))
-    single = {"KKLVanDerPol-v0", *(f"KKLVanDerPol-v0, {what}" for what in wrapped)}
-    batched = {f"{name}, 4 rows" for name in (*single, "KKLVanDerPol-v0, z", "CartPole-v1")}
-    assert set(ratios) == {"Pendulum-v1", *single, *batched}
+    single = {"Pendulum-v1", "Pendulum-v1, memory"}
+    single |= {"KKLVanDerPol-v0", *(f"KKLVanDerPol-v0, {what}" for what in wrapped)}
+    batched = {f"KKLVanDerPol-v0{what}, 4 rows" for what in ("", ", z", *(f", {each}" for each in wrapped))}
+    assert set(ratios) == {*single, *batched, "CartPole-v1, 4 rows", "CartPole-v1, 4 rows, memory"}
     assert (ratios["Pendulum-v1"], ratios["CartPole-v1, 4 rows"]) == (1.0, 1.0)
     lines = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if "│" in line]
-    rows = [sum(len(cells) == columns for cells in lines) for columns in (3, 5, 6)]
-    assert rows == [3 + len(wrapped), 3 + len(wrapped), 6 * observers]
+    names = [cells[0].strip() for cells in lines]
+    assert {*single, *batched} < {*names}
+    of_tables = ("KKL", "KKL, NumPy", "KKL, error bars", "KKL, error bars, NumPy", "EKF", "EKF of filterpy")
+    own = [name.removeprefix("van_der_pol").removeprefix("-large").removeprefix(", ") for name in names]
+    assert {what: own.count(what) for what in of_tables} == {
+        what: observers + (what == "KKL") for what in of_tables
+    }  # the last is of records
+    assert {len(cells) for cells in lines} == {3}
     with pytest.raises(ValueError, match="turns must be positive"):
         Speed(turns=0).run(Console())
 
@@ -42,22 +45,3 @@ def test_the_table_of_torch_has_a_row_for_each_observer_and_the_memory(capsys):
     assert capsys.readouterr().out.count("| lorenz | 128 |") == 1
     with pytest.raises(ValueError, match="rows positive, got 3 and"):
         TorchSpeed(rows=(0,)).run(Console())
-
-
-def test_sizes_trains_each_width_once(tmp_path):
-    settings = {"trajectories": 20, "duration": 5.0, "samples": 20, "inverse_steps": 5, "batch": 64, "runs": 100}
-    (tmp_path / "tiny.json").write_text(json.dumps(settings))
-    how = {"config": tmp_path / "tiny.json", "trajectories": 2, "num_envs": 4, "out": tmp_path / "out"}
-    frame = Sizes("van_der_pol", widths=(4,), **how).run(Console(quiet=True))
-    assert list(frame.width) == [4]
-    assert (frame[["smape_without_noise", "smape_under_noise", "us_single", "us_a_row"]] > 0).all(axis=None)
-    written = pd.read_csv(tmp_path / "out" / "sizes.csv")
-    assert list(written.columns) == list(frame.columns)
-    assert (tmp_path / "out" / "sizes.png").stat().st_size > 1000
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "4").glob("*.checkpoint*")}
-    again = Sizes("van_der_pol", widths=(4,), **how).run(Console(quiet=True))
-    assert before == {path: path.stat().st_mtime_ns for path in before}
-    assert before
-    assert again.smape_under_noise[0] == frame.smape_under_noise[0]
-    with pytest.raises(ValueError, match="widths must be positive and differ"):
-        Sizes("lorenz", widths=(8, 8)).run(Console())

@@ -1,1 +1,1 @@
-"""How long steps take, and how small maps can be."""
+"""How long steps of environments and observers take."""

@@ -1,17 +1,18 @@
-"""How fast observers step by themselves: against Kalman filters, and against the matrix products in their networks."""
+"""Tasks that return the CPU seconds of a step: of environments, and of observers beside Kalman filters."""
 
 import time
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
 
+import gymnasium as gym
 import numpy as np
 
 from examples.research.derivatives import jacobian
 from kkl_gym.simulate import advance, simulate
 from kkl_gym.system import System
-from observers import Artifact, InverseMap, KKLObserver
+from observers import Artifact, KKLObserver
 from observers.estimator import Running
 from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
@@ -27,7 +28,7 @@ Name = TypeVar("Name", bound=Hashable)
 def in_turns(
     tasks: Mapping[Name, Callable[[], float]], turns: int, report: Callable[[int], object] = lambda done: None
 ) -> dict[Name, list[float]]:
-    """Let tasks take turns, because a shared machine's speed drifts."""
+    """Let tasks take turns, because a shared machine's speed drifts; the first turn is not counted."""
     seconds: dict[Name, list[float]] = {name: [] for name in tasks}
     for turn in range(turns + 1):
         for i, (name, task) in enumerate(tasks.items(), 1):
@@ -38,24 +39,42 @@ def in_turns(
     return seconds
 
 
-def observer_tasks(
-    artifact: Artifact, system: System, *, rows: int | None, steps: int
-) -> dict[str, Callable[[], float]]:
-    """What steps an observer and extended Kalman filters along the same samples, of motions from X.
+def seconds_of(task: Callable[[], object], count: int) -> float:
+    """CPU seconds of one of the steps that a task takes."""
+    began = time.process_time()
+    task()
+    return (time.process_time() - began) / count
+
+
+def environment_task(env: Any, actions: Sequence[np.ndarray]) -> Callable[[], float]:
+    """Steps of an environment; vector environments reset by themselves."""
+    single = isinstance(env, gym.Env)
+
+    def steps() -> None:
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if single and (terminated or truncated):
+                env.reset()
+
+    def task() -> float:
+        env.reset(seed=0)
+        return seconds_of(steps, len(actions))
+
+    return task
+
+
+def observer_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
+    """Steps of an observer and of extended Kalman filters along the same samples, of motions from X.
 
     Of observers the first half is not timed: there those that track may still ask T_inv at each sample. What takes a
     single sample in Python, by far the slowest, is timed on fewer of them.
     """
-    rng, n = np.random.default_rng(0), rows or 1
-    u = np.array(system.u_max) * rng.uniform(-1, 1, (steps + 1, n, system.nu))
-    low, high = np.transpose(system.X)
-    starts = rng.uniform(low, high, (n, system.nx))
-    clean = system.output(simulate(system, starts, steps, artifact.filter.dt, u=u[1:]))
-    y = np.nan_to_num(clean) + np.asarray(artifact.measurement_noise) * rng.standard_normal(clean.shape)
+    u = np.array(system.u_max) * np.random.default_rng(1).uniform(-1, 1, (steps + 1, rows, system.nu))
+    y = noisy_samples(artifact, system, rows, steps, u=u[1:])
     known = u[..., : artifact.nu]
-    samples = (y, known) if rows else (y[:, 0], known[:, 0])
+    samples = (y, known) if rows > 1 else (y[:, 0], known[:, 0])
     few = -(-steps // FEWER)
-    ways = {", NumPy": (False, few), "": (True, steps)} if rows is None and available() else {"": (None, steps)}
+    ways = {", NumPy": (False, few), "": (True, steps)} if rows == 1 and available() else {"": (None, steps)}
     tasks = {}
     for way, (compiled, count) in ways.items():
         taken = tuple(each[: count + 1] for each in samples)
@@ -66,47 +85,44 @@ def observer_tasks(
     R = measurement_covariance(system, artifact.measurement_noise)
     Q = process_intensity(system, system.process_noise, artifact.filter.dt)
     ekf = Running(ExtendedKalmanFilter(system, artifact.filter.dt, Q=Q, R=R))
-    tasks["EKF"] = _stepping(ekf, y[: (BATCHES if rows else few) + 1], u)
-    try:
+    tasks["EKF"] = _stepping(ekf, y[: (BATCHES if rows > 1 else few) + 1], u)
+    with suppress(ImportError):
         from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
-    except ImportError:
-        return tasks
-    each = [_Filterpy(FilterpyEKF, system, artifact.filter.dt, Q=Q, R=R) for _ in range(n)]
 
-    def filterpy() -> float:
-        count = min(BATCHES, steps) if rows else few
-        began = time.process_time()
-        for k in range(count):
-            for row, one in enumerate(each):
-                one.step(y[k, row], u[k, row])
-        return (time.process_time() - began) / count
+        each = [_Filterpy(FilterpyEKF, system, artifact.filter.dt, Q=Q, R=R) for _ in range(rows)]
+        count = min(BATCHES, steps) if rows > 1 else few
 
-    return {**tasks, "EKF of filterpy": filterpy}
+        def filterpy() -> None:
+            for k in range(count):
+                for row, one in enumerate(each):
+                    one.step(y[k, row], u[k, row])
+
+        tasks["EKF of filterpy"] = partial(seconds_of, filterpy, count)
+    return tasks
 
 
 def record_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
-    """What estimates along records, in seconds for a sample of a row: the observer and, where installed, dynamax's EKF.
+    """Estimates along records, in seconds for a sample of a row: the observer and, where installed, dynamax's EKF.
 
-    Both run on the equations of the observer's tracker. The first run, in which dynamax compiles, is not to be counted.
+    Both run on the equations of the observer's tracker.
     """
-    rng, motion = np.random.default_rng(0), artifact.motion
-    low, high = np.transpose(system.X)
-    starts = rng.uniform(low, high, (rows, system.nx))
-    y = system.output(simulate(system, starts, steps, artifact.filter.dt))
-    y = np.nan_to_num(y) + np.asarray(artifact.measurement_noise) * rng.standard_normal(y.shape)
-    observer = KKLObserver(artifact)
-    estimates: dict[str, Callable[[], object]] = {"KKL": lambda: observer.estimate(y if rows > 1 else y[:, 0])}
+    y, motion, observer = noisy_samples(artifact, system, rows, steps), artifact.motion, KKLObserver(artifact)
+    taken = y if rows > 1 else y[:, 0]
+    estimates: dict[str, Callable[[], object]] = {"KKL": lambda: observer.estimate(taken)}
     if motion is not None and motion.equations is not None and motion.equations.substeps:
         with suppress(ImportError):
             of_dynamax = _dynamax(artifact)
-            estimates["EKF of dynamax"] = lambda: of_dynamax(y.swapaxes(0, 1) if rows > 1 else y[:, 0])
-    return {name: partial(_seconds_of, estimate, y.shape[0] * rows) for name, estimate in estimates.items()}
+            estimates["EKF of dynamax"] = lambda: of_dynamax(y.swapaxes(0, 1) if rows > 1 else taken)
+    return {name: partial(seconds_of, estimate, y.shape[0] * rows) for name, estimate in estimates.items()}
 
 
-def _seconds_of(estimate: Callable[[], object], count: int) -> float:
-    began = time.process_time()
-    estimate()
-    return (time.process_time() - began) / count
+def noisy_samples(artifact: Artifact, system: System, rows: int, steps: int, u: np.ndarray | None = None) -> np.ndarray:
+    """Noisy samples of motions from X, (steps + 1, rows, ny)."""
+    rng = np.random.default_rng(0)
+    low, high = np.transpose(system.X)
+    starts = rng.uniform(low, high, (rows, system.nx))
+    y = np.nan_to_num(system.output(simulate(system, starts, steps, artifact.filter.dt, u=u)))
+    return np.asarray(y + np.asarray(artifact.measurement_noise) * rng.standard_normal(y.shape))
 
 
 def _dynamax(artifact: Artifact) -> Callable[[np.ndarray], np.ndarray]:
@@ -147,37 +163,6 @@ def _dynamax(artifact: Artifact) -> Callable[[np.ndarray], np.ndarray]:
 
     one, several = jax.jit(along), jax.jit(jax.vmap(along))
     return lambda y: np.asarray((several if y.ndim == 3 else one)(y))
-
-
-def limit(inverse: InverseMap, rows: int) -> tuple[Callable[[], float], float]:
-    """The matrix products of a map's network, and nothing else."""
-    weights = [np.ascontiguousarray(weight.T, dtype=np.float32) for weight in inverse.mlp.weights]
-    values = [np.ones((rows, len(weight)), np.float32) for weight in weights]
-    out = [np.empty((rows, weight.shape[1]), np.float32) for weight in weights]
-
-    def products() -> float:
-        began = time.process_time()
-        for _ in range(BATCHES):
-            for value, weight, into in zip(values, weights, out):
-                np.matmul(value, weight, out=into)
-        return (time.process_time() - began) / BATCHES
-
-    return products, 2.0 * rows * sum(weight.size for weight in weights)
-
-
-def table_rows(
-    single: Mapping[str, float], batch: Mapping[str, float], *, network: float, products: float, operations: float
-) -> list[list[str]]:
-    """Rows of the table."""
-    found = []
-    for name, seconds in single.items():
-        many = f"{1e6 * batch[name]:,.0f}" if name in batch else ""
-        speeds = ["", "", ""]
-        if name == "KKL":
-            reached, most = (operations / time / 1e9 for time in (network, products))
-            speeds = [f"{reached:.0f}", f"{most:.0f}", f"{100 * reached / most:.0f} %"]
-        found.append([name, f"{1e6 * seconds:.1f}", many, *speeds])
-    return found
 
 
 def _stepping(observer: Any, y: np.ndarray, u: np.ndarray, *, error_bars: bool = False) -> Callable[[], float]:
