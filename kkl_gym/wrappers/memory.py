@@ -109,8 +109,9 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Which of these are angles; each is replaced by its cosine and sine. A pair such as (0, 1) names the cosine and
         the sine of an angle that is measured by them. An angle is taken to turn by less than half a turn in a step.
     period : float, optional
-        A turn of all angles but pairs. None: 360 where the bounds are whole turns in degrees, 2 pi where they are
-        less than 100 apart or there are none.
+        A turn of all angles but pairs. None: 360 where the bounds are one or two turns in degrees, 2 pi where they are
+        at most two turns in rad or there are none; of other bounds, and where they are 1, 2 or 4 apart, it is asked
+        for.
     missing : {"error", "hold"}
         What becomes of NaN in what is measured: an error, or the value before. The first sample must be whole.
     weights : array_like, optional
