@@ -76,6 +76,8 @@ class Outputs:
         if not {i for angle in at for entry in angle for i in entry} <= set(taken):
             raise ValueError(f"angles must be among what is measured, {self.measured}, got {self.angles}")
         plain = [i for angle in at if len(angle) == 1 for i in angle[0]]
+        if period is not None and not plain:
+            raise ValueError(f"period = {period:g} is a turn of entries that are angles, and angles names none")
         units = {i: TURN / (self.period or self._period_of(low[i], high[i], self._names[i])) for i in plain}
         self._take = np.repeat(taken, [1 + (i in units) for i in taken])
         self._whole = self._take.tolist() == list(range(len(owners)))
