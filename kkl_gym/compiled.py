@@ -103,7 +103,7 @@ def _shared(
             _kept.pop(next(iter(_kept)), None)
         try:
             _kept[of] = motion if isinstance(motion, str) else compile_kernel(system, motion)
-        except Exception as error:  # Python takes the equations as they are, and raises for what is wrong on numbers
+        except Exception as error:  # Python then runs the equations, and raises their errors
             _kept[of] = _reason(error)
         if isinstance(_kept[of], str):
             logger.info("%s: %s", without, _kept[of])

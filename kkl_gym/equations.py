@@ -181,7 +181,7 @@ def complex_motion(system: Any, x: Any) -> EquationError:
 def _called(equations: Equations, *args: Any) -> Any:
     try:
         return equations(*args)
-    except NotImplementedError:  # its message names what is missing
+    except NotImplementedError:  # its message names the missing method
         raise
     except Exception as error:  # whatever a user's code raises
         raise failed(error, equations, *args) from error

@@ -13,7 +13,7 @@ from observers.checks import real_array, shown
 SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
 CLOSEST = 1.5  # ratio of neighbouring ones; closer ones hold the same, and their coordinates would be rounding errors
 IMAGINED = 64  # steps before the first output
-FILLED = 20  # longest time constants, after which e^-20 is left of what was before
+FILLED = 20  # longest time constants, after which e^-20 of the past is left
 TURN = 2 * math.pi
 
 
@@ -40,7 +40,7 @@ class Memory:
     angles come after those of the other outputs.
 
     Shapes: ``angles``, indices of cosines and sines, (number of angles, 2); ``decay``, ``rise`` (m,), ``mixing``
-    (m, m), ``input_decay`` (k,); outputs, inputs and what is shown (..., ny), (..., nu), (..., size).
+    (m, m), ``input_decay`` (k,); outputs, inputs and the coordinates returned (..., ny), (..., nu), (..., size).
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Memory:
         self._cosines, self._sines = pairs.T
         self._others = np.setdiff1d(np.arange(ny), pairs)
         self._ny, self._nu = ny, nu
-        self.size = ny + (len(self._others) + len(pairs)) * m + nu * len(self.input_decay)  # of what is shown
+        self.size = ny + (len(self._others) + len(pairs)) * m + nu * len(self.input_decay)  # of the coordinates
         ages = np.arange(FILLED * math.ceil(self.time_constants[-1]))[:, None]
         with np.errstate(under="ignore"):
             self._with_past = (1 - self.decay ** (ages + IMAGINED)) / (1 - self.decay ** np.maximum(ages, 1))

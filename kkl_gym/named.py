@@ -59,7 +59,7 @@ def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str
 
 
 def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]:
-    """The entries that a name without a function stands for, none if there are none."""
+    """The entries that a name without a function stands for; empty if it names no entry."""
     if name in there or _INFO.fullmatch(name):
         return (name,)
     if index := _INDEX.fullmatch(name):
@@ -127,7 +127,7 @@ class Reader:
 
 
 def _info(entry: str) -> tuple[str, int | None]:
-    """The key in ``info``, and the index in what is there."""
+    """The key in ``info``, and the index in its value."""
     found = _INFO.fullmatch(entry)
     if found is None:
         raise ValueError(f"there is no entry {entry!r}")

@@ -77,11 +77,11 @@ class Plant:
         return w, v
 
     def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Scale what was drawn, (..., nx) and (..., nv)."""
+        """Scale draws (..., nx) and (..., nv) to noise."""
         return (drawn_w - 0.5) * self._w_range, drawn_v * self._v_scale
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
-        """A start drawn uniformly in ``start_box``, or as the system draws it where there is none; shape (nx,)."""
+        """A start drawn uniformly in ``start_box``, or by the system where it has no box; shape (nx,)."""
         if self._draws:
             return self.start(self.system.draw_starts(rng, 1)[0])
         low, high = self.start_box

@@ -111,7 +111,7 @@ class Window:
         self._clock = pygame.time.Clock()
 
     def show(self, frame: np.ndarray) -> None:
-        """Show a frame (height, width, 3) as soon as it is due; opens the window if there is none yet."""
+        """Show a frame (height, width, 3) as soon as it is due; opens the window at the first one."""
         pygame = self._pygame
         if not self._open():
             pygame.display.init()

@@ -148,9 +148,9 @@ class Readings:
 
     @np.errstate(over="ignore", invalid="ignore")  # of states that have escaped
     def read(self, h: np.ndarray, v: np.ndarray, rows: np.ndarray | None = None, *, start: bool) -> np.ndarray:
-        """Samples of ``rows`` (m,), at the start of episodes or a step later: (ny, m), NaN where there is none.
+        """Samples of ``rows`` (m,), at the start of episodes or a step later: (ny, m), NaN where one is missing.
 
-        Shapes: ``h`` (ny, m), ``v`` (ny, m) or (3 ny, m): white noise, and what a random sensor draws.
+        Shapes: ``h`` (ny, m), ``v`` (ny, m) or (3 ny, m): white noise, and the draws of a random sensor.
         """
         rows, of, drawn = self._everyone if rows is None else rows, self._of, len(v) > self._ny
         white, fresh, chance = np.split(v, 3) if drawn else (v, None, None)

@@ -74,7 +74,7 @@ class Outputs:
             raise ValueError(f"angles must be keys, as measured is, got {self.angles}")
         at = [tuple(_positions("angles", (entry,), owners) for entry in angle) for angle in each]
         if not {i for angle in at for entry in angle for i in entry} <= set(taken):
-            raise ValueError(f"angles must be among what is measured, {self.measured}, got {self.angles}")
+            raise ValueError(f"angles must be among the measured entries, {self.measured}, got {self.angles}")
         plain = [i for angle in at if len(angle) == 1 for i in angle[0]]
         if period is not None and not plain:
             raise ValueError(f"period = {period:g} is a turn of entries that are angles, and angles names none")
@@ -131,7 +131,7 @@ class Outputs:
             at = np.argwhere(~(np.abs(y) <= LARGEST))[0]
             row = f", row {at[0]}" if y.ndim > 1 else ""
             raise ValueError(
-                f"{self._source} holds {y[tuple(at)]} among what is read, in {self._names[self._take[at[-1]]]}{row}: "
+                f"{self._source} holds {y[tuple(at)]} in {self._names[self._take[at[-1]]]}{row}: "
                 "it would stay in the memory, so replace it, with gymnasium.wrappers.TransformObservation for instance"
             )
         if len(self._sines):
@@ -158,7 +158,7 @@ class Inputs:
         _check(space, self._source)
         self.low, self.high = _limits(space)
         boxes = [isinstance(leaf, spaces.Box) for leaf in _leaves(space) for _ in range(spaces.flatdim(leaf))]
-        # Bounds that no action may reach, as the largest float is, are none.
+        # Bounds that no action may reach, such as the largest float, do not count.
         scaled = np.array(boxes, dtype=bool) & (abs(self.low) <= LARGEST) & (abs(self.high) <= LARGEST)
         low, high = np.where(scaled, self.low, -1.0), np.where(scaled, self.high, 1.0)
         self._middle, self._half = (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
@@ -213,7 +213,7 @@ def _check_keys(name: str, keys: Collection[str], known: Collection[Any]) -> Non
     for key in keys:
         if key not in known:
             there = "keys " + ", ".join(map(repr, known)) if None not in known else "no keys: name indices"
-            raise ValueError(f"{name} names {key!r}, but what is observed has {there}")
+            raise ValueError(f"{name} names {key!r}, but the observation has {there}")
 
 
 def _positions(name: str, chosen: tuple[Any, ...], owners: list[Any]) -> list[int]:
@@ -248,7 +248,7 @@ def _check(space: Space, source: str) -> None:
         if _is_image(leaf):
             raise ValueError(
                 f"{source} is an image, {leaf}: let an encoder turn it into a vector inside, with "
-                "gymnasium.wrappers.TransformObservation, or name what is measured beside it by measured=[...]"
+                "gymnasium.wrappers.TransformObservation, or name the entries measured beside it by measured=[...]"
             )
         if not isinstance(leaf, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
             raise ValueError(

@@ -155,7 +155,7 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
 
 def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: float) -> Components | None:
-    """The next state by a batch, where `where` may leave out what is infinite; None if it escapes or fails there."""
+    """The next state by a batch, where `where` may leave out infinite values; None if it escapes or fails there."""
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
         end: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
@@ -239,7 +239,7 @@ def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, 
 
 
 def _powers(need: np.ndarray) -> np.ndarray:
-    """The least power of two that is not less than what is needed, or 0 beyond MOST_EQUAL. Shapes: (n,) to (n,)."""
+    """The least power of two that is not less than ``need``, or 0 beyond MOST_EQUAL. Shapes: (n,) to (n,)."""
     mantissa, exponent = np.frexp(np.where(need <= MOST_EQUAL, np.maximum(need, 1), 1))
     return np.where(need <= MOST_EQUAL, 1 << (exponent - (mantissa == 0.5)), 0)
 

@@ -95,7 +95,7 @@ class System:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if not vars(cls).keys() <= EMPTY:  # cloudpickle makes a class empty, and fills in what is complete already
+        if not vars(cls).keys() <= EMPTY:  # cloudpickle fills an empty class with complete attributes
             complete(cls, System)
 
     def __post_init__(self) -> None:
@@ -282,7 +282,7 @@ class System:
         return low, high
 
     def replace(self, parameters: Mapping[str, float]) -> "System":
-        """The same system with some parameters changed; ValueError on an unknown name and on what is not finite."""
+        """The same system with some parameters changed; ValueError on unknown names and values that are not finite."""
         known = self.parameters
         parameters = mapping("parameters", parameters)
         for name in parameters:

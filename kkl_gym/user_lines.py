@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from types import CodeType, TracebackType
 
-# Wherever they are installed; the rest of what is installed is known by its folder.
+# Wherever they are installed; other installed packages are known by their folder.
 _LIBRARIES = sys.stdlib_module_names - {"__main__"} | {"kkl_gym", "observers", "training"}
 _LIBRARIES |= {"mpmath", "numba", "numpy", "sympy", "torch"}
 

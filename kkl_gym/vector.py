@@ -47,8 +47,8 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     render_mode : {None, "rgb_array"}
         Whether :meth:`render` draws.
     max_episode_steps : int, optional
-        Steps after which an episode is truncated; None or -1 is never. ``gym.make_vec`` passes what is registered where
-        it is left out there.
+        Steps after which an episode is truncated; None or -1 is never. ``gym.make_vec`` passes the registered number
+        where its caller leaves it out.
     autoreset_mode : str or gymnasium.vector.AutoresetMode
         One of Gymnasium's, see above.
     **options

@@ -248,7 +248,7 @@ class Artifact:
         return apart if self.C is not None else np.where(np.isfinite(apart), apart, 0.0)
 
     def require_forward(self) -> ForwardMap:
-        """Return T, or raise ArtifactError if there is none."""
+        """Return T, or raise ArtifactError if the artifact has no T."""
         return self.forward or self._lacks(
             "holds no forward map T; take one of the pipeline spinn, which does: for the package's systems those named "
             "SYSTEM-spinn ship, others are made by kkl-gym train SYSTEM --pipeline spinn"
@@ -268,7 +268,7 @@ class Artifact:
             self._lacks("holds no covariance; kkl-gym train makes one that does")
 
     def require_motion(self) -> Motion:
-        """Return the motion by which the observer tracks, or raise ArtifactError if there is none."""
+        """Return the motion by which the observer tracks, or raise ArtifactError if it has no motion."""
         return self.motion or self._lacks("does not track; kkl-gym train makes one that does")
 
     def _lacks(self, text: str) -> NoReturn:

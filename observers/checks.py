@@ -1,4 +1,4 @@
-"""What is taken from outside: real numbers, and nothing that Python or NumPy would quietly turn into one."""
+"""Checks of arguments: real numbers, and nothing that Python or NumPy would quietly turn into one."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -131,9 +131,9 @@ def real_array(name: str, values: Any) -> np.ndarray:
             if array.dtype is _FLOAT:
                 return array
             if array.dtype.kind in "fiu":
-                with np.errstate(over="ignore"):  # what is too large is infinite, which those who ask refuse
+                with np.errstate(over="ignore"):  # larger values become infinite, which callers reject
                     return array.astype(float)
-    except Exception as error:  # ragged lists, and whatever an object of a stranger raises when it is to be an array
+    except Exception as error:  # ragged lists, and any exception that __array__ of a foreign object raises
         raise ValueError(f"{name} must hold real numbers in the shape of an array, got {shown(values)}") from error
     raise ValueError(f"{name} must hold real numbers, got {shown(values)}")
 

@@ -87,7 +87,7 @@ class CompiledStep:
 
         Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu), ``record`` (steps, n, width).
         """
-        y, u = np.array(y, order="C"), np.array(u, order="C")  # Numba would compile again for what is read-only
+        y, u = np.array(y, order="C"), np.array(u, order="C")  # Numba would compile again for read-only arrays
         model = self._usual if linear is None or linear is self._linear else self._at(linear)
         given = rows, y, u, np.empty((1, 0, 0)) if record is None else record
         few = self._first if len(rows) == 1 else np.arange(len(rows))

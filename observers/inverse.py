@@ -124,7 +124,7 @@ class InverseMap:
             for end in self._each(f"{name}_max"):
                 if name in self.features and (not is_finite(end) or end <= 0):
                     raise ArtifactError(
-                        f"{name}_max must be a positive, finite number for a map that is told, got {end!r}"
+                        f"{name}_max must be a positive, finite number for a map that takes it, got {end!r}"
                     )
                 if end != math.inf and (not is_finite(end) or end < 0):
                     raise ArtifactError(f"{name}_max must be a number, not negative, got {end!r}")
@@ -168,8 +168,8 @@ class InverseMap:
         """
         if isinstance(measurement_noise, tuple) and self.noise_gain.ndim == 1 and self.noise_gain.any():
             raise ValueError(
-                f"this map is told one level of measurement noise for all outputs, got {measurement_noise}: pass one "
-                "number, or train it again, which makes a map that is told a level for each"
+                f"this map takes one level of measurement noise for all outputs, got {measurement_noise}: pass one "
+                "number, or train it again, which makes a map that takes a level for each"
             )
         if "measurement_noise" not in self.features:
             return measurement_noise
@@ -188,12 +188,12 @@ class InverseMap:
 
     def noise_features(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> list[float]:
         """Return the network's inputs for levels of noise, in the order of the features."""
-        told = []
+        features = []
         if "measurement_noise" in self.features:
-            told += np.atleast_1d(np.log1p(np.divide(measurement_noise, self.measurement_noise_unit))).tolist()
+            features += np.atleast_1d(np.log1p(np.divide(measurement_noise, self.measurement_noise_unit))).tolist()
         if "process_noise" in self.features:
-            told.append(math.log1p(min(process_noise, self.process_noise_max) / self.process_noise_unit))
-        return told
+            features.append(math.log1p(min(process_noise, self.process_noise_max) / self.process_noise_unit))
+        return features
 
     def age_feature(self, age: Any) -> Any:
         """The network's input for a time since reset, in seconds; for an array, as many inputs."""

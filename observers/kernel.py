@@ -228,7 +228,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
-        """White innovations, by which V moves the state: x + V white and P - V V^T are what is known then."""
+        """White innovations: V moves the state to x + V white, with the covariance P - V V^T."""
         for k in range(ny):
             white[k] = choose(finite(y[k]), 0.0, y[k] - expected[k], 0.0)
         for k in range(ny):
@@ -340,7 +340,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_part
     def is_driven(z: Any, nz: int) -> bool:
-        """Whether an input has acted, or there is none."""
+        """Whether an input has acted, or the system has no input."""
         acted = len(z) == nz
         for i in range(nz, len(z)):
             acted = acted or z[i] != 0.0

@@ -253,5 +253,5 @@ class KKL(Estimator[np.ndarray]):
 
 
 def _filled(y: np.ndarray, gaps: np.ndarray, predicted: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Samples with gaps filled by what is predicted, or by the outputs before where that is undefined."""
+    """Samples with gaps filled by predicted outputs, or by the outputs before where those are undefined."""
     return np.where(gaps, np.where(np.isfinite(predicted), predicted, before), y)

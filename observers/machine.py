@@ -38,7 +38,7 @@ def kernel(**options: Any) -> Callable[[_F], _F]:
 
 
 def pointer(function: Callable[..., Any], signature: Any, **options: Any) -> Any:
-    """Compile a function that kernels call by its ``address``; it lasts as long as what is returned."""
+    """Compile a function that kernels call by its ``address``; it lasts as long as the returned object."""
     from numba.core.ccallback import CFunc
 
     named = _named(function, options)

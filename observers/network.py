@@ -65,7 +65,7 @@ class MLP:
                 )
             if width not in (None, weight.shape[1]):
                 raise ValueError(f"weights of shape {weight.shape} cannot follow {width} values")
-            with np.errstate(over="ignore"):  # what is too large is infinite, and refused
+            with np.errstate(over="ignore"):  # larger values become infinite, and are rejected
                 layers.append((np.ascontiguousarray(weight.T, dtype=np.float32), np.asarray(bias, dtype=np.float32)))
             if not all(np.isfinite(values).all() for values in layers[-1]):
                 raise ValueError("the network holds weights or biases that are not finite")

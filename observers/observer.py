@@ -41,10 +41,10 @@ class KKLObserver(RecordEstimates):
     Parameters
     ----------
     artifact : Artifact
-        What was learned.
+        The learned filter, maps and motion.
     measurement_noise : float or sequence of float, length ny, optional
-        Standard deviation of the noise on each sample, of all outputs or each, for maps that ask for it. None is what
-        is usual, :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
+        Standard deviation of the noise on each sample, of all outputs or each, for maps that take it. None: the
+        usual one, :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
     process_noise : float, optional
         Level of the noise on the state's derivative, in multiples of the system's scale per second as for the
         environments, for maps that ask for it. T_inv takes levels beyond its training for its largest; where the
@@ -374,7 +374,7 @@ class KKLObserver(RecordEstimates):
     def _warn_of_gaps(self) -> None:
         if not self.artifact.knows_output:
             self._warn(
-                f"the map for {self.artifact.system!r} holds no output h(x) by which to predict what is missing: it "
+                f"the map for {self.artifact.system!r} holds no output h(x) by which to predict missing outputs: it "
                 "holds the last value of a missing output"
             )
 

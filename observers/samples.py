@@ -64,15 +64,15 @@ def check_replacement(artifact: Artifact, other: Artifact) -> None:
     for what, here in _serves(artifact).items():
         if here != there[what]:
             raise ArtifactError(
-                f"the observer in use has {what} {shown(here)}, the other {shown(there[what])}: one that is to replace "
-                "it may differ in its maps alone; make the wrapper anew"
+                f"the observer in use has {what} {shown(here)}, the other {shown(there[what])}: the replacement "
+                "may differ in its maps alone; make a new wrapper"
             )
     for name in ("A", "B", "dt"):
         mine, others = (np.asarray(getattr(each.filter, name)) for each in (artifact, other))
         if mine.shape != others.shape or not np.allclose(mine, others, rtol=1e-9, atol=0.0):
             raise ArtifactError(
                 f"the filters differ in {name}, so that the state of one means nothing to the other: train with the "
-                "eigenvalues and dt of the observer in use, or make the wrapper anew"
+                "eigenvalues and dt of the observer in use, or make a new wrapper"
             )
 
 
@@ -106,7 +106,7 @@ def check_output(
 
 
 def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
-    """Return inputs as floats, zeros where there are none. Shapes: ``u`` (..., nu), or None; returns (..., nu)."""
+    """Return inputs as floats, zeros for None. Shapes: ``u`` (..., nu), or None; returns (..., nu)."""
     nu = artifact.nu
     if u is None:
         return np.zeros((*batch, nu))

@@ -31,7 +31,7 @@ _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype
 
 @contextmanager
 def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Put the name of what is written into errors that name no file, as that of a full disk."""
+    """Put the name of the written file into errors that name no file, such as a full disk."""
     try:
         yield
     except OSError as problem:
@@ -113,7 +113,7 @@ def read(
     if set(metadata) != {key}:
         raise error(f"{path} is damaged: unknown metadata: {', '.join(sorted(set(metadata) - {key}))}")
     if expected != hashlib.sha256(_whole(header, data)).hexdigest():
-        raise error(f"{path} is damaged: it holds something else than its checksum says; get it again")
+        raise error(f"{path} is damaged: its content does not match its checksum; get it again")
     try:
         described = json.loads(metadata[key])
     except (ValueError, RecursionError) as problem:

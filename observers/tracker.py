@@ -11,9 +11,9 @@ from observers.decoder import Decoders
 from observers.motion import Motion
 from observers.unscented import add, factor, shift, solved, transformed, whitened
 
-# Normal quantiles of the limits: to start again in vain costs the estimate, to inflate a covariance in vain little. The
-# running means are more skewed than the chi-square distribution that the limits assume: chance exceeds the second some
-# twenty times as often as it says.
+# Normal quantiles of the limits: a needless re-initialisation costs the estimate, a needless inflation of a covariance
+# little. The running means are more skewed than the chi-square distribution that the limits assume: chance exceeds the
+# second limit about twenty times as often as its quantile states.
 _DIVERGED = 6.0  # 1e-9, of the NIS
 _COLOURED = 4.265  # 1e-5, of the mean square of the innovations' running mean
 _TREND = 0.25  # windows over which innovations are averaged to see whether they agree

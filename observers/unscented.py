@@ -85,7 +85,7 @@ def factor(P: np.ndarray) -> np.ndarray:
     """Cholesky factors (n, nx, nx) of covariances; NaN where one is not positive definite or not finite."""
     try:
         root: np.ndarray = np.linalg.cholesky(P)
-    except np.linalg.LinAlgError:  # which says that there is one, not which
+    except np.linalg.LinAlgError:  # which does not name the matrix
         root = np.full_like(P, np.nan)
         rows = np.flatnonzero(np.isfinite(P).all((1, 2)))
         if len(P) > 1:

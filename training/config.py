@@ -157,7 +157,7 @@ class Config:
                 "pipeline 'input-aware' without uncertain parameters"
             )
         if self.estimate_parameters and not any(self.uncertain.values()):
-            raise ValueError("estimate_parameters needs uncertain parameters, of which there are none")
+            raise ValueError(f"estimate_parameters needs uncertain parameters, got uncertain = {self.uncertain!r}")
         if self.policy is not None and (self.pipeline != "input-aware" or not self.inputs):
             raise ValueError(
                 f"policy = {self.policy!r} needs the pipeline 'input-aware' with inputs; got {self.pipeline!r}, "

@@ -65,7 +65,7 @@ def train(
     """Learn an observer: a filter, T_inv, a motion to track by, covariances and the limits of a monitor.
 
     The lessons, in order: the map (:func:`training.learn_map`); the motion, which is the system's equations, or a
-    learned flow where there are none or no expression can hold them (:func:`training.learn_flow`); the calibration
+    learned flow where they are unknown or no expression can hold them (:func:`training.learn_flow`); the calibration
     (:func:`training.calibrate`). Each network has checkpoints of its own in ``folder``.
 
     Parameters

@@ -18,7 +18,7 @@ class Stream(IntEnum):
 
 
 def generator(stream: Stream, *seed: int) -> np.random.Generator:
-    """Make the generator of a stream for a seed, and for a part of what is drawn with it."""
+    """Make the generator of a stream for a seed, and for a part of its draws."""
     for entry in seed:
         if not 0 <= entry < 2**32:
             raise ValueError(f"seed = {entry} must be a whole number from 0 to 2**32 - 1")

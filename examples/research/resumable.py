@@ -72,7 +72,7 @@ def run_and_report(
     what: str,
     report: Callable[[ProgressBars], None],
 ) -> None:
-    """Run the jobs that are not done and report on what is there, also after an interruption."""
+    """Run the jobs that are not done and report on the results, also after an interruption."""
     failures = list[str]()
     try:
         with progress_bars(console, out / LOG) as progress:

@@ -17,7 +17,7 @@ from observers.names import resolve
 
 
 class Estimates:
-    """Any estimator of states, as :class:`VectorEstimate` drives and shows it; it is not told states at a start."""
+    """Any estimator of states, as :class:`VectorEstimate` drives and shows it; it takes no known states at a start."""
 
     def __init__(self, estimator: Estimator[Any], space: gym.spaces.Box) -> None:
         self._running, self.space = Running(estimator), space

@@ -1,4 +1,4 @@
-"""A memory around any environment: filtered outputs and actions beside what is measured, without training."""
+"""A memory around any environment: filtered outputs and actions beside the measured entries, without training."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -72,7 +72,7 @@ class _Remembering:
         self.space: gym.Space[Any] = flat if keys is None else spaces.Dict(keys | {"memory": flat})
 
     def read(self, obs: Any, batch: tuple[int, ...] = (), before: np.ndarray | None = None) -> np.ndarray:
-        """Read what is measured, with values before where it is NaN and is held. Shapes: returns (*batch, entries)."""
+        """Read the measured entries; the last value replaces a NaN that is held. Shapes: returns (*batch, entries)."""
         flat = self.outputs.flat(obs, batch)
         return np.where(np.isnan(flat), before, flat) if self._hold and before is not None else flat
 
@@ -82,7 +82,7 @@ class _Remembering:
 
 
 class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Shows what is measured and a memory of it and of the actions, around any environment.
+    """Shows the measured entries and a memory of them and of the actions, around any environment.
 
     With it an agent without memory of its own, such as an MLP, can act where part of the state is hidden. The memory is
     linear, stable and fixed: filters of the outputs and inputs, the linear half of a KKL observer.
@@ -110,10 +110,9 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         the sine of an angle that is measured by them. An angle is taken to turn by less than half a turn in a step.
     period : float, optional
         A turn of all angles but pairs. None: 360 where the bounds are one or two turns in degrees, 2 pi where they are
-        at most two turns in rad or there are none; of other bounds, and where they are 1, 2 or 4 apart, it is asked
-        for.
+        at most two turns in rad or infinite. It must be given for other bounds, and for those 1, 2 or 4 apart.
     missing : {"error", "hold"}
-        What becomes of NaN in what is measured: an error, or the value before. The first sample must be whole.
+        How to treat NaN among the measured entries: an error, or the value before. The first sample must be whole.
     weights : array_like, optional
         Under noise: what :meth:`learn_weights` returns. The observation is then [y as expected in the next step,
         what else predicts y], see :class:`kkl_gym.prediction.PredictiveMemory`.
@@ -167,13 +166,13 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._flat = np.empty(0)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and the memory: what is measured, with the memory of an output at rest."""
+        """Reset the environment and the memory: the measured entries, with the memory of an output at rest."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._flat = self._of.read(obs)
         return self._of.show(obs, self._flat, self._of.memory.reset(self._of.outputs.of_flat(self._flat))), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment, and remember the action and what is measured then."""
+        """Step the environment, and remember the action and the entries measured then."""
         u = self._of.inputs(action)
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._flat = self._of.read(obs, before=self._flat)
@@ -276,7 +275,7 @@ class KKLVectorMemory(VectorWrapper):
         return self._of.show(obs, self._flat, memory.shown()), info
 
     def step(self, actions: Any) -> Step:
-        """Step the environments, and remember the actions and what is measured then."""
+        """Step the environments, and remember the actions and the entries measured then."""
         batch, of, memory, before = (self.num_envs,), self._of, self._of.memory, self._ended
         u = of.inputs(actions, batch)
         obs, reward, terminated, truncated, info = self.env.step(actions)

@@ -15,7 +15,7 @@ from observers.checks import choice, flag
 
 
 class NamedEstimator(KKLEstimator):
-    """An observer from rollouts: what is measured is shown beside what it estimates."""
+    """An observer from rollouts, which shows the measured outputs beside its estimates."""
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class NamedEstimator(KKLEstimator):
         self._held = np.where(np.isnan(self._y), self._held, self._y)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains: as :class:`KKLEstimator`, and ``y``, what is measured, NaN where it is missing."""
+        """What ``info`` gains: as :class:`KKLEstimator`, and ``y``, the measured outputs, NaN where missing."""
         return super().report(rows) | {"y": self._y.copy() if rows is None else self._y[rows]}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -101,7 +101,7 @@ class Samples:
         self.count = 0
 
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs after a reset, and what is hidden, NaN if that is not shown; ``info`` gains what ours says."""
+        """The outputs after a reset, and the hidden signals, NaN if not shown; ``info`` gains the keys of our own."""
         self.count = 0
         y, x = self.outputs(observation, info), self.states(observation, info)
         info.pop("x", None)  # whatever else the environment calls so
@@ -109,7 +109,7 @@ class Samples:
         return y, x.get("x", self._nothing)
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs after a step, and the inputs that led to them; ``info`` gains what ours says."""
+        """The outputs after a step, and the inputs that led to them; ``info`` gains the keys of our own."""
         y, u = self.outputs(observation, info), self.inputs(action)
         x = self.states(observation, info)
         info.pop("x", None)

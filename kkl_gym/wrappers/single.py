@@ -23,7 +23,7 @@ _FLOAT32 = np.dtype(np.float32)
 
 
 class _SystemSamples:
-    """What an observer sees of environments of systems: ``info`` says it, and numbers the samples."""
+    """Samples of environments of systems, which their ``info`` holds and numbers."""
 
     def __init__(self, env: Any) -> None:
         self.count = 0  # of the sample that the observer has seen last
@@ -64,7 +64,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
     ``training.learn``). That one sees the signals of the observation that its file names, and the actions. The
-    observation is then [y, x_hat] or [y, z]: what is measured, and beside it what is estimated. ``info`` gains ``y``
+    observation is then [y, x_hat] or [y, z]: the measured outputs, and the estimates beside them. ``info`` gains ``y``
     as well, ``u``, the inputs that led to it, and the number of the ``sample`` since the reset. It also gains ``x``,
     shape (nx,), the true hidden signals, where the environment inside shows them. That is privileged: it is for
     evaluation and for ``training.KKLTrainingCallback``.
@@ -88,7 +88,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     monitor : bool
         Whether to keep the score, see :attr:`observers.KKLObserver.score`.
     known_start : bool
-        Whether the observer is told the true state ``info["x"]`` at reset, and only there. It then has no transient.
+        Whether the observer takes the true state ``info["x"]`` at reset, and only there. It then has no transient.
         Maps that track can use it, as the default ones, and those with a forward map T, ``observer="SYSTEM-spinn"``.
     uncertainty : bool
         Whether the observation is [x_hat, std], with the standard deviation of each state's error behind the estimate.
@@ -213,7 +213,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Parameters
         ----------
         observer : str or path or Artifact
-            A shipped name, a path if it ends in ``.safetensors``, or what is behind one.
+            A shipped name, a path if it ends in ``.safetensors``, or an artifact.
 
         Raises
         ------

@@ -106,7 +106,7 @@ class VectorEstimate(VectorWrapper):
         self._check(expected, np.where(ended, final["sample"], info["sample"]), np.zeros_like(ended))
         y, u = (np.where(ended[:, None], final[key], info[key]) for key in ("y", "u"))
         self._estimator.advance(y, u)
-        y0 = info["y"][ended]  # what is shown next may report y itself
+        y0 = info["y"][ended]  # the estimates may replace y in info
         shown = self._show(info, np.ones_like(ended))
         for row in np.flatnonzero(ended):
             info["final_obs"][row] = shown[row].copy()
@@ -183,11 +183,11 @@ class _Telling(VectorWrapper):
         options, mask = with_mask(options, self.num_envs)
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         if not isinstance(info, dict):
-            return obs, info  # of which the observers say what is wrong
+            return obs, info  # which the observers reject with a reason
         self._ended, self._count = self._ended & ~mask, np.where(mask, 0, self._count)
-        told = {"y": self._read.outputs(obs, info, (self.num_envs,)), "sample": self._count.copy()}
-        told |= self._states(obs, info)
-        return obs, info | told
+        signals = {"y": self._read.outputs(obs, info, (self.num_envs,)), "sample": self._count.copy()}
+        signals |= self._states(obs, info)
+        return obs, info | signals
 
     def step(self, actions: Any) -> Step:
         batch = (self.num_envs,)
@@ -207,14 +207,14 @@ class _Telling(VectorWrapper):
                     there = {key: reported[key][row] for key in asked if reported.get(f"_{key}", ended)[row]}
                     shown = self._read.states(final[row], there)
                     x[row], known[row] = shown.get("x", np.nan), bool(shown)
-                told = {"y": last, "u": u, "sample": count, "x": x, "_x": known}
-                info = info | {"final_obs": final, "final_info": {**reported, **told}}
+                signals = {"y": last, "u": u, "sample": count, "x": x, "_x": known}
+                info = info | {"final_obs": final, "final_info": {**reported, **signals}}
             self._count = np.where(ended, 0, count)
         else:
             waits = self._count if self._mode is AutoresetMode.DISABLED else 0
             self._ended, self._count = ended, np.where(before, waits, count)
-        told = {"y": y, "u": u, "sample": self._count.copy()} | self._states(obs, info)
-        return obs, reward, terminated, truncated, info | told
+        signals = {"y": y, "u": u, "sample": self._count.copy()} | self._states(obs, info)
+        return obs, reward, terminated, truncated, info | signals
 
     def _states(self, obs: Any, info: Infos) -> dict[str, np.ndarray]:
         """True hidden signals and of which rows they are, where they are shown."""
@@ -230,7 +230,7 @@ class _Telling(VectorWrapper):
 
 
 def _states(info: Infos, rows: np.ndarray) -> np.ndarray:
-    """True states in some rows, as far as ``info`` says them."""
+    """True states in some rows, as far as ``info`` holds them."""
     return info["x"][rows] if "x" in info else np.full((int(rows.sum()), 0), np.nan)
 
 
@@ -239,7 +239,7 @@ class KKLVectorObservation(VectorEstimate):
 
     Works on the package's vector environments and on Gymnasium's Sync and Async ones over the package's environments,
     in every autoreset mode. Around vectors of another environment it needs an observer from rollouts of that, and shows
-    what is measured beside the estimates, as :class:`kkl_gym.KKLObservation` does.
+    the measured outputs beside the estimates, as :class:`kkl_gym.KKLObservation` does.
 
     ``info`` gains ``z``, with ``estimate="x"`` ``x_hat``, and with ``monitor`` ``score``, a row for each environment;
     so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates. Around another environment it
@@ -414,7 +414,7 @@ def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
-    """The autoreset mode that a vector environment says it has, or ValueError if it says none."""
+    """The autoreset mode in the metadata of a vector environment, or ValueError if that has no mode."""
     mode = env.metadata.get("autoreset_mode")
     if not isinstance(mode, AutoresetMode):
         raise ValueError(

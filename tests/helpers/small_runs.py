@@ -50,7 +50,7 @@ def open_loop(process_noise_share=0.0):
         linear,
         BATCHES,
         device=CPU,
-        process_noise_max=VanDerPol.process_noise if process_noise_share else 0.0,
+        process_noise_max=VanDerPol().process_noise if process_noise_share else 0.0,
     )
     return sampler, data, linear
 

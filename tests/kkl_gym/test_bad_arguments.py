@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from monitor_limits import limits
 
 from kkl_gym import (
     ActionRepeat,
@@ -18,7 +19,7 @@ from kkl_gym import (
     VectorActionRepeat,
     get_system,
 )
-from observers import MLP, KKLObserver, Limits, LinearFilter, Monitor, load
+from observers import MLP, KKLObserver, LinearFilter, Monitor, load
 
 N = 3
 ENV, ENVS = partial(KKLEnv, "van_der_pol"), partial(KKLVectorEnv, "van_der_pol", N)
@@ -30,10 +31,6 @@ CHOICES = ("nonsense", "", 3, b"x", object(), [])
 MAPPINGS = ("x", 3, [("mu", 1.0)], {"unknown": 1.0}, {1: 2})
 A, B = np.diag([-1.0, -2.0]), np.ones((2, 1))
 WEIGHTS, BIASES = [np.ones((4, 2)), np.ones((1, 4))], [np.ones(4), np.ones(1)]
-LIMITS = {
-    "levels": np.array([0.0, 1.0]), "mean": np.array([[0.3], [0.5]]), "low": np.array([[0.0], [0.4]]),
-    "high": np.array([[0.1], [2.1]]), "window": 0.1, "warm_up": 0.05, "false_alarms": 0.01, "duration": 50.0,
-}  # fmt: skip
 
 
 def arrays_unlike(good, *more):
@@ -66,6 +63,7 @@ OBSERVER_ARGUMENTS = {
     **MAP_ARGUMENTS,
     "process_noise": (LEVELS, "process_noise"),
     "compiled": ((1, "yes", [True]), "compiled"),
+    "tracking": ((1, "yes", [True]), "tracking"),
     "gate": (POSITIVE, "gate"),
     "delay": ((*NO_NUMBERS, -1, 1.5, 1001), "delay"),
 }
@@ -89,9 +87,10 @@ def named(make, table):
     *named(partial(KKLObserver, ARTIFACT), OBSERVER_ARGUMENTS),
     *named(lambda **given: KKLObservation(ENV(), **given), WRAPPER_ARGUMENTS),
     *named(lambda **given: KKLVectorObservation(ENVS(), **given), WRAPPER_ARGUMENTS),
-    *named(lambda **given: Limits(**LIMITS | given),
-           {name: (arrays_unlike(LIMITS[name], -1.0 - LIMITS[name]), "limits|levels") for name in list(LIMITS)[:4]}
-           | dict.fromkeys(list(LIMITS)[4:], ((*NO_NUMBERS, -1.0, math.inf), "limits|window"))),
+    *named(limits, {name: (arrays_unlike(getattr(limits(), name), -1.0 - getattr(limits(), name)), "limits|levels")
+                    for name in ("levels", "mean", "low", "high")}
+           | dict.fromkeys(("window", "warm_up", "false_alarms", "duration"),
+                           ((*NO_NUMBERS, -1.0, math.inf), "limits|window"))),
     *((lambda v, kind=kind, more=more: kind(v, *more), "[Ee]nv|environments", (None, 3, "CartPole-v1", object()))
       for kind, *more in ((KKLObservation,), (KKLVectorObservation,), (KKLMemory,), (ActionRepeat, 2),
                           (VectorActionRepeat, 2))),
@@ -110,7 +109,7 @@ def named(make, table):
     (lambda v: LinearFilter(A, B, 0.1, v), "number of inputs", (*NO_NUMBERS, -1, 65, 1.0)),
     (lambda v: MLP([v, WEIGHTS[1]], BIASES, "tanh"), "weights|layer", arrays_unlike(WEIGHTS[0].T)),
     (lambda v: MLP(WEIGHTS, BIASES, v), "activation", (*CHOICES, "gelu")),
-    (lambda v: Monitor(Limits(**LIMITS), 0.2, v), "dt", POSITIVE),
+    (lambda v: Monitor(limits(), 0.2, v), "dt", POSITIVE),
 ])  # fmt: skip
 def test_arguments(make, words, bad):
     for value in bad:

@@ -157,11 +157,3 @@ def test_worker_processes_find_the_class_by_its_name(where, instance, tmp_path, 
     name = "found_from_here:Oscillator" if where == "module" else "found_from_here.py:Oscillator"
     make = partial(gym.make, f"kkl_gym:{kkl_gym.OWN_ID}", system=kkl_gym.get_system(name) if instance else name)
     assert SPAWN(make) == start(make)
-
-
-@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
-def test_a_system_must_be_named(make):
-    with pytest.raises(TypeError, match="missing 1 required positional argument: 'system'"):
-        make(kkl_gym.OWN_ID)
-    with pytest.raises(ValueError, match="the system must be the name of one or"):
-        make(kkl_gym.OWN_ID, system=None)

@@ -108,18 +108,3 @@ def test_extremes_are_alike_and_silent(name, x, expected):
         with np.errstate(invalid="ignore"):  # of the sine of an infinite array alone
             value = function(*map(kind, np.atleast_1d(x).tolist()))
         assert float(value) == pytest.approx(expected, nan_ok=True)
-
-
-def test_gradients():
-    x = torch.tensor([0.3, -0.7], dtype=torch.float64, requires_grad=True)
-    for value, slope in (
-        (elementary.sin(x), [math.cos(0.3), math.cos(0.7)]),
-        (elementary.abs(x), [1.0, -1.0]),
-        (elementary.sign(x) * x, [1.0, -1.0]),
-        (elementary.maximum(x, 0.0), [1.0, 0.0]),
-        (elementary.clip(x, -0.5, 0.5), [1.0, 0.0]),
-        (elementary.where(x > 0, x * x, -x), [0.6, -1.0]),
-        (elementary.atan2(x, 1.0), [1 / 1.09, 1 / 1.49]),
-    ):
-        (got,) = torch.autograd.grad(value.sum(), x)
-        assert got.tolist() == close(slope)

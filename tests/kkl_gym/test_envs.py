@@ -13,7 +13,6 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import kkl_gym
 from kkl_gym import ENV_IDS, KKLEnv, Lorenz, System, get_system
 from kkl_gym.elementary import sin
 from kkl_gym.plant import NOISE_BLOCK, output_bounds
@@ -143,17 +142,14 @@ def test_reward_is_one_at_the_target_and_follows_the_formula(name):
         assert reward < 1
 
 
-@both
-def test_results_are_copies(observe):
-    env, other = (KKLEnv("lorenz", observe=observe) for _ in range(2))
-    obs, info = env.reset(seed=0)
-    other.reset(seed=0)
+def test_results_are_copies():
+    env, other = KKLEnv("lorenz"), KKLEnv("lorenz")
+    (obs, info), _ = env.reset(seed=0), other.reset(seed=0)
     for _ in range(3):
         for array in (obs, *info.values()):
             array[...] = 7
         (obs, *_, info), (expected, *_, theirs) = env.step(np.ones(1)), other.step(np.ones(1))
-        assert np.array_equal(obs, expected)
-        assert all(np.array_equal(info[key], theirs[key]) for key in info)
+        np.testing.assert_equal((obs, info), (expected, theirs))
 
 
 def test_escape_terminates_with_the_last_state():
@@ -235,21 +231,6 @@ def test_step_and_render_before_reset():
             call()
 
 
-def test_render():
-    pytest.importorskip("matplotlib")
-    silent, env = (gym.make("KKLRossler-v0", render_mode=mode) for mode in (None, "rgb_array"))
-    silent.reset(seed=0), env.reset(seed=0)
-    assert silent.render() is None
-    first = env.render()
-    assert first.dtype == np.uint8
-    assert first.shape == (480, 480, 3)
-    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 5
-    env.step(np.zeros(1, np.float32))
-    assert not np.array_equal(env.render(), first)
-    env.reset(seed=0)
-    assert np.array_equal(env.render(), first)
-
-
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 @pytest.mark.parametrize("render_mode", [None, "rgb_array"])
 def test_a_copy_mid_episode_continues_identically(duplicate, render_mode):
@@ -312,11 +293,3 @@ def test_actions_are_scaled_and_clipped_and_without_noise_a_step_is_a_step():
         assert info["u"] == pytest.approx([u], rel=1e-12)
         assert info["x"].tolist() == list(x)
         assert info["y"].tolist() == list(env.system.h(x))
-
-
-@pytest.mark.parametrize(("dt", "fps"), [(0.01, 100), (0.05, 20), (0.001, 100), (3.0, 1)])
-def test_a_video_shows_motions_as_they_are(dt, fps):
-    env, batch = KKLEnv("lorenz", dt=dt), kkl_gym.KKLVectorEnv("lorenz", dt=dt, autoreset_mode="Disabled")
-    assert env.metadata["render_fps"] == batch.metadata["render_fps"] == fps
-    for slow in (kkl_gym.ActionRepeat(env, 5), kkl_gym.VectorActionRepeat(batch, 5)):
-        assert slow.metadata["render_fps"] == max(1, fps // 5)

@@ -45,7 +45,6 @@ def test_it_is_open_from_reset_to_close(shown):
     assert np.array_equal(shown[-1], arrays.render())
     env.close()
     assert not pygame.display.get_init()
-    env.close()
     env.reset(seed=0)
     assert len(shown) == 7
     env.close()

@@ -96,14 +96,6 @@ def test_noise_is_amplified_at_most_threefold(shortest, ratio):
         assert 0.5 < np.sqrt((found.mixing @ of_filters @ found.mixing.T).diagonal().max()) < 3.0
 
 
-def test_noise_is_amplified_more_at_first():
-    pulses = np.eye(6)[:, :, None]  # each row of the batch has one at another step
-    shown = run(memory(1, 0, inputs=()), pulses, np.zeros((5, 6, 0)))[:, :, 1:]
-    first, fifth = (np.sqrt((shown[k] ** 2).sum(0)).max() for k in (1, 5))
-    assert 21 < first < 22.5
-    assert 4 < fifth < 4.5
-
-
 def test_an_output_at_rest_leaves_no_trace():
     filters = memory()
     rest, away = np.array([1e4, -3.0]), np.array([1e4 + 1.0, -3.0])
@@ -128,34 +120,6 @@ def test_a_single_row_and_a_batch_agree():
 def test_nothing_underflows_while_a_memory_fills():
     with np.errstate(all="raise"):
         run(memory(2, 1, (0.5, 50.0)), signals(800, 2), signals(799, 1, seed=1))
-
-
-@pytest.mark.parametrize("make", [lambda: memory(5, 2), of_angles])
-def test_rows_that_rest_and_rows_that_restart(make):
-    (y, _), u = turning(4, 3), signals(3, 3, 2, seed=1)
-    filters, some = make(), np.array([True, False, True])
-    before = run(filters, y[:3], u[:2])[-1]
-    after = filters.advance(y[3], u[2], some)
-    assert np.array_equal(after[1], before[1])
-    assert np.allclose(after[some], run(make(), y, u)[-1][some])
-    first = filters.restart(y[0, :1], ~some)
-    assert np.array_equal(filters.shown()[some], after[some])
-    assert np.array_equal(filters.shown()[1:2], first)
-    fresh = make()
-    assert np.array_equal(first[0], fresh.reset(y[0, 0]))
-    again = filters.advance(y[1], u[0], ~some)[1]
-    assert np.allclose(again, fresh.advance(y[1, 1], u[0, 1]), atol=1e-6)
-
-
-@pytest.mark.parametrize(("make", "ny"), [(lambda: memory(5, 2), 5), (lambda: memory(100, 2), 100), (of_angles, 5)])
-def test_a_memory_begins_with_a_reset(make, ny):
-    for shape in ((), (3,)):
-        with pytest.raises(RuntimeError, match="before its first step"):
-            make().advance(np.zeros((*shape, ny)), np.zeros((*shape, 2)))
-    with pytest.raises(RuntimeError, match="before its first step"):
-        of_angles().shown()
-    with pytest.raises(RuntimeError, match="reset all environments"):
-        make().restart(np.zeros((1, ny)), np.array([True, False]))
 
 
 @pytest.mark.parametrize("shape", [(), (4,)])

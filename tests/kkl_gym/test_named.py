@@ -56,24 +56,21 @@ def test_of_a_dict_entries_that_are_not_read_are_not_looked_at():
     reader = Reader(KEYED, names("gap", "arm[1]", space=KEYED), source="Env-v0")
     values = {"arm": np.array([np.nan, 0.2]), "camera": None, "gap": np.array([4.0])}
     assert reader(values, {}).tolist() == [4.0, 0.2]
-    with pytest.raises(ValueError, match=r"nan among what is read, in entry 1 of 'arm':"):
+    with pytest.raises(ValueError, match=r"nan in entry 1 of 'arm':"):
         reader({**values, "arm": np.array([0.1, np.nan])}, {})
     space = spaces.Dict({"arm": PLAIN, "arm[x]": spaces.Box(-1.0, 1.0, (2,))})
     reader = Reader(space, names("arm[x][1]", "arm[2]", space=space), source="Env-v0")
     assert reader({"arm": np.arange(4.0).reshape(2, 2), "arm[x]": np.array([0.1, 0.2])}, {}).tolist() == [0.2, 2.0]
 
 
-@pytest.mark.parametrize(
-    ("name", "info", "told"),
-    [
-        ("info[speed]", {"other": 1.0}, "has no 'speed'; there is other"),
-        ("info[speed]", {"speed": [1.0, 2.0]}, r"holds 2 numbers: name one, as in info\[speed\]\[0\]"),
-        ("info[speed][2]", {"speed": [1.0, 2.0]}, "holds 2 numbers there"),
-        ("info[speed]", {"speed": "fast"}, "real numbers"),
-    ],
-)
-def test_what_info_does_not_hold(name, info, told):
-    with pytest.raises(ValueError, match=told):
+@pytest.mark.parametrize(("name", "info", "match"), [
+    ("info[speed]", {"other": 1.0}, "has no 'speed'; there is other"),
+    ("info[speed]", {"speed": [1.0, 2.0]}, r"holds 2 numbers: name one, as in info\[speed\]\[0\]"),
+    ("info[speed][2]", {"speed": [1.0, 2.0]}, "holds 2 numbers there"),
+    ("info[speed]", {"speed": "fast"}, "real numbers"),
+])  # fmt: skip
+def test_what_info_does_not_hold(name, info, match):
+    with pytest.raises(ValueError, match=match):
         Reader(PLAIN, [name], source="Env-v0")(np.zeros((2, 2)), info)
 
 
@@ -83,6 +80,5 @@ def test_inputs_are_scaled_or_one_hot():
     assert InputReader(box, ["action[1]"], source="Env-v0")(np.array([1.0, 3.0])).tolist() == [0.5]
     one_of = InputReader(spaces.Discrete(3), acting(spaces.Discrete(3)), source="Env-v0")
     np.testing.assert_array_equal(one_of(np.array([2, 0]), (2,)), [[0, 0, 1], [1, 0, 0]])
-    assert one_of.largest.tolist() == [1.0, 1.0, 1.0]
     with pytest.raises(ValueError, match=r"inputs names 'action\[3\]'"):
         InputReader(spaces.Discrete(3), ["action[3]"], source="Env-v0")

@@ -30,7 +30,6 @@ ALL = {
     "drop_out": 0.2,
     "every": 2,
 }
-kinds = pytest.mark.parametrize("kind", ["single", "vector"])
 
 
 class Drifting(System):
@@ -49,60 +48,44 @@ class Drifting(System):
         return 1.0
 
 
-def record(kind, system="van_der_pol", steps=300, n=6, seed=0, **options):
+def record(system="van_der_pol", steps=300, n=6, seed=0, **options):
     """Outputs without noise, samples and observations, (steps + 1, n, ...), of n seeds from seed on."""
-    actions = np.random.default_rng(1).uniform(-1, 1, (steps, 1))
-    clean = kkl_gym.get_system(system).output
-    if kind == "vector":
-        env = KKLVectorEnv(system, n, **options)
-        obs, info = env.reset(seed=seed)
-        found = [(clean(info["x"]), info["y"], obs)]
-        for action in actions:
-            obs, *_, info = env.step(np.tile(action, (n, 1)))
-            found.append((clean(info["x"]), info["y"], obs))
-        return tuple(map(np.array, zip(*found, strict=True)))
-    rows = []
-    for row in range(n):
-        env = KKLEnv(system, **options)
-        obs, info = env.reset(seed=seed + row)
-        found = [(clean(info["x"]), info["y"], obs)]
-        for action in actions:
-            obs, *_, info = env.step(action)
-            found.append((clean(info["x"]), info["y"], obs))
-        rows.append(tuple(map(np.array, zip(*found, strict=True))))
-    return tuple(np.stack(each, axis=1) for each in zip(*rows, strict=True))
+    env, clean = KKLVectorEnv(system, n, **options), kkl_gym.get_system(system).output
+    obs, info = env.reset(seed=seed)
+    found = [(clean(info["x"]), info["y"], obs)]
+    for action in np.random.default_rng(1).uniform(-1, 1, (steps, 1)):
+        obs, *_, info = env.step(np.tile(action, (n, 1)))
+        found.append((clean(info["x"]), info["y"], obs))
+    return tuple(map(np.array, zip(*found, strict=True)))
 
 
-@kinds
-def test_quantum_bias_gain_and_saturation(kind):
-    clean, y, _ = record(kind, measurement_noise=0.0, sensor=Sensor(quantum=0.3))
+def test_quantum_bias_gain_and_saturation():
+    clean, y, _ = record(measurement_noise=0.0, sensor=Sensor(quantum=0.3))
     assert abs(y - clean).max() <= 0.15 + 1e-12
     assert np.allclose(y / 0.3, np.rint(y / 0.3))
     assert np.ptp(y) > 1.0
-    clean, y, _ = record(kind, measurement_noise=0.0, sensor={"gain": -2, "bias": 0.5})
+    clean, y, _ = record(measurement_noise=0.0, sensor={"gain": -2, "bias": 0.5})
     assert np.allclose(y, 0.5 - 2.0 * clean)
-    clean, y, obs = record(kind, measurement_noise=0.0, sensor={"saturation": (-1.0, 0.5)}, observe="output")
+    clean, y, obs = record(measurement_noise=0.0, sensor={"saturation": (-1.0, 0.5)}, observe="output")
     assert np.allclose(y, np.clip(clean, -1.0, 0.5))
     assert {obs.min(), obs.max()} == {-1.0, 0.5}
 
 
-@kinds
-def test_a_delay_shifts_the_record(kind):
-    now, late = (record(kind, sensor=Sensor(delay=delay))[1] for delay in (0, 7))
+def test_a_delay_shifts_the_record():
+    now, late = (record(sensor=Sensor(delay=delay))[1] for delay in (0, 7))
     assert np.array_equal(late[7:], now[:-7])
     assert (late[:7] == now[0]).all()
 
 
-@kinds
-def test_every_third_step_and_drop_outs(kind):
-    _, plain, _ = record(kind)
-    _, y, obs = record(kind, sensor=Sensor(every=3), observe="output")
+def test_every_third_step_and_drop_outs():
+    _, plain, _ = record()
+    _, y, obs = record(sensor=Sensor(every=3), observe="output")
     there = np.arange(len(y)) % 3 == 0
     assert np.array_equal(y[there], plain[there])
     assert np.isnan(y[~there]).all()
     assert np.array_equal(obs[1::3], obs[0:-1:3])  # held
     assert np.isfinite(obs).all()
-    _, y, _ = record(kind, steps=2000, sensor=Sensor(drop_out=0.3))
+    _, y, _ = record(steps=2000, sensor=Sensor(drop_out=0.3))
     lost = np.isnan(y[1:])
     assert not np.isnan(y[0]).any()
     assert lost.mean() == pytest.approx(0.3, abs=4 * (0.3 * 0.7 / lost.size) ** 0.5)
@@ -110,10 +93,9 @@ def test_every_third_step_and_drop_outs(kind):
     assert pairs.mean() == pytest.approx(0.09, abs=0.012)  # independent
 
 
-@kinds
-def test_coloured_noise_is_of_first_order(kind):
+def test_coloured_noise_is_of_first_order():
     sensor = Sensor(coloured_noise=0.4, time_constant=0.2)  # at dt = 0.01 s
-    clean, y, _ = record(kind, steps=2000, n=20, measurement_noise=0.0, sensor=sensor)
+    clean, y, _ = record(steps=2000, n=20, measurement_noise=0.0, sensor=sensor)
     noise, decay = y - clean, np.exp(-0.01 / 0.2)
     assert noise.mean() == pytest.approx(0.0, abs=0.04)
     assert noise.var() == pytest.approx(0.16, rel=0.1)
@@ -123,10 +105,9 @@ def test_coloured_noise_is_of_first_order(kind):
     assert fresh.var() == pytest.approx(0.16 * (1 - decay**2), rel=0.02)
 
 
-@kinds
-def test_each_output_has_its_own(kind):
+def test_each_output_has_its_own():
     sensor = Sensor(bias=[0.0, 5.0], delay=(0, 4), every=[2, 1], saturation=((-9, 0), (9.0, 7.0)))
-    clean, y, _ = record(kind, Drifting(), 50, 2, measurement_noise=0.0, sensor=sensor)
+    clean, y, _ = record(Drifting(), 50, 2, measurement_noise=0.0, sensor=sensor)
     assert np.allclose(y[::2, :, 0], clean[::2, :, 0])
     assert np.isnan(y[1::2, :, 0]).all()
     assert np.allclose(y[4:, :, 1], np.clip(clean[:-4, :, 1] + 5.0, 0.0, 7.0))
@@ -142,11 +123,10 @@ def test_rows_are_single_environments(mode):
     assert compare(vector, sync, actions, mode, infos=("x", "u", "sample"))
 
 
-@kinds
-def test_motions_and_white_noise_of_a_seed_are_those_without(kind):
-    clean, plain, _ = record(kind)
+def test_motions_and_white_noise_of_a_seed_are_those_without():
+    clean, plain, _ = record()
     for sensor in (Sensor(), Sensor(**ALL)):
-        same, y, _ = record(kind, sensor=sensor)
+        same, y, _ = record(sensor=sensor)
         assert np.array_equal(clean, same)
         assert np.array_equal(plain, y) == (sensor == Sensor())
 
@@ -175,7 +155,7 @@ def test_checkers_are_content(gym_id, own):
     assert envs.unwrapped.sensor == Sensor(**ALL)
 
 
-@kinds
+@pytest.mark.parametrize("kind", ["single", "vector"])
 def test_the_observer_takes_what_the_sensor_reads(kind, saved, make_artifact):
     if kind == "single":
         env = KKLObservation(KKLEnv("van_der_pol", sensor=ALL), saved())

@@ -7,18 +7,16 @@ import pytest
 from kinked_systems import SYSTEMS as KINKED
 from pushed_systems import Pendulum, TwoInputs
 
-from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, Lorenz, ReverseDuffing, Rossler, System, get_system
+from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.compiled import batch_step, single_step
 from kkl_gym.elementary import exp, sign, sin
 from kkl_gym.simulate import (
     SubstepsError,
     advance,
     advance_batch,
-    equal_substeps,
     runge_kutta,
     simulate,
 )
-from kkl_gym.system import rate_under
 
 solve_ivp = pytest.importorskip("scipy.integrate").solve_ivp
 DT = 0.01
@@ -210,27 +208,12 @@ def test_what_ignites_within_an_interval_is_followed_and_not_lost(system):
     expected = np.array(
         [solve_ivp(lambda _, x: system.f(x), (0, dt), x0, "LSODA", rtol=1e-10, atol=1e-12).y[:, -1] for x0 in starts]
     )
-    np.testing.assert_allclose(simulate(system, starts, 3, dt)[1], expected, rtol=1e-4, atol=1e-5)
-    env = KKLEnv(system, dt=dt, process_noise=0.0)
-    envs = KKLVectorEnv(system, 2, dt=dt, process_noise=0.0)
-    envs.reset(seed=0, options={"x0": starts})
-    *_, terminated, _, infos = envs.step(np.zeros((2, 0)))
-    assert not terminated.any()
-    for x0, end, x in zip(starts, expected, infos["x"], strict=True):
-        env.reset(seed=0, options={"x0": x0})
-        *_, terminated, _, info = env.step(np.zeros(0))
-        assert not terminated
-        np.testing.assert_allclose(info["x"], end, rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(info["x"], x, rtol=1e-9)
-
-
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_the_shipped_systems_never_need_substeps_of_unequal_length(name):
-    system, rng = get_system(name), np.random.default_rng(0)
-    low, high = np.array(system.bounds, dtype=float).T
-    x = rng.uniform(low, high, (20_000, system.nx)).T
-    u = rng.uniform(-1, 1, (system.nu, 20_000)) * np.array(system.u_max)[:, None]
-    assert not equal_substeps(system, x, u, np.zeros_like(x), 0.01)[1]
+    for step in (advance_batch, lambda system, *at: batch_step(system)(*at)):
+        found = step(system, starts.T, np.zeros((0, 2)), np.zeros((2, 2)), dt)
+        np.testing.assert_allclose(found.T, expected, rtol=1e-4, atol=1e-5)
+    for step in (advance, lambda system, *at: single_step(system)(*at)):
+        found = [step(system, x0, [], [0.0, 0.0], dt) for x0 in starts.tolist()]
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("system", [Lorenz(), Pendulum(), TwoInputs()], ids=lambda s: s.name)
@@ -303,8 +286,3 @@ def test_huge_steps_of_a_batch_are_refused():
     x, none = np.ones((2, 1)), np.zeros((2, 1))
     with pytest.raises(SubstepsError, match=r"dt = 1e\+06 s of two_inputs, .* at x = \[.*take a smaller dt"):
         advance_batch(TwoInputs(), x, none, none, 1e6)
-
-
-def test_an_own_rate_stands_for_inputs_too():
-    rated = type("Rated", (Flushed,), {"name": "rated", "rate": lambda self, x: 7.0})
-    assert rate_under(rated(), (0.3,), (400.0,)) == 7.0

@@ -104,38 +104,26 @@ UNEVEN = spaces.Dict(a=spaces.Box(-1, 1, (1,)), b=spaces.Box(-1, 1, (2,)))
 MIXED = spaces.Dict(camera=IMAGE, place=spaces.Box(-1, 1, (2,)), word=spaces.Text(5))
 
 
-@pytest.mark.parametrize(
-    ("space", "measured", "angles", "match"),
-    [
-        (THREE, [3], (), r"measured names entry 3, but .* entries 0 to 2"),
-        (THREE, [0, 0], (), r"measured must name each entry once, got \[0, 0\]"),
-        (THREE, ["x"], (), "names 'x', but what is observed has no keys: name indices"),
-        (THREE, [0, 1], [(0, 2)], r"angles must be among what is measured, \(0, 1\), got"),
-        (UNEVEN, None, [("a", "b")], r"equally many, got \('a', 'b'\), which are 1 and 2 entries"),
-        (IMAGE, None, (), r"X-v0 is an image, .*: let an encoder .*TransformObservation"),
-        (MIXED, [1], (), "X-v0, 'camera', is an image"),
-        (MIXED, ["word"], (), r"holds Text.*convert it by a wrapper inside, or leave its key out"),
-        (MIXED, ["speed"], (), "names 'speed', but what is observed has keys 'camera', 'place', 'word'"),
-        (spaces.Sequence(spaces.Discrete(2)), None, (), "only Box, Discrete"),
-        (spaces.Dict(a=spaces.Box(-1, 1, (0,)), b=spaces.Discrete(2)), ["a"], (), "X-v0 holds no numbers"),
-    ],
-)
+@pytest.mark.parametrize(("space", "measured", "angles", "match"), [
+    (THREE, [3], (), r"measured names entry 3, but .* entries 0 to 2"),
+    (THREE, [0, 0], (), r"each entry once, got \[0, 0\]"),
+    (THREE, ["x"], (), "no keys: name indices"),
+    (THREE, [0, 1], [(0, 2)], r"angles must be among the measured entries, \(0, 1\), got"),
+    (UNEVEN, None, [("a", "b")], "1 and 2 entries"),
+    (MIXED, [1], (), "X-v0, 'camera', is an image"),
+    (MIXED, ["word"], (), "holds Text"),
+    (MIXED, ["speed"], (), "has keys 'camera', 'place', 'word'"),
+    (spaces.Sequence(spaces.Discrete(2)), None, (), "only Box, Discrete"),
+])  # fmt: skip
 def test_what_cannot_be_measured_says_what_to_do(space, measured, angles, match):
     with pytest.raises(ValueError, match=match):
         outputs(space, measured, angles)
 
 
-@pytest.mark.parametrize(
-    ("space", "wrong"),
-    [
-        (spaces.Box(-1, 1, (2,)), [0.0, np.nan]),
-        (spaces.Box(-1, 1, (2,)), [0.0]),
-        (spaces.Discrete(3, start=1), 0),
-        (spaces.MultiDiscrete([2, 2]), [0, 2]),
-        (spaces.Dict(a=spaces.Discrete(2)), {}),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("space", "wrong"), [
+    (spaces.Box(-1, 1, (2,)), [0.0, np.nan]), (spaces.Box(-1, 1, (2,)), [0.0]), (spaces.Discrete(3, start=1), 0),
+    (spaces.MultiDiscrete([2, 2]), [0, 2]), (spaces.Dict(a=spaces.Discrete(2)), {}),
+], ids=str)  # fmt: skip
 def test_wrong_actions_are_refused(space, wrong):
     with pytest.raises(ValueError, match="the action of X-v0 must"):
         inputs(space)(wrong)

@@ -114,21 +114,10 @@ def test_get_system_from_a_script_or_a_module(script, monkeypatch):
         get_system(f"{script}:NoSystem")
 
 
-@pytest.mark.parametrize("nonsense", [
-    "nonsense", "", "Lorentz", "no_such_module:Class", "kkl_gym:NoClass", "no/such/file.py:Class",
-    ":Lorenz", "..:Lorenz", "kkl_gym:KKLEnv", "kkl_gym:__version__", "kkl_gym:System",
-])  # fmt: skip
+@pytest.mark.parametrize("nonsense", ["nonsense", "no_such_module:Class", "kkl_gym:NoClass", "kkl_gym:__version__"])
 def test_nonsense_names_raise_with_the_name(nonsense):
     with pytest.raises(ValueError, match=r"unknown system|cannot load|not a subclass") as raised:
         get_system(nonsense)
     assert repr(nonsense) in str(raised.value)
     if ":" not in nonsense:
         assert "reverse_duffing, van_der_pol, rossler, lorenz" in str(raised.value)
-
-
-def test_script_that_fails_is_not_half_loaded(tmp_path):
-    path = tmp_path / "failing.py"
-    path.write_text("raise RuntimeError('mine')")
-    for _ in range(2):
-        with pytest.raises(ValueError, match=r"cannot load the system '.*failing\.py:Class': .*failing\.py, line 1 \("):
-            get_system(f"{path}:Class")

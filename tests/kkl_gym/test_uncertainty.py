@@ -32,7 +32,6 @@ def test_single(path):
     space = env.observation_space
     shown = np.concatenate([info["x_hat"], np.sqrt(np.diag(info["x_cov"]))])
     np.testing.assert_allclose(obs, np.clip(shown, space.low, space.high), rtol=1e-6)
-    assert info["x_cov"].shape == (2, 2)
     np.testing.assert_array_equal(info["x_cov"], env.observer.covariance)
 
 
@@ -63,8 +62,6 @@ def test_where_there_is_none(path, saved):
         KKLObservation(env, plain, uncertainty=True)
     with pytest.raises(ValueError, match="estimate='x'"):
         KKLObservation(env, path, uncertainty=True, estimate="z")
-    with pytest.raises(ValueError, match="uncertainty must be True or False"):
-        KKLObservation(env, path, uncertainty="no")
     with pytest.raises(ArtifactError, match="no covariance"):
         KKLObservation(env, path, uncertainty=True).replace_observer(plain)
     assert "x_cov" not in KKLObservation(env, path).reset(seed=0)[1]

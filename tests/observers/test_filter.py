@@ -50,24 +50,6 @@ def test_one_interval_is_exact(A, nu, dt):
 
 
 @both
-def test_a_record_is_exact(A):
-    """Against an integrator that knows nothing of matrix exponentials."""
-    solve_ivp = pytest.importorskip("scipy.integrate").solve_ivp
-    linear = random_filter(A)
-    steps, nz = 15, len(A)
-    y, u = signals(linear, steps)
-    z = np.concatenate([-np.linalg.solve(A, linear.B @ y[0]), np.zeros(nz)])
-    for k in range(steps):
-
-        def field(t, z, k=k):
-            held = y[k] + (y[k + 1] - y[k]) * t / DT
-            return np.concatenate([A @ z[:nz] + linear.B @ held, A @ z[nz:] + linear.B @ np.ones(2) * u[k, 0]])
-
-        z = solve_ivp(field, (0, DT), z, "DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
-    assert np.allclose(run(linear, y, u)[-1], z, rtol=1e-9, atol=1e-10)
-
-
-@both
 def test_start_is_the_equilibrium_of_a_constant_output(A):
     linear = random_filter(A)
     y = np.array([0.7, -1.3])
@@ -119,13 +101,3 @@ def test_a_filter_keeps_what_it_was_made_of():
     assert linear.A[0, 0] == -1.0
     with pytest.raises(ValueError, match="read-only"):
         linear.B[0] = 2.0
-
-
-@pytest.mark.parametrize("rows", [3, 128])
-def test_batches_that_do_not_go_together(rows):
-    linear, zeros = random_filter(PAIR, 2, 0), np.zeros
-    for z, y in ((2, 2), (3, 1)):
-        with pytest.raises(ValueError):  # noqa: PT011 - NumPy's words or ours
-            linear.advance(zeros((rows, z)), zeros((rows, y)), zeros((rows, 0)), zeros((rows, y)))
-    with pytest.raises(ValueError):  # noqa: PT011
-        linear.advance(zeros((2 * rows, 3)), zeros((rows, 2)), zeros((rows, 0)), zeros((rows, 2)))

@@ -7,9 +7,6 @@ import pytest
 from linear_system import C, F, exact_observer, sylvester
 from scipy.linalg import expm
 
-import observers
-from kkl_gym import get_system
-from kkl_gym.simulate import simulate
 from observers import KKLObserver
 
 KINDS = [{"inputs": 0, "age": 0}, {"pair": True}]
@@ -118,22 +115,3 @@ def test_rows_restart_with_known_and_unknown_starts(make_artifact):
         assert np.allclose(together.z, [one.z for one in alone], rtol=1e-6)
         assert np.allclose(together.decode(), [one.decode() for one in alone], **CLOSE)
         assert np.allclose(together.mismatch, [one.mismatch for one in alone], **CLOSE)
-
-
-def test_the_shipped_map_of_reverse_duffing_starts_where_it_is_told():
-    system, observer = get_system("reverse_duffing"), observers.load("reverse_duffing-spinn", 0.0)
-    x0 = np.random.default_rng(1).uniform(*system.box(), (50, 2))
-    x = simulate(system, x0, steps=100, dt=0.01)
-    y = system.output(x)
-
-    def errors(x_hat):
-        return np.median(np.linalg.norm(x_hat - x, axis=-1), axis=1)
-
-    known, unknown = errors(observer.estimate(y, x0=x0)), errors(observer.estimate(y))
-    assert known.max() < 0.1
-    assert (unknown[:50] > 4 * known[:50]).all()
-    scores = []
-    for start in (x0, None):
-        observer.reset(y[0], start)
-        scores.append(np.median(observer.mismatch))
-    assert scores[1] > 5 * scores[0]

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_system import TwoOutputs, exact_observer
-from random_artifacts import random_artifact
-from random_tracking import tracking
+from monitor_limits import limits
 
 from kkl_gym.simulate import simulate
-from observers import Expression, KKLObserver, Limits, Monitor
+from observers import Expression, KKLObserver, Monitor
 
 DT, STEPS = 0.05, 400
 C, H = np.eye(2), Expression([["x", 0], ["x", 1]])
@@ -87,29 +86,6 @@ def test_where_all_outputs_are_missing_the_sample_is(batch):
     assert np.array_equal(one.z, other.z)
 
 
-@pytest.mark.parametrize("make", [tracking, random_artifact])
-def test_of_one_output_samples_of_rows_and_of_records_may_be_missing(make):
-    def fresh():
-        return KKLObserver(make())
-
-    rng = np.random.default_rng(3)
-    y, u = rng.normal(size=(40, 2, 1)), rng.normal(size=(39, 2, 1))
-    y[10:15, 1] = math.nan
-    batch, single = fresh(), fresh()
-    x_hat = np.array([batch.reset(y[0]), *(batch.step(*row) for row in zip(y[1:], u, strict=True))])
-    rows = zip(y[1:, 1], u[:, 1], strict=True)
-    alone = [single.reset(y[0, 1]), *(single.step(None if np.isnan(sample) else sample, held) for sample, held in rows)]
-    np.testing.assert_allclose(x_hat[:, 1], alone, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(fresh().estimate(y, u), x_hat, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(fresh().estimate(y[:, 1], u[:, 1]), alone, rtol=0, atol=1e-4)
-    other = fresh()
-    single.reset(y[0, 1])
-    other.reset(y[0, 1])
-    np.testing.assert_array_equal(single.step([math.nan], [0.0]), other.step(None, [0.0]))
-    with pytest.raises(ValueError, match="the first sample must be whole"):
-        fresh().estimate(y[12:], u[12:])
-
-
 def test_what_is_neither_there_nor_missing():
     observer, gap = KKLObserver(exact()), np.array([0.1, math.nan])
     for call in (observer.reset, lambda y: observer.estimate([y, [0.1, 0.2]])):
@@ -139,22 +115,10 @@ def test_a_prediction_that_is_no_number_is_not_taken():
     assert np.isfinite(observer.step(None)).all()
 
 
-LIMITS = Limits(
-    levels=np.array([0.0, 1.0]),
-    mean=np.array([[0.3, 0.3], [0.5, 0.5]]),
-    low=np.array([[0.0, 0.0], [0.4, 0.4]]),
-    high=np.array([[0.1, 0.1], [2.1, 2.1]]),
-    window=0.5,
-    warm_up=0.05,
-    false_alarms=0.01,
-    duration=50.0,
-)
-
-
 def test_what_is_missing_is_not_judged():
     """One output of two is never there: the score is that of a monitor of the other one alone."""
-    artifact, y = exact(limits=LIMITS), TwoOutputs().output(motions(1)[:, 0])
-    watched, first = KKLObserver(artifact, 0.0, monitor=True), Monitor(LIMITS, 0.0, DT)
+    artifact, y = exact(limits=limits(2)), TwoOutputs().output(motions(1)[:, 0])
+    watched, first = KKLObserver(artifact, 0.0, monitor=True), Monitor(limits(2), 0.0, DT)
     watched.reset(y[0])
     rows = first.start(1)
     for k in range(1, 60):
@@ -169,7 +133,7 @@ def test_what_is_missing_is_not_judged():
 
 
 def test_rows_of_monitored_batches_with_gaps_are_monitors_of_their_own():
-    artifact = exact(limits=LIMITS)
+    artifact = exact(limits=limits(2))
     rng = np.random.default_rng(3)
     y = rng.normal(size=(30, 3, 2))
     y[1:][rng.random((29, 3, 2)) < 0.3] = math.nan

@@ -6,24 +6,11 @@ import dataclasses
 import gymnasium as gym
 import numpy as np
 import pytest
+from monitor_limits import limits
 from random_artifacts import random_artifact
 
 from kkl_gym import ENV_IDS, KKLObservation, KKLVectorObservation
-from observers import ArtifactError, KKLObserver, Limits, Monitor, load
-
-
-def limits(ny=1, **changes):
-    values = {
-        "levels": np.array([0.0, 1.0]),
-        "mean": np.array([[0.3] * ny, [0.5] * ny]),
-        "low": np.array([[0.0] * ny, [0.4] * ny]),
-        "high": np.array([[0.1] * ny, [2.1] * ny]),
-        "window": 0.1,
-        "warm_up": 0.05,
-        "false_alarms": 0.01,
-        "duration": 50.0,
-    }
-    return Limits(**(values | changes))
+from observers import ArtifactError, KKLObserver, Monitor, load
 
 
 def test_running_means_by_hand():
@@ -110,7 +97,7 @@ def test_another_noise_level_is_another_monitor():
     assert observer.measurement_noise == 0.5
 
 
-def test_copies_have_monitors_of_their_own_and_files_keep_limits(tmp_path):
+def test_copies_have_monitors_of_their_own(tmp_path):
     watched_artifact().save(tmp_path / "a.safetensors")
     observer = load(tmp_path / "a.safetensors", monitor=True)
     observer.reset(np.zeros(1))
@@ -120,8 +107,6 @@ def test_copies_have_monitors_of_their_own_and_files_keep_limits(tmp_path):
     for _ in range(30):
         other.step(np.full(1, 5.0))
     assert other.score > score == observer.score
-    for entry in dataclasses.fields(Limits):
-        assert np.array_equal(getattr(observer.artifact.limits, entry.name), getattr(limits(), entry.name))
 
 
 def test_wrappers_report_the_score(tmp_path):

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 from linear_system import exact_observer
+from monitor_limits import limits
 
-from observers import ArtifactError, Expression, KKLObserver, Limits, Monitor, load
-from observers.network import MLP
+from observers import ArtifactError, Expression, KKLObserver, Monitor, load
 
 
 def test_each_output_has_an_input_of_the_network_and_its_part_in_the_shrinkage(make_artifact):
@@ -20,22 +20,11 @@ def test_each_output_has_an_input_of_the_network_and_its_part_in_the_shrinkage(m
     np.testing.assert_allclose(inverse.noise_features(levels, 0.1), told)
     np.testing.assert_array_equal(inverse.gain(0.3), inverse.gain((0.3, 0.3)))
     assert inverse.noise_features(0.3, 0.1) == inverse.noise_features((0.3, 0.3), 0.1)
-    seen = []
-    heard = dataclasses.replace(inverse, mlp=Spy(inverse.mlp, seen))
-    KKLObserver(dataclasses.replace(artifact, inverse=heard), levels, process_noise=0.1, compiled=False).reset(
-        np.zeros(2)
-    )
-    np.testing.assert_allclose(seen[0][-4:], [*told, 0.0], rtol=1e-6)
-
-
-class Spy(MLP):
-    def __init__(self, mlp, seen):
-        super().__init__(mlp.weights, mlp.biases, mlp.activation)
-        self.seen = seen
-
-    def __call__(self, inputs):
-        self.seen.append(inputs)
-        return super().__call__(inputs)
+    z = artifact.filter.start(np.ones(2))
+    modes = gain * (inverse.whiten @ (z - inverse.z_offset))
+    expected = inverse.x_offset + inverse.x_scale * inverse.mlp(np.array([*modes, *told, 0.0]))
+    found = KKLObserver(artifact, levels, process_noise=0.1).reset(np.ones(2))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_levels_beyond_the_range_of_an_output(make_artifact):
@@ -56,10 +45,8 @@ def test_maps_of_several_outputs_that_are_told_one_level(make_artifact):
     )
     artifact = dataclasses.replace(now, inverse=inverse)
     assert KKLObserver(artifact, 0.3).measurement_noise == KKLObserver(artifact, (0.3, 0.3)).measurement_noise == 0.3
-    with pytest.raises(ValueError, match=r"told one level of measurement noise for all outputs, got \(0\.1, 0\.3\)"):
+    with pytest.raises(ValueError, match=r"takes one level of measurement noise for all outputs, got \(0\.1, 0\.3\)"):
         KKLObserver(artifact, (0.1, 0.3))
-    with pytest.raises(ValueError, match="told one level"):
-        dataclasses.replace(artifact, measurement_noise=(0.1, 0.3))
     papers = exact_observer(C=np.eye(2))  # to which noise is nothing
     assert KKLObserver(papers, (0.1, 7.0)).measurement_noise == (0.1, 7.0)
 
@@ -67,16 +54,10 @@ def test_maps_of_several_outputs_that_are_told_one_level(make_artifact):
 def test_what_is_told_of_each_output_must_fit_the_outputs(make_artifact):
     artifact = make_artifact(outputs=2, free_inverse=True)
     inverse = artifact.inverse
-    one = dataclasses.replace(inverse, measurement_noise_unit=0.1, measurement_noise_max=3.0)
-    assert one.measurement_noise_max == (3.0, 3.0)
     for name in ("measurement_noise_unit", "measurement_noise_max"):
-        with pytest.raises(ArtifactError, match=f"{name} = .* does not fit a noise_gain of shape"):
-            dataclasses.replace(inverse, **{name: (1.0, 2.0, 3.0)})
-        for wrong in ((1.0, -1.0), (1.0, "1"), (0.0, 1.0)):
-            with pytest.raises(ArtifactError, match=f"{name} must be"):
+        for wrong in ((1.0, 2.0, 3.0), (1.0, -1.0), (1.0, "1"), (0.0, 1.0)):
+            with pytest.raises(ArtifactError, match=name):
                 dataclasses.replace(inverse, **{name: wrong})
-        with pytest.raises(ArtifactError, match=f"{name} must be"):
-            dataclasses.replace(make_artifact().inverse, **{name: (1.0, 2.0)})
     with pytest.raises(ArtifactError, match="noise_gain of 3 outputs does not fit 2"):
         dataclasses.replace(artifact, inverse=make_artifact(outputs=3).inverse)
     with pytest.raises(ArtifactError, match="differ in measurement noise"):
@@ -104,22 +85,18 @@ def test_what_is_usual_is_assumed_where_nothing_is_said(make_artifact, tmp_path)
             dataclasses.replace(make_artifact(), measurement_noise=wrong)
 
 
-def limits(**changes):
+def limits_of_two(**changes):
     values = {
         "levels": np.array([[0.0, 0.0], [0.1, 10.0], [1.0, 100.0]]),
         "mean": np.array([[0.1, 1.0], [0.2, 2.0], [0.5, 50.0]]),
         "low": np.array([[0.0, 0.0], [0.005, 50.0], [0.5, 5000.0]]),
         "high": np.array([[0.1, 10.0], [0.2, 200.0], [2.0, 20000.0]]),
-        "window": 0.1,
-        "warm_up": 0.05,
-        "false_alarms": 0.01,
-        "duration": 50.0,
     }
-    return Limits(**(values | changes))
+    return limits(**(values | changes))
 
 
 def test_limits_of_outputs_with_levels_of_their_own():
-    found = limits()
+    found = limits_of_two()
     for row, levels in enumerate(found.levels):
         for part, at in zip((found.mean, found.low, found.high), found.at(tuple(levels)), strict=True):
             np.testing.assert_allclose(at, part[row])
@@ -133,7 +110,7 @@ def test_limits_of_outputs_with_levels_of_their_own():
     monitor = Monitor(dataclasses.replace(found, warm_up=0.0), (0.1, 10.0), 0.01)
     rows = monitor.update(monitor.start(1), np.zeros((1, 2)), np.ones((1, 2), bool))  # from squares of the noise
     assert monitor.score(rows) == pytest.approx(0.005 / (0.01 * np.exp(-0.1)))
-    old = limits(levels=np.array([0.0, 1.0, 100.0]))  # of all outputs
+    old = limits_of_two(levels=np.array([0.0, 1.0, 100.0]))  # of all outputs
     np.testing.assert_allclose(old.at(1.0)[0], found.mean[1])
     np.testing.assert_allclose(old.at((1.0, 100.0))[0], found.mean[2])
 
@@ -141,7 +118,7 @@ def test_limits_of_outputs_with_levels_of_their_own():
 def test_impossible_levels_of_limits():
     for wrong in ([[0], [0], [0]], [[0, 0], [0, 0]], [[0, 0.1], [0.1, 1], [1, 2]], [[0, 0], [0.1, 10], [0.2, 10]], 0.0):
         with pytest.raises(ValueError, match="levels must"):
-            limits(levels=np.array(wrong, dtype=float))
+            limits_of_two(levels=np.array(wrong, dtype=float))
 
 
 def test_residuals_where_the_output_is_not_defined_count_as_none(make_artifact):

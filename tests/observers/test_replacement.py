@@ -4,8 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from monitor_limits import limits
 
-from observers import ArtifactError, KKLObserver, Limits, LinearFilter
+from observers import ArtifactError, KKLObserver, LinearFilter
 
 
 @pytest.fixture
@@ -63,9 +64,7 @@ def test_what_cannot_replace_leaves_the_observer_as_it_was(artifact):
 
 
 def test_monitors_begin_anew(artifact):
-    ones = np.ones((2, 1))
-    limits = Limits(np.array([0.0, 1.0]), ones, 0 * ones, ones, window=0.5, warm_up=0.1, false_alarms=0.01, duration=50)
-    watched = dataclasses.replace(artifact, C=np.array([[1.0, 0.0]]), limits=limits)
+    watched = dataclasses.replace(artifact, C=np.array([[1.0, 0.0]]), limits=limits())
     observer = KKLObserver(watched, monitor=True)
     observer.reset(np.full((2, 1), 3.0))
     for _ in range(20):

@@ -183,7 +183,7 @@ def test_damage_is_noticed_wherever_it_is(path):
         with pytest.raises(UnreadableError, match=re.escape(str(path))):
             read(path)
     path.write_bytes(whole[:-16] + whole[-8:] + whole[-16:-8])
-    with named(path, "it holds something else than its checksum says; get it again"):
+    with named(path, "its content does not match its checksum; get it again"):
         read(path)
 
 

@@ -1,6 +1,5 @@
 """Observers that track: on a linear system they are a Kalman filter, which T_inv starts and starts again."""
 
-import copy
 import functools
 import pickle
 from dataclasses import replace
@@ -20,7 +19,7 @@ from tracking import (
     tracking_observer,
 )
 
-from observers import ArtifactError, Expression, Factors, KKLObserver, Limits, unscented
+from observers import ArtifactError, Expression, Factors, KKLObserver, unscented
 from observers.tracker import INFLATION, Supervision
 
 LEVEL, WINDOW = 0.2, 10  # samples within which T_inv is asked
@@ -204,20 +203,6 @@ def test_maps_are_replaced_while_it_runs():
     assert np.abs(observer.decode() - x[49]).max() < 0.3
 
 
-def test_copies_and_pickles_go_on_alike():
-    observer, _, y = settled()
-    others = [pickle.loads(pickle.dumps(observer)), copy.deepcopy(observer), copy.copy(observer)]
-    for sample in y[:5]:
-        found = observer.step(sample)
-        for other in others:
-            np.testing.assert_array_equal(other.step(sample), found)
-    fresh = KKLObserver(tracking_observer(), LEVEL)
-    other = copy.copy(fresh)  # goes its own way from before a reset on
-    x_hat = fresh.reset(np.array([0.5]))
-    other.reset(np.full((3, 1), -0.5))
-    np.testing.assert_array_equal(fresh.decode(), x_hat)
-
-
 def test_covariances_are_multiplied_by_factors_of_level_and_age():
     """In logarithms between the ages, of the largest level that the map was trained for, which is 1."""
     ages, values = np.array([0.0, 2.0, 4.0]), np.array([[9.0, 3.0, 1.0], [4.0, 8.0, 2.0]])
@@ -254,15 +239,6 @@ def test_without_tracking_it_is_the_map_without_a_motion(options):
         np.testing.assert_array_equal(*(getattr(each, name)(y, u) for each in (one, other)))
     with pytest.raises(ArtifactError, match="does not track; kkl-gym train"):
         KKLObserver(bare, tracking=True)
-    ones = np.ones((2, artifact.ny))
-    limits = Limits(
-        np.array([0.0, 1.0]), ones, 0 * ones, ones, window=0.5, warm_up=5.0, false_alarms=0.01, duration=50.0
-    )
-    with pytest.raises(ValueError, match="leave tracking=False out"):
-        KKLObserver(replace(artifact, limits=limits), monitor=True, tracking=False)
-    for wrong in ("no", 1):
-        with pytest.raises(ValueError, match="tracking must be True or False"):
-            KKLObserver(artifact, tracking=wrong)
 
 
 def test_artifacts_with_a_motion_that_does_not_fit(make_artifact):

@@ -44,7 +44,7 @@ class Checkpoint(BaseCallback):
         self.saved = checkpoints.load(path, fingerprint=fingerprint) if path.exists() else None
 
     def restore(self, model: BaseAlgorithm, steps: int) -> None:
-        """Take up what was saved, if anything was."""
+        """Restore the saved training, if there is one."""
         if (saved := self.saved) is None:
             return
         with checkpoints.restoring(self.path):

@@ -65,7 +65,7 @@ class Privileged:
         return self._recorders[-1]
 
     def records(self) -> list[Record]:
-        """Return what was recorded, the episodes that ended first at the beginning."""
+        """Return the recorded episodes, those that ended first at the beginning."""
         rows = [recorder.rollouts(going_on=True).records() for recorder in self._recorders]
         return latest([*self._earlier, *oldest_first(rows)])
 

@@ -78,7 +78,7 @@ def from_sb3(
 ) -> Agent:
     """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task, without VecNormalize.
 
-    Of the file, its tensors and its text are read; what is pickled in it stays so.
+    Of the file, its tensors and its text are read; nothing is unpickled.
     """
     if task.system is not None and information in OBSERVED and observer is None:
         observer = observer_of(get_system(task.system))

@@ -60,7 +60,7 @@ class Train:
 
     system: Annotated[
         tyro.conf.Positional[str],
-        hint(metavar="SYSTEM", help=f"{SYSTEM} With --data, a name of your choice for what was recorded."),
+        hint(metavar="SYSTEM", help=f"{SYSTEM} With --data, a name of your choice for the recorded plant."),
     ] = ""
     pipeline: Pipeline = "input-aware"
     """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs, which

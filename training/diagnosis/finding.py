@@ -11,7 +11,7 @@ Verdict = Literal["ok", "note", "problem"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a check: what was found, and what to change."""
+    """One line of a check: the finding, and the remedy."""
 
     check: str
     verdict: Verdict

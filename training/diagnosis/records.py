@@ -308,7 +308,7 @@ def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.nda
     design = np.column_stack([np.ones(len(others_z)), others_z])
     gram = design.T @ design + ROUNDING * len(design) * np.eye(len(design.T))
     coefficients = np.linalg.solve(gram, design.T @ others_x)
-    others_x = others_x - design @ coefficients  # neighbours predict what is not linear
+    others_x = others_x - design @ coefficients  # neighbours predict the nonlinear rest
     x = x - np.column_stack([np.ones(len(z)), z]) @ coefficients
     linear: np.ndarray = np.sqrt((x**2).mean(0)) / deviation
     n, modes = z.shape

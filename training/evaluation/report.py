@@ -43,8 +43,7 @@ def write_report(path: Path, result: Result, source: Source | System) -> None:
         ax.legend()
         for column, level in enumerate((levels[0], levels[-1]) if runs else ()):
             assert runs is not None
-            # Of simulated runs the first has no process noise, and the second half has.
-            run = column * (RUNS // 2) % runs.x.shape[1]
+            run = int((np.argmin, np.argmax)[column](runs.process_noise))
             axes = [figure.add_subplot(grid[1 + i, column]) for i in range(rows)]
             noise = f"measurement noise {show_level(level)}, process noise {runs.process_noise[run]:g}"
             axes[0].set_title("as recorded" if artifact.signals else noise, loc="left")

@@ -1,4 +1,4 @@
-"""What is exported: an observer, the levels of noise that it assumes, and what is said of where it comes from."""
+"""An observer to export: its artifact, the levels of noise that it assumes, and its origin."""
 
 import dataclasses
 import math
@@ -70,14 +70,14 @@ class Exported:
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """What is assumed of measurement noise: nothing, one level for all outputs, or one for each of several."""
+        """Assumed levels of measurement noise: none, one for all outputs, or one for each of several."""
         rows = {inverse.noise_gain.ndim == 2 for inverse in self.maps.values()}
         if True in rows:
             return tuple(np.broadcast_to(self.measurement_noise, self.artifact.ny).tolist())
-        told = any(
+        takes_level = any(
             "measurement_noise" in inverse.features or inverse.noise_gain.any() for inverse in self.maps.values()
         )
-        return (float(np.max(self.measurement_noise)),) if told else ()
+        return (float(np.max(self.measurement_noise)),) if takes_level else ()
 
     @property
     def needs_process_noise(self) -> bool:
@@ -92,7 +92,7 @@ class Exported:
 
     @property
     def estimates(self) -> list[str]:
-        """Names of what is estimated: states, biases of outputs, then parameters."""
+        """Names of the estimates: states, biases of outputs, then parameters."""
         artifact, system = self.artifact, SYSTEMS.get(self.artifact.system)
         bias = np.broadcast_to(artifact.training.get("bias", 0.0), artifact.ny)
         biases = [f"y{i + 1}_bias" for i in np.flatnonzero(bias)]
@@ -114,7 +114,7 @@ class Exported:
 
     @property
     def described(self) -> dict[str, Any]:
-        """What a file says of it beside the numbers of a step, as JSON can hold it."""
+        """Metadata of exported files beside the numbers of a step, as JSON can hold them."""
         described: dict[str, Any] = {
             "name": self.name,
             "artifact": self.source,

@@ -60,7 +60,7 @@ def onnx_model(exported: Exported) -> Any:
     for node in model.graph.node:
         del node.metadata_props[:]  # where in Torch it came from, most of the file
     model.graph.name = exported.name
-    model.graph.doc_string = f"One step of the KKL observer {exported.source}; a row whose state is zeros begins anew."
+    model.graph.doc_string = f"One step of the KKL observer {exported.source}; a row whose state is zeros starts again."
     model.producer_name, model.producer_version = "kkl-gym", kkl_gym.__version__
     texts = {key: said if isinstance(said, str) else json.dumps(said) for key, said in exported.described.items()}
     helper.set_model_props(model, texts)

@@ -106,7 +106,7 @@ class TorchMemory(Module):
         return torch.cat([age + 1.0, signals, w.flatten(1), v], 1), shown
 
     def _signals(self, y: Tensor, before: Tensor) -> Tensor:
-        """What is filtered: the other outputs, then angles, which turn by less than half a turn in a step."""
+        """The signals to filter: the other outputs, then angles, which turn by less than half a turn in a step."""
         if not self.cosines:
             return y
         cosine, sine, before = y[:, self.cosines], y[:, self.sines], before[:, len(self.others) :]

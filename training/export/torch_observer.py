@@ -216,13 +216,13 @@ class TorchMap(Module):
         self.features, self.network = inverse.features, Network(inverse.mlp, dtype)
         self.process_noise_unit, self.process_noise_max = inverse.process_noise_unit, inverse.process_noise_max
         self.age_unit, self.age_max = inverse.age_unit, inverse.age_max
-        told = "measurement_noise" in inverse.features
+        takes_level = "measurement_noise" in inverse.features
         self.put(
             whiten=inverse.whiten.T,
             offset=inverse.z_offset @ inverse.whiten.T,
             squared_gain=np.atleast_2d(inverse.noise_gain) ** 2,
             measurement_noise_unit=np.atleast_1d(inverse.measurement_noise_unit),
-            measurement_noise_max=np.atleast_1d(inverse.measurement_noise_max if told else np.inf),
+            measurement_noise_max=np.atleast_1d(inverse.measurement_noise_max if takes_level else np.inf),
             x_offset=inverse.x_offset,
             x_scale=inverse.x_scale,
         )
@@ -233,14 +233,14 @@ class TorchMap(Module):
     def forward(self, z: Tensor, age: Tensor, measurement_noise: Tensor, process_noise: Tensor) -> Tensor:
         """The estimates (n, nx), of filter states (n, size) at ages (n, 1) in seconds."""
         modes = (z @ self.whiten - self.offset) / (1.0 + measurement_noise**2 @ self.squared_gain)
-        told = [modes]
+        inputs = [modes]
         if "measurement_noise" in self.features:
-            told.append(torch.log1p(measurement_noise / self.measurement_noise_unit))
+            inputs.append(torch.log1p(measurement_noise / self.measurement_noise_unit))
         if "process_noise" in self.features:
-            told.append(torch.log1p(process_noise.clamp(max=self.process_noise_max) / self.process_noise_unit))
+            inputs.append(torch.log1p(process_noise.clamp(max=self.process_noise_max) / self.process_noise_unit))
         if "age" in self.features:
-            told.append(torch.log1p(age.clamp(max=self.age_max) / self.age_unit))
-        return self.x_offset + self.x_scale * self.network(torch.cat([each.expand(z.shape[0], -1) for each in told], 1))
+            inputs.append(torch.log1p(age.clamp(max=self.age_max) / self.age_unit))
+        return self.x_offset + self.x_scale * self.network(torch.cat([one.expand(z.shape[0], -1) for one in inputs], 1))
 
     def share(self, measurement_noise: Tensor) -> Tensor:
         """Levels (n, 1) in multiples of the largest in training, of the noisiest output."""

@@ -143,7 +143,7 @@ class TorchTracker(Module):
         return mean, S, product(L, E) + product(G, D), sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What samples say: mean + V white and P - V V^T are what is known then; what was expected; soundness."""
+        """The update: V and white, for the mean + V white and P - V V^T; the expected outputs; soundness."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)

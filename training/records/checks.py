@@ -12,7 +12,7 @@ from training.records.record import LONGEST_GAP, ROLES, Record, median_step
 Warn = Callable[[str], object]
 
 MAX_WARNINGS = 5  # of the same kind: beyond it the first alone
-OTHER_UNITS = 100.0  # times what is expected: no motion does that, but a unit a thousand times smaller
+OTHER_UNITS = 100.0  # times the expected size: a unit a thousand times smaller exceeds it, a motion does not
 OTHER_CLOCK = 30.0  # times the steps of a record, the longest sampling interval that it is put on
 WHOLE_TURN = 0.9 * 2 * np.pi, 2 * np.pi + 0.1  # least and largest jump of a wrapped angle
 FAR_OFF = 10.0  # ranges of all other samples, between these and a value that marks missing ones

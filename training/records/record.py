@@ -144,8 +144,8 @@ def resampled(record: Record, dt: float | None = None) -> Record:
 
     Outputs are linear between samples, as the filter takes them for: the value at a time of the grid is there one
     sample later at most. States, which no observer sees, follow a monotone cubic (PCHIP). Both are NaN between samples
-    of their own column that are more than 3 dt apart. An input is the mean over each interval of the grid of what was
-    held. On a record that has this grid nothing but rounding changes.
+    of their own column that are more than 3 dt apart. An input, held between samples, is averaged over each interval of
+    the grid. On a record that has this grid nothing but rounding changes.
     """
     dt = median_step(record) if dt is None else dt
     if not 0 < dt <= record.duration * (1 + ROUNDING):

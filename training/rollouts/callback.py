@@ -241,7 +241,7 @@ def rehearsed(model: BaseAlgorithm, steps: int) -> Iterator[tuple[Sequence[dict[
 
 
 def _in_use(env: VecEnv) -> tuple[list[KKLObserver], Callable[[Artifact], object]]:
-    """The observers in use, and the function that replaces them; ValueError where there are none."""
+    """The observers in use, and the function that replaces them; ValueError without any."""
     inside = getattr(env.unwrapped, "env", None)  # a vector environment of Gymnasium's
     while isinstance(inside, gym.vector.VectorWrapper):
         if isinstance(inside, KKLVectorObservation):

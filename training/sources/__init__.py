@@ -62,7 +62,7 @@ class Source(Protocol):
     pace : float
         Seconds in which signals change.
     process_noise : float
-        Usual level of process noise, of which T_inv is informed; 0 where there is none.
+        Usual level of process noise, an input of T_inv; 0 without process noise.
     """
 
     name: str

@@ -28,9 +28,9 @@ BEYOND = 0.5  # of the states' range, by which estimates may leave it
 INCREMENTS = 400_000  # at most
 WINDOW = 10  # samples at least over which innovations are averaged
 # What C x leaves of an output is noise, unless it is nearly all, or squares of states explain a part of it.
-UNEXPLAINED, SQUARES = 0.7, 0.8  # of the output's standard deviation, and of what is left
+UNEXPLAINED, SQUARES = 0.7, 0.8  # of the output's standard deviation, and of the remainder
 LITTLE = 0.1  # of that standard deviation: less is taken for noise in any case
-ROUNDING, OUTLIER = 1e-6, 6.0  # of an output's size, and standard deviations of what is left, by its median
+ROUNDING, OUTLIER = 1e-6, 6.0  # of an output's size, and standard deviations of the remainder, by its median
 LEAST_NOISE = 1e-4  # assumed at least, in standard deviations of the outputs: with R = 0 the gain would not fall
 MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # of records: eigenvalues for each output, in multiples of the signals' rate
 RECORD_MEMORIES = 3.0  # of the filter in a record at least, unless its slowest mode were faster than the signals
@@ -202,7 +202,7 @@ class RecordedSource:
         if not self.held_out:
             raise ValueError("covariances are calibrated on held-out records: held_out must be positive, got 0")
         _, least = linear_output(self.kept, self.C)
-        _ = self._increments  # or the reason why there are none
+        _ = self._increments  # raises ValueError if the records hold none
         x = np.concatenate([record.x for record in self.kept if record.x is not None])
         x = x[np.isfinite(x).all(-1)]
         low, high = x.min(0), x.max(0)

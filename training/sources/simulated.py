@@ -171,7 +171,7 @@ class SimulatedSource:
         if self.ranges:
             raise ValueError(f"a motion is of one plant, not of a range of {', '.join(self.ranges)}")
         if output_matrix(system) is None:
-            output_expression(system)  # or the reason why there is none
+            output_expression(system)  # raises ValueError if none can be written
         low, high = np.array(system.bounds, dtype=float).T
         offset, scale = self._scale
         mean, covariance = unknown_start(system)

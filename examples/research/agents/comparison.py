@@ -237,7 +237,7 @@ def read_results(folder: Path) -> "pd.DataFrame":
 
 
 def unusual_settings(tasks: Sequence[Task]) -> str:
-    """Settings of agents on memories and stacks that are not the defaults, as a sentence; empty if there are none."""
+    """Settings of agents on memories and stacks that are not the defaults, as a sentence; empty if all are."""
     changed = []
     for field in fields(Task):
         values = {getattr(task, field.name) for task in tasks} if field.name in CONCERNED else set()

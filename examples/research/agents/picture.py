@@ -76,6 +76,6 @@ def animate(task: Task, played: Mapping[str, Episodes], path: Path) -> None:
 
 
 def _frame(canvas: Canvas, episodes: Episodes, k: int) -> np.ndarray:
-    """The frame of what was before the instant k."""
+    """The frame of the samples before the instant k."""
     estimates = () if episodes.x_hat is None else episodes.x_hat[:k, 0]
     return canvas.draw(episodes.signals("x")[:k, 0], estimates, episodes.signals("u")[k - 1, 0])

@@ -68,7 +68,7 @@ def tasks_in(results: "pd.DataFrame") -> list[tuple[str, Any]]:
 
 
 def _kinds_in(results: "pd.DataFrame") -> list[str]:
-    """Kinds of agents in the order of their table, the usual ones of systems even if there are none."""
+    """Kinds of agents in the order of their table, the usual ones of systems even without results."""
     systems = on_systems(results)
     there = {*results.shown} | ({*ON_SYSTEMS} if systems else set())
     order = KINDS if systems else dict.fromkeys((*IN_ENVIRONMENTS, *KINDS))

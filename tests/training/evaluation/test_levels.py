@@ -39,4 +39,4 @@ def test_the_systems_own_level_as_far_as_the_map_knows_it(make_artifact):
     assert not beyond(make_artifact(noise=False), np.inf)
     assert beyond(artifact, 1.5) == "measurement noise 1.5 is beyond the map's range, 0 to 1"
     assert beyond(two, (0.1, 2.5)) == "measurement noise 0.1, 2.5 is beyond the map's range, 0 to 1, 0 to 2"
-    assert "told one level of measurement noise for all outputs" in beyond(artifact, (0.1, 0.3))
+    assert "takes one level of measurement noise for all outputs" in beyond(artifact, (0.1, 0.3))

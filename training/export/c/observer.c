@@ -225,7 +225,7 @@ typedef struct {
 } prediction;
 
 typedef struct {
-    double V[NX][NY], white[NY], expected[NY]; /* x + V white and P - V V^T are what is known then */
+    double V[NX][NY], white[NY], expected[NY]; /* the corrected mean is x + V white, the covariance P - V V^T */
 } correction;
 
 static prediction predict(const double x[NX], double P[NX][NX], const real *u)
@@ -237,7 +237,7 @@ static prediction predict(const double x[NX], double P[NX][NX], const real *u)
     return p;
 }
 
-/* What a sample says, of which NaN is missing. */
+/* The correction by a sample, of which NaN is missing. */
 static correction correct(prediction *p, const real y[NY])
 {
     correction c;
@@ -316,7 +316,7 @@ static correction take_in(NAME_observer *observer, prediction *p, const real y[N
     return c;
 }
 
-/* Predict, and take in a sample. What is missing of it is replaced by what was predicted. */
+/* Predict, and take in a sample. Predicted outputs replace missing ones. */
 static void track(NAME_observer *observer, const real y[NY], const real *u, real whole[NY])
 {
     double squared = 0.0, raised = 0.0;
@@ -351,7 +351,7 @@ static void track(NAME_observer *observer, const real y[NY], const real *u, real
 /* Take T_inv's estimate where it is surer, soon after a reset, or where the filter diverged. */
 static void supervise(NAME_observer *observer)
 {
-    int lost = !(observer->nis <= LIMIT); /* also where it is no number */
+    int lost = !(observer->nis <= LIMIT); /* also where it is NaN */
     double P[NX][NX], L[NX][NX];
     real x_hat[NX];
     if (!lost && observer->seen >= WINDOW)
