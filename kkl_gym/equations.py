@@ -71,7 +71,7 @@ def _number_at(equations: Equations, wanted: str, *args: Any) -> Any:
 def check_equations(system: Any) -> None:
     """Check what a system's equations return at a few starts, one by one on floats and all at once on arrays."""
     names = ["step", "h", "rate"] if system.discrete else ["f", "h", "g", "rate"]
-    names += ["reward"] if system.states_task else []
+    names += ["reward", "terminated"] if system.states_task else []
     for name in names[:2]:
         if _is_default(getattr(system, name)):
             raise EquationError(f"{type(system).__name__} defines no {signature(getattr(system, name), 'self, ')}")
@@ -114,8 +114,8 @@ def _values(system: Any, name: str, x: Any, u: Any) -> list[Any]:
         return [value for row in input_matrix(system, x) for value in row]
     if name == "rate":
         return [rate_at(system, x)]
-    if name == "reward":
-        return check_task(system, x, u)
+    if name in ("reward", "terminated"):
+        return [check_task(system, x, u)[name == "terminated"]]
     inputs = (u,) if name == "step" else ()
     return [*components(getattr(system, name), x, *inputs)]
 

@@ -18,7 +18,7 @@ Entries = Sequence[int] | Sequence[str]
 Angles = Sequence[int | Sequence[int]] | Sequence[str | Sequence[str]]
 """Entries that are angles, and pairs of entries that are the cosine and the sine of one."""
 TURN = 2 * math.pi
-NARROW = 100.0  # width of bounds, below which they are in rad: 16 turns, and less than one in degrees
+UNITS = 1.0, 2.0, 4.0  # widths of bounds that are as likely in turns or half turns as in rad
 
 
 class Outputs:
@@ -76,6 +76,8 @@ class Outputs:
         if not {i for angle in at for entry in angle for i in entry} <= set(taken):
             raise ValueError(f"angles must be among the measured entries, {self.measured}, got {self.angles}")
         plain = [i for angle in at if len(angle) == 1 for i in angle[0]]
+        if period is not None and not plain:
+            raise ValueError(f"period = {period:g} is a turn of entries that are angles, and angles names none")
         units = {i: TURN / (self.period or self._period_of(low[i], high[i], self._names[i])) for i in plain}
         self._take = np.repeat(taken, [1 + (i in units) for i in taken])
         self._whole = self._take.tolist() == list(range(len(owners)))
@@ -100,13 +102,13 @@ class Outputs:
     def _period_of(self, low: float, high: float, name: str) -> float:
         """A turn of an angle, by its bounds."""
         width = high - low
-        if width < NARROW or np.isinf(width):
+        if np.isinf(width) or (width < 2.01 * TURN and width not in UNITS):
             return TURN
-        if width % 360 == 0:
+        if width in (360.0, 720.0):
             return 360.0
         raise ValueError(
             f"the period of the angle in {name} of {self._source} is unknown: its bounds are {low:g} and {high:g}; "
-            "pass period=, 360 for degrees"
+            "pass period=, 2 * math.pi for rad, 360 for degrees, 1 for turns"
         )
 
     def flat(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:

@@ -109,8 +109,8 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Which of these are angles; each is replaced by its cosine and sine. A pair such as (0, 1) names the cosine and
         the sine of an angle that is measured by them. An angle is taken to turn by less than half a turn in a step.
     period : float, optional
-        A turn of all angles but pairs. None: 360 where the bounds are whole turns in degrees, 2 pi where they are
-        less than 100 apart or infinite.
+        A turn of all angles but pairs. None: 360 where the bounds are one or two turns in degrees, 2 pi where they are
+        at most two turns in rad or infinite. It must be given for other bounds, and for those 1, 2 or 4 apart.
     missing : {"error", "hold"}
         How to treat NaN among the measured entries: an error, or the value before. The first sample must be whole.
     weights : array_like, optional

@@ -57,8 +57,8 @@ def test_checkers_are_content(env_id, package):
     ("env_id", "arguments"),
     [
         ("Blackjack-v1", {"measured": [0], "time_constants": [1, 3], "input_time_constants": np.array([2.0])}),
-        ("Pendulum-v1", {"angles": [0]}),
-        ("Pendulum-v1", {"angles": [[0, 1], 2]}),
+        ("Pendulum-v1", {"angles": [0], "period": 2}),
+        ("Pendulum-v1", {"angles": [[0, 1], 2], "period": 360}),
         ("Pendulum-v1", {"angles": np.array([[0, 1]])}),
     ],
     ids=str,
@@ -192,10 +192,13 @@ def test_the_period_of_angles_follows_from_the_bounds_or_is_given():
     assert np.allclose(shown[0], shown[0][-1], atol=0.03)  # a steady turn
     for other in shown[1:]:
         assert np.allclose(shown[0], other, atol=1e-3)
-    with pytest.raises(ValueError, match=r"the period of the angle in entry 0 .* unknown: its bounds are 0 and 4095"):
-        dial(4095.0, 0.0)
+    for low, high in [(0.0, 4095.0), (-0.5, 0.5), (-1.0, 1.0), (-45.0, 45.0), (-3600.0, 3600.0)]:  # counts, turns, ...
+        with pytest.raises(ValueError, match=f"the period of the .* unknown: its bounds are {low:g} and {high:g}"):
+            dial(high, low)
     with pytest.raises(ValueError, match="period must be the positive length of a turn, such as 360, got -1"):
         dial(period=-1)
+    with pytest.raises(ValueError, match="period = 360 is a turn of entries that are angles, and angles names none"):
+        KKLMemory(gym.make("Pendulum-v1"), angles=[(0, 1)], period=360)
 
 
 @modes

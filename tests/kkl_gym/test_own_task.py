@@ -74,6 +74,7 @@ def changed(**methods):
         ({"reward": lambda self, x: x[0]}, r"must be defined as reward\(self, x, u\)"),
         ({"terminated": lambda self, x: x[0]}, r"terminated\(x\) of 'changed' .* must return a bool or a comparison"),
         ({"terminated": lambda self, x: None}, r"terminated\(x\) of 'changed' .* must return a bool or a comparison"),
+        ({"reward": System.reward, "terminated": lambda self, x: np.any(np.abs(x) > 0.5)}, r"terminated\(x\) .* batch"),
         ({"terminated": lambda self, x: max(x) > 1}, r"terminated\(x\) of 'changed' .* use kkl_gym.elementary.maximum"),
     ],
 )

@@ -67,7 +67,7 @@ def test_bounds_that_are_the_largest_floats_are_none(dtype):
 
 
 def test_what_is_measured_and_angles():
-    space = spaces.Box(-10.0, 10.0, (4,))
+    space = spaces.Box(-6.0, 6.0, (4,))
     values = np.array([0.1, 2.0, -3.0, 9.0])
     assert outputs(space, [2, 0])(values).tolist() == [-3.0, 0.1]
     read = outputs(space, (3, 1, 2), np.array([1, 3]))
@@ -75,7 +75,7 @@ def test_what_is_measured_and_angles():
     assert np.allclose(read(values), expected)
     assert np.allclose(read(np.array([values] * 2), (2,)), [expected] * 2)
     assert values.tolist() == [0.1, 2.0, -3.0, 9.0]
-    assert read.low.tolist() == [-1.0] * 4 + [-10.0]
+    assert read.low.tolist() == [-1.0] * 4 + [-6.0]
     parts = spaces.Dict(
         camera=spaces.Box(0, 255, (8, 8, 3), np.uint8), place=spaces.Box(-1, 1, (2,)), way=spaces.Box(-4, 4, (1,))
     )
@@ -85,7 +85,7 @@ def test_what_is_measured_and_angles():
 
 
 def test_pairs_are_cosines_and_sines_that_are_measured():
-    space = spaces.Box(-10.0, 10.0, (5,))
+    space = spaces.Box(-6.0, 6.0, (5,))
     read = outputs(space, [4, 3, 0, 1], [(0, 4), [1, 3]])
     assert read(np.arange(5.0)).tolist() == [4.0, 3.0, 0.0, 1.0]
     assert read.pairs == [(2, 0), (3, 1)]

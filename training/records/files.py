@@ -64,6 +64,8 @@ def _read(path: Path, wanted: Signals) -> Record:
         return _record(path, wanted, reader(path))
     except ModuleNotFoundError:
         raise
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} is not in UTF-8: save it in this encoding") from None
     except Exception as error:  # whatever a damaged file leads to
         raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
 
@@ -129,9 +131,13 @@ def _seconds(values: Any, column: str) -> np.ndarray:
     import pandas as pd
 
     values = pd.Series(values)
+    if values.empty:
+        raise ValueError(f"column {column} has no rows")
     if not pd.api.types.is_numeric_dtype(values):
         dates = pd.to_datetime(values, format="ISO8601", errors="coerce", utc=True)
-        if dates.notna().all():
+        if dates.notna().any():
+            for row in np.flatnonzero(dates.isna()):
+                raise ValueError(f"column {column}, row {row + 1}: {shown(values.iloc[row])} is not a date in ISO 8601")
             return np.asarray((dates - dates.iloc[0]).dt.total_seconds())
     return _numbers(values, column)
 
@@ -197,7 +203,11 @@ def _csv(path: Path) -> Columns:
 
     with path.open(encoding="utf-8-sig", newline="") as file:
         header = file.readline()
-        separator = max(SEPARATORS, key=re.sub('"[^"]*"', "", header).count)
+        first = next(filter(str.strip, file), header)
+        bare = [re.sub('"[^"]*"', "", line) for line in (header, first)]
+        separator = max(SEPARATORS, key=lambda mark: min(line.count(mark) for line in bare))
+        file.seek(0)
+        file.readline()
         layout: Any = {"delimiter": separator, "skipinitialspace": True}
         names = [name.strip() for name in next(csv.reader([header], **layout), [])]
         if not any(names):
@@ -206,7 +216,7 @@ def _csv(path: Path) -> Columns:
             raise ValueError(f"more than one column {', '.join(twice)}")
         for row, cells in enumerate(csv.reader(file, **layout), 1):
             if len(cells) not in (0, len(names)):  # pandas would fill or cut it
-                raise ValueError(f"row {row} has {len(cells)} cells, the header {len(names)}")
+                raise ValueError(f"row {row} has {len(cells)} cells, the header {len(names)}: {shown(names)}")
     layout |= {"header": None, "skiprows": 1, "names": range(len(names)), "na_values": MISSING}
     frame = pd.read_csv(path, encoding="utf-8-sig", **layout)
     return {name: frame[i] for i, name in enumerate(names)}

@@ -20,7 +20,7 @@ def npz(path, **arrays):
 
 
 def csv(path, header="time,theta,alpha,note", rows=None):
-    rows = rows or [f"{t},{y},{2 * y},kept" for t, y in zip(T, Y)]
+    rows = [f"{t},{y},{2 * y},kept" for t, y in zip(T, Y)] if rows is None else rows
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     return path
 
@@ -53,6 +53,7 @@ def test_csv_by_names(tmp_path, separator):
     [
         '"time, in s";"y, in mm"\n0;1\n1;3\n',
         '"time, in s", "y, in mm"\n"0", "1"\n"1", "3"\n',  # with spaces before quotes
+        '"time, in s"\t"y, in mm"\t; x\r\r0\t1\t7\r1\t3\t7\r',
         '"time, in s","y, in mm"\n2024-05-01T23:59:59.5Z,1\n2024-05-02T00:00:00.5Z,3\n',
     ],
 )
@@ -93,6 +94,9 @@ BAD_CSV = {
     "time stands": (["0,1,2,a", "0,2,2,a"], "column time, row 2: time must increase"),
     "no time": (["0,1,2,a", ",2,2,a"], "column time, row 2: a number is missing"),
     "all missing": (["0,,2,a", "1,nan,2,a"], "column theta, row 1: no row holds a number"),
+    "no rows": ([], "column time has no rows"),
+    "a date is missing": (["2024-05-01,1,2,a", ",2,2,a"], "column time, row 2: nan is not a date in ISO 8601"),
+    "one row": (["0,1,2,a"], "t must be two samples at least"),
     "rounding moves": ([f"{k},0.1,2,a" for k in range(99)], "column theta: 0.1 in all rows"),
     "decimal comma": (['0,"1",2,a', '1,"2,5",2,a'], "theta, row 2: '2,5' is not a number; write decimals with a point"),
     "hidden never moves": (["0,3,2,a", "1,4,2,a"], r"column cos\(alpha\): -0.416147 in all rows"),
@@ -112,6 +116,7 @@ def test_bad_header(tmp_path):
         ("when,theta,alpha,note", r"no column t; there are .* \(--time\)"),
         ("time,theta,theta,alpha", "more than one column theta"),
         ("", "first row must hold the names"),
+        ("# a logger, 3", r"row 1 has 4 cells, the header 2: \['# a logger', '3'\]"),
     ):
         with pytest.raises(ValueError, match=message):
             read_records([csv(tmp_path / "bad.csv", header)], signals=WANTED)
@@ -144,7 +149,7 @@ def test_no_record(tmp_path):
         "a.npz": "pickle",
         "b.npz": "a single array",
         "a.mat": "a.mat: ",
-        "a.csv": "'utf-8' codec can't decode byte 0xff",
+        "a.csv": "a.csv is not in UTF-8",
         "a.txt": "its name must end in .npz, .mat, .csv, .parquet",
         "folder.csv": "is a folder",
         "nowhere.csv": "there is no file",
