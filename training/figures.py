@@ -38,17 +38,12 @@ ALIKE: dict[str, Any] = {
     "figure.constrained_layout.use": True,
     "figure.dpi": 110,
     "figure.titlesize": "medium",
-    "font.size": 10.0,
     "grid.linewidth": 0.6,
     "legend.fontsize": "small",
-    "legend.framealpha": 0.8,
     "lines.linewidth": 1.2,
     "lines.markersize": 4.0,
-    "savefig.dpi": 110,
-    "savefig.facecolor": "auto",
 }
-COLOURS = 32  # of a moving picture
-NEAR = 16  # of 255, below which a colour could be taken for the ground
+SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # of each colour on the ground, in moving pictures
 
 _around: ContextVar[Theme] = ContextVar("theme", default="light")
 
@@ -88,30 +83,23 @@ def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
     with style():
         figure = Figure(figsize=(width, height))
         yield figure
-        save(path, figure)
-
-
-def save(path: Path, figure: "Figure") -> None:
-    """Write a figure, whole or not at all."""
-    with style(), replacing(path) as temporary:
-        figure.savefig(temporary)
+        with replacing(path) as temporary:  # whole or not at all
+            figure.savefig(temporary)
 
 
 def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
     """Write a moving picture that repeats itself, whole or not at all.
 
-    All frames have the same few colours, for which the first, the middle and the last are looked at: what does not move
-    then costs nothing. Those of the style stay as they are, and so does the ground.
+    All frames have the same few colours, the ground and shades of the style's own: what does not move then costs
+    nothing, and small things keep their colours.
     """
     from matplotlib.colors import to_rgb
     from PIL import Image
 
-    some = np.concatenate([np.asarray(frames[i]) for i in (0, len(frames) // 2, -1)])
-    ground, own = some[0, 0].astype(int), 255 * np.array([to_rgb(colour) for colour in CYCLES[_around.get()]])
-    few = Image.fromarray(some).quantize(COLOURS - len(own), kmeans=1)
-    colours = np.array(few.getpalette()).reshape(-1, 3)[: COLOURS - len(own)]
-    colours[np.abs(colours - ground).max(axis=1) < NEAR] = ground  # and nothing that is nearly like it
-    few.putpalette([*colours.ravel().tolist(), *own.round().astype(int).ravel().tolist()])
+    ground, *own = (255 * np.array(to_rgb(each)) for each in (GROUNDS[_around.get()], *CYCLES[_around.get()]))
+    palette = [ground, *(ground + share * (colour - ground) for colour in own for share in SHADES)]
+    few = Image.new("P", (1, 1))
+    few.putpalette(np.round(palette).astype(int).ravel().tolist())
     first, *others = (frame.quantize(palette=few, dither=Image.Dither.NONE) for frame in frames)
     how: dict[str, Any] = {"save_all": True, "duration": round(1000 * seconds / len(frames)), "loop": 0}
     with replacing(path) as temporary:

@@ -8,7 +8,7 @@ import numpy as np
 from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from observers.estimator import Estimate
-from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
+from training.sources.simulated import unknown_start
 
 Gaussian = tuple[np.ndarray, np.ndarray]
 """Means (n, nx) and covariances (n, nx, nx)."""
@@ -25,9 +25,8 @@ def measurement_covariance(system: System, measurement_noise: float | Sequence[f
 
 
 def process_intensity(system: System, process_noise: float, dt: float) -> np.ndarray:
-    """Intensity (nx, nx) of the white noise that a filter assumes for the plant's process noise, never quite 0."""
-    assumed = max(process_noise, LEAST_PROCESS_NOISE / system.pace)
-    return np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)
+    """Intensity (nx, nx) of the white noise that a filter assumes for the plant's process noise."""
+    return np.diag((process_noise * np.array(system.scale)) ** 2 / 3 * dt)
 
 
 class Belief(NamedTuple):
@@ -76,16 +75,19 @@ class ExtendedKalmanFilter:
         """Return means and covariances."""
         return Estimate(state.x.copy(), state.P.copy())
 
-    def along(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Covariances (steps + 1, n, nx, nx) with derivatives along motions (steps + 1, n, nx) themselves.
+    def along(self, y: np.ndarray, u: np.ndarray, x: np.ndarray | None = None) -> Gaussian:
+        """Means (steps + 1, n, nx) and covariances along samples (steps + 1, n, ny) and inputs (steps, n, nu).
 
-        With the plant's own noise that is the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
+        With motions x (steps + 1, n, nx) derivatives are taken along these. With the plant's own noise the covariances
+        are then the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
         """
-        state, y, covariances = self.start(x.shape[1]), self._system.output(x), []
-        for k in range(len(x)):
-            state = self.advance(state._replace(x=x[max(k - 1, 0)]), y[k], u[k - 1])  # the first sample has no input
-            covariances.append(state.P)
-        return np.array(covariances)
+        state, states = self.start(y.shape[1]), []
+        for k in range(len(y)):
+            state = state if x is None else state._replace(x=x[max(k - 1, 0)])
+            state = self.advance(state, y[k], u[k - 1])  # the first sample has no input
+            states.append(state)
+        means, covariances, _ = zip(*states, strict=True)
+        return np.array(means), np.array(covariances)
 
     def _starts(self, n: int) -> Gaussian:
         x0, P0 = self._start

@@ -8,13 +8,13 @@ import numpy as np
 from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.checks import is_finite, noise_levels, shown
+from observers.checks import noise_levels
 from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.maps.coordinates import root
 from training.seeds import Stream, generator
-from training.sources.simulated import unknown_start
+from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
 from training.trajectories.motions import Controller, draw_process_noise, random_inputs, under_policy
 from training.trajectories.parameters import blind, with_parameters
 
@@ -30,12 +30,11 @@ class NoStartsError(ValueError):
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of each trajectory that stayed within bounds, (n,) and (n, nx), and how many did not."""
+    """Errors of each trajectory that stayed within bounds, (n,) and (n, nx)."""
 
     full: np.ndarray
     late: np.ndarray
     nrmse: np.ndarray
-    escaped: int
 
 
 @dataclass(frozen=True)
@@ -224,18 +223,18 @@ def noise_limit(
         If the level of noise is invalid.
     """
     level, dt = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt
-    intensity = np.diag((trajectories.process_noise * np.array(system.scale)) ** 2 / 3 * dt)
-    R, plant = measurement_covariance(system, level), trajectories.plant or system
-    bound = ExtendedKalmanFilter(plant, dt, Q=intensity, R=R, start=unknown_start(system))
-    P = bound.along(trajectories.x, trajectories.u)
-    drawn = generator(Stream.EVALUATION, seed, 1).standard_normal((*trajectories.x.shape, 1))
-    return _errors(trajectories, trajectories.x + (root(P) @ drawn)[..., 0], skip)
+    x, plant = trajectories.x, trajectories.plant or system
+    Q, R = process_intensity(system, trajectories.process_noise, dt), measurement_covariance(system, level)
+    bound = ExtendedKalmanFilter(plant, dt, Q=Q, R=R, start=unknown_start(system))
+    _, P = bound.along(plant.output(x), trajectories.u, x)
+    drawn = generator(Stream.EVALUATION, seed, 1).standard_normal((*x.shape, 1))
+    return _errors(trajectories, x + (root(P) @ drawn)[..., 0], skip)
 
 
 def _errors(trajectories: UnseenTrajectories, x_hat: np.ndarray, skip: float | None) -> Errors:
     x = trajectories.x
     first = round(TRANSIENT * len(x)) if skip is None else round(skip / trajectories.dt)
-    return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first), trajectories.escaped)
+    return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first))
 
 
 def estimates(
@@ -246,46 +245,21 @@ def estimates(
     measurement_noise: Level,
     seed: int,
     covariances: bool = False,
-) -> tuple[np.ndarray, np.ndarray | None]:
+) -> tuple[np.ndarray, Any]:
     """Estimates along test trajectories, (steps + 1, n, nx), and on request their covariances; as :func:`errors`."""
-    level, dt = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt
-    observer: KKLObserver | ExtendedKalmanFilter
-    if artifact is not None:
-        observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
-    else:
-        Q, R = process_intensity(system, trajectories.process_noise, dt), measurement_covariance(system, level)
-        observer = ExtendedKalmanFilter(system, dt, Q=Q, R=R)
-    return follow(observer, measured(system, trajectories, level, seed), trajectories.u, covariances=covariances)
-
-
-def follow(
-    observer: KKLObserver | ExtendedKalmanFilter, y: np.ndarray, u: np.ndarray, *, covariances: bool = False
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Estimates along records (steps + 1, n, nx), and on request their covariances."""
-    if isinstance(observer, KKLObserver):
-        inputs = u if observer.artifact.nu else None
-        return observer.estimate(y, inputs), observer.estimate_covariance(y, inputs) if covariances else None
-    state, x_hat, P = observer.start(y.shape[1]), [], []
-    for k in range(len(y)):
-        state = observer.advance(state, y[k], u[k - 1])  # the filter ignores the input before the first sample
-        x_hat.append(state.x)
-        P.append(state.P if covariances else ())
-    return np.array(x_hat), np.array(P) if covariances else None
+    level, dt, u = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt, trajectories.u
+    y, process_noise = measured(system, trajectories, level, seed), trajectories.process_noise
+    if artifact is None:
+        Q = process_intensity(system, max(process_noise, LEAST_PROCESS_NOISE / system.pace), dt)
+        return ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, level)).along(y, u)
+    observer, inputs = KKLObserver(artifact, level, process_noise=process_noise), u if artifact.nu else None
+    return observer.estimate(y, inputs), observer.estimate_covariance(y, inputs) if covariances else None
 
 
 def measured(system: System, trajectories: UnseenTrajectories, measurement_noise: Level, seed: int) -> np.ndarray:
     """Outputs of trajectories with noise, (steps + 1, n, ny)."""
     y = (trajectories.plant or system).output(trajectories.x)
     return y + np.asarray(measurement_noise) * generator(Stream.EVALUATION, seed, 1).standard_normal(y.shape)
-
-
-def off_by(system: System, share: float) -> System:
-    """The same system with every parameter larger by a share of itself."""
-    if not is_finite(share):
-        raise ValueError(f"the error of the parameters must be a finite number, such as 0.1, got {shown(share)}")
-    if not system.parameters:
-        raise ValueError(f"{system.name} has no parameters that could be off")
-    return system.replace({name: (1.0 + share) * value for name, value in system.parameters.items()})
 
 
 def parameter_errors(

@@ -5,7 +5,7 @@ An estimate that is not finite counts as one infinitely far away.
 
 import numpy as np
 
-STILL = 1e-12  # of a state's size: a standard deviation below it is rounding
+from training.maps.coordinates import STILL
 
 
 def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:

@@ -32,12 +32,9 @@ class TorchTracker(Module):
         self.least_process_noise = motion.least_process_noise
         self.h = None if artifact.h is None else TorchExpression(artifact.h.components)
         others = [numbers["other"]] * (2 * self.nx)
-        columns = tracker_arrays(motion) | {"eye": np.eye(self.nx), "eye_y": np.eye(self.ny)}
+        columns = tracker_arrays(motion) | {"units": np.outer(motion.x_scale, motion.x_scale)}
         columns |= {name: getattr(motion, name) for name in ("error", "process_noise", "least_measurement_noise")}
-        columns |= {
-            "weights": np.array([numbers["middle"], *others]),
-            "units": np.outer(motion.x_scale, motion.x_scale),
-        }
+        columns |= {"eye": np.eye(self.nx), "eye_y": np.eye(self.ny), "weights": np.array([numbers["middle"], *others])}
         columns |= {"square_weights": np.array([numbers["middle_squares"], *others])}
         if motion.equations is not None:
             self.equations: Any = replace(motion.equations, field=TorchExpression(motion.equations.field.components))
