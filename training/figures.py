@@ -4,10 +4,9 @@ Colours are named for their use, as places in the cycle of colours, so that they
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -45,29 +44,25 @@ ALIKE: dict[str, Any] = {
 }
 SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # of each colour on the ground, in moving pictures
 
-_around: ContextVar[Theme] = ContextVar("theme", default="light")
 
-
-@contextmanager
-def style(theme: Theme | None = None) -> Iterator[None]:
-    """Draw in the style of this package until the end of a block."""
+def theme_around() -> Theme:
+    """The theme of the block of :func:`style` around, which its ground shows."""
     import matplotlib
 
-    chosen = _around.get() if theme is None else theme
-    with matplotlib.rc_context(looks(chosen)):
-        outer = _around.set(chosen)
-        try:
-            yield
-        finally:
-            _around.reset(outer)
+    return "dark" if matplotlib.rcParams["figure.facecolor"] == GROUNDS["dark"] else "light"
+
+
+def style(theme: Theme | None = None) -> AbstractContextManager[None]:
+    """Draw in the style of this package until the end of a block, by default in the theme of the block around."""
+    import matplotlib
+
+    return matplotlib.rc_context(looks(theme or theme_around()))
 
 
 def looks(theme: Theme = "light") -> dict[Any, Any]:
     """Settings of matplotlib that make this style: for notebooks, as in ``plt.rcParams |= looks()``."""
     from cycler import cycler
 
-    if theme not in get_args(Theme):
-        raise ValueError(f"theme must be one of {', '.join(get_args(Theme))}, got {theme!r}")
     ink = CYCLES[theme][int(TRUTH[1])]
     grounds = dict.fromkeys(("axes.facecolor", "figure.facecolor", "legend.facecolor"), GROUNDS[theme])
     inks = dict.fromkeys(("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color"), ink)
@@ -96,7 +91,8 @@ def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> Non
     from matplotlib.colors import to_rgb
     from PIL import Image
 
-    ground, *own = (255 * np.array(to_rgb(each)) for each in (GROUNDS[_around.get()], *CYCLES[_around.get()]))
+    theme = theme_around()
+    ground, *own = (255 * np.array(to_rgb(each)) for each in (GROUNDS[theme], *CYCLES[theme]))
     palette = [ground, *(ground + share * (colour - ground) for colour in own for share in SHADES)]
     few = Image.new("P", (1, 1))
     few.putpalette(np.round(palette).astype(int).ravel().tolist())

@@ -59,7 +59,8 @@ class ExtendedKalmanFilter:
 
     def start(self, n: int) -> Belief:
         """Return n rows before their first sample."""
-        return Belief(*self._starts(n), np.zeros(n, dtype=bool))
+        x0, P0 = self._start
+        return Belief(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), np.zeros(n, dtype=bool))
 
     def advance(self, state: Belief, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Belief:
         """Predict over dt, by default that of the samples, in rows that have begun; then correct."""
@@ -89,10 +90,6 @@ class ExtendedKalmanFilter:
         means, covariances, _ = zip(*states, strict=True)
         return np.array(means), np.array(covariances)
 
-    def _starts(self, n: int) -> Gaussian:
-        x0, P0 = self._start
-        return np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1))
-
     def _inside(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
         return np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
 
@@ -109,10 +106,8 @@ class ExtendedKalmanFilter:
 
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
         """Mean and covariance given the samples y, (n, ny); lost filters start again."""
-        lost = ~self._inside(x, P)
-        if lost.any():
-            x, P = x.copy(), P.copy()
-            x[lost], P[lost] = self._start
+        (x0, P0), inside = self._start, self._inside(x, P)
+        x, P = np.where(inside[:, None], x, x0), np.where(inside[:, None, None], P, P0)
         aside, R = np.diag(self._aside), self._R
         beside = self._system.output(x[:, None] + np.stack([aside, -aside])[:, None])
         H = ((beside[0] - beside[1]) / (2 * self._aside[:, None])).mT

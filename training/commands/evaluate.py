@@ -43,6 +43,7 @@ from training.evaluation.metrics import by_state
 from training.files import require_writable, write
 from training.progress import ProgressBars, progress_bars
 from training.trajectories.motions import Controller
+from training.trajectories.parameters import blind, with_parameters
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -252,14 +253,18 @@ class Evaluate:
         return frames
 
     def _parameters(self, of: Subject, levels: Sequence[Level]) -> Table:
-        """A table of errors of estimated parameters, from starts in X."""
+        """A table of errors of estimated parameters, from starts in X: of the plant, or of many from their ranges."""
         inputs, rows, names = bool(of.artifact.nu), list[list[str]](), of.artifact.estimated_parameters
-        motions = of.runs(process_noise=self.motions.process_noise, seed=self.motions.seed) | {"plant": of.plant}
+        ranges = {name: of.artifact.parameter_ranges[name] for name in names}
+        system = of.system if of.plant else with_parameters(of.system, ranges)
+        how: dict[str, Any] = {"n": self._trajectories, "duration": of.duration, "plant": of.plant}
+        how |= {"seed": self.motions.seed, "process_noise": self.motions.process_noise}
+        how |= {"policy": of.policy and blind(of.policy, of.system.nx)}
         for driven in (False, True)[: 1 + inputs]:
+            runs = unseen_trajectories(system, of.artifact.filter.dt, driven=driven, **how)
             for level in levels:
-                motions |= {"trajectories": self._trajectories, "measurement_noise": level, "driven": driven}
-                values = map(percent, parameter_errors(of.artifact, of.system, **motions))
-                rows.append([*[("no", "yes")[driven]] * inputs, show_level(level), *values])
+                found = parameter_errors(of.artifact, system, runs, measurement_noise=level, seed=self.motions.seed)
+                rows.append([*[("no", "yes")[driven]] * inputs, show_level(level), *map(percent, found)])
         on = f"plant {show_parameters(of.plant)}" if of.plant else "plants drawn from their ranges"
         title = f"{of.name}: parameters, rms error in % of their values after transient, {on}"
         return table(title, [], rows, [*["driven"] * inputs, "noise\non y", *names])

@@ -16,7 +16,6 @@ from training.maps.coordinates import root
 from training.seeds import Stream, generator
 from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
 from training.trajectories.motions import Controller, draw_process_noise, random_inputs, under_policy
-from training.trajectories.parameters import blind, with_parameters
 
 TRANSIENT = 0.2  # part of a trajectory that the errors "after the transient" leave out
 MAX_TRIES = 1000  # starts in a row within X, after which none is expected beyond it
@@ -143,14 +142,12 @@ def unseen_trajectories(
     u = np.zeros((steps, n, system.nu))
     if driven and not policy:
         u = random_inputs(system, n, steps, dt=dt, rng=rng, kinds=("steps", "sine"))
-    w = None
-    if process_noise:
-        w = draw_process_noise(system, process_noise, n=n, steps=steps, rng=generator(stream, seed, 2))
+    w = draw_process_noise(system, process_noise, n=n, steps=steps, rng=generator(stream, seed, 2))
     if policy:
         exploring, own = generator(stream, seed, 3), np.full(n, not driven)
         x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=exploring, own=own, w=w, plant=plant)
     else:
-        x = simulate(moving, x0, steps, dt, u=u if driven else None, w=w)
+        x = simulate(moving, x0, steps, dt, u=u, w=w)
     inside = np.isfinite(x[-1]).all(-1)
     return UnseenTrajectories(x[:, inside], u[:, inside], inside, dt, process_noise, plant)
 
@@ -263,29 +260,15 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 
 
 def parameter_errors(
-    artifact: Artifact,
-    system: System,
-    *,
-    trajectories: int,
-    measurement_noise: Level,
-    seed: int,
-    plant: System | None = None,
-    policy: Controller | None = None,
-    **motions: Any,
+    artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Errors in % of estimated parameters after the transient, on a plant or on many from the ranges of the training.
-
-    ``motions`` are further arguments of :func:`unseen_trajectories`.
-    """
-    nx, names = system.nx, artifact.estimated_parameters
-    moving = plant or with_parameters(system, {name: artifact.parameter_ranges[name] for name in names})
-    runs = unseen_trajectories(
-        moving, artifact.filter.dt, n=trajectories, seed=seed, policy=policy and blind(policy, nx), **motions
-    )
-    if not runs.inside.any():
-        raise ValueError(f"each of {trajectories} runs left bounds = {system.bounds}")
+    """Errors in % of estimated parameters after the transient: those of the plant, or else the system's last states."""
+    names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
+    if not n:
+        raise ValueError(f"each of {trajectories.escaped} runs left bounds = {system.bounds}")
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
-    observer = KKLObserver(artifact, level, process_noise=runs.process_noise)
-    values = observer.estimate_parameters(measured(moving, runs, level, seed), runs.u if artifact.nu else None)
-    true = [plant.parameters[name] for name in names] if plant else runs.x[0, :, nx:]
+    observer, u = KKLObserver(artifact, level, process_noise=trajectories.process_noise), trajectories.u
+    values = observer.estimate_parameters(measured(system, trajectories, level, seed), u if artifact.nu else None)
+    plant = trajectories.plant
+    true = [plant.parameters[name] for name in names] if plant else trajectories.x[0, :, nx - len(names) :]
     return np.asarray(100.0 * np.sqrt(np.mean((values[round(TRANSIENT * len(values)) :] / true - 1.0) ** 2, (0, 1))))

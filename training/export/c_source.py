@@ -39,8 +39,6 @@ def c_files(exported: Exported) -> dict[str, str]:
     networks = {label: inverse.mlp for label, inverse in exported.maps.items()}
     single, signals = exported.precision == "float", exported.signals
     parts = {"inputs" if artifact.nu else "autonomous", "static" if motion is None else "tracks", *exported.maps}
-    assumed = {"levels": exported.levels, "process": exported.needs_process_noise}
-    parts |= {level for level, present in assumed.items() if present}
     texts = {"SOURCE": exported.source, "SYSTEM": artifact.system, "OUTPUTS": ", ".join(signals["y"])}
     texts |= {"INPUTS": ", ".join(signals["u"]), "ESTIMATES": ", ".join(signals["x_hat"])}
     words: dict[str, object] = {key: comment(text) for key, text in texts.items()}

@@ -96,7 +96,8 @@ class TorchTracker(Module):
         x, P, nis, square, seen, trend = tracked
         learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)  # z depends on so much for certain
         lost, learned = ~(nis <= self.numbers["limit"]), learned.reshape(P.shape) / self.units
-        taken = lost | ((seen < self.window) & (self._log_det(learned) < self._log_det(P)))
+        of_learned, own = (eliminated(each)[0].diagonal().log().sum(1) for each in (learned, P))
+        taken = lost | ((seen < self.window) & (of_learned < own))  # by their determinants
         x = torch.where(taken, self._within((x_hat - self.x_offset) / self.x_scale), x)
         P = torch.where(taken, learned, P).flatten(0, 1)
         nis, square = torch.where(lost, 1.0, nis), torch.where(lost, 1.0, square)
@@ -171,7 +172,3 @@ class TorchTracker(Module):
 
     def _within(self, s: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(s, self.low), self.high)
-
-    def _log_det(self, P: Tensor) -> Tensor:
-        """Half the logarithm of the determinants of covariances."""
-        return eliminated(P)[0].diagonal().log().sum(1)

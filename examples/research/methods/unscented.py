@@ -30,7 +30,7 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         x, P = self._updated(x, P, y)
         lost = ~self._inside(x, P)
         if lost.any():
-            start = self._starts(int(lost.sum()))
+            *start, _ = self.start(int(lost.sum()))
             restarted = self._updated(*start, y[lost])
             sound = self._inside(*restarted)  # else the start stays without the sample
             x[lost] = np.where(sound[:, None], restarted[0], start[0])
