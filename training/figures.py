@@ -1,7 +1,4 @@
-"""One style for all figures, on a light ground or a dark one, and how figures and moving pictures are written.
-
-Colours are named for their use, as places in the cycle of colours, so that they follow the theme.
-"""
+"""One style for all figures, on a light ground or a dark one, and how figures and moving pictures are written."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -19,7 +16,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 Theme = Literal["light", "dark"]
-RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"
+RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"  # places in the cycle of colours, which follows the theme
 # All eight can be distinguished with each kind of colour blindness. The same places of matplotlib's own cycle, in which
 # environments render outside of this style, have like colours.
 CYCLES: dict[Theme, tuple[str, ...]] = {

@@ -38,12 +38,11 @@ class Belief(NamedTuple):
 
 
 class ExtendedKalmanFilter:
-    """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3), in continuous or in discrete time.
+    """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3), an :class:`observers.estimator.Estimator`.
 
-    P = Phi P Phi^T + Q dt; Phi and the slope of h are central differences. It is an
-    :class:`observers.estimator.Estimator`. A filter starts again where its predicted mean leaves the system's declared
-    bounds or its covariance is no longer finite. Entries of samples that are NaN are missing, and correct nothing;
-    neither does an output that is undefined at the mean, or its slope.
+    P = Phi P Phi^T + Q dt; Phi and the slope of h are central differences. A filter starts again where its predicted
+    mean leaves the system's declared bounds or its covariance is no longer finite. Outputs that are NaN, or undefined
+    at the mean, correct nothing.
 
     Shapes: ``Q`` (nx, nx), ``R`` (ny, ny) or (n, ny, ny), ``start`` (nx,) and (nx, nx).
     """
