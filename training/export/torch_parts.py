@@ -48,7 +48,7 @@ class Network(Module):
 
     def __init__(self, mlp: MLP, dtype: torch.dtype) -> None:
         super().__init__()
-        self.layers = from_mlp(mlp, dtype=dtype).requires_grad_(True)
+        self.layers: Any = from_mlp(mlp, dtype=dtype).requires_grad_(True)
 
     def forward(self, h: Tensor) -> Tensor:
         """Evaluate in the type of the weights; returns the type that was given."""
