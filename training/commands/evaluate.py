@@ -333,12 +333,10 @@ class Evaluate:
             try:
                 runs = of.runs(domain=domain, driven=driven, **motions)
                 trajectories = unseen_trajectories(of.model, of.artifact.filter.dt, **runs)
-                lacking = "" if trajectories.inside.any() else f"each of {self._trajectories} runs left bounds = "
-                lacking += str(of.model.bounds) * bool(lacking)
+                if not trajectories.inside.any():
+                    raise NoStartsError(f"each of {self._trajectories} runs left bounds = {of.model.bounds}")
             except NoStartsError as error:
-                lacking = str(error)
-            if lacking:
-                left_out.append(f"starts in {starts}{', driven' if driven else ''}: {lacking}")
+                left_out.append(f"starts in {starts}{', driven' if driven else ''}: {error}")
                 progress.advance(bar, len(levels))
                 continue
             for level in levels:

@@ -24,7 +24,7 @@ Domain = Literal["X", "1.5X", "2X"]
 
 
 class NoStartsError(ValueError):
-    """A multiple of X holds no starts beyond X."""
+    """There are no starts in a domain, or none from which trajectories stay within the bounds."""
 
 
 @dataclass(frozen=True)
