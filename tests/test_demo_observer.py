@@ -14,7 +14,7 @@ from exported_steps import MAPS, apart, exported_of, in_doubles, mapped, motion,
 from random_tracking import KINDS, signals, tracking
 
 from observers import KKLObserver, Limits
-from training.export import Exported
+from training.export.exported import Exported
 
 REPLAY, DEMO = Path(__file__).parent / "helpers" / "replay.mjs", Path(__file__).parents[1] / "docs" / "demo"
 write_step = runpy.run_path(str(DEMO / "step_file.py"))["write_step"]

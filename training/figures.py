@@ -1,13 +1,9 @@
-"""One style for all figures, on a light ground or a dark one, and how figures and moving pictures are written.
-
-Colours are named for their use, as places in the cycle of colours, so that they follow the theme.
-"""
+"""One style for all figures, on a light ground or a dark one, and how figures and moving pictures are written."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -20,7 +16,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 Theme = Literal["light", "dark"]
-RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"
+RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"  # places in the cycle of colours, which follows the theme
 # All eight can be distinguished with each kind of colour blindness. The same places of matplotlib's own cycle, in which
 # environments render outside of this style, have like colours.
 CYCLES: dict[Theme, tuple[str, ...]] = {
@@ -38,41 +34,32 @@ ALIKE: dict[str, Any] = {
     "figure.constrained_layout.use": True,
     "figure.dpi": 110,
     "figure.titlesize": "medium",
-    "font.size": 10.0,
     "grid.linewidth": 0.6,
     "legend.fontsize": "small",
-    "legend.framealpha": 0.8,
     "lines.linewidth": 1.2,
     "lines.markersize": 4.0,
-    "savefig.dpi": 110,
-    "savefig.facecolor": "auto",
 }
-COLOURS = 32  # of a moving picture
-NEAR = 16  # of 255, below which a colour could be taken for the ground
-
-_around: ContextVar[Theme] = ContextVar("theme", default="light")
+SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # of each colour on the ground, in moving pictures
 
 
-@contextmanager
-def style(theme: Theme | None = None) -> Iterator[None]:
-    """Draw in the style of this package until the end of a block."""
+def theme_around() -> Theme:
+    """The theme of the block of :func:`style` around, which its ground shows."""
     import matplotlib
 
-    chosen = _around.get() if theme is None else theme
-    with matplotlib.rc_context(looks(chosen)):
-        outer = _around.set(chosen)
-        try:
-            yield
-        finally:
-            _around.reset(outer)
+    return "dark" if matplotlib.rcParams["figure.facecolor"] == GROUNDS["dark"] else "light"
+
+
+def style(theme: Theme | None = None) -> AbstractContextManager[None]:
+    """Draw in the style of this package until the end of a block, by default in the theme of the block around."""
+    import matplotlib
+
+    return matplotlib.rc_context(looks(theme or theme_around()))
 
 
 def looks(theme: Theme = "light") -> dict[Any, Any]:
     """Settings of matplotlib that make this style: for notebooks, as in ``plt.rcParams |= looks()``."""
     from cycler import cycler
 
-    if theme not in get_args(Theme):
-        raise ValueError(f"theme must be one of {', '.join(get_args(Theme))}, got {theme!r}")
     ink = CYCLES[theme][int(TRUTH[1])]
     grounds = dict.fromkeys(("axes.facecolor", "figure.facecolor", "legend.facecolor"), GROUNDS[theme])
     inks = dict.fromkeys(("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color"), ink)
@@ -88,30 +75,24 @@ def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
     with style():
         figure = Figure(figsize=(width, height))
         yield figure
-        save(path, figure)
-
-
-def save(path: Path, figure: "Figure") -> None:
-    """Write a figure, whole or not at all."""
-    with style(), replacing(path) as temporary:
-        figure.savefig(temporary)
+        with replacing(path) as temporary:  # whole or not at all
+            figure.savefig(temporary)
 
 
 def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
     """Write a moving picture that repeats itself, whole or not at all.
 
-    All frames have the same few colours, for which the first, the middle and the last are looked at: what does not move
-    then costs nothing. Those of the style stay as they are, and so does the ground.
+    All frames have the same few colours, the ground and shades of the style's own: what does not move then costs
+    nothing, and small things keep their colours.
     """
     from matplotlib.colors import to_rgb
     from PIL import Image
 
-    some = np.concatenate([np.asarray(frames[i]) for i in (0, len(frames) // 2, -1)])
-    ground, own = some[0, 0].astype(int), 255 * np.array([to_rgb(colour) for colour in CYCLES[_around.get()]])
-    few = Image.fromarray(some).quantize(COLOURS - len(own), kmeans=1)
-    colours = np.array(few.getpalette()).reshape(-1, 3)[: COLOURS - len(own)]
-    colours[np.abs(colours - ground).max(axis=1) < NEAR] = ground  # and nothing that is nearly like it
-    few.putpalette([*colours.ravel().tolist(), *own.round().astype(int).ravel().tolist()])
+    theme = theme_around()
+    ground, *own = (255 * np.array(to_rgb(each)) for each in (GROUNDS[theme], *CYCLES[theme]))
+    palette = [ground, *(ground + share * (colour - ground) for colour in own for share in SHADES)]
+    few = Image.new("P", (1, 1))
+    few.putpalette(np.round(palette).astype(int).ravel().tolist())
     first, *others = (frame.quantize(palette=few, dither=Image.Dither.NONE) for frame in frames)
     how: dict[str, Any] = {"save_all": True, "duration": round(1000 * seconds / len(frames)), "loop": 0}
     with replacing(path) as temporary:

@@ -8,7 +8,7 @@ import numpy as np
 from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from observers.estimator import Estimate
-from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
+from training.sources.simulated import unknown_start
 
 Gaussian = tuple[np.ndarray, np.ndarray]
 """Means (n, nx) and covariances (n, nx, nx)."""
@@ -25,9 +25,8 @@ def measurement_covariance(system: System, measurement_noise: float | Sequence[f
 
 
 def process_intensity(system: System, process_noise: float, dt: float) -> np.ndarray:
-    """Intensity (nx, nx) of the white noise that a filter assumes for the plant's process noise, never quite 0."""
-    assumed = max(process_noise, LEAST_PROCESS_NOISE / system.pace)
-    return np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)
+    """Intensity (nx, nx) of the white noise that a filter assumes for the plant's process noise."""
+    return np.diag((process_noise * np.array(system.scale)) ** 2 / 3 * dt)
 
 
 class Belief(NamedTuple):
@@ -39,12 +38,11 @@ class Belief(NamedTuple):
 
 
 class ExtendedKalmanFilter:
-    """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3), in continuous or in discrete time.
+    """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3), an :class:`observers.estimator.Estimator`.
 
-    P = Phi P Phi^T + Q dt; Phi and the slope of h are central differences. It is an
-    :class:`observers.estimator.Estimator`. A filter starts again where its predicted mean leaves the system's declared
-    bounds or its covariance is no longer finite. Entries of samples that are NaN are missing, and correct nothing;
-    neither does an output that is undefined at the mean, or its slope.
+    P = Phi P Phi^T + Q dt; Phi and the slope of h are central differences. A filter starts again where its predicted
+    mean leaves the system's declared bounds or its covariance is no longer finite. Outputs that are NaN, or undefined
+    at the mean, correct nothing.
 
     Shapes: ``Q`` (nx, nx), ``R`` (ny, ny) or (n, ny, ny), ``start`` (nx,) and (nx, nx).
     """
@@ -60,7 +58,8 @@ class ExtendedKalmanFilter:
 
     def start(self, n: int) -> Belief:
         """Return n rows before their first sample."""
-        return Belief(*self._starts(n), np.zeros(n, dtype=bool))
+        x0, P0 = self._start
+        return Belief(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), np.zeros(n, dtype=bool))
 
     def advance(self, state: Belief, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Belief:
         """Predict over dt, by default that of the samples, in rows that have begun; then correct."""
@@ -76,20 +75,19 @@ class ExtendedKalmanFilter:
         """Return means and covariances."""
         return Estimate(state.x.copy(), state.P.copy())
 
-    def along(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Covariances (steps + 1, n, nx, nx) with derivatives along motions (steps + 1, n, nx) themselves.
+    def along(self, y: np.ndarray, u: np.ndarray, x: np.ndarray | None = None) -> Gaussian:
+        """Means (steps + 1, n, nx) and covariances along samples (steps + 1, n, ny) and inputs (steps, n, nu).
 
-        With the plant's own noise that is the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
+        With motions x (steps + 1, n, nx) derivatives are taken along these. With the plant's own noise the covariances
+        are then the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
         """
-        state, y, covariances = self.start(x.shape[1]), self._system.output(x), []
-        for k in range(len(x)):
-            state = self.advance(state._replace(x=x[max(k - 1, 0)]), y[k], u[k - 1])  # the first sample has no input
-            covariances.append(state.P)
-        return np.array(covariances)
-
-    def _starts(self, n: int) -> Gaussian:
-        x0, P0 = self._start
-        return np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1))
+        state, states = self.start(y.shape[1]), []
+        for k in range(len(y)):
+            state = state if x is None else state._replace(x=x[max(k - 1, 0)])
+            state = self.advance(state, y[k], u[k - 1])  # the first sample has no input
+            states.append(state)
+        means, covariances, _ = zip(*states, strict=True)
+        return np.array(means), np.array(covariances)
 
     def _inside(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
         return np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
@@ -107,10 +105,8 @@ class ExtendedKalmanFilter:
 
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
         """Mean and covariance given the samples y, (n, ny); lost filters start again."""
-        lost = ~self._inside(x, P)
-        if lost.any():
-            x, P = x.copy(), P.copy()
-            x[lost], P[lost] = self._start
+        (x0, P0), inside = self._start, self._inside(x, P)
+        x, P = np.where(inside[:, None], x, x0), np.where(inside[:, None, None], P, P0)
         aside, R = np.diag(self._aside), self._R
         beside = self._system.output(x[:, None] + np.stack([aside, -aside])[:, None])
         H = ((beside[0] - beside[1]) / (2 * self._aside[:, None])).mT

@@ -12,7 +12,7 @@ import numpy as np
 from step_file import write_step
 
 import kkl_gym
-from training.export import Exported
+from training.export.exported import Exported
 
 HERE = Path(__file__).parent
 PAGE = ("index.html", "style.css", "main.js", "world.js", "systems.js", "drawing.js", "kkl_observer.js")

@@ -9,8 +9,7 @@ import numpy as np
 from observers import storage
 from observers.inverse import InverseMap
 from observers.motion import Motion
-from training.export import Exported
-from training.export.exported import tracker_arrays, tracker_numbers
+from training.export.exported import Exported, tracker_arrays, tracker_numbers
 
 KEY = "kkl_step"  # of the metadata
 _MAP_ARRAYS = ("z_offset", "whiten", "x_offset", "x_scale")

@@ -37,7 +37,7 @@ from training.commands.options import shown
 from training.evaluation.errors import estimates as estimates_of
 from training.evaluation.errors import unseen_trajectories
 from training.evaluation.faults import FAULTS
-from training.evaluation.metrics import percentage_error
+from training.evaluation.metrics import smape
 from training.figures import ALARM, ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
 from training.files import write
 
@@ -181,7 +181,8 @@ def errors_of_runs(
             estimates_of(Artifact.read(resolve(name)), system, runs, **how)[0],
             estimates_of(None, system, runs, **how)[0],
         )
-        errors[name] = [percentage_error(runs.x, x_hat) for x_hat in x_hats]
+        rows = 1, -1, system.nx  # errors at each step
+        errors[name] = [smape(runs.x.reshape(rows), x_hat.reshape(rows)).reshape(x_hat.shape[:2]) for x_hat in x_hats]
     return errors
 
 

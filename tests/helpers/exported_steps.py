@@ -17,7 +17,7 @@ import kkl_gym
 from kkl_gym.simulate import simulate
 from observers import MLP, Artifact, Expression, KKLObserver, decoder
 from observers.names import resolve
-from training.export import Exported
+from training.export.exported import Exported
 
 _ACTIVE = {"tanh": np.tanh, "silu": lambda h: h / (1 + np.exp(-h)), "relu": lambda h: h * (h > 0)}
 # Options of random_artifact that exports have to get right, with activations.

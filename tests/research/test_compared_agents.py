@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import research
+from matplotlib.figure import Figure
 from PIL import Image
 
 from examples.research.agents import picture
@@ -15,7 +16,6 @@ from examples.research.agents.comparison import read_results
 from examples.research.agents.filtered import kalman_filters, show_filtered
 from examples.research.agents.statistics import interval, middle, normalised
 from examples.research.agents.tables import write_table
-from training import figures
 from training.agents.agent import Agent, find
 from training.agents.observing import SETTINGS
 from training.agents.play import play
@@ -111,8 +111,8 @@ def test_kalman_filters_that_know_the_input_follow_a_driven_state():
 
 
 def test_pictures_show_states_outputs_and_inputs(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(figures, "save", lambda path, figure: drawn.append(figure))
+    drawn, savefig = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure) or savefig(figure, path))
     agent = Agent.read(find("van_der_pol"))
     task = replace(agent.task, env_kwargs={**agent.task.env_kwargs, "max_episode_steps": 50})
     env = replace(agent, task=task).make()

@@ -94,10 +94,10 @@ def test_regions_hold_what_they_should_on_other_runs(tracking, quiet, alone):
     for level in (0.1, 0.7):
         spans = (slice(20, 22), slice(100, None))
         early, late = coverage(artifact, system, runs, measurement_noise=level, seed=7, spans=spans)
-        assert late.joint[1] == pytest.approx(0.9, abs=0.05 if alone else 0.03)
+        assert late["90"] == pytest.approx(90, abs=5 if alone else 3)
         # Of 600, three standard deviations are 0.037. Beyond X, where T_inv's covariance counts too, starts are worse.
-        assert 0.85 < early.joint[1] < (0.97 if alone else 0.95)
-        np.testing.assert_allclose(late.joint, REGIONS, atol=0.1 if alone else 0.07)
+        assert 85 < early["90"] < (97 if alone else 95)
+        assert all(late[name] == pytest.approx(100 * share, abs=10 if alone else 7) for name, share in REGIONS.items())
 
 
 def test_a_second_calibration_finds_the_same_factors(tracking):
@@ -200,16 +200,17 @@ def test_a_kalman_filter_is_consistent_on_a_linear_system():
     trajectories = unseen_trajectories(system, 0.05, n=600, duration=15.0, seed=2, process_noise=0.2)
     how = {"measurement_noise": 0.5, "seed": 2, "spans": (slice(-1, None),)}
     (found,) = coverage(None, system, trajectories, **how)
-    limits = 3.5 * np.sqrt(np.array(REGIONS) * (1 - np.array(REGIONS)) / 600)
-    assert (abs(found.joint - REGIONS) < limits).all()
-    assert (abs(found.states - np.array(REGIONS)[:, None]) < limits[:, None]).all()
-    assert found.limits[0] < found.nees < found.limits[1]
-    assert found.limits[0] < 2.0 < found.limits[1]
+    for name, share in REGIONS.items():
+        limit = 3.5 * np.sqrt(share * (1 - share) / 600)
+        for region in (name, *(f"{name} {state}" for state in system.state_names)):
+            assert found[region] / 100 == pytest.approx(share, abs=limit)
+    assert found["nees_low"] < found["nees"] < found["nees_high"]
+    assert found["nees_low"] < 2.0 < found["nees_high"]
     # One that takes the noise for half of what it is believes too much.
     half = dataclasses.replace(trajectories, process_noise=0.01)
     (wrong,) = coverage(None, system, half, **how)
-    assert wrong.nees > found.limits[1]
-    assert wrong.joint[1] < 0.8
+    assert wrong["nees"] > found["nees_high"]
+    assert wrong["90"] < 80
 
 
 def test_distances_do_not_depend_on_units():

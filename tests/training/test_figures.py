@@ -25,11 +25,6 @@ def test_a_theme_holds_within_its_block_alone():
     assert dict(matplotlib.rcParams) == before
 
 
-def test_another_theme_is_refused():
-    with pytest.raises(ValueError, match="theme must be one of light, dark, got 'sepia'"), style("sepia"):
-        pass
-
-
 @pytest.mark.parametrize("theme", THEMES)
 def test_a_drawing_is_written_at_its_end(tmp_path, theme):
     path = tmp_path / "new" / "figure.png"

@@ -15,6 +15,7 @@ from kkl_gym import VanDerPol
 from training import SimulatedSource, errors, train, unseen_trajectories
 from training.evaluation.errors import parameter_errors
 from training.spectrum import Spectrum
+from training.trajectories.parameters import with_parameters
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,9 @@ def test_it_identifies_the_plant_while_it_runs():
     assert artifact.estimated_parameters == ("stiffness",)
     assert artifact.parameter_ranges == {"stiffness": (2.8, 5.2)}
     drawn = 30.0 / np.sqrt(3)  # in percent, of who only knows the range
-    how = {"trajectories": 30, "duration": 15.0, "seed": 5}
-    clean, noisy = (parameter_errors(artifact, system, measurement_noise=level, **how)[0] for level in (0.0, 0.02))
+    many = with_parameters(system, artifact.parameter_ranges)
+    runs = unseen_trajectories(many, artifact.filter.dt, n=30, duration=15.0, seed=5)
+    clean, noisy = (parameter_errors(artifact, many, runs, measurement_noise=level, seed=5)[0] for level in (0.0, 0.02))
     assert clean < noisy < 0.5 * drawn
 
 

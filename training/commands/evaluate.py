@@ -35,7 +35,6 @@ from training.evaluation.errors import (
     UnseenTrajectories,
     errors,
     noise_limit,
-    off_by,
     parameter_errors,
     unseen_trajectories,
 )
@@ -44,6 +43,7 @@ from training.evaluation.metrics import by_state
 from training.files import require_writable, write
 from training.progress import ProgressBars, progress_bars
 from training.trajectories.motions import Controller
+from training.trajectories.parameters import blind, with_parameters
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,7 +79,11 @@ class Motions:
             return system.replace(changes) if changes else None
         if changes:
             raise ValueError("give --plant or --plant-error, not both")
-        return off_by(system, self.plant_error)
+        if not np.isfinite(self.plant_error):
+            raise ValueError(f"plant_error must be a finite number, such as 0.1, got {self.plant_error}")
+        if not system.parameters:
+            raise ValueError(f"{system.name} has no parameters that could be off")
+        return system.replace({name: (1.0 + self.plant_error) * value for name, value in system.parameters.items()})
 
 
 @dataclass(frozen=True)
@@ -223,7 +227,7 @@ class Evaluate:
                 one = measure(trajectories, measurement_noise=level, seed=self.motions.seed, skip=skip)
                 case = [estimator] * several + [starts] + [("no", "yes")[driven]] * inputs
                 case += [f"{process_noise:g}"] * bool(process_noise) + [show_level(level)]
-                smape.append([*case, spread(one.full), spread(one.late), str(one.escaped)])
+                smape.append([*case, spread(one.full), spread(one.late), str(trajectories.escaped)])
                 nrmse.append([*case, *map(percent, np.median(one.nrmse, axis=0))])
                 columns: dict[str, Any] = {"observer": estimator} | (
                     {"plant": show_parameters(of.plant)} if of.plant else {}
@@ -249,14 +253,18 @@ class Evaluate:
         return frames
 
     def _parameters(self, of: Subject, levels: Sequence[Level]) -> Table:
-        """A table of errors of estimated parameters, from starts in X."""
+        """A table of errors of estimated parameters, from starts in X: of the plant, or of many from their ranges."""
         inputs, rows, names = bool(of.artifact.nu), list[list[str]](), of.artifact.estimated_parameters
-        motions = of.runs(process_noise=self.motions.process_noise, seed=self.motions.seed) | {"plant": of.plant}
+        ranges = {name: of.artifact.parameter_ranges[name] for name in names}
+        system = of.system if of.plant else with_parameters(of.system, ranges)
+        how: dict[str, Any] = {"n": self._trajectories, "duration": of.duration, "plant": of.plant}
+        how |= {"seed": self.motions.seed, "process_noise": self.motions.process_noise}
+        how |= {"policy": of.policy and blind(of.policy, of.system.nx)}
         for driven in (False, True)[: 1 + inputs]:
+            runs = unseen_trajectories(system, of.artifact.filter.dt, driven=driven, **how)
             for level in levels:
-                motions |= {"trajectories": self._trajectories, "measurement_noise": level, "driven": driven}
-                values = map(percent, parameter_errors(of.artifact, of.system, **motions))
-                rows.append([*[("no", "yes")[driven]] * inputs, show_level(level), *values])
+                found = parameter_errors(of.artifact, system, runs, measurement_noise=level, seed=self.motions.seed)
+                rows.append([*[("no", "yes")[driven]] * inputs, show_level(level), *map(percent, found)])
         on = f"plant {show_parameters(of.plant)}" if of.plant else "plants drawn from their ranges"
         title = f"{of.name}: parameters, rms error in % of their values after transient, {on}"
         return table(title, [], rows, [*["driven"] * inputs, "noise\non y", *names])
@@ -272,7 +280,6 @@ class Evaluate:
             levels = self._levels(of, left_out)
         dt, rows, shown = of.artifact.filter.dt, list[dict[str, Any]](), list[list[str]]()
         first, settled = (round(seconds * of.system.pace / dt) for seconds in (FIRST, SETTLED))
-        names = [f"{100 * region:g}" for region in REGIONS]
         cases = self._cases(f"judging the error bars of {of.name}", of, levels, progress, left_out)
         for starts, driven, trajectories, level in cases:
             late = slice(min(settled, len(trajectories.x) - 1), None)
@@ -283,24 +290,17 @@ class Evaluate:
                     continue
                 for span, one in zip(spans, coverage(artifact, of.model, trajectories, **how), strict=True):
                     case = {"map": of.name, "starts": starts, "driven": driven, "observer": who, "span": span}
-                    cells = {"measurement_noise": as_cell(level)}
-                    for name, joint, states in zip(names, one.joint, one.states, strict=True):
-                        of_states = {
-                            f"{name} {state}": 100 * share for state, share in zip(of.model.state_names, states)
-                        }
-                        cells |= {name: 100 * joint} | of_states
-                    low, high = one.limits
-                    rows.append(case | cells | {"nees": one.nees, "nees_low": low, "nees_high": high})
+                    rows.append(case | {"measurement_noise": as_cell(level)} | one)
                     start = f"{starts}{', driven' if driven else ''}"
-                    regions = [f"{100 * share:.1f}" for share in one.joint]
-                    shown.append([who, start, span, show_level(level), *regions, f"{one.nees:.2f}"])
+                    regions = [f"{one[name]:.1f}" for name in REGIONS]
+                    shown.append([who, start, span, show_level(level), *regions, f"{one['nees']:.2f}"])
         if not rows:
             return []
         frame = pd.DataFrame(rows)
         limits = f"{frame.nees_low.min():.2f} to {frame.nees_high.max():.2f}"
         caption = f"NEES lies from {limits} with probability 95 % where covariances are true"
         title = f"{of.name}: errors in regions, %, {self._runs(of)}{of.on}"
-        right = ["noise", *(f"{name} %" for name in names), "NEES"]
+        right = ["noise", *(f"{name} %" for name in REGIONS), "NEES"]
         progress.console.print(table(title, ["observer", "starts", "span"], shown, right, caption))
         return [frame]
 
@@ -333,12 +333,10 @@ class Evaluate:
             try:
                 runs = of.runs(domain=domain, driven=driven, **motions)
                 trajectories = unseen_trajectories(of.model, of.artifact.filter.dt, **runs)
-                lacking = "" if trajectories.inside.any() else f"each of {self._trajectories} runs left bounds = "
-                lacking += str(of.model.bounds) * bool(lacking)
+                if not trajectories.inside.any():
+                    raise NoStartsError(f"each of {self._trajectories} runs left bounds = {of.model.bounds}")
             except NoStartsError as error:
-                lacking = str(error)
-            if lacking:
-                left_out.append(f"starts in {starts}{', driven' if driven else ''}: {lacking}")
+                left_out.append(f"starts in {starts}{', driven' if driven else ''}: {error}")
                 progress.advance(bar, len(levels))
                 continue
             for level in levels:

@@ -48,7 +48,7 @@ class ExportCommand:
 
     def run(self, console: Console) -> list[Path]:
         """Export."""
-        from training.export import Exported
+        from training.export.exported import Exported
 
         if self.format == "onnx" and (self.measurement_noise, self.process_noise) != (None, None):
             raise ValueError(

@@ -74,7 +74,7 @@ def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
     floor = [RESOLUTION * (size or 1.0) for size in system.output_range]  # of y without noise, as a network reads it
     R = np.repeat([np.diag(np.maximum(level, floor) ** 2) for level in levels], n, axis=0)
     bound = ExtendedKalmanFilter(system, subject.dt, Q=np.zeros_like(start), R=R)
-    P = bound.along(*(np.tile(each, (1, len(levels), 1)) for each in (x, u)))
+    _, P = bound.along(*(np.tile(each, (1, len(levels), 1)) for each in (system.output(x), u, x)))
     square = P.diagonal(axis1=2, axis2=3).reshape(length, len(levels), n, nx).mean(2).swapaxes(0, 1)
     deviation = np.sqrt(start.diagonal())
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,9 +1,5 @@
 """How many errors lie in the regions that covariances state, and how large the errors are against these."""
 
-from dataclasses import dataclass
-
-import numpy as np
-
 from kkl_gym.system import System
 from observers import Artifact
 from observers.factors import standard_deviations
@@ -11,18 +7,8 @@ from training.calibration import chi_square, squared_distance
 from training.evaluation.errors import UnseenTrajectories, estimates
 from training.evaluation.levels import Level
 
-REGIONS = (0.5, 0.9, 0.99)  # shares of the errors
+REGIONS = {"50": 0.5, "90": 0.9, "99": 0.99}  # shares of the errors by their names in tables
 INTERVAL = 0.95  # of the mean NEES of a consistent filter
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """Shares of errors in the regions (regions,) of covariances, jointly and by state, in a span of time."""
-
-    joint: np.ndarray
-    states: np.ndarray
-    nees: float
-    limits: tuple[float, float]
 
 
 def coverage(
@@ -33,25 +19,24 @@ def coverage(
     measurement_noise: Level,
     seed: int,
     spans: tuple[slice, ...] = (slice(None),),
-) -> list[Coverage]:
-    """Compare covariances with errors on test trajectories; arguments are those of :func:`training.errors`."""
-    if artifact is not None:
-        artifact.require_covariance()
+) -> list[dict[str, float]]:
+    """Compare covariances with errors on test trajectories; arguments are those of :func:`training.errors`.
+
+    Returns for each span of time the percentages of errors in the regions, of all states and of each ("90", "90 x1"),
+    the mean NEES, and the limits of that of a consistent filter.
+    """
     x_hat, P = estimates(
         artifact, system, trajectories, measurement_noise=measurement_noise, seed=seed, covariances=True
     )
-    assert P is not None
     error = trajectories.x - x_hat
-    nees, ratios = squared_distance(error, P), (error / standard_deviations(P)) ** 2
-    _, n, nx = error.shape
-    joint, single = chi_square(REGIONS, nx), chi_square(REGIONS, 1)
+    squares, (_, n, nx) = (error / standard_deviations(P)) ** 2, error.shape
+    nees, table = squared_distance(error, P), []
     low, high = (float(chi_square((1 + side * INTERVAL) / 2, n * nx) / n) for side in (-1, 1))
-    return [
-        Coverage(
-            np.array([(nees[span] <= edge).mean() for edge in joint]),
-            np.array([(ratios[span] <= edge).mean((0, 1)) for edge in single]),
-            float(nees[span].mean()),
-            (low, high),
-        )
-        for span in spans
-    ]
+    for span in spans:
+        shares = dict[str, float]()
+        for name, region in REGIONS.items():
+            shares[name] = 100 * float((nees[span] <= chi_square(region, nx)).mean())
+            for state, ratios in zip(system.state_names, squares[span].T, strict=True):
+                shares[f"{name} {state}"] = 100 * float((ratios <= chi_square(region, 1)).mean())
+        table.append(shares | {"nees": float(nees[span].mean()), "nees_low": low, "nees_high": high})
+    return table

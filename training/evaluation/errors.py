@@ -8,15 +8,14 @@ import numpy as np
 from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.checks import is_finite, noise_levels, shown
+from observers.checks import noise_levels
 from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.maps.coordinates import root
 from training.seeds import Stream, generator
-from training.sources.simulated import unknown_start
+from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
 from training.trajectories.motions import Controller, draw_process_noise, random_inputs, under_policy
-from training.trajectories.parameters import blind, with_parameters
 
 TRANSIENT = 0.2  # part of a trajectory that the errors "after the transient" leave out
 MAX_TRIES = 1000  # starts in a row within X, after which none is expected beyond it
@@ -25,17 +24,16 @@ Domain = Literal["X", "1.5X", "2X"]
 
 
 class NoStartsError(ValueError):
-    """A multiple of X holds no starts beyond X."""
+    """There are no starts in a domain, or none from which trajectories stay within the bounds."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of each trajectory that stayed within bounds, (n,) and (n, nx), and how many did not."""
+    """Errors of each trajectory that stayed within bounds, (n,) and (n, nx)."""
 
     full: np.ndarray
     late: np.ndarray
     nrmse: np.ndarray
-    escaped: int
 
 
 @dataclass(frozen=True)
@@ -144,14 +142,12 @@ def unseen_trajectories(
     u = np.zeros((steps, n, system.nu))
     if driven and not policy:
         u = random_inputs(system, n, steps, dt=dt, rng=rng, kinds=("steps", "sine"))
-    w = None
-    if process_noise:
-        w = draw_process_noise(system, process_noise, n=n, steps=steps, rng=generator(stream, seed, 2))
+    w = draw_process_noise(system, process_noise, n=n, steps=steps, rng=generator(stream, seed, 2))
     if policy:
         exploring, own = generator(stream, seed, 3), np.full(n, not driven)
         x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=exploring, own=own, w=w, plant=plant)
     else:
-        x = simulate(moving, x0, steps, dt, u=u if driven else None, w=w)
+        x = simulate(moving, x0, steps, dt, u=u, w=w)
     inside = np.isfinite(x[-1]).all(-1)
     return UnseenTrajectories(x[:, inside], u[:, inside], inside, dt, process_noise, plant)
 
@@ -224,18 +220,18 @@ def noise_limit(
         If the level of noise is invalid.
     """
     level, dt = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt
-    intensity = np.diag((trajectories.process_noise * np.array(system.scale)) ** 2 / 3 * dt)
-    R, plant = measurement_covariance(system, level), trajectories.plant or system
-    bound = ExtendedKalmanFilter(plant, dt, Q=intensity, R=R, start=unknown_start(system))
-    P = bound.along(trajectories.x, trajectories.u)
-    drawn = generator(Stream.EVALUATION, seed, 1).standard_normal((*trajectories.x.shape, 1))
-    return _errors(trajectories, trajectories.x + (root(P) @ drawn)[..., 0], skip)
+    x, plant = trajectories.x, trajectories.plant or system
+    Q, R = process_intensity(system, trajectories.process_noise, dt), measurement_covariance(system, level)
+    bound = ExtendedKalmanFilter(plant, dt, Q=Q, R=R, start=unknown_start(system))
+    _, P = bound.along(plant.output(x), trajectories.u, x)
+    drawn = generator(Stream.EVALUATION, seed, 1).standard_normal((*x.shape, 1))
+    return _errors(trajectories, x + (root(P) @ drawn)[..., 0], skip)
 
 
 def _errors(trajectories: UnseenTrajectories, x_hat: np.ndarray, skip: float | None) -> Errors:
     x = trajectories.x
     first = round(TRANSIENT * len(x)) if skip is None else round(skip / trajectories.dt)
-    return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first), trajectories.escaped)
+    return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first))
 
 
 def estimates(
@@ -246,31 +242,15 @@ def estimates(
     measurement_noise: Level,
     seed: int,
     covariances: bool = False,
-) -> tuple[np.ndarray, np.ndarray | None]:
+) -> tuple[np.ndarray, Any]:
     """Estimates along test trajectories, (steps + 1, n, nx), and on request their covariances; as :func:`errors`."""
-    level, dt = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt
-    observer: KKLObserver | ExtendedKalmanFilter
-    if artifact is not None:
-        observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
-    else:
-        Q, R = process_intensity(system, trajectories.process_noise, dt), measurement_covariance(system, level)
-        observer = ExtendedKalmanFilter(system, dt, Q=Q, R=R)
-    return follow(observer, measured(system, trajectories, level, seed), trajectories.u, covariances=covariances)
-
-
-def follow(
-    observer: KKLObserver | ExtendedKalmanFilter, y: np.ndarray, u: np.ndarray, *, covariances: bool = False
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Estimates along records (steps + 1, n, nx), and on request their covariances."""
-    if isinstance(observer, KKLObserver):
-        inputs = u if observer.artifact.nu else None
-        return observer.estimate(y, inputs), observer.estimate_covariance(y, inputs) if covariances else None
-    state, x_hat, P = observer.start(y.shape[1]), [], []
-    for k in range(len(y)):
-        state = observer.advance(state, y[k], u[k - 1])  # the filter ignores the input before the first sample
-        x_hat.append(state.x)
-        P.append(state.P if covariances else ())
-    return np.array(x_hat), np.array(P) if covariances else None
+    level, dt, u = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt, trajectories.u
+    y, process_noise = measured(system, trajectories, level, seed), trajectories.process_noise
+    if artifact is None:
+        Q = process_intensity(system, max(process_noise, LEAST_PROCESS_NOISE / system.pace), dt)
+        return ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, level)).along(y, u)
+    observer, inputs = KKLObserver(artifact, level, process_noise=process_noise), u if artifact.nu else None
+    return observer.estimate(y, inputs), observer.estimate_covariance(y, inputs) if covariances else None
 
 
 def measured(system: System, trajectories: UnseenTrajectories, measurement_noise: Level, seed: int) -> np.ndarray:
@@ -279,39 +259,16 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
     return y + np.asarray(measurement_noise) * generator(Stream.EVALUATION, seed, 1).standard_normal(y.shape)
 
 
-def off_by(system: System, share: float) -> System:
-    """The same system with every parameter larger by a share of itself."""
-    if not is_finite(share):
-        raise ValueError(f"the error of the parameters must be a finite number, such as 0.1, got {shown(share)}")
-    if not system.parameters:
-        raise ValueError(f"{system.name} has no parameters that could be off")
-    return system.replace({name: (1.0 + share) * value for name, value in system.parameters.items()})
-
-
 def parameter_errors(
-    artifact: Artifact,
-    system: System,
-    *,
-    trajectories: int,
-    measurement_noise: Level,
-    seed: int,
-    plant: System | None = None,
-    policy: Controller | None = None,
-    **motions: Any,
+    artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Errors in % of estimated parameters after the transient, on a plant or on many from the ranges of the training.
-
-    ``motions`` are further arguments of :func:`unseen_trajectories`.
-    """
-    nx, names = system.nx, artifact.estimated_parameters
-    moving = plant or with_parameters(system, {name: artifact.parameter_ranges[name] for name in names})
-    runs = unseen_trajectories(
-        moving, artifact.filter.dt, n=trajectories, seed=seed, policy=policy and blind(policy, nx), **motions
-    )
-    if not runs.inside.any():
-        raise ValueError(f"each of {trajectories} runs left bounds = {system.bounds}")
+    """Errors in % of estimated parameters after the transient: those of the plant, or else the system's last states."""
+    names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
+    if not n:
+        raise ValueError(f"each of {trajectories.escaped} runs left bounds = {system.bounds}")
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
-    observer = KKLObserver(artifact, level, process_noise=runs.process_noise)
-    values = observer.estimate_parameters(measured(moving, runs, level, seed), runs.u if artifact.nu else None)
-    true = [plant.parameters[name] for name in names] if plant else runs.x[0, :, nx:]
+    observer, u = KKLObserver(artifact, level, process_noise=trajectories.process_noise), trajectories.u
+    values = observer.estimate_parameters(measured(system, trajectories, level, seed), u if artifact.nu else None)
+    plant = trajectories.plant
+    true = [plant.parameters[name] for name in names] if plant else trajectories.x[0, :, nx - len(names) :]
     return np.asarray(100.0 * np.sqrt(np.mean((values[round(TRANSIENT * len(values)) :] / true - 1.0) ** 2, (0, 1))))

@@ -51,9 +51,8 @@ def simulate_faults(
     frames = []
     for done, (fault, late) in enumerate(faulty.items(), 1):
         report(done)
-        seen = y.copy()
+        seen, score = y.copy(), np.zeros(y.shape[:2])
         seen[half:] = late
-        score = np.zeros(y.shape[:2])
         observer.reset(seen[0])
         for k in range(1, len(y)):
             observer.advance(seen[k], u[k - 1] if artifact.nu else None)

@@ -27,11 +27,6 @@ def show_level(level: float | Sequence[float]) -> str:
     return ", ".join(f"{each:g}" for each in np.atleast_1d(level))
 
 
-def as_name(level: Level) -> str:
-    """For names of files and folders, without spaces: ``0.5``, or ``0.1-0.3``."""
-    return show_level(level).replace(", ", "-")
-
-
 def as_cell(level: Level) -> float | str:
     """For CSV files: a number wherever there is but one."""
     return show_level(level) if isinstance(level, tuple) else level

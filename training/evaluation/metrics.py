@@ -5,7 +5,7 @@ An estimate that is not finite counts as one infinitely far away.
 
 import numpy as np
 
-STILL = 1e-12  # of a state's size: a standard deviation below it is rounding
+from training.maps.coordinates import STILL
 
 
 def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
@@ -30,16 +30,11 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     ValueError
         If the shapes differ, or no step is left.
     """
-    return np.asarray(percentage_error(x, x_hat, skip).mean(0))
-
-
-def percentage_error(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Symmetric absolute percentage error at each step, (steps - skip, n), whose mean is :func:`smape`."""
     x, x_hat = _compared(x, x_hat, skip)
     size = np.linalg.norm(x, axis=-1) + np.linalg.norm(x_hat, axis=-1)
     error = np.linalg.norm(x - x_hat, axis=-1)
     ratio = np.divide(error, size, out=np.zeros_like(size), where=(size > 0) & np.isfinite(size))
-    return np.where(np.isfinite(size), 200.0 * ratio, 200.0)
+    return np.asarray(np.where(np.isfinite(size), 200.0 * ratio, 200.0).mean(0))
 
 
 def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Collection, Mapping
+from functools import reduce
 from importlib.resources import files
 from textwrap import fill
 from typing import Any
@@ -38,8 +39,6 @@ def c_files(exported: Exported) -> dict[str, str]:
     networks = {label: inverse.mlp for label, inverse in exported.maps.items()}
     single, signals = exported.precision == "float", exported.signals
     parts = {"inputs" if artifact.nu else "autonomous", "static" if motion is None else "tracks", *exported.maps}
-    assumed = {"levels": exported.levels, "process": exported.needs_process_noise}
-    parts |= {level for level, present in assumed.items() if present}
     texts = {"SOURCE": exported.source, "SYSTEM": artifact.system, "OUTPUTS": ", ".join(signals["y"])}
     texts |= {"INPUTS": ", ".join(signals["u"]), "ESTIMATES": ", ".join(signals["x_hat"])}
     words: dict[str, object] = {key: comment(text) for key, text in texts.items()}
@@ -158,14 +157,13 @@ def network_calls(prefix: str, mlp: MLP, width: str, out: str) -> dict[str, obje
 def function(name: str, expression: Expression) -> str:
     """A function ``name(x, u, out)``, which computes repeated parts of an expression once."""
     lines: list[str] = []
-    variables: dict[object, str] = {}
+    variables: dict[str, str] = {}
 
-    def variable(part: tuple[Any, ...], value: str) -> str:
-        if part not in variables:
-            kind = "int" if part[0] in _CONDITIONS else "double"
-            variables[part] = f"{kind[0]}{len(variables)}"
-            lines.append(f"    const {kind} {variables[part]} = {value};\n")
-        return variables[part]
+    def variable(value: str, kind: str) -> str:
+        if value not in variables:
+            variables[value] = f"{kind[0]}{len(variables)}"
+            lines.append(f"    const {kind} {variables[value]} = {value};\n")
+        return variables[value]
 
     def written(part: Any) -> str:
         if not isinstance(part, tuple):
@@ -177,12 +175,11 @@ def function(name: str, expression: Expression) -> str:
         exponent = arguments[-1] if operation == "**" else None
         if isinstance(exponent, float) and exponent.is_integer() and 0 < abs(exponent) <= _POWERS:
             product = " * ".join([first] * int(abs(exponent)))
-            return variable(part, product if exponent > 0 else f"1.0 / ({product})")
+            return variable(product if exponent > 0 else f"1.0 / ({product})", "double")
+        form, kind = _OPERATIONS[operation], "int" if operation in _CONDITIONS else "double"
         if operation == "where" or not others:
-            return variable(part, _OPERATIONS[operation].format(first, *others))
-        for i, other in enumerate(others):
-            first = variable(part[: i + 3], _OPERATIONS[operation].format(first, other))
-        return first
+            return variable(form.format(first, *others), kind)
+        return reduce(lambda one, other: variable(form.format(one, other), kind), others, first)
 
     results = [f"    out[{i}] = {written(part)};\n" for i, part in enumerate(expression.components)]
     head = f"static void {name}(const double x[NX], const real *u, double *out)\n{{\n    (void)x, (void)u;\n"

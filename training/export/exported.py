@@ -55,16 +55,10 @@ class Exported:
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """Levels of measurement noise that T_inv takes: none, one for all outputs, or one for each."""
+        """Levels of measurement noise: one for all outputs, or one for each where T_inv takes so many."""
         if self.artifact.inverse.noise_gain.ndim == 2:
             return tuple(np.broadcast_to(self.measurement_noise, self.artifact.ny).tolist())
-        takes = any("measurement_noise" in each.features or each.noise_gain.any() for each in self.maps.values())
-        return (float(np.max(self.measurement_noise)),) * takes
-
-    @property
-    def needs_process_noise(self) -> bool:
-        """Whether the step depends on the level of process noise."""
-        return self.artifact.process_noise_max is not None or self.artifact.motion is not None
+        return (float(np.max(self.measurement_noise)),)
 
     @property
     def signals(self) -> dict[str, list[str]]:
@@ -86,8 +80,7 @@ class Exported:
         artifact = self.artifact
         metadata: dict[str, Any] = {"name": self.name, "artifact": self.source, "sha256": self.checksum}
         metadata |= {"system": artifact.system, "parameters": dict(artifact.parameters), "dt": artifact.filter.dt}
-        metadata |= self.signals | ({"measurement_noise": list(self.levels)} if self.levels else {})
-        return metadata | ({"process_noise": self.process_noise} if self.needs_process_noise else {})
+        return metadata | self.signals | {"measurement_noise": list(self.levels), "process_noise": self.process_noise}
 
 
 def output_expression(artifact: Artifact) -> Expression | None:

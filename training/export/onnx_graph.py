@@ -16,7 +16,7 @@ OPSET = 18
 
 
 def onnx_model(exported: Exported) -> Any:
-    """Export the graph, with metadata; levels and ``u`` are inputs as far as the observer depends on them."""
+    """Export the graph, with metadata."""
     import onnx_ir
     from onnx import checker, helper
     from onnxscript import opset18
@@ -29,8 +29,7 @@ def onnx_model(exported: Exported) -> Any:
     artifact, dtype = exported.artifact, {"float": torch.float32, "double": torch.float64}[exported.precision]
     measurement_noise, process_noise = exported.measurement_noise, exported.process_noise
     step = _Step(artifact, measurement_noise, process_noise=process_noise, dtype=dtype).requires_grad_(False).eval()
-    widths = {"y": artifact.ny, "u": artifact.nu, "measurement_noise": len(exported.levels)}
-    widths["process_noise"] = int(exported.needs_process_noise)
+    widths = {"y": artifact.ny, "u": artifact.nu, "measurement_noise": len(exported.levels), "process_noise": 1}
     example: dict[str, Tensor | None] = {"state": step.start(2)}
     example |= {name: torch.zeros(2, width, dtype=dtype) if width else None for name, width in widths.items()}
     batch = torch.export.Dim("batch")

@@ -50,8 +50,7 @@ class TorchMemory(Module):
         time_constants: Sequence[float] = (1.0, 2.0, 4.0, 8.0),
         input_time_constants: Sequence[float] = (1.0, 4.0),
     ) -> None:
-        pairs = np.asarray(list(angles) if isinstance(angles, Sequence) else angles)
-        pairs = pairs if pairs.size else np.empty((0, 2), dtype=int)
+        pairs = np.asarray(angles) if np.size(angles) else np.empty((0, 2), dtype=int)
         if pairs.dtype.kind not in "iu" or pairs.shape[1:] != (2,) or len({*pairs.flat} & {*range(ny)}) < pairs.size:
             raise ValueError(f"angles must be pairs of different outputs, of 0 to {ny - 1}, got {angles!r}")
         super().__init__()

@@ -82,7 +82,7 @@ class TorchObserver(Module):
         x = torch.split(state, self.widths, 1)[3]
         if self.tracker is not None:
             x = self.tracker.states(x[:, : self.nx].T).T
-        return x.to(self.driven.network.weights[0].dtype)
+        return x.to(self.driven.network.layers[0].weight.dtype)
 
     def covariance(
         self, state: Tensor, measurement_noise: Tensor | None = None, process_noise: Tensor | None = None

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from observers.expression import Expression
 from observers.network import MLP
+from training.maps.networks import from_mlp
 
-_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"tanh": torch.tanh, "silu": functional.silu, "relu": torch.relu}
 LEAST_PIVOT = 1e-30  # a variance of scaled states
 
 
@@ -25,11 +24,9 @@ def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return lambda *arguments: function(*(each if isinstance(each, Tensor) else tensor(each) for each in arguments))
 
 
-# NumPy's names, which the source of expressions holds.
-_SAME = ["sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "abs", "sign", "floor", "minimum", "maximum", "where"]
-_OTHER = {name: getattr(torch, name) for name in ("logical_and", "logical_or", "logical_not")}
-_OTHER |= {"power": torch.pow, "mod": torch.remainder, "arctan2": torch.atan2}
-_FUNCTIONS = {name: getattr(torch, name) for name in _SAME} | _OTHER
+# By NumPy's names, which the source of expressions holds.
+_SAME = "sin cos tan exp log sqrt tanh abs sign floor minimum maximum where arctan2 logical_and logical_or logical_not"
+_FUNCTIONS = {name: getattr(torch, name) for name in _SAME.split()} | {"power": torch.pow, "mod": torch.remainder}
 _NUMPY = SimpleNamespace(**{name: _of_tensors(function) for name, function in _FUNCTIONS.items()})
 
 
@@ -51,16 +48,12 @@ class Network(Module):
 
     def __init__(self, mlp: MLP, dtype: torch.dtype) -> None:
         super().__init__()
-        layers = ([nn.Parameter(torch.tensor(np.asarray(each), dtype=dtype)) for each in part] for part in mlp.layers)
-        self.weights, self.biases = (nn.ParameterList(parts) for parts in zip(*layers, strict=True))
-        self._active = _ACTIVATIONS[mlp.activation]
+        self.layers: Any = from_mlp(mlp, dtype=dtype).requires_grad_(True)
 
     def forward(self, h: Tensor) -> Tensor:
         """Evaluate in the type of the weights; returns the type that was given."""
-        kind, h = h.dtype, h.to(self.weights[0].dtype)
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            h = torch.addmm(bias, self._active(h) if i else h, weight)
-        return h.to(kind)
+        result: Tensor = self.layers(h.to(self.layers[0].weight.dtype))
+        return result.to(h.dtype)
 
 
 class TorchExpression(Expression):

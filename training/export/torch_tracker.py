@@ -32,12 +32,9 @@ class TorchTracker(Module):
         self.least_process_noise = motion.least_process_noise
         self.h = None if artifact.h is None else TorchExpression(artifact.h.components)
         others = [numbers["other"]] * (2 * self.nx)
-        columns = tracker_arrays(motion) | {"eye": np.eye(self.nx), "eye_y": np.eye(self.ny)}
+        columns = tracker_arrays(motion) | {"units": np.outer(motion.x_scale, motion.x_scale)}
         columns |= {name: getattr(motion, name) for name in ("error", "process_noise", "least_measurement_noise")}
-        columns |= {
-            "weights": np.array([numbers["middle"], *others]),
-            "units": np.outer(motion.x_scale, motion.x_scale),
-        }
+        columns |= {"eye": np.eye(self.nx), "eye_y": np.eye(self.ny), "weights": np.array([numbers["middle"], *others])}
         columns |= {"square_weights": np.array([numbers["middle_squares"], *others])}
         if motion.equations is not None:
             self.equations: Any = replace(motion.equations, field=TorchExpression(motion.equations.field.components))
@@ -99,7 +96,8 @@ class TorchTracker(Module):
         x, P, nis, square, seen, trend = tracked
         learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)  # z depends on so much for certain
         lost, learned = ~(nis <= self.numbers["limit"]), learned.reshape(P.shape) / self.units
-        taken = lost | ((seen < self.window) & (self._log_det(learned) < self._log_det(P)))
+        of_learned, own = (eliminated(each)[0].diagonal().log().sum(1) for each in (learned, P))
+        taken = lost | ((seen < self.window) & (of_learned < own))  # by their determinants
         x = torch.where(taken, self._within((x_hat - self.x_offset) / self.x_scale), x)
         P = torch.where(taken, learned, P).flatten(0, 1)
         nis, square = torch.where(lost, 1.0, nis), torch.where(lost, 1.0, square)
@@ -174,7 +172,3 @@ class TorchTracker(Module):
 
     def _within(self, s: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(s, self.low), self.high)
-
-    def _log_det(self, P: Tensor) -> Tensor:
-        """Half the logarithm of the determinants of covariances."""
-        return eliminated(P)[0].diagonal().log().sum(1)

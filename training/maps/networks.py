@@ -12,7 +12,7 @@ from torch import nn
 from observers import MLP
 from training.config import Config
 
-ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU}
+ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU, "relu": nn.ReLU}
 
 
 class Network(nn.Sequential):

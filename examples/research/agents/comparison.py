@@ -21,7 +21,7 @@ from training.agents.information import OBSERVED, Information, make, observer_of
 from training.agents.play import play
 from training.agents.seeds import AGENT_EVALUATION_SEED
 from training.agents.tasks import Task, scores, successes
-from training.evaluation.levels import as_cell, as_name
+from training.evaluation.levels import as_cell, show_level
 from training.files import write
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class ComparedAgent(Job):
     @property
     def name(self) -> str:
         """Task, noise, kind and seed."""
-        return f"{self.task.name} at noise {as_name(self.task.measurement_noise)}/{self.kind}/{self.seed}"
+        return f"{self.task.name} at noise {show_level(self.task.measurement_noise)}/{self.kind}/{self.seed}"
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -197,7 +197,7 @@ def planned(
                 own = task.without_noise if task.system is None and kind in ("state", IDLE) else task
                 if task.system is not None and kind.startswith("recurrent") and seed >= _most(task):
                     continue
-                folder = out / "jobs" / f"{own.name}-{as_name(own.measurement_noise)}" / kind / str(seed)
+                folder = out / "jobs" / f"{own.name}-{show_level(own.measurement_noise)}" / kind / str(seed)
                 observer = (observers or {}).get(own.name)
                 agents.setdefault(folder, ComparedAgent(own, kind, seed, **how, folder=folder, observer=observer))
     return list(agents.values())

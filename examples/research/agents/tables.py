@@ -11,7 +11,7 @@ import numpy as np
 from examples.research.agents.comparison import COLUMNS, IDLE, IN_ENVIRONMENTS, KINDS, ON_SYSTEMS, ComparedAgent
 from examples.research.agents.statistics import interval, middle, normalised
 from training import files
-from training.evaluation.levels import as_cell, as_name
+from training.evaluation.levels import as_cell
 from training.figures import MEASURED, RIVAL, drawing
 from training.files import write
 
@@ -83,7 +83,7 @@ def _labels(results: "pd.DataFrame") -> dict[str, str]:
 def _task_name(environment: str, noise: float | str) -> str:
     """A task's title; a column of levels has numbers, and texts of a level for each output."""
     try:
-        level = as_name(float(noise))
+        level = f"{float(noise):g}"
     except ValueError:
         level = str(noise)
     return environment.replace("_", " ") + ("" if level == "0" else f", noise {level}")

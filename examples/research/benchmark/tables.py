@@ -5,17 +5,14 @@ import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from training.evaluation.levels import read_level, show_level
-from training.figures import save, style
+from training.figures import drawing
 from training.files import table, write
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 PAPERS_MEASURE = "The paper's measure: median ± half the interquartile range [bootstrap 95 % interval of the median]."
 # Column of results.csv, and title.
@@ -168,14 +165,8 @@ def _configuration(costs: pd.DataFrame, job: tuple[str, str]) -> str:
 
 
 def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> None:
-    """Write :func:`heatmap` as a picture."""
-    save(path, heatmap(results, methods, note=note))
-
-
-def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figure":
     """Draw the paper's heatmap: median ± half the interquartile range of the SMAPE over all steps."""
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
     results = _by_text_of_noise(results)
     labels, systems = _labels(methods), list(dict.fromkeys(methods.system))
@@ -183,10 +174,9 @@ def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figu
     domains = [domain for domain in DOMAINS if domain in set(results.starts)]
     levels = sorted(set(results.noise), key=_size)
     width = max(NARROWEST, 2.4 + 0.9 * len(systems) * len(levels))
-    size = (width, 1.4 + (0.3 + 0.24 * len(labels)) * len(domains))
+    height = 1.4 + (0.3 + 0.24 * len(labels)) * len(domains)
     image: Any = None
-    with style():
-        figure = Figure(figsize=size)
+    with drawing(path, width, height) as figure:
         axes: Any = figure.subplots(len(domains), len(levels), squeeze=False, sharex=True, sharey=True)
         for row, domain in zip(axes, domains, strict=True):
             for ax, noise in zip(row, levels, strict=True):
@@ -205,7 +195,6 @@ def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figu
                 ax.grid(visible=False)
         figure.colorbar(image, ax=axes, label="SMAPE in %, all steps", location="bottom", aspect=60, pad=0.01)
         figure.suptitle(note, fontsize=9)
-    return figure
 
 
 def _write_cell(ax: Any, at: tuple[int, int], median: float, half_iqr: float) -> None:

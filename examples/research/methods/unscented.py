@@ -30,11 +30,11 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         x, P = self._updated(x, P, y)
         lost = ~self._inside(x, P)
         if lost.any():
-            start = self._starts(int(lost.sum()))
-            restarted = self._updated(*start, y[lost])
+            x0, P0, _ = self.start(int(lost.sum()))
+            restarted = self._updated(x0, P0, y[lost])
             sound = self._inside(*restarted)  # else the start stays without the sample
-            x[lost] = np.where(sound[:, None], restarted[0], start[0])
-            P[lost] = np.where(sound[:, None, None], restarted[1], start[1])
+            x[lost] = np.where(sound[:, None], restarted[0], x0)
+            P[lost] = np.where(sound[:, None, None], restarted[1], P0)
         return x, P
 
     def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:

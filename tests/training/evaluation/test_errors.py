@@ -12,8 +12,8 @@ from kkl_gym import VanDerPol, get_system
 from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
 from training import errors, noise_limit, unseen_trajectories
-from training.commands.evaluate import show_parameters
-from training.evaluation.errors import estimates, measured, off_by
+from training.commands.evaluate import Motions, show_parameters
+from training.evaluation.errors import estimates, measured
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, unknown_start
 from training.maps.coordinates import stationary_covariance
 
@@ -119,14 +119,15 @@ def test_the_limit_of_a_linear_system_is_the_error_of_its_kalman_filter():
     _, P = estimates(None, system, runs, measurement_noise=0.3, seed=0, covariances=True)
     Q = np.diag((0.1 * np.array(system.scale)) ** 2 / 3 * 0.05)
     bound = ExtendedKalmanFilter(system, 0.05, Q=Q, R=measurement_covariance(system, 0.3))
-    np.testing.assert_allclose(bound.along(runs.x, runs.u), P, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(bound.along(system.output(runs.x), runs.u, runs.x)[1], P, rtol=1e-6, atol=1e-9)
 
 
 def test_the_limit_follows_tichavskys_recursion_on_the_plant():
     """J' = F^-T J F^-1 + H^T R^-1 H, where nothing disturbs the motion; and the figure of Lorenz's."""
     model, plant, how = Turning(), Turning(omega=2.0), {"measurement_noise": 0.3, "seed": 0}
     runs = unseen_trajectories(model, 0.05, n=3, duration=1.0, seed=0, plant=plant)
-    bound = ExtendedKalmanFilter(plant, 0.05, Q=np.zeros((2, 2)), R=np.array([[0.09]])).along(runs.x, runs.u)
+    filters = ExtendedKalmanFilter(plant, 0.05, Q=np.zeros((2, 2)), R=np.array([[0.09]]))
+    _, bound = filters.along(plant.output(runs.x), runs.u, runs.x)
     c, s = np.cos(0.1), np.sin(0.1)
     J, back = np.linalg.inv(unknown_start(model)[1]) + np.diag([1, 0]) / 0.09, np.array([[c, -s], [s, c]])
     for P in bound[1:]:
@@ -142,13 +143,14 @@ def test_the_limit_follows_tichavskys_recursion_on_the_plant():
 
 
 def test_every_parameter_is_off_by_a_share():
-    assert off_by(get_system("lorenz"), 0.1).parameters == pytest.approx({"sigma": 11.0, "rho": 30.8, "beta": 8.8 / 3})
-    assert off_by(VanDerPol(-2.0), 0.5) == VanDerPol(-3.0)
-    assert show_parameters(off_by(get_system("rossler"), 0.1)) == "a=0.22 b=0.22 c=6.27"
-    with pytest.raises(ValueError, match="the error of the parameters must be a finite number"):
-        off_by(VanDerPol(), np.inf)
+    lorenz, rossler = (Motions(plant_error=0.1).plant_of(get_system(name)) for name in ("lorenz", "rossler"))
+    assert lorenz.parameters == pytest.approx({"sigma": 11.0, "rho": 30.8, "beta": 8.8 / 3})
+    assert Motions(plant_error=0.5).plant_of(VanDerPol(-2.0)) == VanDerPol(-3.0)
+    assert show_parameters(rossler) == "a=0.22 b=0.22 c=6.27"
+    with pytest.raises(ValueError, match="plant_error must be a finite number"):
+        Motions(plant_error=np.inf).plant_of(VanDerPol())
     with pytest.raises(ValueError, match="two-outputs has no parameters that could be off"):
-        off_by(TwoOutputs(), 0.1)
+        Motions(plant_error=0.1).plant_of(TwoOutputs())
 
 
 def test_a_plant_moves_from_the_models_starts_under_its_inputs_or_policy():

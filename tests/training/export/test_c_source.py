@@ -11,9 +11,8 @@ from rollout_observers import observer_of
 
 from kkl_gym import get_system
 from observers import shipped
-from training.export import Exported
 from training.export.c_source import c_files
-from training.export.exported import identifier
+from training.export.exported import Exported, identifier
 
 TOLERANCES = {"float": 1e-5, "double": 1e-9}
 

@@ -12,7 +12,7 @@ from observers.checks import ArtifactError
 from observers.names import resolve
 from observers.storage import checksum
 from training import TorchObserver
-from training.export import Exported
+from training.export.exported import Exported
 
 pytest.importorskip("onnx", reason="needs the extra onnx")
 pytest.importorskip("onnxruntime", reason="needs the extra onnx")

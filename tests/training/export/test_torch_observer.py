@@ -133,7 +133,7 @@ def test_a_row_whose_covariance_breaks_down_is_lost():
 @pytest.mark.parametrize("kind", [{"by": "flow"}, {"outputs": 2, "nonlinear": True}])
 def test_gradients_are_those_of_finite_differences(kind):
     """Through filter, T_inv, which is surer for a while, tracker, gaps and covariance, and to T_inv's weights."""
-    artifact, name = tracking(surer=1.0, **kind), "driven.network.weights.0"
+    artifact, name = tracking(surer=1.0, **kind), "driven.network.layers.0.weight"
     module = TorchObserver(artifact, dtype=torch.float64)
     y, u = (torch.tensor(each) for each in signals(artifact, 5, (2,)))
     y[3, 0] = torch.nan

@@ -13,6 +13,7 @@ from scipy.linalg import solve_discrete_are
 from observers import Artifact, KKLObserver
 from training import RecordedSource, recorded_preset, train
 from training.calibration import chi_square, squared_distance
+from training.evaluation.report import write_report
 from training.records import Record, resampled
 from training.sources.recorded import linear_output, recorded_errors, signal_rate, split
 
@@ -98,7 +99,7 @@ def test_signals_that_are_not_among_the_hidden_ones_cannot_be_tracked(tmp_path):
         read.check("spring", {}, dt=0.05, ny=1, nu=1)
 
 
-def test_without_enough_that_is_held_out_there_are_no_covariances():
+def test_without_enough_that_is_held_out_there_are_no_covariances(tmp_path):
     records = [both(seed, n=300) for seed in range(3)]
     for share, reason in (
         (0.0, "held_out must be positive, got 0"),
@@ -110,6 +111,8 @@ def test_without_enough_that_is_held_out_there_are_no_covariances():
         artifact = result.artifact
         assert (artifact.motion, artifact.inverse.error_covariance) == (None, None)
         assert artifact.C is not None
+        source = RecordedSource(records, recorded_preset(records, {"held_out": share}), "speed")
+        write_report(tmp_path / "report.png", result, source)  # of the losses alone, where nothing is held out
 
 
 def test_resuming_makes_the_same_observer(tmp_path):

@@ -19,12 +19,7 @@
  * must know NaN, as it does without -ffast-math.
 // end tracks
  * Nothing is allocated, and observers share constants alone.
-// if levels
- * It assumes measurement noise of standard deviation LEVELS.
-// end levels
-// if process
- * It assumes process noise of level PROCESS.
-// end process
+ * It assumes measurement noise of standard deviation LEVELS and process noise of level PROCESS.
  */
 #ifndef MACRO_H
 #define MACRO_H
