@@ -48,12 +48,12 @@ def same(one, other):
     [
         (SHORT, "state", {"algorithm": "ppo", "timesteps": 128}, 3),
         (SHORT, "state", {"algorithm": "sac", "timesteps": 60}, 50),
-        (CART, "z", {"algorithm": "ppo", "timesteps": 128}, 3),  # whose observations are normalised
         (CART, "y", {"algorithm": "dqn", "timesteps": 60}, 12),
         (CART, "recurrent", {"timesteps": 128}, 3),
         (CART, "x_hat", {"timesteps": 600, "observer_steps": 400}, 8),  # which sees hidden signals
         (CART, "x_hat", {"timesteps": 600, "observer_steps": 300, "aggregate": 1}, 14),  # which sees estimates
         (replace(CART, measurement_noise=0.1), "x_hat", {"timesteps": 600, "observer_steps": 300}, 5),
+        (replace(CART, measurement_noise=0.1), "z", {"timesteps": 600, "observer_steps": 500}, 2),  # is normalised
     ],
 )
 def test_all_but_the_episodes_goes_on(task, information, options, stop, tmp_path, small, saves):
@@ -75,6 +75,7 @@ def test_all_but_the_episodes_goes_on(task, information, options, stop, tmp_path
     assert agent.training["timesteps"] >= 0.95 * options["timesteps"]  # the rest is rehearsal
     again = learn(task, information, tmp_path / "copy", resume=True, **options)
     assert same(again, agent)  # random by seed and checkpoint alone
+    assert again.task == agent.task == Agent.read(out / "agent.safetensors").task
     assert pd.read_csv(out / "curve.csv").steps.is_monotonic_increasing
     whole = (out / "agent.safetensors").read_bytes()
     assert same(learn(task, information, out, resume=True, **options), agent)  # nothing is left to do
