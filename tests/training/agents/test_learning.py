@@ -111,13 +111,12 @@ def test_an_agent_on_estimates_sees_hidden_signals_until_there_are_estimates(tmp
 
 def test_z_under_noise_shows_what_predicts(tmp_path, small):
     task = replace(PENDULUM, measurement_noise=0.1, angles=((0, 1),))
-    agent = learn(task, "z", tmp_path / "a", algorithm="ppo", timesteps=3_000, seed=1)
-    again = Agent.read(tmp_path / "a" / "agent.safetensors")
+    agent = learn(task, "z", tmp_path, algorithm="ppo", timesteps=3_000, seed=1)
+    again = Agent.read(tmp_path / "agent.safetensors")
     assert again.task == agent.task == replace(task, weights=agent.task.weights)
     (here, _), (there, _) = (one.make(2).reset(seed=3) for one in (agent, again))
     np.testing.assert_array_equal(here, there)
-    plain = learn(task, "z", tmp_path / "b", algorithm="ppo", observer_steps=0)
-    assert here.shape[1] < plain.inputs == 8
+    assert here.shape[1] < learn(task, "z", tmp_path, algorithm="ppo", observer_steps=0).inputs == 8
 
 
 @pytest.mark.parametrize(
