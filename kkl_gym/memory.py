@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -13,6 +14,7 @@ from observers.checks import real_array, shown
 SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
 CLOSEST = 1.5  # ratio of neighbouring ones; closer ones hold the same, and their coordinates would be rounding errors
 IMAGINED = 64  # steps before the first output
+SMALL = 200  # coordinates, up to which one product advances a single row faster than several calls of NumPy do
 FILLED = 20  # longest time constants, after which e^-20 of the past is left
 TURN = 2 * math.pi
 
@@ -69,13 +71,36 @@ class Memory:
         with np.errstate(under="ignore"):
             self._with_past = (1 - self.decay ** (ages + IMAGINED)) / (1 - self.decay ** np.maximum(ages, 1))
         self._y: np.ndarray | None = None  # (..., ny); there are w, (m, ..., signals), and v, (k, ..., nu)
+        self._row: np.ndarray | None = None  # [signals, w, v] of a single small one, of which the three are views
+
+    @cached_property
+    def _products(self) -> tuple[np.ndarray, np.ndarray]:
+        """The matrices of a step, from [signals, w, v, next signals, u] to the next [signals, w, v], and of mixing."""
+        n, m, nu, of_inputs = len(self._signals), len(self.decay), self._nu, len(self.input_decay)
+        each, rise = np.eye(n), np.kron(self.rise, np.eye(n))
+        sizes = np.cumsum([n, m * n, of_inputs * nu, n, nu])
+        w, v, after, u = (slice(*ends) for ends in pairwise(sizes))
+        update, combine = np.zeros((sizes[-1], v.stop)), np.eye(v.stop)
+        update[w, w], update[v, v] = np.diag(self.decay.repeat(n)), np.diag(self.input_decay.repeat(nu))
+        update[after, :n], update[after, w], update[:n, w] = each, rise, -rise
+        update[u, v] = np.kron(1 - self.input_decay, np.eye(nu))
+        combine[w, w] = np.kron(self.mixing.T, each)
+        return update, combine
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """Forget all, as if outputs (..., ny) had rested at ``y0`` and no input had acted."""
-        self._y, self._signals = y0.copy(), self._read(y0, 0.0)
+        self._y = y0.copy()
+        self._signals = self._read(self._y, 0.0)
         self._w = np.zeros((len(self.decay), *self._signals.shape))
         self._v = np.zeros((len(self.input_decay), *y0.shape[:-1], self._nu))
         self._ages = np.zeros(y0.shape[:-1], dtype=int)
+        if y0.ndim == 1 and self.size <= SMALL:
+            n = len(self._signals)
+            self._row = np.concatenate((self._signals, self._w.ravel(), self._v.ravel()))
+            self._signals, w, v = np.split(self._row, (n, n + self._w.size))
+            self._w, self._v = w.reshape(self._w.shape), v.reshape(self._v.shape)
+        else:
+            self._row = None
         return self.shown()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -88,17 +113,23 @@ class Memory:
 
     def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Take in the next outputs (..., ny), and the inputs (..., nu) that led to them, in some rows or in all."""
+        if self._row is not None:
+            self._y, self._ages = y.copy(), self._ages + 1
+            signals = self._read(y, self._signals[len(self._others) :])
+            np.concatenate((self._row, signals, u)).dot(self._products[0], out=self._row)
+            return self.shown()
         self._check_begun()
         of_filters = (-1, *(1,) * y.ndim)
         decay, rise, input_decay = (each.reshape(of_filters) for each in (self.decay, self.rise, self.input_decay))
         if rows is not None:
             y = np.where(rows[:, None], y, self._y)  # type: ignore[arg-type]
             decay, input_decay = (np.where(rows[:, None], kept, 1.0) for kept in (decay, input_decay))
-        signals = self._read(y, self._signals[..., len(self._others) :])
+        self._y = y.copy()
+        signals = self._read(self._y, self._signals[..., len(self._others) :])
         self._w *= decay
         self._w += rise * (signals - self._signals)
         self._v += (1 - input_decay) * (u - self._v)
-        self._y, self._signals = y.copy(), signals
+        self._signals = signals
         self._ages = self._ages + (1 if rows is None else rows)
         return self.shown()
 
@@ -109,7 +140,7 @@ class Memory:
     def _read(self, y: np.ndarray, before: np.ndarray | float) -> np.ndarray:
         """The signals that are filtered: the other outputs, then the angles."""
         if not len(self._cosines):
-            return y.copy()
+            return y
         angles = turned(y.take(self._cosines, -1), y.take(self._sines, -1), before)
         return np.concatenate((y.take(self._others, -1), angles), axis=-1)
 
@@ -117,6 +148,15 @@ class Memory:
         """The outputs and the memory of them and of the inputs, (..., size), of all rows or some."""
         self._check_begun()
         w, filled = self._w, len(self._with_past)
+        if self._row is not None:
+            row, n = self._row, len(self._signals)
+            if self._ages < filled:
+                row = row.copy()
+                row[n : n + w.size] *= self._with_past[self._ages].repeat(n)
+            out = row.dot(self._products[1])
+            if len(self._cosines):
+                out = np.concatenate((self._y, out[n:]))  # type: ignore[arg-type]
+            return out.astype(np.float32)
         if (self._ages < filled).any():
             w = w * np.moveaxis(self._with_past[np.minimum(self._ages, filled - 1)], -1, 0)[..., None]
         parts = [self._y, *(self.mixing @ w.reshape(len(w), -1)).reshape(w.shape), *self._v]

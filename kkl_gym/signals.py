@@ -41,7 +41,7 @@ class Outputs:
     ) -> None:
         self._missing = missing  # whether NaN may stand for an entry that is missing
         self.measured = None if measured is None else _entries("measured", measured)
-        self.angles = _angles(angles)
+        self.angles = angle_entries(angles)
         self.period = period
         if period is not None and not (is_finite(period) and period > 0):
             raise ValueError(f"period must be the positive length of a turn, such as 360, got {shown(period)}")
@@ -192,7 +192,7 @@ def _entries(name: str, values: Any) -> tuple[Any, ...]:
     return found
 
 
-def _angles(values: Any) -> tuple[Any, ...]:
+def angle_entries(values: Any) -> tuple[Any, ...]:
     """Entries, and pairs of entries as tuples, or ValueError."""
     if not _is_sequence(values):
         raise ValueError(

@@ -103,3 +103,5 @@ def test_an_agent_sees_estimates_of_the_state_as_it_is_now(tmp_path, monkeypatch
     np.testing.assert_allclose(estimates, info["x_hat"], rtol=1e-5)
     if kind == "parameters":
         np.testing.assert_allclose(obs[:, :2], info["y"], rtol=1e-5)
+    z = [kinds.TimedAgent("Pendulum-v1", sensor, "z", 0, 0.1, tmp_path).make(1) for sensor in ("masked", "noise")]
+    assert z[0].observation_space.shape == (1, 8) > z[1].observation_space.shape  # under noise, what predicts

@@ -16,7 +16,7 @@ from kkl_gym.wrappers.vector import VectorEnv
 from observers import MLP, storage
 from observers.checks import ArtifactError, choice, shown
 from observers.names import matching, resolve
-from training.agents.information import ESTIMATED, INFORMATION, Information, make
+from training.agents.information import INFORMATION, Information, make
 from training.agents.tasks import Task
 from training.files import describe
 
@@ -155,8 +155,6 @@ class Agent:
                 f"the agent's environment is {named!r}, and {trusted!r} is trusted: trust {named!r} if you trust the "
                 "agent's file with what that imports"
             )
-        if self.information in ESTIMATED and self.observer is None:
-            raise AgentError(f"an agent that sees {self.information} must name its observer")
         observer = observer or self.observer
         if observer is not None and fingerprint(observer) != self.fingerprint:
             raise AgentError(f"the agent was trained on another observer than the one in {observer!r}")
@@ -183,11 +181,14 @@ class Agent:
             tensors |= {"mean": self.mean, "scale": self.scale}
         if self.lstm is not None:
             tensors |= {"lstm.weight": self.lstm.weight, "lstm.bias": self.lstm.bias}
+        task = asdict(self.task)
+        if (weights := task.pop("weights")) is not None:
+            tensors["memory.weights"] = np.array(weights)
         described = {
             "format": FORMAT,
             "activation": self.network.activation,
             "head": self.head,
-            "task": asdict(self.task),
+            "task": task,
             "information": self.information,
             "observer": self.observer,
             "fingerprint": self.fingerprint,
@@ -208,7 +209,7 @@ class Agent:
                 raise AgentError(f"unknown metadata keys: {', '.join(unknown)}")
             network = storage.get_mlp(tensors, "", described.pop("activation"))
             lstm = LSTM(tensors["lstm.weight"], tensors["lstm.bias"]) if "lstm.weight" in tensors else None
-            task = Task(**described.pop("task"))
+            task = Task(**described.pop("task"), weights=tensors.get("memory.weights"))
             return cls(network, task=task, mean=tensors.get("mean"), scale=tensors.get("scale"), lstm=lstm, **described)
 
 

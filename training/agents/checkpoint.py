@@ -26,9 +26,9 @@ class Checkpoint(BaseCallback):
     """Writes a checkpoint and the learning curve now and then, between two rollouts, and at the end.
 
     A checkpoint holds networks, optimisers, counters, the scaling of observations, the replay buffer, the learning
-    curve and the steps from which an observer is learned. It holds neither the environments nor random generators: a
-    training that goes on begins new episodes, with random numbers of its own. The learning curve has a row for each
-    episode: steps, CPU seconds and return.
+    curve, the weights of z and the steps from which an observer is learned. It holds neither the environments nor
+    random generators: a training that goes on begins new episodes, with random numbers of its own. The learning curve
+    has a row for each episode: steps, CPU seconds and return.
     """
 
     def __init__(self, path: Path, fingerprint: str, *, resume: bool) -> None:
@@ -42,6 +42,7 @@ class Checkpoint(BaseCallback):
         if not resume:
             path.unlink(missing_ok=True)
         self.saved = checkpoints.load(path, fingerprint=fingerprint) if path.exists() else None
+        self.weights = (self.saved or {}).get("weights")  # of z under noise
 
     def restore(self, model: BaseAlgorithm, steps: int) -> None:
         """Restore the saved training, if there is one."""
@@ -99,6 +100,7 @@ class Checkpoint(BaseCallback):
             "restarts": self.restarts,
             "privileged": self.privileged,
             "records": kept,
+            "weights": self.weights,
             "curve": torch.tensor(self._curve, dtype=torch.float64).reshape(-1, 3),
             "moments": _moments(model.get_vec_normalize_env()),
         }

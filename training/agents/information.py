@@ -1,6 +1,8 @@
 """Information sets: the observations of an agent, as a vector environment of flat arrays."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -8,13 +10,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from kkl_gym import KKLVectorMemory, KKLVectorObservation, get_system
+from kkl_gym import KKLMemory, KKLVectorMemory, KKLVectorObservation, get_system
 from kkl_gym.system import System
 from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper, column
 from observers import Artifact, shipped
+from observers.checks import choice
 from observers.factors import standard_deviations
 from observers.names import resolve
-from training.agents.environments import vector
+from training.agents.environments import single, vector
 from training.agents.history import stacked, traces
 from training.agents.tasks import Task, deviation
 from training.trajectories.equations import linearised
@@ -67,46 +70,45 @@ class FeatureObservation(VectorWrapper):
 
 def make(task: Task, information: Information, num_envs: int, *, observer: str | None = None) -> VectorEnv:
     """Make a task in which the agent sees ``information``; of systems in units of about one, taken from the target."""
-    if information not in INFORMATION:
-        raise ValueError(f"unknown information {information!r}; there are {', '.join(INFORMATION)}")
+    choice("information", information, INFORMATION)
     if observer is not None and information not in OBSERVED:
         raise ValueError(f"an agent that sees {information!r} has no use for the observer {observer!r}")
-    if information in ESTIMATED and observer is None:
+    if information in (ESTIMATED if task.system is None else OBSERVED) and observer is None:
         raise ValueError(f"an agent that sees {information!r} needs an observer")
     if observer is not None:
         return estimates(task, information, num_envs, observer)
-    if information == "state":
-        return state(task, num_envs)
-    env = outputs(task, vector(task, num_envs))
+    if information == "state" and task.system is None:
+        return vector(task.without_noise, num_envs)
+    env = vector(task, num_envs)
+    if information == "z":
+        return KKLVectorMemory(env, **_memory(task))
+    if task.system is None:
+        entries = list(task.measured)
+        env = FeatureObservation(env, lambda at: at["obs"][:, entries], len(entries))
+    else:
+        system = get_system(task.system)
+        if information == "state":
+            return FeatureObservation(env, lambda at: deviation(system, at["x"]), system.nx, ["x"])
+        env = FeatureObservation(env, output_deviation(system), system.ny, ["y"])
     if information == "stacked":
         return stacked(env, task.frames, actions=task.past_actions)
     if information == "traces":
         return traces(env, task.time_constants, actions=task.past_actions)
     if information == "recurrent":
         return stacked(env, 1)
-    if information == "z":
-        place = task.measured.index
-        angles = [(place(cosine), place(sine)) for cosine, sine in task.angles]
-        without = {} if task.past_actions else {"input_time_constants": ()}
-        return KKLVectorMemory(env, angles=angles, time_constants=task.time_constants, **without)
     return env
 
 
-def state(task: Task, num_envs: int) -> VectorEnv:
-    """Show the full state of a system, or the whole observation of another environment, without noise."""
-    if task.system is None:
-        return vector(task.without_noise, num_envs)
-    system = get_system(task.system)
-    return FeatureObservation(vector(task, num_envs), lambda at: deviation(system, at["x"]), system.nx, ["x"])
+def weighted(task: Task, steps: int, *, seed: int) -> Task:
+    """Let z show what predicts the next outputs, by weights that are learned from random actions in a simulator."""
+    with closing(single(task)) as env:
+        return replace(task, weights=KKLMemory(env, **_memory(task)).learn_weights(steps, seed=seed))
 
 
-def outputs(task: Task, env: VectorEnv) -> VectorEnv:
-    """Show a task's measured signals."""
-    if task.system is None:
-        entries = list(task.measured)
-        return FeatureObservation(env, lambda at: at["obs"][:, entries], len(entries))
-    system = get_system(task.system)
-    return FeatureObservation(env, output_deviation(system), system.ny, ["y"])
+def _memory(task: Task) -> dict[str, Any]:
+    """The arguments of a memory of an environment's measured entries."""
+    arguments = {name: getattr(task, name) for name in ("measured", "angles", "time_constants", "weights")}
+    return arguments if task.past_actions else arguments | {"input_time_constants": ()}
 
 
 def estimates(task: Task, information: Information, num_envs: int, observer: str) -> VectorEnv:

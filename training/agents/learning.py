@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from copy import deepcopy
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
@@ -29,7 +29,7 @@ from training.agents.bridge import SB3VecEnv
 from training.agents.checkpoint import Checkpoint
 from training.agents.cost import Cost
 from training.agents.environments import CLEAN_Y, vector
-from training.agents.information import ESTIMATED, OBSERVED, Information, make, observer_of
+from training.agents.information import ESTIMATED, OBSERVED, Information, make, observer_of, weighted
 from training.agents.observing import OBSERVER, Privileged, estimated_entries, learn_observer, refits, wander
 from training.agents.policy import ALGORITHMS, CONTINUOUS, head_of, linear, lstm_in, perceptron
 from training.agents.seeds import agent_training_seed
@@ -99,7 +99,8 @@ def learn(
     Where an observer has to be learned, the agent's first steps are for both. Without noise, the agent sees the hidden
     signals in place of estimates; the observer is learned from these steps, and the agent goes on with estimates. Under
     noise estimates are far from the truth; these steps are then fewer, and random actions, from which the observer
-    alone is learned. They count too.
+    alone is learned. They count too. The weights of z under noise are learned in this way too if ``observer_steps`` are
+    given.
 
     A training that goes on from a checkpoint begins new episodes, so that it makes another agent than one that never
     stopped; ``Agent.training`` then has the number of times it was resumed.
@@ -112,8 +113,6 @@ def learn(
     _check_actions(name, actions, task.env_id)
     if information == "recurrent" and name != RECURRENT:
         raise ValueError(f"recurrent agents learn by {RECURRENT}, got {name!r}")
-    if observer is not None and information not in OBSERVED:
-        raise ValueError(f"an agent that sees {information!r} has no use for the observer {observer!r}")
     if aggregate and (task.system is not None or information not in ESTIMATED):
         raise ValueError(f"an agent that sees {information!r} of {task.env_id} has no observer to fit again")
     if task.system is not None and information in OBSERVED and observer is None and show is make:
@@ -125,9 +124,11 @@ def learn(
         raise ValueError(f"{information}: train an observer with error bars first, and name it (--observer FILE)")
     if fits and not estimated_entries(task, size):
         raise ValueError(f"all entries of {task.env_id} are measured, without noise: nothing is left to estimate")
-    if observer_steps is not None and not fits:
-        raise ValueError("observer_steps is for agents on x_hat that are given no observer")
-    first = _first_steps(task, steps, rehearsal, observer_steps) if fits else 0
+    noisy_z = information == "z" and observer is None and task.measurement_noise and task.weights is None
+    if observer_steps is not None and not (fits or noisy_z):
+        raise ValueError("observer_steps is for agents on z under noise, and for those on x_hat without an observer")
+    weighs = noisy_z and observer_steps is not None
+    first = _first_steps(task, steps, rehearsal, observer_steps) if fits or weighs else 0
     how = {"algorithm": name, **settings, "seed": seed, "observer_steps": first, "aggregate": aggregate}
     observed = None if observer is None else [observer, fingerprint(observer)]
     identity = json.dumps([asdict(task), information, observed, rules(task), how], sort_keys=True)
@@ -135,6 +136,10 @@ def learn(
     resumes = checkpoint.saved is not None
     if resumes and (folder / FILE).exists():
         return Agent.read(folder / FILE)  # nothing is left to do
+    if weighs:
+        checkpoint.spent = first
+        task = replace(task, weights=checkpoint.weights) if resumes else weighted(task, first, seed=seed)
+        checkpoint.weights = task.weights
     with progress_bars(progress) as bars:
         fit = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
         privileged = None

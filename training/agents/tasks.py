@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,8 +11,9 @@ import numpy as np
 
 from kkl_gym import ENV_IDS, OWN_ID, SYSTEMS, get_system
 from kkl_gym.memory import output_time_constants
+from kkl_gym.signals import Angles, angle_entries
 from kkl_gym.system import Box, System
-from observers.checks import LARGEST, flag, integer, is_finite, shown
+from observers.checks import LARGEST, flag, integer, is_finite, real_array, shown
 from observers.names import matching
 from training.evaluation.levels import Level
 
@@ -27,6 +28,7 @@ class Task:
 
     Of a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` stay empty. ``env_id`` and
     ``env_kwargs`` are those of ``gym.make``; ``repeat`` is in samples, ``time_constants`` and ``frames`` in actions.
+    ``weights`` are those of z, as :meth:`kkl_gym.KKLMemory.learn_weights` returns them.
     """
 
     env_id: str
@@ -38,7 +40,8 @@ class Task:
     time_constants: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
     frames: int = 8
     past_actions: bool = True
-    angles: tuple[tuple[int, int], ...] = ()
+    angles: Angles = ()
+    weights: Sequence[Sequence[float]] | np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.env_id, str):
@@ -54,7 +57,7 @@ class Task:
                 if len(set(entries)) < len(entries) or empty:
                     raise ValueError(f"{name} must name entries of the observation, each once, got {shown(given)}")
                 object.__setattr__(self, name, entries)
-        object.__setattr__(self, "angles", _pairs(self.env_id, self.angles, self.measured))
+        object.__setattr__(self, "angles", angle_entries(self.angles))
         if self.system is None:
             if not is_finite(self.measurement_noise) or not 0 <= self.measurement_noise < LARGEST:  # type: ignore[operator]
                 raise ValueError(
@@ -72,6 +75,8 @@ class Task:
         object.__setattr__(self, "time_constants", output_time_constants("time_constants", self.time_constants))
         object.__setattr__(self, "past_actions", flag("past_actions", self.past_actions))
         object.__setattr__(self, "frames", integer("frames", self.frames, 1, MAX_FRAMES))
+        if self.weights is not None:
+            object.__setattr__(self, "weights", real_array("weights", self.weights).tolist())
 
     @property
     def system(self) -> str | None:
@@ -94,22 +99,6 @@ class Task:
     def without_noise(self) -> "Task":
         """The same environment, measured exactly."""
         return replace(self, measurement_noise=0.0)
-
-
-def _pairs(env_id: str, values: Any, measured: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
-    """Angles as pairs of entries, or ValueError."""
-    given = values.tolist() if isinstance(values, np.ndarray) else values
-    if not (
-        isinstance(given, list | tuple) and all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in given)
-    ):
-        raise ValueError(f"angles must be pairs of entries, cosine and sine, such as 0,1; got {shown(values)}")
-    pairs = tuple((integer("a cosine", cosine, 0), integer("a sine", sine, 0)) for cosine, sine in given)
-    named = [entry for pair in pairs for entry in pair]
-    if len(set(named)) < len(named) or not set(named) <= set(measured):
-        raise ValueError(
-            f"angles must name entries of {env_id} that are measured, {shown(measured)}, each once, got {shown(values)}"
-        )
-    return pairs
 
 
 def control_task(

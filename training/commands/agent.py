@@ -134,7 +134,7 @@ class Train:
     observer_steps: Annotated[int | None, hint("nine tenths of all, under noise one tenth")] = None
     """First steps of an agent in an environment, from the latest 100,000 of which its observer is learned, where none
     is named. Without noise the agent learns from them too: it sees hidden signals where estimates will be. Under noise
-    actions are random."""
+    actions are random; if named, an agent on z learns from them which parts of its memory predict y."""
     aggregate: int = 0
     """How often an observer is fitted again, to the agent's own steps, while the agent learns on estimates. The last
     twentieth of all steps is then without exploration, and followed by one more fit."""

@@ -13,7 +13,6 @@ import numpy as np
 import kkl_gym
 from examples.research.resumable import Job
 from kkl_gym import get_system
-from kkl_gym.memory import IMAGINED
 from observers.storage import explained
 from training.agents.agent import fingerprint, rules
 from training.agents.environments import vector
@@ -53,6 +52,7 @@ CONCERNED = {  # by settings of a task that matter to some agents alone
     "frames": ("stacked",),
     "past_actions": ("z", "traces", "stacked"),
     "angles": ("z",),
+    "weights": ("z",),
 }
 SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # further levels at which agents are trained
 SEEDS = 5
@@ -108,8 +108,6 @@ class ComparedAgent(Job):
         elif self.kind == "x_hat":
             begins = WANDERED if self.task.measurement_noise else PRIVILEGED
             described |= {"aggregate": self.aggregate, "begins": begins, "rehearsal": REHEARSAL}
-        elif self.kind == "z":
-            described["past"] = IMAGINED
         return described
 
     @property
@@ -157,7 +155,7 @@ class ComparedAgent(Job):
                 show=show,
             )
             observer = str(self.folder / OBSERVER) if fitted else self._observer
-            env = show(task, self._information, self.episodes, observer=observer)
+            env = show(agent.task, self._information, self.episodes, observer=observer)
             policy = agent.policy(env.single_action_space)
         seconds = time.process_time() - began
         with closing(env):
@@ -193,20 +191,16 @@ def planned(
     for seed in range(seeds):
         for task in tasks:
             usual = IN_ENVIRONMENTS if task.system is None else ON_SYSTEMS
+            second = SECOND_NOISE.get(task.name) == task.measurement_noise
+            most = SECOND_NOISE_RECURRENT_SEEDS if second else RECURRENT_SEEDS
             for kind in (*((IDLE,) if seed == 0 else ()), *(usual if kinds is None else kinds)):
                 own = task.without_noise if task.system is None and kind in ("state", IDLE) else task
-                if task.system is not None and kind.startswith("recurrent") and seed >= _most(task):
+                if task.system is not None and kind.startswith("recurrent") and seed >= most:
                     continue
                 folder = out / "jobs" / f"{own.name}-{show_level(own.measurement_noise)}" / kind / str(seed)
                 observer = (observers or {}).get(own.name)
                 agents.setdefault(folder, ComparedAgent(own, kind, seed, **how, folder=folder, observer=observer))
     return list(agents.values())
-
-
-def _most(task: Task) -> int:
-    """Recurrent agents of a system's task, at most."""
-    second = SECOND_NOISE.get(task.name) == task.measurement_noise
-    return SECOND_NOISE_RECURRENT_SEEDS if second else RECURRENT_SEEDS
 
 
 def seeds_in(out: Path) -> int:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
@@ -13,12 +14,12 @@ from gymnasium.spaces import flatdim
 from rich.console import Console
 
 import kkl_gym
-from examples.research.agents.partly import ENV_ID, KINDS, MEASURED
+from examples.research.agents.partly import ANGLES, ENV_ID, KINDS, MEASURED
 from examples.research.agents.statistics import middle
 from examples.research.resumable import Job, Workers, run_and_report
 from training import files
 from training.agents.environments import single, vector
-from training.agents.information import FeatureObservation, make
+from training.agents.information import FeatureObservation, make, weighted
 from training.agents.play import play
 from training.agents.seeds import AGENT_EVALUATION_SEED, agent_training_seed
 from training.agents.tasks import Task
@@ -33,7 +34,7 @@ Shown = Literal["state", "y", "stacked", "traces", "z", "x_hat", "lru"]
 ALGORITHMS = {"CartPole-v1": "ppo"}  # sac for all others
 FRAMES = 32  # that the linear recurrent unit runs over
 EVALUATIONS, EPISODES, LAST_EPISODES = 15, 20, 100
-OBSERVER_STEPS = 40_000  # random ones, from which an observer is learned
+OBSERVER_STEPS = 40_000  # random ones, from which an observer, or the weights of z under noise, are learned
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which an observer tracks, and the agent sees its estimates alone
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return", "observer_seconds")
 
@@ -63,11 +64,14 @@ class TimedAgent(Job):
         own = {"kind": KINDS[self.kind], "shown": self.shown, "seconds": self.seconds}
         return {"env_id": self.env_id, **own, "version": kkl_gym.__version__}
 
-    @property
+    @cached_property
     def task(self) -> Task:
         """The environment, whose observation is [y, state]."""
         how = {"env_id": self.env_id, **KINDS[self.kind], "hold": self.shown != "x_hat"}
-        return Task(f"examples.research.agents.partly:{ENV_ID}", tuple(range(self._ny)), env_kwargs=how)
+        y, angles = tuple(range(self._ny)), ANGLES.get(self.env_id, ())
+        task = Task(f"examples.research.agents.partly:{ENV_ID}", y, env_kwargs=how, angles=angles)
+        weighs = self.shown == "z" and self._noise and angles  # without angles the weights are no better
+        return weighted(task, OBSERVER_STEPS, seed=self.seed) if weighs else task
 
     @property
     def _ny(self) -> int:
@@ -101,12 +105,11 @@ class TimedAgent(Job):
         first = self._ny if self.kind in FAULTY else 0
         return FeatureObservation(env, lambda at: at["obs"][:, first:], flatdim(env.single_observation_space) - first)
 
-    def learn_observer(self) -> tuple[Path, float]:
-        """Learn an observer from random steps in a simulator; returns its file and CPU seconds."""
+    def learn_observer(self) -> Path:
+        """Learn an observer from random steps in a simulator; returns its file."""
         from training.agents.observing import learn_observer
         from training.rollouts.playing import WANDERING, policy_of, roll_out
 
-        began = time.process_time()
         with single(self.task) as env:
             env.get_wrapper_attr("exact")()
             known = () if self.kind in FAULTY else MEASURED[self.env_id]
@@ -116,15 +119,16 @@ class TimedAgent(Job):
             rollouts = roll_out(env, policy, measured=outputs, hidden=hidden, steps=OBSERVER_STEPS, seed=self.seed)
         task, tracking = replace(self.task, measurement_noise=self._noise), self.kind in FAULTY
         quiet = ProgressBars(None)
-        path = learn_observer(task, rollouts.records(), self.folder, seed=self.seed, progress=quiet, tracking=tracking)
-        return path, time.process_time() - began
+        return learn_observer(task, rollouts.records(), self.folder, seed=self.seed, progress=quiet, tracking=tracking)
 
     def work(self) -> None:
         """Train for the CPU time; an evaluation's own does not count."""
         from examples.research.agents.recurrent import LinearRecurrence
         from training.agents.learning import Learner, hyperparameters
 
-        observer, spent = self.learn_observer() if self.shown == "x_hat" else (None, 0.0)
+        began = time.process_time()
+        task, observer = self.task, self.learn_observer() if self.shown == "x_hat" else None
+        spent = time.process_time() - began
         algorithm = ALGORITHMS.get(self.env_id, "sac")
         settings = hyperparameters(algorithm, Task(self.env_id, tuple(MEASURED[self.env_id])))
         if algorithm == "sac":
@@ -138,7 +142,7 @@ class TimedAgent(Job):
             settings["policy_kwargs"] |= extractor
         rows, curve = settings.get("n_envs", 1), list[tuple[Any, ...]]()
         with (
-            closing(Learner(algorithm, settings, self.seed, self.task, self.make(rows, observer), ())) as learner,
+            closing(Learner(algorithm, settings, self.seed, task, self.make(rows, observer), ())) as learner,
             closing(self.make(EPISODES, observer)) as few,
             closing(self.make(LAST_EPISODES, observer)) as many,
         ):

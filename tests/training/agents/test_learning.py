@@ -22,18 +22,10 @@ from training.progress import ProgressBars
 PENDULUM, CART = HIDDEN_VELOCITIES["Pendulum-v1"], HIDDEN_VELOCITIES["CartPole-v1"]
 NOISY_CART = replace(CART, measurement_noise=0.1)
 SHORT = control_task("van_der_pol", 0.2, duration=0.5)
-QUIET = ProgressBars(None)
 
 
 def steps_of(records):
     return sum(len(record.t) - 1 for record in records)
-
-
-def play_at_random(env, steps, seed=0):
-    env.action_space.seed(seed)
-    env.reset(seed=seed)
-    for _ in range(steps):
-        env.step(env.action_space.sample())
 
 
 def test_all_settings_are_ones_of_their_algorithm(script):
@@ -112,11 +104,19 @@ def test_seeds_make_agents_and_never_the_episodes_of_the_evaluation(tmp_path, sm
 
 def test_an_agent_on_estimates_sees_hidden_signals_until_there_are_estimates(tmp_path, small):
     agent = learn(CART, "x_hat", tmp_path, timesteps=300, observer_steps=200)
-    assert agent.observer == str(tmp_path / "observer.safetensors")
-    assert agent.make().reset(seed=0)[0].shape == (1, 4)  # two positions, two estimates
     assert 300 <= agent.training["timesteps"] < 400
     curve = pd.read_csv(tmp_path / "curve.csv")
     assert curve.steps.min() < 200 < curve.steps.max()
+
+
+def test_z_under_noise_shows_what_predicts(tmp_path, small):
+    task = replace(PENDULUM, measurement_noise=0.1, angles=((0, 1),))
+    agent = learn(task, "z", tmp_path, algorithm="ppo", timesteps=3_000, observer_steps=300, seed=1)
+    again = Agent.read(tmp_path / "agent.safetensors")
+    assert again.task == agent.task == replace(task, weights=agent.task.weights)
+    (here, _), (there, _) = (one.make(2).reset(seed=3) for one in (agent, again))
+    np.testing.assert_array_equal(here, there)
+    assert here.shape[1] < learn(task, "z", tmp_path, algorithm="ppo").inputs == 8
 
 
 @pytest.mark.parametrize(
@@ -147,10 +147,12 @@ def test_from_how_many_steps_an_observer_is_learned(
 def test_hidden_signals_stand_where_estimates_will(tmp_path, small, task):
     privileged = Privileged(task, 1)
     env = privileged.make()
-    play_at_random(env, 250)
+    env.reset(seed=0)
+    for _ in range(250):
+        env.step(env.action_space.sample())
     records = privileged.records()
     assert steps_of(records) == 250
-    path = learn_observer(task, records, tmp_path, seed=0, progress=QUIET)
+    path = learn_observer(task, records, tmp_path, seed=0, progress=ProgressBars(None))
     truth, _ = env.reset(seed=3)
     _, info = make(task, "x_hat", 1, observer=str(path)).reset(seed=3)
     np.testing.assert_allclose(truth, np.concatenate([info["y"], info["x"]], axis=1), rtol=1e-6)
@@ -165,7 +167,7 @@ def test_short_episodes_are_no_error(tmp_path, small, task):
     options = {"algorithm": "dqn", "timesteps": 600, "observer_steps": 300, "aggregate": 1, "seed": 11}
     agent = learn(task, "x_hat", tmp_path, **options)
     assert agent.observer == str(tmp_path / "observer.safetensors")
-    assert agent.make().reset(seed=0)[0].shape == (1, 4)
+    assert agent.make().reset(seed=0)[0].shape == (1, 4)  # two positions, two estimates
 
 
 def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, monkeypatch):
@@ -193,7 +195,6 @@ def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, mon
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"information": "y", "observer": "a.safetensors"}, "no use for the observer"),
         ({"information": "z", "aggregate": 2}, "no observer to fit again"),
         ({"information": "recurrent", "algorithm": "ppo"}, "recurrent agents learn by ppo_lstm"),
         ({"information": "x_hat_std"}, "error bars first"),
