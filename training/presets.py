@@ -90,7 +90,7 @@ PROFILES: dict[str, Profile] = {
         # Of a T_inv that stands alone. Slow complex modes at frequencies of y average its noise.
         large_settings={
             "pairs": ((-0.1, 0.718), (-0.1, 2.128), (-0.1, 0.6836), (-0.3, 0.718)),
-            "inverse_steps": 24000,
+            "inverse_steps": 32_000,
             "learning_rate": 2.5e-3,
         },
         fault_deadline=8.9,  # a period
