@@ -160,7 +160,7 @@ class Train:
         from training.sources.recorded import RecordedSource
 
         records = self.data.read(progress)
-        source = RecordedSource(records, recorded_preset(records, changes), name, warn=progress.say)
+        source = RecordedSource(records, recorded_preset(records, changes), name)
         for line in source.described():
             progress.say(line)
         return source

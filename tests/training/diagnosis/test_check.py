@@ -52,7 +52,6 @@ def test_a_system_that_ships():
     assert "problem" not in {one.verdict for one in found}
     assert {one.check for one in found} == set(CHECKS)
     assert all(bool(one.advice) == (one.verdict != "ok") for one in found)
-    assert found[0].found == "van_der_pol: 2 states (x1, x2); 1 input up to 5; parameters mu = 3"
 
 
 def test_the_page_explains_every_line_of_its_example():
@@ -95,7 +94,7 @@ def test_discrete_time_and_starts_of_its_own():
     system = made(Sampled, draw_starts=on_a_circle)
     found = {one.check: one for one in findings(system)}
     assert "problem" not in {one.verdict for one in found.values()}
-    assert found["equations"].found.startswith("step and h work on floats, arrays, tensors, symbols")
+    assert found["equations"].found.startswith("step and h work on floats, arrays, symbols")
     assert found["observability"].found.startswith("x2: at best an error of ")
     with pytest.raises(ValueError, match="no others"):
         findings(system, dt=0.2)
@@ -119,9 +118,8 @@ def test_an_if_on_the_state_is_a_problem_and_ends_the_command_with_status_1(caps
         main(["diagnose", f"{__file__}:Branching", "--parameters", "gain=2", "--json", str(tmp_path / "found.json")])
     assert end.value.code == 1
     shown = capsys.readouterr().out
-    assert "gain = 2" in shown
     assert "→ as it is, batches, training and evaluation do not run" in shown
-    assert shown.splitlines()[-1] == "1 problem, 3 notes"
+    assert shown.splitlines()[-1] == "1 problem, 2 notes"
     found = json.loads((tmp_path / "found.json").read_text())
     (wrong,) = (one["found"] for one in found if one["verdict"] == "problem")
     assert wrong in shown  # square brackets are no markup
@@ -175,20 +173,13 @@ BLIND = NO_INPUT | {
         ("inputs", "problem", {"u_max": (1.0, 1.0), "G": ((0.0, 0.0), (1.0, 0.0))}, {}, "input 2 moves no state",
          "give column 2 of G"),
         ("inputs", "ok", {"g": lambda self, x: ((0.0,), (2.0 + 0.0 * x[0],))}, {}, "moves x2 by 1 per second", ""),
-        ("sampling", "problem", {"rate": lambda self, x: 0.01 + 0.0 * x[0]}, {"duration": 20.0},
-         "rate(x) is 0.01/s at the median over X", "leave rate(x) out, or raise it"),
         ("bounds", "problem", UPRIGHT, LONG, "50 of 50 free and 50 of 50 driven leave them",
-         "train with --policy controller, under which 100 of 100 stay"),
-        ("bounds", "problem", UPRIGHT | {"u_max": (0.01,)}, LONG, "leave them", "--policy script.py:function"),
+         "they run away, also in bounds 10 times as wide: shrink X, or train under a policy"),
         ("sampling", "note", {}, {"dt": 0.7, "duration": 60.0}, "dt = 0.7 s", "samples are few: take dt = 0.1 s"),
         ("sampling", "problem", {}, {"dt": 1.5, "duration": 60.0}, "dt = 1.5 s",
          "the motion between samples is lost: take dt = 0.1 s"),  # 2 pi / 0.1: some sixty samples a period
-        ("sampling", "note", {}, {"duration": 0.5}, "motions of 0.5 s",
-         "motions end before the slow part has moved: take a duration of 5 s"),
         ("output", "problem", {"h": lambda self, x: (x[0], 0.0 * x[0] + 2.5)}, {}, "y2 is 2.5 everywhere in X",
          "let h measure something that moves, or leave this output out"),
-        ("output", "note", {"measurement_noise": 1.0}, {}, "noise 1 by default",
-         "set measurement_noise: 0.1 is 5 % of the range"),
         ("observability", "problem", BLIND, {}, "y does not determine bias", "let h measure bias too, or"),
         ("observability", "problem", BLIND | {"f": lambda self, x: (x[1] + x[2], 0.0 * x[0], 0.0 * x[0])}, {},
          "y does not determine a combination of x2 and bias", "let h measure x2 or bias too"),
