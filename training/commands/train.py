@@ -161,8 +161,7 @@ class Train:
 
         records = self.data.read(progress)
         source = RecordedSource(records, recorded_preset(records, changes), name)
-        for line in source.described():
-            progress.say(line)
+        progress.say(source.described())
         return source
 
     def _motions(self, system: System, changes: Mapping[str, Any], progress: ProgressBars) -> "SimulatedSource":

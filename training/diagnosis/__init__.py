@@ -17,11 +17,9 @@ from training.trajectories.motions import Controller
 CHECKS: dict[str, Callable[[Subject], Iterator[Finding]]] = {
     "equations": system.equations,  # the others need equations that work
     "compiled": system.machine_code,
-    "inputs": system.inputs,
     "bounds": system.bounds,
     "sampling": system.sampling,
     "output": system.outputs,
-    "spectrum": outputs.spectrum,
     "observability": outputs.observability,
 }
 

@@ -2,25 +2,24 @@
 
 import contextlib
 import importlib.util
-from collections.abc import Callable, Iterator
-from functools import cached_property, partial
+from collections.abc import Iterator
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from kkl_gym import EquationError
 from kkl_gym.compiled import SamplingStep, batch_step, single_step
-from kkl_gym.equations import components, input_matrix, rate_at
+from kkl_gym.equations import components, input_matrix
 from kkl_gym.simulate import SubstepsError, simulate
 from kkl_gym.system import System
 from training.diagnosis.finding import Finding, Verdict, number, percent, point
 from training.evaluation.levels import Level
 from training.trajectories.motions import DRIVEN, Controller, random_inputs, under_policy
 
-COMPARED = 100  # points of X, and as many of the bounds, at which the kinds of numbers are compared
-POINTS = 1000  # of X, for outputs and inputs
+COMPARED = 100  # points of X, and as many of 2X, at which the equations are evaluated
+POINTS = 1000  # of X, for outputs
 MOTIONS = 100  # half of them driven, where there are inputs
-LEAST_EFFECT = 1e-11  # of an input at its bound within a sampling interval, in half-widths of X
 MANY, FEW = 0.5, 0.1  # shares of motions that leave the bounds; that run away where wider bounds help
 WIDER = 10.0  # times as wide are the bounds in which motions are followed that leave the declared ones
 ROOM = 1.1  # of bounds around those motions
@@ -43,20 +42,11 @@ def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
     return x
 
 
-def of_bounds(system: System, n: int) -> np.ndarray:
-    """Points within the bounds, (n, nx); of 2X where not every point of a box is a state."""
-    if type(system).draw_starts is not System.draw_starts:
-        return of_X(system, n, 2.0)
-    low, high = np.array(system.bounds, dtype=float).T
-    return np.random.default_rng(2).uniform(low, high, (n, system.nx))
-
-
 class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
-    ``x`` (POINTS, nx) are points of X and ``half`` (nx,) its half-widths. ``motions`` are states (steps + 1, MOTIONS,
-    nx), NaN from where they leave the bounds, and inputs, in equal shares of each of the ``kinds``. Those that
-    ``stay`` (MOTIONS,) have the outputs ``y``.
+    ``motions`` are states (steps + 1, MOTIONS, nx), NaN from where they leave the bounds, and inputs, in equal shares
+    of each of the ``kinds``. Those that ``stay`` (MOTIONS,) have the outputs ``y``.
     """
 
     def __init__(
@@ -69,18 +59,11 @@ class Subject:
     ) -> None:
         self.system, self.dt, self.duration, self.policy, self.noise = system, dt, duration, policy, noise
         self.kinds = ("under the policy",) if policy else ("free", "driven") if system.nu else ("free",)
-        low, high = system.box()
-        self.half = (high - low) / 2
 
     @cached_property
     def step(self) -> SamplingStep[np.ndarray]:
         """One sampling interval of a batch, compiled where it can be."""
         return batch_step(self.system)
-
-    @cached_property
-    def x(self) -> np.ndarray:
-        """Draw points of X."""
-        return of_X(self.system, POINTS)
 
     @cached_property
     def motions(self) -> tuple[np.ndarray, np.ndarray]:
@@ -113,37 +96,33 @@ class Subject:
 
 
 def equations(subject: Subject) -> Iterator[Finding]:
-    """The equations on floats, arrays and symbols: whether they work, agree, and give finite numbers."""
-    system = subject.system
-    x = np.concatenate([of_X(system, COMPARED), of_bounds(system, COMPARED)])
-    values: dict[str, np.ndarray] = {}
-    for kind, evaluated in KINDS.items():
+    """Whether the equations work on floats, arrays and symbols, and give finite numbers."""
+    import sympy
+
+    system, works = subject.system, list[str]()
+    x = np.concatenate([of_X(system, COMPARED), of_X(system, COMPARED, 2.0)])
+    symbols = list(sympy.symbols(f"x:{system.nx}", real=True))
+    for kind, states in {"floats": x.tolist(), "arrays": [x.T], "symbols": [symbols]}.items():
         try:
             with np.errstate(all="ignore"):
-                here = evaluated(partial(_everything, system), x)
+                values = [_everything(system, state) for state in states]
         except (EquationError, NotImplementedError) as error:
-            verdict: Verdict = "problem" if kind in ("floats", "arrays") else "note"
-            yield Finding("equations", verdict, f"on {kind}: {error}", f"as it is, {COST[kind]}")
-            continue
-        first = next(iter(values), kind)
-        apart = _apart(values.get(first, here), here, rate=not system.discrete)
-        if apart.any():
-            text = f"on {kind} they differ from those on {first}, such as at x = {point(x[int(apart.argmax())])}"
-            advice = "let them depend on state, input and parameters alone; replace `if` by kkl_gym.elementary.where"
-            yield Finding("equations", "problem", text, advice)
-        else:
-            values[kind] = here
-    if not values:
-        return
-    bad = ~np.isfinite(next(iter(values.values()))).all(1)
-    if bad.any():
-        shares = f"{percent(bad[:COMPARED].mean())} of X and {percent(bad[COMPARED:].mean())} of the bounds"
-        text = f"f or h is not a finite number in {shares}, such as at x = {point(x[bad][0])}"
-        advice = "draw the bounds, and X, where the equations hold, or change the equations"
-        yield Finding("equations", "problem", text, advice)
-    parts = "step and h" if system.discrete else "f, g, h and rate"
-    agree = f" and agree at {len(x)} points" if len(values) > 1 else ""
-    yield Finding("equations", "ok", f"{parts} work on {', '.join(values)}{agree}")
+            if kind != "floats" or not isinstance(error.__cause__, ArithmeticError):  # 1 / 0 is infinite in arrays
+                verdict: Verdict = "note" if kind == "symbols" else "problem"
+                yield Finding("equations", verdict, f"on {kind}: {error}", f"as it is, {COST[kind]}")
+                continue
+        works.append(kind)
+        if kind == "arrays":
+            rows = [np.broadcast_to(np.asarray(value, dtype=float), len(x)) for value in values[0]]
+            bad = ~np.isfinite(rows).all(0)
+            if bad.any():
+                shares = f"{percent(bad[:COMPARED].mean())} of X and {percent(bad[COMPARED:].mean())} of 2X"
+                text = f"f or h is not a finite number in {shares}, such as at x = {point(x[bad][0])}"
+                advice = "draw the bounds, and X, where the equations hold, or change the equations"
+                yield Finding("equations", "problem", text, advice)
+    if works:
+        parts = "step and h" if system.discrete else "f, g and h"
+        yield Finding("equations", "ok", f"{parts} work on {', '.join(works)}")
 
 
 def _everything(system: System, x: Any) -> list[Any]:
@@ -151,47 +130,7 @@ def _everything(system: System, x: Any) -> list[Any]:
     if system.discrete:
         return [*components(system.step, x, [0.5 * u_max for u_max in system.u_max]), *components(system.h, x)]
     g = [gij for row in input_matrix(system, x) for gij in row]
-    return [*components(system.f, x), *g, *components(system.h, x), rate_at(system, x)]
-
-
-def _on_floats(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
-    rows: list[list[float]] = []
-    for state in x.tolist():
-        try:
-            rows.append([float(value) for value in values(state)])
-        except EquationError as error:
-            if not isinstance(error.__cause__, ArithmeticError):  # 1 / 0, which is infinite in arrays
-                raise
-            rows.append([])
-    width = max(map(len, rows))
-    return np.array([row or [np.nan] * width for row in rows])
-
-
-def _on_arrays(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
-    return np.stack([np.broadcast_to(np.asarray(value, dtype=float), len(x)) for value in values(x.T)], axis=-1)
-
-
-def _on_symbols(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
-    import sympy
-
-    symbols = list(sympy.symbols(f"x:{x.shape[1]}", real=True))
-    evaluated = sympy.lambdify(symbols, [sympy.sympify(value) for value in values(symbols)], "numpy", cse=True)
-    return _on_arrays(lambda at: evaluated(*at), x)
-
-
-KINDS = {"floats": _on_floats, "arrays": _on_arrays, "symbols": _on_symbols}
-
-
-def _apart(expected: np.ndarray, values: np.ndarray, *, rate: bool) -> np.ndarray:
-    """At which points (n,) two kinds of numbers disagree, where both are finite; a rate, the last, to three digits."""
-    if expected.shape != values.shape:
-        return np.ones(len(expected), dtype=bool)
-    both = np.isfinite(expected) & np.isfinite(values)
-    size = np.where(both, np.abs(expected), 0.0)
-    part = np.full(expected.shape[1], 1e-6)
-    part[-1:] = 1e-3 if rate else 1e-6
-    with np.errstate(invalid="ignore"):
-        return np.asarray((both & (np.abs(expected - values) > part * size + 1e-9 * size.max(0))).any(1))
+    return [*components(system.f, x), *g, *components(system.h, x)]
 
 
 def machine_code(subject: Subject) -> Iterator[Finding]:
@@ -208,23 +147,6 @@ def machine_code(subject: Subject) -> Iterator[Finding]:
         slow = single_step(subject.system).obstacle
         singly = "and so do single ones" if slow is None else f"single ones take their steps in Python ({slow})"
         yield Finding("compiled", "ok", f"large batches of environments run as machine code, {singly}")
-
-
-def inputs(subject: Subject) -> Iterator[Finding]:
-    """How far each input moves the states within a sampling interval."""
-    system, x = subject.system, subject.x.T
-    for j, u_max in enumerate(system.u_max):
-        u = np.zeros((2, system.nu, POINTS))
-        u[0, j] = u_max
-        ends = [subject.step(x, held, np.zeros_like(x), subject.dt) for held in u]
-        speed = np.sqrt(np.nanmean((ends[0] - ends[1]) ** 2, axis=1)) / subject.dt
-        most = int((speed / subject.half).argmax())
-        if speed[most] * subject.dt <= LEAST_EFFECT * subject.half[most]:
-            advice = f"give column {j + 1} of G, or of g(x), its numbers"
-            yield Finding("inputs", "problem", f"input {j + 1} moves no state", advice)
-        else:
-            moved = f"{system.state_names[most]} by {number(speed[most])} per second"
-            yield Finding("inputs", "ok", f"input {j + 1} at its bound {u_max:g} moves {moved}")
 
 
 def bounds(subject: Subject) -> Iterator[Finding]:
@@ -260,7 +182,7 @@ def sampling(subject: Subject) -> Iterator[Finding]:
 
 def outputs(subject: Subject) -> Iterator[Finding]:
     """How far each output ranges, and how noisy it is."""
-    system, y, moving = subject.system, subject.system.output(subject.x), subject.y
+    system, y, moving = subject.system, subject.system.output(of_X(subject.system, POINTS)), subject.y
     levels = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
     for i, level in enumerate(levels):
         name, size, along = f"y{i + 1}", float(np.ptp(y[:, i])), ""

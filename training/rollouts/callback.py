@@ -139,15 +139,8 @@ class KKLTrainingCallback(BaseCallback):
                 "one by training.learn, or by kkl-gym record and kkl-gym train"
             )
         config = settings_of(artifact.training, **QUICK | self._settings | {"tracking": artifact.motion is not None})
-        if artifact.inverse.error_covariance is not None and not config.held_out:
-            raise ValueError("covariances are calibrated on held-out episodes: held_out must be positive, got 0")
         for observer in used:
             check_replacement(artifact, observer.artifact)
-            level, largest = observer.measurement_noise, config.measurement_noise_max
-            if np.any(np.asarray(level) > np.asarray(largest)):
-                raise ValueError(
-                    f"measurement_noise_max = {largest} is less than the noise {level} that the observer in use assumes"
-                )
         if hasattr(self, "_gathering"):
             check_replacement(self.artifact, artifact)
         else:

@@ -210,19 +210,16 @@ class RecordedSource:
             "window": max(WINDOW * self.dt, 0.5 * self.pace),
         }
 
-    def described(self) -> list[str]:
-        """The signals, the records and the filter, for people."""
+    def described(self) -> str:
+        """The signals and the records, for people."""
         signals, records = self.signals, self.records
         given = " and ".join(", ".join(names) for names in (signals.measured, signals.inputs) if names)
-        seconds, step, uneven = sum(each.duration for each in records), median_step(*records), max(map(jitter, records))
-        lacking = sum(int(np.isnan(record.y).any(-1).sum()) for record in records)
-        rates = Spectrum(self.config.eigenvalues, self.config.pairs).poles.real
-        return [
-            f"training an observer for {self.name} from recorded states: {', '.join(signals.hidden)} from {given}",
-            f"{len(records)} records of {seconds:.4g} s together, {lacking} rows without an output",
-            f"steps of {step:.4g} s (median), uneven by up to {uneven:.1%}; resampled to {self.dt:g} s",
-            f"{len(rates)} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
-        ]
+        seconds, step = sum(record.duration for record in records), median_step(*records)
+        text = f"training an observer for {self.name} from recorded states: {', '.join(signals.hidden)} from {given}; "
+        text += (
+            f"{len(records)} records of {seconds:.4g} s together, in steps of {step:.4g} s (median, uneven by up to "
+        )
+        return text + f"{max(map(jitter, records)):.1%}), resampled to {self.dt:g} s"
 
 
 def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> Config:
