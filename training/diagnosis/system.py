@@ -1,6 +1,5 @@
 """A system before any training: its equations, inputs, motions, sampling and outputs."""
 
-import contextlib
 import importlib.util
 from collections.abc import Iterator
 from functools import cached_property
@@ -11,18 +10,16 @@ import numpy as np
 from kkl_gym import EquationError
 from kkl_gym.compiled import SamplingStep, batch_step, single_step
 from kkl_gym.equations import components, input_matrix
-from kkl_gym.simulate import SubstepsError, simulate
+from kkl_gym.simulate import simulate
 from kkl_gym.system import System
-from training.diagnosis.finding import Finding, Verdict, number, percent, point
+from training.diagnosis.finding import Finding, Verdict, percent, point
 from training.evaluation.levels import Level
 from training.trajectories.motions import DRIVEN, Controller, random_inputs, under_policy
 
 COMPARED = 100  # points of X, and as many of 2X, at which the equations are evaluated
 POINTS = 1000  # of X, for outputs
 MOTIONS = 100  # half of them driven, where there are inputs
-MANY, FEW = 0.5, 0.1  # shares of motions that leave the bounds; that run away where wider bounds help
-WIDER = 10.0  # times as wide are the bounds in which motions are followed that leave the declared ones
-ROOM = 1.1  # of bounds around those motions
+MANY = 0.5  # share of motions that leave the bounds, beyond which it is a problem
 COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1  # changes of y from sample to sample, in its standard deviations
 STILL = 1e-9  # range of an output in its size
 
@@ -150,7 +147,7 @@ def machine_code(subject: Subject) -> Iterator[Finding]:
 
 
 def bounds(subject: Subject) -> Iterator[Finding]:
-    """Whether motions from X stay within the bounds, and which bounds would hold them."""
+    """Whether motions from X stay within the bounds."""
     (x, _), lost = subject.motions, ~subject.stay
     followed = f"{len(lost)} motions of {subject.duration:g} s from X"
     if not lost.any():
@@ -159,9 +156,10 @@ def bounds(subject: Subject) -> Iterator[Finding]:
     counts = np.split(lost, len(subject.kinds))
     parts = [f"{one.sum()} of {len(one)} {kind}" for one, kind in zip(counts, subject.kinds)]
     when = subject.dt * np.median(np.isfinite(x[:, lost]).all(-1).sum(0))
-    text = f"of {followed}, {' and '.join(parts)} leave them, after {number(when)} s at the median"
+    text = f"of {followed}, {' and '.join(parts)} leave them, after {when:.3g} s at the median"
     verdict: Verdict = "problem" if max(one.mean() for one in counts) > MANY else "note"
-    yield Finding("bounds", verdict, text, _way_out(subject))
+    advice = "widen the bounds, shrink X, or take a policy that holds the system from all of X (--policy)"
+    yield Finding("bounds", verdict, text, advice)
 
 
 def sampling(subject: Subject) -> Iterator[Finding]:
@@ -191,29 +189,6 @@ def outputs(subject: Subject) -> Iterator[Finding]:
             yield Finding("output", "problem", f"{name} is {y[0, i]:.4g} everywhere in X", advice)
             continue
         if moving.size:
-            along = f", {number(np.ptp(moving[..., i]))} along motions"
-        noise = f"noise {number(level)} by default, {percent(level / size)} of that in X"
-        yield Finding("output", "ok", f"{name} ranges over {number(size)} in X{along}; {noise}")
-
-
-def _way_out(subject: Subject) -> str:
-    """Advice for motions that leave: the bounds that hold them, or else another X or a policy."""
-    system, (x, u), lost = subject.system, subject.motions, ~subject.stay
-    if subject.policy:
-        return "let the policy hold the system from all of X, widen the bounds, shrink X, or take a smaller dt"
-    low, high = np.array(system.bounds, dtype=float).T
-    aside = (WIDER - 1) / 2 * (high - low)
-    ends = tuple(zip((low - aside).tolist(), (high + aside).tolist()))
-    wider = type("Wider", (type(system),), {"name": f"{system.name}-wider", "bounds": ends})(**system.parameters)
-    with contextlib.suppress(SubstepsError):  # too fast out there
-        x = simulate(wider, x[0, lost], len(u), subject.dt, u=u[:, lost], step=subject.step)
-        if (held := np.isfinite(x[-1]).all(-1)).mean() >= 1 - FEW:
-            reached = ROOM * np.array([x[:, held].min((0, 1)), x[:, held].max((0, 1))]).T
-            widened = [
-                f"of {name} to ({min(bound[0], float(f'{least:.2g}')):g}, {max(bound[1], float(f'{most:.2g}')):g})"
-                for name, bound, (least, most) in zip(system.state_names, system.bounds, reached, strict=True)
-                if least < ROOM * bound[0] or most > ROOM * bound[1]
-            ]
-            return "widen the bounds " + " and ".join(widened)
-    way = f"they run away, also in bounds {WIDER:g} times as wide: shrink X"
-    return way + (", or train under a policy that holds the system (--policy)" if system.nu else "")
+            along = f", {np.ptp(moving[..., i]):.3g} along motions"
+        noise = f"noise {level:.3g} by default, {percent(level / size)} of that in X"
+        yield Finding("output", "ok", f"{name} ranges over {size:.3g} in X{along}; {noise}")

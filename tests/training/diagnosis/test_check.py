@@ -11,7 +11,7 @@ import linear_system
 import numpy as np
 import pytest
 from discrete_systems import Sampled
-from linear_system import Autonomous, Oscillator
+from linear_system import Oscillator
 
 import kkl_gym.compiled
 import training.diagnosis.system
@@ -171,7 +171,7 @@ BLIND = NO_INPUT | {
         ("equations", "problem", {"f": lambda self, x: (x[1], -sqrt(x[0] + 0.5))}, {}, " % of 2X, such as",
          "draw the bounds, and X, where the equations hold, or change the equations"),
         ("bounds", "problem", UPRIGHT, LONG, "50 of 50 free and 50 of 50 driven leave them",
-         "they run away, also in bounds 10 times as wide: shrink X, or train under a policy"),
+         "widen the bounds, shrink X, or take a policy"),
         ("sampling", "note", {}, {"dt": 0.7, "duration": 60.0}, "dt = 0.7 s", "samples are few: take dt = 0.1 s"),
         ("sampling", "problem", {}, {"dt": 1.5, "duration": 60.0}, "dt = 1.5 s",
          "the motion between samples is lost: take dt = 0.1 s"),  # 2 pi / 0.1: some sixty samples a period
@@ -191,23 +191,11 @@ def test_what_is_wrong_is_found_and_how_to_change_it(name, verdict, changes, opt
     assert bool(said.advice) == (verdict != "ok")
 
 
-def test_bounds_that_are_too_narrow():
-    elongated = {"f": lambda self, x: (4.0 * x[1], -0.25 * x[0])}  # x1 swings four times as far as x2
-    found = one(made(Autonomous, bounds=((-1.3, 1.3), (-3, 3)), **elongated), "bounds", dt=0.1, duration=20.0)
-    assert "leave them" in found.found
-    low, high = map(float, found.advice.removeprefix("widen the bounds of x1 to (").removesuffix(")").split(","))
-    assert -4.6 < low < -4.0  # sqrt(17) and some room
-    assert 4.0 < high < 4.6
-    wide = made(Autonomous, bounds=((1.2 * low, 1.2 * high), (-3, 3)), **elongated)
-    assert one(wide, "bounds", "ok", dt=0.1, duration=20.0)
-
-
 def test_a_system_that_only_a_policy_holds():
     upright = made(**UPRIGHT)
     assert findings(upright, "bounds", policy=controller(upright), **LONG)[0].verdict == "ok"
     found = one(upright, "bounds", policy=lambda x: np.zeros((len(x), 1)), **LONG)
     assert "100 of 100 under the policy leave them" in found.found
-    assert found.advice.startswith("let the policy hold the system")
 
 
 def test_starts_of_another_shape_end_the_check():
@@ -235,5 +223,5 @@ class ThroughThird(Lorenz):
 def test_a_symmetry_is_no_poor_observability():
     found = findings(ThroughThird(), "observability", duration=6.0)
     assert [one.verdict for one in found] == ["problem", "ok"]
-    assert found[0].found.startswith("x1, x2: y determines them near each state, but not globally")
+    assert found[0].found.startswith("x1, x2: y determines them near each state, but distant states")
     assert not any("near each state" in one.found for one in findings(Lorenz(), "observability", duration=6.0))
