@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from scipy.spatial import cKDTree
 
-from observers.checks import integer, noise_levels, shown
+from observers.checks import integer, noise_levels
 from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
 from training.evaluation.levels import Level, show_level
 from training.maps.coordinates import SETTLED, coordinates, noise_covariance, root, settling_time
@@ -196,8 +196,7 @@ def of_records(
     if any(record.x is None for record in records):
         raise ValueError("no hidden states were recorded; name their columns (--hidden)")
     config = recorded_preset(records)
-    spectrum = Spectrum(config.eigenvalues, config.pairs)
-    linear = spectrum.filter(len(signals.measured), config.dt, len(signals.inputs))
+    linear = Spectrum(config.eigenvalues, config.pairs).filter(len(signals.measured), config.dt, len(signals.inputs))
     records = [resampled(record, linear.dt) for record in records]
     noise = _levels(records, measurement_noise)
     others, queries = (Windows(part, linear, len(signals.hidden)) for part in split(records, QUERY_SHARE, seed))
@@ -232,8 +231,6 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
     y = np.concatenate([record.y for record in records])
     if given is None:
         given = [tuple(float(f"{share * size:.3g}") for size in np.nanstd(y, 0)) for share in NOISE_SHARES]
-    elif not isinstance(given, Sequence) or isinstance(given, str):
-        raise ValueError(f"measurement_noise must be a list of levels, as in [0.1, 0.3], got {shown(given)}")
     levels = [noise_levels("measurement_noise", level, y.shape[1]) for level in given]
     return tuple(dict.fromkeys([0.0, *levels]))
 
@@ -268,8 +265,8 @@ def compare(
         signal = 1 / (1 + scaled.noise_gain**2) if noisy else 1.0  # share of it in each coordinate
         R = root(own).T
         at, others_at = (signal * scaled(each + rng.standard_normal(each.shape) @ R) for each in (z, others_z))
-        errors.append(np.split(left_by(at, x, others_at, others_x), 2))
-    left, changes = np.moveaxis(errors, 1, 0)
+        errors.append(left_by(at, x, others_at, others_x))
+    left, changes = np.split(np.array(errors), 2, axis=1)
     return left, changes[0]
 
 

@@ -111,7 +111,7 @@ def equations(subject: Subject) -> Iterator[Finding]:
         works.append(kind)
         if kind == "arrays":
             rows = [np.broadcast_to(np.asarray(value, dtype=float), len(x)) for value in values[0]]
-            bad = ~np.isfinite(rows).all(0)
+            bad = ~np.isfinite(np.array(rows)).all(0)
             if bad.any():
                 shares = f"{percent(bad[:COMPARED].mean())} of X and {percent(bad[COMPARED:].mean())} of 2X"
                 text = f"f or h is not a finite number in {shares}, such as at x = {point(x[bad][0])}"

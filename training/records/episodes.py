@@ -97,8 +97,8 @@ def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
     minari, name = _minari(), str(name)
     try:
         folder = _folder(name.removeprefix(PREFIX)) if name.startswith(PREFIX) else Path(name)
-        spaces = "observation_space", "action_space"
-        if not {*spaces} <= json.loads((folder / METADATA).read_text(encoding="utf-8")).keys():
+        written = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+        if "observation_space" not in written or "action_space" not in written:
             raise ValueError("its spaces are missing")  # Minari would make the environment, whatever that runs
         dataset = minari.MinariDataset((folder / METADATA).parent)
         metadata, spec = dataset.storage.metadata, dataset.env_spec
@@ -117,7 +117,8 @@ def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
         warn(f"{name} has no sampling interval: a step counts as 1 s")
     kwargs = {} if spec is None else {key: value for key, value in spec.kwargs.items() if key not in APPEARANCE}
     environment = None if spec is None else {"id": spec.id, "kwargs": kwargs}
-    return Rollouts(name.removeprefix(PREFIX), environment, dt, *map(metadata.get, spaces), episodes, signals, spec)
+    spaces = metadata["observation_space"], metadata["action_space"]
+    return Rollouts(name.removeprefix(PREFIX), environment, dt, *spaces, episodes, signals, spec)
 
 
 def write_dataset(rollouts: Rollouts, *, policy: str) -> Path:

@@ -2,7 +2,6 @@
 
 import csv
 import re
-import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -106,8 +105,7 @@ def _named(wanted: Signals, columns: tuple[str, ...]) -> Signals:
         for signal in (signals.time,) if role == "time" else getattr(signals, role):
             name, _ = _column(signal, columns)
             if name not in columns:
-                there = textwrap.shorten(", ".join(columns), 200, placeholder=" ...") or "none"
-                raise ValueError(f"no column {name}; there are {there} (--{role})")
+                raise ValueError(f"no column {name}; there are {shown(columns)} (--{role})")
             if name == signals.time and role != "time":
                 raise ValueError(f"column {name} is the time, and cannot be a signal too")
     return signals
@@ -137,8 +135,6 @@ def _seconds(values: Any, column: str) -> np.ndarray:
     if not pd.api.types.is_numeric_dtype(values):
         dates = pd.to_datetime(values, format="ISO8601", errors="coerce", utc=True)
         if dates.notna().any():
-            for row in np.flatnonzero(dates.isna()):
-                raise ValueError(f"column {column}, row {row + 1}: {shown(values.iloc[row])} is not a date in ISO 8601")
             return np.asarray((dates - dates.iloc[0]).dt.total_seconds())
     return _numbers(values, column)
 

@@ -216,10 +216,8 @@ class RecordedSource:
         given = " and ".join(", ".join(names) for names in (signals.measured, signals.inputs) if names)
         seconds, step = sum(record.duration for record in records), median_step(*records)
         text = f"training an observer for {self.name} from recorded states: {', '.join(signals.hidden)} from {given}; "
-        text += (
-            f"{len(records)} records of {seconds:.4g} s together, in steps of {step:.4g} s (median, uneven by up to "
-        )
-        return text + f"{max(map(jitter, records)):.1%}), resampled to {self.dt:g} s"
+        steps = f"steps of {step:.4g} s (median), uneven by up to {max(map(jitter, records)):.1%}"
+        return text + f"{len(records)} records of {seconds:.4g} s together, in {steps}; resampled to {self.dt:g} s"
 
 
 def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> Config:
@@ -247,13 +245,8 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
     """
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     chosen: dict[str, Any] = {"dt": sampling_interval(*records), **RECORDED} | given
-    dt, step, environment = chosen["dt"], median_step(*records), records[0].environment
+    dt = chosen["dt"]
     check_dt(records, dt)
-    if environment is not None and not np.isclose(dt, step, rtol=1e-6):
-        raise ValueError(
-            f"dt = {dt:g} s: an observer for {environment['id']} takes a sample at each step, every {step:g} s; leave "
-            "dt out"
-        )
     if records[0].source:
         settled = EPISODE_MEMORIES * SETTLED / float(np.median([len(record.t) for record in records]))
         slowest = min(max(EPISODE_SLOWEST, settled), EPISODE_FASTEST / 4)

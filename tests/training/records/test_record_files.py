@@ -93,7 +93,7 @@ BAD_CSV = {
     "no time": (["0,1,2,a", ",2,2,a"], "column time, row 2: a number is missing"),
     "all missing": (["0,,2,a", "1,nan,2,a"], "column theta, row 1: no row holds a number"),
     "no rows": ([], "column time has no rows"),
-    "a date is missing": (["2024-05-01,1,2,a", ",2,2,a"], "column time, row 2: nan is not a date in ISO 8601"),
+    "a date is missing": (["2024-05-01,1,2,a", ",2,2,a"], "column time, row 2: a number is missing"),
     "one row": (["0,1,2,a"], "t must be two samples at least"),
     "rounding moves": ([f"{k},0.1,2,a" for k in range(99)], "column theta: 0.1 in all rows"),
     "decimal comma": (['0,"1",2,a', '1,"2,5",2,a'], "theta, row 2: '2,5' is not a number; write decimals with a point"),
@@ -110,7 +110,7 @@ def test_bad_csv(tmp_path, case):
 
 def test_bad_header(tmp_path):
     for header, message in (
-        ("time,theta,beta,note", r"no column alpha; there are time, theta, beta, note \(--hidden\)"),
+        ("time,theta,beta,note", r"no column alpha; there are .*'beta', 'note'\) \(--hidden\)"),
         ("when,theta,alpha,note", r"no column t; there are .* \(--time\)"),
         ("time,theta,theta,alpha", "more than one column theta"),
         ("", "first row must hold the names"),
@@ -121,9 +121,9 @@ def test_bad_header(tmp_path):
 
 
 BAD_NPZ = {
-    "objects": ({"y": np.array([None] * 200)}, "bad.npz: no column y; there are t "),
+    "objects": ({"y": np.array([None] * 200)}, r"bad.npz: no column y; there are \('t',\)"),
     "transposed": ({"y": np.stack([Y, Y])}, "columns must be of one length; t has 200, y1 has 2 rows$"),
-    "rows for columns": ({"t": T[None]}, r"no column t; there are t1, t2, [t0-9, ]* \.\.\. \(--time\)$"),
+    "rows for columns": ({"t": T[None]}, r"no column t; there are \('t1', 't2', .* … .* \(--time\)$"),
     "missing input": ({"u": np.where(T < 5, T, np.nan)}, "bad.npz: column u, row 101: a number is missing"),
 }
 

@@ -259,7 +259,6 @@ def test_arguments_that_make_no_sense():
         ({"every": 10.5}, "every must be"),
         ({"records": ["a"]}, r"records must be a list of training\.records\.Record, got"),
         ({"path": "observer.zip"}, "path must end in"),
-        ({"on_refit": 3}, "on_refit must be a function"),
         ({"eigenvalues": (-1.0,), "dt": 0.1}, "eigenvalues, dt cannot change"),
         ({"neurons": 3}, "neurons"),
     ):
