@@ -75,9 +75,8 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
                             f"{record.name}: column {column}, row {row}: {mark:g} is far from all other values, "
                             f"{rest.min():.3g} to {rest.max():.3g}; if it marks missing samples, leave its cells empty"
                         )
-            for texts in (wrapped, marked):
-                if texts:
-                    warn(texts[0] + (f" (and {len(texts) - 1} more like that)" if len(texts) > 1 else ""))
+            for texts in filter(None, (wrapped, marked)):
+                warn(texts[0] + (f" (and {len(texts) - 1} more like that)" if len(texts) > 1 else ""))
 
 
 def check_dt(records: Sequence[Record], dt: float) -> None:
