@@ -38,7 +38,7 @@ from rich.console import Console
 from scipy.signal import savgol_filter
 
 from kkl_gym.simulate import simulate
-from observers import Artifact
+from observers import Artifact, KKLObserver
 from observers.estimator import Running
 from training.figures import ESTIMATE, RIVAL, TARGET, TRUTH, drawing
 from training.files import table, write
@@ -48,7 +48,7 @@ from training.identification.windows import windows
 from training.kalman import ExtendedKalmanFilter
 from training.lessons import train
 from training.records import Record, Signals, read_records, resampled
-from training.sources.recorded import RecordedSource, estimates, recorded_preset
+from training.sources.recorded import RecordedSource, recorded_preset
 
 SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))
 MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # what these signals are multiplied with in the mirror
@@ -220,6 +220,11 @@ def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> di
         for run, record, last in zip(fold, left, recursive, strict=True):
             found[run] = estimates(alone, record), estimates(both, record), last
     return {name: [found[run][i] for run in TRAINING] for i, name in enumerate((ALONE, BOTH, GUIDED))}
+
+
+def estimates(observer: Artifact, record: Record) -> np.ndarray:
+    """An observer's estimates along a record."""
+    return KKLObserver(observer, 0.0).estimate(record.y, record.u)
 
 
 def rest(records: Sequence[Record]) -> float:

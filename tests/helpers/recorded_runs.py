@@ -32,7 +32,8 @@ def swing(seed, n=600, dt=0.05, jitter=0.0):
 
 def as_csv(path, record):
     """Write a record as a table with its names."""
-    names = [record.signals.time, *record.signals.all]
+    signals = record.signals
+    names = [signals.time, *signals.measured, *signals.inputs, *signals.hidden]
     columns = np.column_stack([record.t, record.y, record.u, record.x])
     np.savetxt(path, columns, delimiter=",", header=",".join(names), comments="")
     return str(path)

@@ -183,8 +183,8 @@ class DataOptions:
     """The recorded data of a command; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
 
     data: Annotated[tuple[Path, ...], hint(metavar="FILE [FILE ...]")] = ()
-    """Records: .npz or .mat files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named
-    columns; rollouts in a Minari data set, minari:ID or its folder, whose signals are named as in `kkl-gym record`."""
+    """Records: .npz files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named columns;
+    rollouts in a Minari data set, minari:ID or its folder, whose signals are named as in `kkl-gym record`."""
     time: Annotated[str, hint("t or time", metavar="COLUMN")] = ""
     """Column of the time in seconds."""
     measured: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""

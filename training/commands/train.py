@@ -160,9 +160,8 @@ class Train:
         from training.sources.recorded import RecordedSource
 
         records = self.data.read(progress)
-        source = RecordedSource(records, recorded_preset(records, changes), name, warn=progress.say)
-        for line in source.described():
-            progress.say(line)
+        source = RecordedSource(records, recorded_preset(records, changes), name)
+        progress.say(source.described())
         return source
 
     def _motions(self, system: System, changes: Mapping[str, Any], progress: ProgressBars) -> "SimulatedSource":

@@ -18,7 +18,6 @@ CHECKS: dict[str, Callable[[Subject], Iterator[Finding]]] = {
     "system": system.declaration,
     "equations": system.equations,  # the others need equations that work
     "compiled": system.machine_code,
-    "inputs": system.inputs,
     "bounds": system.bounds,
     "sampling": system.sampling,
     "output": system.outputs,
@@ -36,31 +35,33 @@ def check(
     measurement_noise: Sequence[Level] | None = None,
 ) -> Iterator[Finding]:
     """Find what would fail with a system in environments, training and evaluation."""
-    subject, failed = Subject(of, np.nan, np.nan), False
-    for name, look in CHECKS.items():
-        if name == "compiled":
-            if failed:
-                yield Finding("equations", "note", "all other checks are left out", "mend this first")
-                return
-            given = [of.measurement_noise] if measurement_noise is None else measurement_noise
-            noise = tuple(level for one in given if np.any(level := noise_levels("measurement_noise", one, of.ny)))
-            interval, seconds = check_dt(of.dt if dt is None else dt), of.duration if duration is None else duration
-            try:
-                check_interval(of, interval)
-            except SubstepsError as error:
-                yield _problem("sampling", error)
-                return
-            check_duration(seconds, interval)
-            subject = Subject(of, interval, seconds, policy, noise)
-        try:
-            for finding in look(subject):
-                failed |= finding.verdict == "problem"
-                yield finding
-        except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-            failed = True
-            yield _problem("sampling" if isinstance(error, SubstepsError) else name, error)
-            if isinstance(error, SubstepsError):
-                return
+    first = list(CHECKS)[:2]
+    equations = [finding for name in first for finding in _findings(name, Subject(of, np.nan, np.nan))]
+    yield from equations
+    if any(finding.verdict == "problem" for finding in equations):
+        yield Finding("equations", "note", "all other checks are left out", "mend this first")
+        return
+    given = [of.measurement_noise] if measurement_noise is None else measurement_noise
+    noise = tuple(level for one in given if np.any(level := noise_levels("measurement_noise", one, of.ny)))
+    interval, seconds = check_dt(of.dt if dt is None else dt), of.duration if duration is None else duration
+    subject = Subject(of, interval, seconds, policy, noise)
+    try:
+        check_interval(of, interval)
+        check_duration(seconds, interval)
+        _ = subject.motions
+    except SubstepsError as error:
+        yield _problem("sampling", error)
+        return
+    for name in list(CHECKS)[2:]:
+        yield from _findings(name, subject)
+
+
+def _findings(name: str, subject: Subject) -> Iterator[Finding]:
+    """Findings of one check; a problem where it fails."""
+    try:
+        yield from CHECKS[name](subject)
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        yield _problem(name, error)
 
 
 def _problem(name: str, error: Exception) -> Finding:

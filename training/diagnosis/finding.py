@@ -19,11 +19,6 @@ class Finding:
     advice: str = ""
 
 
-def number(value: float) -> str:
-    """Three digits, without an exponent where that is short."""
-    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
-
-
 def percent(share: float) -> str:
     """Two digits, in percent."""
     return (f"{100 * share:.0f}" if abs(share) >= 1 else f"{100 * share:.2g}") + " %"

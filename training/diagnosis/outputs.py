@@ -5,18 +5,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from training.diagnosis.finding import RESOLUTION, Finding, error, point
-from training.diagnosis.records import AS_GOOD, DETERMINED, MAX_OTHERS, MAX_QUERIES, QUERY_SHARE, compare, samples
+from training.diagnosis.finding import RESOLUTION, Finding, error
+from training.diagnosis.records import AS_GOOD, DETERMINED, of_records
 from training.diagnosis.system import Subject
 from training.evaluation.levels import show_level
 from training.kalman import ExtendedKalmanFilter
-from training.maps.coordinates import settling_time
 from training.presets import eigenvalues
-from training.records import Record, Signals
-from training.records.record import Windows
-from training.sources.recorded import split
+from training.records import Record
 from training.sources.simulated import unknown_start
-from training.spectrum import Spectrum, smooth_spectrum
+from training.spectrum import smooth_spectrum
 
 FOLLOWED, MAX_STEPS = 20, 2000  # motions that are followed, and samples of each
 MIN_STEPS = 10  # samples
@@ -24,7 +21,6 @@ UNSEEN, HARDLY = 0.9, 0.3  # of the standard deviation of a start that remains i
 INVOLVED = 0.3  # least component of a state in that direction
 VAGUE = 0.3  # error of a state without noise, in its standard deviations
 LOCALLY, GLOBALLY = 0.1, 0.3  # largest error by the equations, least one by neighbours, of a state with a symmetry
-FAR, OFTEN = 1.0, 0.1  # standard deviations between states of like outputs, and how often they are so far apart
 
 
 def observability(subject: Subject) -> Iterator[Finding]:
@@ -103,9 +99,7 @@ def spectrum(subject: Subject) -> Iterator[Finding]:
     """The eigenvalues that a training takes, and those from which on T is smooth."""
     system, dt = subject.system, subject.dt
     taken = eigenvalues(system, dt)
-    memory = settling_time(Spectrum(taken).filter(system.ny, dt))
-    text = f"{len(taken)} eigenvalues of A for each output, {taken[0]:.3g} to {taken[-1]:.3g} 1/s, with which the "
-    text += f"filter forgets its start in {memory:.3g} s"
+    text = f"{len(taken)} eigenvalues of A for each output, {taken[0]:.3g} to {taken[-1]:.3g} 1/s"
     if not (system.discrete or subject.policy):
         with contextlib.suppress(ValueError):  # motions leave the bounds too soon
             text += f"; T is smooth for those beyond {smooth_spectrum(system, dt).eigenvalues[0]:.3g} 1/s"
@@ -115,30 +109,17 @@ def spectrum(subject: Subject) -> Iterator[Finding]:
 def _symmetries(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Finding]:
     """States that y determines near each state, but not among several distant states, as by a symmetry.
 
-    Motions without input are compared like records, by the state of a training's filter after its memory.
+    Motions without input are judged as records.
     """
-    system = subject.system
-    if subject.policy:
-        return {}
-    linear = Spectrum(eigenvalues(system, subject.dt)).filter(system.ny, subject.dt)
-    x = subject.followed[0]
+    system, x = subject.system, subject.followed[0]
     t = subject.dt * np.arange(len(x))
-    signals = Signals("t", tuple(f"y{i + 1}" for i in range(system.ny)), (), tuple(system.state_names))
-    records = [Record("motion", t, system.output(one), x=one, signals=signals) for one in np.moveaxis(x, 1, 0)]
-    window = min(int(np.ceil(settling_time(linear) / subject.dt)), len(x) // 2)
-    others, queries = (Windows(part, linear, system.nx) for part in split(records, QUERY_SHARE, 0))
-    compared = compare(queries, others, window, noise=(0.0,), rng=np.random.default_rng(0))
-    if compared is None:
-        return {}
-    candidates = (exact <= LOCALLY) & (compared[0][0] >= GLOBALLY)
-    one, other = samples(queries, window, MAX_QUERIES), samples(others, window, MAX_OTHERS)
-    near, distances = other.nearest(one.z)
-    far = (np.abs(other.x[near] - one.x) / one.x.std(0) > FAR)[:, candidates].any(1)
-    if not candidates.any() or far.mean() < OFTEN:
-        return {}
-    pair = int(np.where(far, distances, np.inf).argmin())
-    names = ", ".join(name for name, here in zip(system.state_names, candidates) if here)
-    text = f"{names}: y determines them near each state, but not globally: {point(one.x[pair])} and "
-    text += f"{point(other.x[near[pair]])} had nearly the same y for {window * subject.dt:.3g} s, as by a symmetry"
-    advice = "let h measure what the symmetry changes, or estimate what it leaves as it is"
-    return {tuple(np.flatnonzero(candidates).tolist()): Finding("observability", "problem", text, advice)}
+    records = [Record("motion", t, system.output(one), x=one) for one in np.moveaxis(x, 1, 0)]
+    with contextlib.suppress(ValueError):  # the motions are too short, or an output never moves
+        confused = (exact <= LOCALLY) & (of_records(records, measurement_noise=[]).errors[0].min(0) >= GLOBALLY)
+        if confused.any() and not subject.policy:
+            names = ", ".join(name for name, here in zip(system.state_names, confused) if here)
+            text = f"{names}: y determines them near each state, but distant states have nearly the same y, as by a "
+            advice = "let h measure what the symmetry changes, or estimate what it leaves as it is"
+            found = Finding("observability", "problem", f"{text}symmetry", advice)
+            return {tuple(np.flatnonzero(confused).tolist()): found}
+    return {}

@@ -9,10 +9,10 @@ import numpy as np
 from rich.console import Console
 from scipy.spatial import cKDTree
 
-from observers.checks import integer, noise_levels, shown
+from observers.checks import integer, noise_levels
 from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
 from training.evaluation.levels import Level, show_level
-from training.maps.coordinates import SETTLED, coordinates, noise_covariance, root, settling_time, spread
+from training.maps.coordinates import SETTLED, coordinates, noise_covariance, root, settling_time
 from training.progress import ProgressBars, progress_bars
 from training.records import Record, check_signals, resampled
 from training.records.record import Windows
@@ -175,8 +175,6 @@ def observability(
     ValueError
         If an argument is invalid, or as :func:`training.diagnosis.of_records`.
     """
-    if not hidden:
-        raise ValueError("name the hidden signals, as in hidden=[2]")
     with progress_bars(console) as progress:
         signals: dict[str, Any] = {"measured": list(map(str, measured)), "hidden": list(map(str, hidden))}
         amount: dict[str, Any] = {"episodes": episodes, "steps": steps, "default_steps": STEPS, "seed": seed}
@@ -198,8 +196,7 @@ def of_records(
     if any(record.x is None for record in records):
         raise ValueError("no hidden states were recorded; name their columns (--hidden)")
     config = recorded_preset(records)
-    spectrum = Spectrum(config.eigenvalues, config.pairs)
-    linear = spectrum.filter(len(signals.measured), config.dt, len(signals.inputs))
+    linear = Spectrum(config.eigenvalues, config.pairs).filter(len(signals.measured), config.dt, len(signals.inputs))
     records = [resampled(record, linear.dt) for record in records]
     noise = _levels(records, measurement_noise)
     others, queries = (Windows(part, linear, len(signals.hidden)) for part in split(records, QUERY_SHARE, seed))
@@ -224,12 +221,8 @@ def of_records(
             "record looks determined; record more"
         )
     if len(errors) < len(windows):
-        warnings.append(
-            f"windows of {windows[len(errors)]} steps and more are left out, as too few samples have so many before "
-            "them; record longer episodes, or more"
-        )
-    inputs = signals.inputs if linear.nu else ()
-    known = (signals.measured, inputs, signals.hidden, linear.dt, windows[: len(errors)], noise)
+        warnings.append(f"too few samples for windows of {windows[len(errors)]} steps or more; record longer episodes")
+    known = (signals.measured, signals.inputs, signals.hidden, linear.dt, windows[: len(errors)], noise)
     return Observability(*known, errors=np.stack(errors, 1), changes=np.stack(changes), warnings=tuple(warnings))
 
 
@@ -238,33 +231,20 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
     y = np.concatenate([record.y for record in records])
     if given is None:
         given = [tuple(float(f"{share * size:.3g}") for size in np.nanstd(y, 0)) for share in NOISE_SHARES]
-    elif not isinstance(given, Sequence) or isinstance(given, str):
-        raise ValueError(f"measurement_noise must be a list of levels, as in [0.1, 0.3], got {shown(given)}")
     levels = [noise_levels("measurement_noise", level, y.shape[1]) for level in given]
     return tuple(dict.fromkeys([0.0, *levels]))
 
 
-@dataclass(frozen=True)
-class Samples:
-    """Filter states (n, size), states (n, nx), and how much these have changed since the filter's start."""
+def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Evenly spread samples with a state now and ``steps`` before, when the filter started.
 
-    z: np.ndarray
-    x: np.ndarray
-    change: np.ndarray
-
-    def nearest(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Indices (n,) of those closest to other filter states (n, size), and the distances in standard deviations."""
-        offset, scale = self.z.mean(0), spread(self.z)
-        distances, near = cKDTree((self.z - offset) / scale).query((z - offset) / scale)
-        return near, distances
-
-
-def samples(windows: Windows, steps: int, most: int) -> Samples:
-    """Evenly spread samples with a state now and ``steps`` before, when the filter started."""
+    Returns filter states (n, size), and states with how much these have changed since (n, 2 nx).
+    """
     rows = windows.rows(steps)
     rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
     rows = evenly(rows, min(most, len(rows)))
-    return Samples(windows.restarted(rows, steps), windows.x[rows], windows.x[rows] - windows.x[rows - steps])
+    x = windows.x[rows]
+    return windows.restarted(rows, steps), np.hstack([x, x - windows.x[rows - steps]])
 
 
 def compare(
@@ -274,24 +254,20 @@ def compare(
 
     The first level is 0. Returns None where there are too few samples.
     """
-    one, other = samples(queries, window, MAX_QUERIES), samples(others, window, MAX_OTHERS)
-    if len(one.z) < MIN_QUERIES or len(other.z) <= MIN_OTHERS * other.z.shape[1]:
+    (z, x), (others_z, others_x) = _samples(queries, window, MAX_QUERIES), _samples(others, window, MAX_OTHERS)
+    if len(z) < MIN_QUERIES or len(others_z) <= MIN_OTHERS * others_z.shape[1]:
         return None
     errors, covariance = [], noise_covariance(others.linear, np.array([window]))[0]
     for level in noise:
         noisy = bool(np.any(level))
         own = np.einsum("j,jab->ab", np.broadcast_to(np.square(level), len(covariance)), covariance)
-        scaled = coordinates(other.z, own if noisy else covariance.sum(0))
+        scaled = coordinates(others_z, own if noisy else covariance.sum(0))
         signal = 1 / (1 + scaled.noise_gain**2) if noisy else 1.0  # share of it in each coordinate
         R = root(own).T
-        z, others_z = (signal * scaled(each.z + rng.standard_normal(each.z.shape) @ R) for each in (one, other))
-        if noisy:
-            errors.append(left_by(z, one.x, others_z, other.x))
-        else:
-            both = (np.hstack([each.x, each.change]) for each in (one, other))
-            left, change = np.split(left_by(z, next(both), others_z, next(both)), 2)
-            errors.append(left)
-    return np.array(errors), change
+        at, others_at = (signal * scaled(each + rng.standard_normal(each.shape) @ R) for each in (z, others_z))
+        errors.append(left_by(at, x, others_at, others_x))
+    left, changes = np.split(np.array(errors), 2, axis=1)
+    return left, changes[0]
 
 
 def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.ndarray) -> np.ndarray:

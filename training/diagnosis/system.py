@@ -1,42 +1,31 @@
 """A system before any training: its equations, inputs, motions, sampling and outputs."""
 
-import contextlib
 import importlib.util
-from collections.abc import Callable, Iterator
-from functools import cached_property, partial
+from collections.abc import Iterator
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from kkl_gym import EquationError
 from kkl_gym.compiled import SamplingStep, batch_step, single_step
-from kkl_gym.equations import components, input_matrix, rate_at
-from kkl_gym.simulate import SubstepsError, simulate
-from kkl_gym.system import NOISE_SHARE, System, rate_under
-from training.diagnosis.finding import Finding, Verdict, number, percent, point
+from kkl_gym.equations import components, input_matrix
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from training.diagnosis.finding import Finding, Verdict, percent, point
 from training.evaluation.levels import Level
-from training.presets import named_policy
 from training.trajectories.motions import DRIVEN, Controller, random_inputs, under_policy
 
-COMPARED = 100  # points of X, and as many of the bounds, at which the kinds of numbers are compared
-POINTS = 1000  # of X, for outputs, inputs and time constants
+COMPARED = 100  # points of X, and as many of 2X, at which the equations are evaluated
+POINTS = 1000  # of X, for outputs
 MOTIONS = 100  # half of them driven, where there are inputs
-NUMERICAL_STEP = 1e-5  # of derivatives, in half-widths of X: its cube is about double precision's rounding
-LEAST_EFFECT = 1e-11  # of an input at its bound within a sampling interval, in half-widths of X
-MANY, FEW = 0.5, 0.1  # shares of motions that leave the bounds; that run away where wider bounds help
-WIDER = 10.0  # times as wide are the bounds in which motions are followed that leave the declared ones
-BEYOND = 12  # of them, at most
-ROOM = 1.1  # of bounds around those motions
-TOO_LOW = 0.5  # rate(x), in the fastest eigenvalue of the Jacobian
-COARSE, JERKY, SMOOTH, IDLE = 1.0, 0.5, 0.1, 1e-4  # changes of y from sample to sample, in its standard deviations
-ZERO = 1e-4  # part of the fastest eigenvalue below which one counts as zero
-LOUD = 0.25  # measurement noise in an output's range
+MANY = 0.5  # share of motions that leave the bounds, beyond which it is a problem
+COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1  # changes of y from sample to sample, in its standard deviations
 STILL = 1e-9  # range of an output in its size
 
 COST = {
     "floats": "single environments and observers do not run",
     "arrays": "batches, training and evaluation do not run",
-    "tensors": "no map of --pipeline spinn can be trained",
     "symbols": "no Kalman filter, no monitor of nonlinear outputs, no --pipeline spinn, and batches are not compiled",
 }
 
@@ -50,20 +39,11 @@ def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
     return x
 
 
-def of_bounds(system: System, n: int) -> np.ndarray:
-    """Points within the bounds, (n, nx); of 2X where not every point of a box is a state."""
-    if type(system).draw_starts is not System.draw_starts:
-        return of_X(system, n, 2.0)
-    low, high = np.array(system.bounds, dtype=float).T
-    return np.random.default_rng(2).uniform(low, high, (n, system.nx))
-
-
 class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
-    ``x`` (POINTS, nx) are points of X and ``half`` (nx,) its half-widths. ``motions`` are states (steps + 1, MOTIONS,
-    nx), NaN from where they leave the bounds, and inputs, in equal shares of each of the ``kinds``. Those that
-    ``stay`` (MOTIONS,) have the outputs ``y``.
+    ``motions`` are states (steps + 1, MOTIONS, nx), NaN from where they leave the bounds, and inputs, in equal shares
+    of each of the ``kinds``. Those that ``stay`` (MOTIONS,) have the outputs ``y``.
     """
 
     def __init__(
@@ -76,18 +56,11 @@ class Subject:
     ) -> None:
         self.system, self.dt, self.duration, self.policy, self.noise = system, dt, duration, policy, noise
         self.kinds = ("under the policy",) if policy else ("free", "driven") if system.nu else ("free",)
-        low, high = system.box()
-        self.half = (high - low) / 2
 
     @cached_property
     def step(self) -> SamplingStep[np.ndarray]:
         """One sampling interval of a batch, compiled where it can be."""
         return batch_step(self.system)
-
-    @cached_property
-    def x(self) -> np.ndarray:
-        """Draw points of X."""
-        return of_X(self.system, POINTS)
 
     @cached_property
     def motions(self) -> tuple[np.ndarray, np.ndarray]:
@@ -126,42 +99,37 @@ def declaration(subject: Subject) -> Iterator[Finding]:
     values = ", ".join(f"{name} = {value:g}" for name, value in system.parameters.items())
     text = f"{system.name}: {system.nx} state{'s' * (system.nx > 1)} ({', '.join(system.state_names)}); "
     text += f"{system.nu} input{'s' * (system.nu > 1)} up to {bounds}; " if system.nu else "no inputs; "
-    text += f"parameters {values}" if values else "no parameters"
-    yield Finding("system", "ok", text + (f"; steps of {system.dt:g} s of its own" if system.discrete else ""))
+    yield Finding("system", "ok", text + (f"parameters {values}" if values else "no parameters"))
 
 
 def equations(subject: Subject) -> Iterator[Finding]:
-    """The equations on floats, arrays, tensors and symbols: whether they work, agree, and give finite numbers."""
-    system = subject.system
-    x = np.concatenate([of_X(system, COMPARED), of_bounds(system, COMPARED)])
-    values: dict[str, np.ndarray] = {}
-    for kind, evaluated in KINDS.items():
+    """Whether the equations work on floats, arrays and symbols, and give finite numbers."""
+    import sympy
+
+    system, works = subject.system, list[str]()
+    x = np.concatenate([of_X(system, COMPARED), of_X(system, COMPARED, 2.0)])
+    symbols = list(sympy.symbols(f"x:{system.nx}", real=True))
+    for kind, states in {"floats": x.tolist(), "arrays": [x.T], "symbols": [symbols]}.items():
         try:
             with np.errstate(all="ignore"):
-                here = evaluated(partial(_everything, system), x)
+                values = [_everything(system, state) for state in states]
         except (EquationError, NotImplementedError) as error:
-            verdict: Verdict = "problem" if kind in ("floats", "arrays") else "note"
-            yield Finding("equations", verdict, f"on {kind}: {error}", f"as it is, {COST[kind]}")
-            continue
-        first = next(iter(values), kind)
-        apart = _apart(values.get(first, here), here, rate=not system.discrete)
-        if apart.any():
-            text = f"on {kind} they differ from those on {first}, such as at x = {point(x[int(apart.argmax())])}"
-            advice = "let them depend on state, input and parameters alone; replace `if` by kkl_gym.elementary.where"
-            yield Finding("equations", "problem", text, advice)
-        else:
-            values[kind] = here
-    if not values:
-        return
-    bad = ~np.isfinite(next(iter(values.values()))).all(1)
-    if bad.any():
-        shares = f"{percent(bad[:COMPARED].mean())} of X and {percent(bad[COMPARED:].mean())} of the bounds"
-        text = f"f or h is not a finite number in {shares}, such as at x = {point(x[bad][0])}"
-        advice = "draw the bounds, and X, where the equations hold, or change the equations"
-        yield Finding("equations", "problem", text, advice)
-    parts = "step and h" if system.discrete else "f, g, h and rate"
-    agree = f" and agree at {len(x)} points" if len(values) > 1 else ""
-    yield Finding("equations", "ok", f"{parts} work on {', '.join(values)}{agree}")
+            if kind != "floats" or not isinstance(error.__cause__, ArithmeticError):  # 1 / 0 is infinite in arrays
+                verdict: Verdict = "note" if kind == "symbols" else "problem"
+                yield Finding("equations", verdict, f"on {kind}: {error}", f"as it is, {COST[kind]}")
+                continue
+        works.append(kind)
+        if kind == "arrays":
+            rows = [np.broadcast_to(np.asarray(value, dtype=float), len(x)) for value in values[0]]
+            bad = ~np.isfinite(np.array(rows)).all(0)
+            if bad.any():
+                shares = f"{percent(bad[:COMPARED].mean())} of X and {percent(bad[COMPARED:].mean())} of 2X"
+                text = f"f or h is not a finite number in {shares}, such as at x = {point(x[bad][0])}"
+                advice = "draw the bounds, and X, where the equations hold, or change the equations"
+                yield Finding("equations", "problem", text, advice)
+    if works:
+        parts = "step and h" if system.discrete else "f, g and h"
+        yield Finding("equations", "ok", f"{parts} work on {', '.join(works)}")
 
 
 def _everything(system: System, x: Any) -> list[Any]:
@@ -169,53 +137,7 @@ def _everything(system: System, x: Any) -> list[Any]:
     if system.discrete:
         return [*components(system.step, x, [0.5 * u_max for u_max in system.u_max]), *components(system.h, x)]
     g = [gij for row in input_matrix(system, x) for gij in row]
-    return [*components(system.f, x), *g, *components(system.h, x), rate_at(system, x)]
-
-
-def _on_floats(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
-    rows: list[list[float]] = []
-    for state in x.tolist():
-        try:
-            rows.append([float(value) for value in values(state)])
-        except EquationError as error:
-            if not isinstance(error.__cause__, ArithmeticError):  # 1 / 0, which is infinite in arrays
-                raise
-            rows.append([])
-    width = max(map(len, rows))
-    return np.array([row or [np.nan] * width for row in rows])
-
-
-def _on_arrays(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
-    return np.stack([np.broadcast_to(np.asarray(value, dtype=float), len(x)) for value in values(x.T)], axis=-1)
-
-
-def _on_tensors(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
-    import torch
-
-    return _on_arrays(lambda at: [torch.as_tensor(value) for value in values(torch.tensor(at).unbind(0))], x)
-
-
-def _on_symbols(values: Callable[[Any], list[Any]], x: np.ndarray) -> np.ndarray:
-    import sympy
-
-    symbols = list(sympy.symbols(f"x:{x.shape[1]}", real=True))
-    evaluated = sympy.lambdify(symbols, [sympy.sympify(value) for value in values(symbols)], "numpy", cse=True)
-    return _on_arrays(lambda at: evaluated(*at), x)
-
-
-KINDS = {"floats": _on_floats, "arrays": _on_arrays, "tensors": _on_tensors, "symbols": _on_symbols}
-
-
-def _apart(expected: np.ndarray, values: np.ndarray, *, rate: bool) -> np.ndarray:
-    """At which points (n,) two kinds of numbers disagree, where both are finite; a rate, the last, to three digits."""
-    if expected.shape != values.shape:
-        return np.ones(len(expected), dtype=bool)
-    both = np.isfinite(expected) & np.isfinite(values)
-    size = np.where(both, np.abs(expected), 0.0)
-    part = np.full(expected.shape[1], 1e-6)
-    part[-1:] = 1e-3 if rate else 1e-6
-    with np.errstate(invalid="ignore"):
-        return np.asarray((both & (np.abs(expected - values) > part * size + 1e-9 * size.max(0))).any(1))
+    return [*components(system.f, x), *g, *components(system.h, x)]
 
 
 def machine_code(subject: Subject) -> Iterator[Finding]:
@@ -234,25 +156,8 @@ def machine_code(subject: Subject) -> Iterator[Finding]:
         yield Finding("compiled", "ok", f"large batches of environments run as machine code, {singly}")
 
 
-def inputs(subject: Subject) -> Iterator[Finding]:
-    """How far each input moves the states within a sampling interval."""
-    system, x = subject.system, subject.x.T
-    for j, u_max in enumerate(system.u_max):
-        u = np.zeros((2, system.nu, POINTS))
-        u[0, j] = u_max
-        ends = [subject.step(x, held, np.zeros_like(x), subject.dt) for held in u]
-        speed = np.sqrt(np.nanmean((ends[0] - ends[1]) ** 2, axis=1)) / subject.dt
-        most = int((speed / subject.half).argmax())
-        if speed[most] * subject.dt <= LEAST_EFFECT * subject.half[most]:
-            advice = f"give column {j + 1} of G, or of g(x), its numbers"
-            yield Finding("inputs", "problem", f"input {j + 1} moves no state", advice)
-        else:
-            moved = f"{system.state_names[most]} by {number(speed[most])} per second"
-            yield Finding("inputs", "ok", f"input {j + 1} at its bound {u_max:g} moves {moved}")
-
-
 def bounds(subject: Subject) -> Iterator[Finding]:
-    """Whether motions from X stay within the bounds, and which bounds would hold them."""
+    """Whether motions from X stay within the bounds."""
     (x, _), lost = subject.motions, ~subject.stay
     followed = f"{len(lost)} motions of {subject.duration:g} s from X"
     if not lost.any():
@@ -261,110 +166,39 @@ def bounds(subject: Subject) -> Iterator[Finding]:
     counts = np.split(lost, len(subject.kinds))
     parts = [f"{one.sum()} of {len(one)} {kind}" for one, kind in zip(counts, subject.kinds)]
     when = subject.dt * np.median(np.isfinite(x[:, lost]).all(-1).sum(0))
-    text = f"of {followed}, {' and '.join(parts)} leave them, after {number(when)} s at the median"
-    unstable = max(one.mean() for one in counts) > MANY
-    yield Finding("bounds", "problem" if unstable else "note", text, _way_out(subject, unstable=unstable))
+    text = f"of {followed}, {' and '.join(parts)} leave them, after {when:.3g} s at the median"
+    verdict: Verdict = "problem" if max(one.mean() for one in counts) > MANY else "note"
+    advice = "widen the bounds, shrink X, or take a policy that holds the system from all of X (--policy)"
+    yield Finding("bounds", verdict, text, advice)
 
 
 def sampling(subject: Subject) -> Iterator[Finding]:
-    """The sampling interval and the duration against the system's time constants and the output's changes."""
-    system, dt, duration = subject.system, subject.dt, subject.duration
-    text, advice = f"dt = {dt:g} s, motions of {duration:g} s", list[str]()
+    """How much the outputs change from sample to sample."""
+    dt, y, change = subject.dt, subject.y, 0.0
+    text, advice = f"dt = {dt:g} s, motions of {subject.duration:g} s", ""
     verdict: Verdict = "ok"
-    if not system.discrete:
-        fastest, slowest = time_constants(subject)
-        if np.isfinite(slowest):
-            text += f"; time constants {number(fastest)} to {number(slowest)} s (medians over X), of which the "
-            text += f"fastest spans {number(fastest / dt)} samples and a motion {number(duration / slowest)} of the "
-            text += "slowest"
-        if duration < slowest < np.inf:
-            verdict = "note"
-            advice.append(f"motions end before the slow part has moved: take a duration of {5 * slowest:.1g} s")
-        with np.errstate(all="ignore"):
-            own = np.median(np.broadcast_to(rate_under(system, subject.x.T, system.u_max), POINTS))
-        if type(system).rate is not System.rate and own < TOO_LOW / fastest:
-            verdict, text = "problem", f"{text}; rate(x) is {number(own)}/s at the median over X"
-            advice.append("that is too little: leave rate(x) out, or raise it, as substeps and eigenvalues follow it")
-    y = subject.y
-    moving = y.size > 0 and (spread := np.sqrt(y.var(0).mean(0))) > 0
-    if np.any(moving):
+    if y.size and np.any(moving := (spread := np.sqrt(y.var(0).mean(0))) > 0):
         change = (np.sqrt((np.diff(y, axis=0) ** 2).mean((0, 1)))[moving] / spread[moving]).max()
         text += f"; y changes by {percent(change)} of its standard deviation from sample to sample"
-        way = "" if system.discrete else f": take dt = {dt * SMOOTH / change:.1g} s"
-        if change > JERKY:
-            verdict = "problem" if change > COARSE else "note"
-            advice.append(("the motion between samples is lost" if change > COARSE else "samples are few") + way)
-        elif change < IDLE:
-            verdict = "note"
-            advice.append("samples hardly differ" + way)
-    yield Finding("sampling", verdict, text, "; ".join(advice))
+    if change > JERKY:
+        verdict, advice = "note", "samples are few"
+        if change > COARSE:
+            verdict, advice = "problem", "the motion between samples is lost"
+        advice += "" if subject.system.discrete else f": take dt = {dt * SMOOTH / change:.1g} s"
+    yield Finding("sampling", verdict, text, advice)
 
 
 def outputs(subject: Subject) -> Iterator[Finding]:
     """How far each output ranges, and how noisy it is."""
-    system, y, moving = subject.system, subject.system.output(subject.x), subject.y
-    noise = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
-    for i, level in enumerate(noise):
+    system, y, moving = subject.system, subject.system.output(of_X(subject.system, POINTS)), subject.y
+    levels = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
+    for i, level in enumerate(levels):
         name, size, along = f"y{i + 1}", float(np.ptp(y[:, i])), ""
         if size <= STILL * np.abs(y[:, i]).max():
             advice = "let h measure something that moves, or leave this output out"
             yield Finding("output", "problem", f"{name} is {y[0, i]:.4g} everywhere in X", advice)
             continue
         if moving.size:
-            along = f", {number(np.ptp(moving[..., i]))} along motions"
-        text = f"{name} ranges over {number(size)} in X{along}; noise {number(level)} by default, "
-        text += f"{percent(level / size)} of that in X"
-        if level > LOUD * size:
-            advice = f"set measurement_noise: {NOISE_SHARE * size:.2g} is 5 % of the range"
-            yield Finding("output", "note", text, advice)
-        else:
-            yield Finding("output", "ok", text)
-
-
-def _way_out(subject: Subject, *, unstable: bool) -> str:
-    """Advice for motions that leave: other bounds, if wider ones hold them, or else another X or a policy."""
-    system, (x, u), lost = subject.system, subject.motions, np.flatnonzero(~subject.stay)
-    if subject.policy:
-        return "let the policy hold the system from all of X, widen the bounds, shrink X, or take a smaller dt"
-    lost = lost[np.linspace(0, len(lost) - 1, min(BEYOND, len(lost))).round().astype(int)]
-    low, high = np.array(system.bounds, dtype=float).T
-    ends = np.stack([WIDER * low + (1 - WIDER) * (low + high) / 2, WIDER * high + (1 - WIDER) * (low + high) / 2], 1)
-    wider = type("Wider", (type(system),), {"name": f"{system.name}-wider", "bounds": tuple(map(tuple, ends.tolist()))})
-    try:
-        x = simulate(wider(**system.parameters), x[0, lost], len(u), subject.dt, u=u[:, lost], step=subject.step)
-    except SubstepsError:  # too fast out there
-        x = x[:, lost]
-    held = np.isfinite(x[-1]).all(-1)
-    if held.mean() >= 1 - FEW:
-        reached = np.array([x[:, held].min((0, 1)), x[:, held].max((0, 1))]).T
-        widened = [
-            f"of {name} to ({min(low, float(f'{ROOM * least:.2g}')):g}, {max(high, float(f'{ROOM * most:.2g}')):g})"
-            for name, (low, high), (least, most) in zip(system.state_names, system.bounds, reached, strict=True)
-            if least < low or most > high
-        ]
-        return "widen the bounds " + " and ".join(widened)
-    way = f"they run away, also in bounds {WIDER:g} times as wide: shrink X"
-    if not unstable:
-        return way + ", or accept it, as training leaves them out"
-    if not system.nu:
-        return way
-    with contextlib.suppress(ValueError):  # there is no such controller, or a motion needs too many substeps
-        stay = Subject(system, subject.dt, subject.duration, named_policy(system, "controller")).stay
-        if stay.mean() > MANY:
-            return f"{way}, or train with --policy controller, under which {stay.sum()} of {len(stay)} stay"
-    return f"{way}, or train under a policy of yours that holds the system: --policy script.py:function"
-
-
-def time_constants(subject: Subject) -> tuple[float, float]:
-    """The fastest and the slowest time constant in seconds, medians over X; infinite where nothing changes."""
-    half, system = subject.half, subject.system
-    aside = NUMERICAL_STEP * np.diag(half)
-    with np.errstate(invalid="ignore"):
-        beside = system.drift(subject.x[:, None] + np.stack([aside, -aside])[:, None])
-        derivatives = (beside[0] - beside[1]).mT / (2 * NUMERICAL_STEP) / half[:, None]  # df/dx, in half-widths of X
-    sizes = np.abs(np.linalg.eigvals(derivatives[np.isfinite(derivatives).all((1, 2))]))
-    sizes = sizes[sizes.max(1) > 0]
-    if not len(sizes):
-        return np.inf, np.inf
-    slow = np.where(sizes > ZERO * sizes.max(1, keepdims=True), sizes, np.inf).min(1)
-    return float(1 / np.median(sizes.max(1))), float(1 / np.median(slow))
+            along = f", {np.ptp(moving[..., i]):.3g} along motions"
+        noise = f"noise {level:.3g} by default, {percent(level / size)} of that in X"
+        yield Finding("output", "ok", f"{name} ranges over {size:.3g} in X{along}; {noise}")

@@ -1,8 +1,8 @@
 """Recorded data: files of samples and episodes, checks of them, and uniform grids."""
 
-from training.records.checks import check_dt, check_memory, check_signals
+from training.records.checks import check_dt, check_signals
 from training.records.files import read_records
 from training.records.record import Record, Signals, jitter, median_step, pieces, resampled, sampling_interval
 
-__all__ = ["Record", "Signals", "check_dt", "check_memory", "check_signals", "jitter", "median_step", "pieces"]
+__all__ = ["Record", "Signals", "check_dt", "check_signals", "jitter", "median_step", "pieces"]
 __all__ += ["read_records", "resampled", "sampling_interval"]

@@ -1,11 +1,9 @@
 """Episodes of an environment as records, and the Minari data sets in which they are exchanged. Nothing in one runs."""
 
 import copy
-import errno
 import json
 import os
-import secrets
-import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,19 +12,19 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.identity import APPEARANCE, sampling_interval
+from kkl_gym.identity import APPEARANCE
 from kkl_gym.named import InputReader, Reader, acting, resolved
 from observers.checks import check_dt
 from observers.storage import UNFINISHED
-from training.files import clear_unfinished
+from training.files import require_writable
 from training.records.record import Record, Signals
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
 PREFIX = "minari:"  # of the name of a data set among names of files
-KEY = "kkl_gym"  # in the metadata, of what Minari has no place for
-DATA, METADATA = "data", "metadata.json"  # where a data set keeps both
+KEY = "kkl_gym"  # of the metadata for which Minari has no place
+METADATA = "data/metadata.json"  # in the folder of a data set
 
 
 @dataclass(frozen=True)
@@ -91,72 +89,56 @@ class Rollouts:
 
 def is_dataset(name: str | Path) -> bool:
     """Whether a name is that of a Minari data set: ``minari:ID``, or a folder that holds one."""
-    return str(name).startswith(PREFIX) or any((Path(name) / part / METADATA).is_file() for part in (DATA, "."))
+    return str(name).startswith(PREFIX) or (Path(name) / METADATA).is_file()
 
 
 def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
     """Read a Minari data set."""
-    minari = _minari()
-    name = str(name)
+    minari, name = _minari(), str(name)
     try:
-        if (folder := Path(name)) and name.startswith(PREFIX):
-            folder = Path(minari.storage.datasets_root_dir.get_dataset_path(name.removeprefix(PREFIX)))
-        data = next((part for part in (folder / DATA, folder) if (part / METADATA).is_file()), None)
-        if data is None:
-            raise ValueError(f"there is no data set in {folder}; `minari list local` lists all")
-        if (
-            not {"observation_space", "action_space"}
-            <= json.loads((data / METADATA).read_text(encoding="utf-8")).keys()
-        ):
+        folder = _folder(name.removeprefix(PREFIX)) if name.startswith(PREFIX) else Path(name)
+        written = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+        if "observation_space" not in written or "action_space" not in written:
             raise ValueError("its spaces are missing")  # Minari would make the environment, whatever that runs
-        dataset = minari.MinariDataset(data)
+        dataset = minari.MinariDataset((folder / METADATA).parent)
         metadata, spec = dataset.storage.metadata, dataset.env_spec
         own = metadata.get(KEY, {})
         signals = Signals(measured=own.get("measured", ()), hidden=own.get("hidden", ()))
-        dt = check_dt(own["dt"]) if "dt" in own else None
+        dt = check_dt(own.get("dt", 1.0))
         episodes = [
             Episode(one.observations, one.actions, one.rewards, bool(one.terminations[-1:].any()), one.infos or {})
             for one in dataset.iterate_episodes()
         ]
-    except (AssertionError, AttributeError, KeyError, OSError, TypeError, ValueError, NotImplementedError) as error:
+    except Exception as error:  # whatever a damaged file leads to
         raise ValueError(f"{name} cannot be read as a Minari data set: {error}") from error
     if not episodes:
         raise ValueError(f"{name} holds no episode")
+    if "dt" not in own:
+        warn(f"{name} has no sampling interval: a step counts as 1 s")
     kwargs = {} if spec is None else {key: value for key, value in spec.kwargs.items() if key not in APPEARANCE}
     environment = None if spec is None else {"id": spec.id, "kwargs": kwargs}
-    dt, spaces = dt or _interval(name, spec, kwargs, warn), (metadata["observation_space"], metadata["action_space"])
+    spaces = metadata["observation_space"], metadata["action_space"]
     return Rollouts(name.removeprefix(PREFIX), environment, dt, *spaces, episodes, signals, spec)
 
 
-def _interval(name: str, spec: Any, kwargs: Mapping[str, Any], warn: Callable[[str], object]) -> float:
-    """Seconds between samples, of an environment of Gymnasium's own; to make others may run what a file names."""
-    registered, reason = None if spec is None else gym.registry.get(spec.id), ""
-    if registered is not None and str(registered.entry_point).startswith("gymnasium."):
-        try:
-            with gym.make(spec.id, **kwargs) as env:
-                return sampling_interval(env)
-        except Exception as error:  # whatever is missing
-            reason = f", and {spec.id} cannot be made ({error})"
-    warn(f"{name} has no sampling interval{reason}: a step counts as 1 s")
-    return 1.0
-
-
 def write_dataset(rollouts: Rollouts, *, policy: str) -> Path:
-    """Write a Minari data set, whole or not at all; what killed processes left beside it is removed."""
-    folder = dataset_folder(rollouts.name)
-    minari = _minari()
+    """Write a Minari data set, whole or not at all."""
+    folder, minari, spec = dataset_folder(rollouts.name), _minari(), copy.copy(rollouts.spec)
     namespace, *_ = minari.dataset.minari_dataset.parse_dataset_id(rollouts.name)
     if namespace is not None and namespace not in minari.namespace.list_local_namespaces():
         minari.namespace.create_namespace(namespace)
-    clear_unfinished(folder.parent)
-    temporary = folder.with_name(f"{UNFINISHED}{secrets.token_hex(4)}")
-    temporary.mkdir(parents=True)
-    try:
+    for name in ("entry_point", "vector_entry_point"):
+        if callable(getattr(spec, name, None)):
+            setattr(spec, name, None)  # JSON has no place for classes and functions
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=UNFINISHED) as temporary:
+        whole = Path(temporary) / "whole"
+        whole.mkdir()
         storage = minari.dataset.minari_storage.MinariStorage.new(
-            temporary / DATA,
+            (whole / METADATA).parent,
             observation_space=rollouts.observation_space,
             action_space=rollouts.action_space,
-            env_spec=None if rollouts.spec is None else _in_json(rollouts.spec),
+            env_spec=spec,
             jpeg_encoding=False,
         )
         for episode in rollouts.episodes:
@@ -170,46 +152,28 @@ def write_dataset(rollouts: Rollouts, *, policy: str) -> Path:
                 infos=dict(episode.infos),
             )
             storage.update_episodes([buffer])
-        own = {"dt": rollouts.dt} | {role: list(getattr(rollouts.signals, role)) for role in ("measured", "hidden")}
+        own = {"dt": rollouts.dt, "measured": rollouts.signals.measured, "hidden": rollouts.signals.hidden}
         whose = {"dataset_id": rollouts.name, "minari_version": minari.__version__, "algorithm_name": policy}
         storage.update_metadata(whose | {KEY: own})
-        os.rename(temporary, folder)
-    except BaseException as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if isinstance(error, OSError):
-            _refuse_existing(folder, rollouts.name)  # another process was quicker
-        raise
+        os.rename(whole, folder)
     return folder
 
 
 def dataset_folder(name: str) -> Path:
     """The folder of a data set that is to be written; an error if none can be written there."""
-    minari = _minari()
     try:
-        minari.dataset.minari_dataset.parse_dataset_id(name)
+        _minari().dataset.minari_dataset.parse_dataset_id(name)
     except (TypeError, ValueError):
         raise ValueError(f"a Minari data set is called as in pendulum/random-v0, got {name!r}") from None
-    folder = Path(minari.storage.datasets_root_dir.get_dataset_path(name))
-    _refuse_existing(folder, name)
-    parent = next(parent for parent in folder.parents if parent.exists())
-    if not os.access(parent, os.W_OK):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(parent))
+    folder = _folder(name)
+    if folder.exists():
+        raise ValueError(f"there is a data set {name} already; name another (--dataset), or `minari delete {name}`")
+    require_writable(folder)
     return folder
 
 
-def _refuse_existing(folder: Path, name: str) -> None:
-    if folder.exists():
-        raise ValueError(f"there is a data set {name} already; name another (--dataset), or `minari delete {name}`")
-
-
-def _in_json(spec: "EnvSpec") -> "EnvSpec":
-    """A specification as JSON can hold it: classes and functions by where they are written."""
-    written = copy.copy(spec)
-    for name in ("entry_point", "vector_entry_point"):
-        if callable(made_by := getattr(spec, name)):
-            where = getattr(made_by, "__qualname__", type(made_by).__qualname__)
-            setattr(written, name, f"{made_by.__module__}:{where}")
-    return written
+def _folder(name: str) -> Path:
+    return Path(_minari().storage.datasets_root_dir.get_dataset_path(name))
 
 
 def _minari() -> Any:

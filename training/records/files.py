@@ -1,10 +1,10 @@
-"""Records from NPZ, MAT, CSV and Parquet files and Minari data sets. Nothing in a file runs."""
+"""Records from NPZ, CSV and Parquet files and Minari data sets. Nothing in a file runs."""
 
 import csv
 import re
-import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from kkl_gym.named import FUNCTIONS
 from kkl_gym.system import System
 from observers.checks import shown
-from training.records.checks import Warn, check_motion, check_signals, check_units
+from training.records.checks import Warn, check_motion, check_signals
 from training.records.episodes import is_dataset, read_dataset
 from training.records.record import ROLES, Record, Signals
 
@@ -46,8 +46,8 @@ def read_records(
             records.append(_read(path, signals or Signals()))
     check_signals(records, system)
     check_motion(records, warn)
-    if system is not None or len(paths) > 1:  # episodes of one environment are in the same units
-        check_units(records, system, warn)
+    if system is not None and system.nu and not records[0].signals.inputs:
+        warn(f"{records[0].name}: no column of inputs, which are taken for zero")
     return records
 
 
@@ -105,8 +105,7 @@ def _named(wanted: Signals, columns: tuple[str, ...]) -> Signals:
         for signal in (signals.time,) if role == "time" else getattr(signals, role):
             name, _ = _column(signal, columns)
             if name not in columns:
-                there = textwrap.shorten(", ".join(columns), 200, placeholder=" ...") or "none"
-                raise ValueError(f"no column {name}; there are {there} (--{role})")
+                raise ValueError(f"no column {name}; there are {shown(columns)} (--{role})")
             if name == signals.time and role != "time":
                 raise ValueError(f"column {name} is the time, and cannot be a signal too")
     return signals
@@ -136,8 +135,6 @@ def _seconds(values: Any, column: str) -> np.ndarray:
     if not pd.api.types.is_numeric_dtype(values):
         dates = pd.to_datetime(values, format="ISO8601", errors="coerce", utc=True)
         if dates.notna().any():
-            for row in np.flatnonzero(dates.isna()):
-                raise ValueError(f"column {column}, row {row + 1}: {shown(values.iloc[row])} is not a date in ISO 8601")
             return np.asarray((dates - dates.iloc[0]).dt.total_seconds())
     return _numbers(values, column)
 
@@ -158,31 +155,15 @@ def _npz(path: Path) -> Columns:
     file = np.load(path, allow_pickle=False)
     if not isinstance(file, np.lib.npyio.NpzFile):
         raise ValueError("it holds a single array; save it by numpy.savez(path, t=t, y=y)")
-    arrays = dict[str, np.ndarray]()
+    columns = dict[str, np.ndarray]()
     with file:
         for name in file.files:
-            try:
-                arrays[name] = file[name]
-            except ValueError:  # pickled objects, which are no error unless they are asked for
-                arrays[name] = np.array(["a pickled object"])
-    return _columns(arrays)
-
-
-def _mat(path: Path) -> Columns:
-    from scipy.io import loadmat
-
-    arrays = loadmat(path, squeeze_me=True)
-    return _columns({name: np.asarray(values) for name, values in arrays.items() if name[:2] != "__"})
-
-
-def _columns(arrays: Mapping[str, np.ndarray]) -> Columns:
-    """The columns of arrays, numbered where there are several in one."""
-    columns = dict[str, np.ndarray]()
-    for name, values in arrays.items():
-        if values.ndim == 2 and values.shape[1] > 1:
-            columns |= {f"{name}{i + 1}": column for i, column in enumerate(values.T)}
-        elif values.ndim in (1, 2) and values.size:  # u may be empty where a system has no inputs
-            columns[name] = values.reshape(-1)
+            with suppress(ValueError):  # pickled objects, which are not read
+                values = file[name]
+                if values.ndim == 2 and values.shape[1] > 1:
+                    columns |= {f"{name}{i + 1}": column for i, column in enumerate(values.T)}
+                elif values.ndim in (1, 2) and values.size:  # u may be empty where a system has no inputs
+                    columns[name] = values.reshape(-1)
     return columns
 
 
@@ -222,4 +203,4 @@ def _csv(path: Path) -> Columns:
     return {name: frame[i] for i, name in enumerate(names)}
 
 
-READERS: dict[str, Callable[[Path], Columns]] = {".npz": _npz, ".mat": _mat, ".csv": _csv, ".parquet": _parquet}
+READERS: dict[str, Callable[[Path], Columns]] = {".npz": _npz, ".csv": _csv, ".parquet": _parquet}

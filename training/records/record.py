@@ -40,11 +40,6 @@ class Signals:
                 raise ValueError(f"{role} names {', '.join(twice)} twice")
             object.__setattr__(self, role, tuple(names))
 
-    @property
-    def all(self) -> tuple[str, ...]:
-        """The measured, input and hidden signals, in this order."""
-        return self.measured + self.inputs + self.hidden
-
 
 @dataclass(frozen=True)
 class Record:

@@ -80,7 +80,7 @@ def learn(
         amount: dict[str, Any] = {"episodes": episodes, "steps": steps, "seed": seed}
         rollouts = play(env_id, partial(policy_of, policy), progress, **signals, **amount, env_kwargs=env_kwargs)
         records, name = rollouts.records(), (rollouts.environment or {})["id"].replace("/", "-")
-        source = RecordedSource(records, recorded_preset(records, settings), name, warn=progress.say)
+        source = RecordedSource(records, recorded_preset(records, settings), name)
         artifact = train(source, folder=folder, console=progress).artifact
         if folder is not None:
             artifact.save(folder / f"{name}.safetensors")

@@ -15,7 +15,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from kkl_gym.identity import identity, sampling_interval
 from kkl_gym.loading import load_function
-from kkl_gym.named import InputReader, Reader, acting, resolved
+from kkl_gym.named import Reader, resolved
 from observers.checks import integer, shown
 from training.progress import ProgressBars
 from training.records import Signals
@@ -51,8 +51,6 @@ def policy_of(policy: str | Policy, env: Env) -> Policy:
             f"got {shown(policy)}"
         )
     algorithm, _, file = policy.partition(":")
-    if not file.endswith(".zip") and Path(f"{file}.zip").is_file():  # stable-baselines3 adds the ending as well
-        file += ".zip"
     return _agent(algorithm, Path(file), env) if file.endswith(".zip") else load_function(policy)
 
 
@@ -80,11 +78,7 @@ def _agent(name: str, path: Path, env: Env) -> Policy:
         )
     if not path.is_file():
         raise ValueError(f"there is no file {path}")
-    agent = algorithms[name.lower()].load(path, device="cpu")
-    for space in ("observation_space", "action_space"):
-        here, there = getattr(env, space), getattr(agent, space)
-        if here != there:
-            raise ValueError(f"{path} was trained on the {space.replace('_', ' ')} {there}, but here it is {here}")
+    agent = algorithms[name.lower()].load(path, env=env, device="cpu")
     return lambda observation: agent.predict(observation, deterministic=True)[0]
 
 
@@ -138,9 +132,7 @@ def roll_out(
         if played == 1:
             recorder.rollouts().records()  # an error now, not after hours
         report(played if steps is None else total)
-    rollouts = recorder.rollouts()
-    rollouts.records()  # an error now where a signal cannot be read
-    return rollouts
+    return recorder.rollouts()
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
@@ -162,12 +154,9 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
             role: resolved(names, space, role=role, source=source)
             for role, names in (("measured", measured), ("hidden", hidden))
         }
-        if not chosen["measured"]:
-            raise ValueError("name the measured entries of the observation, as in measured=[0, 1]")
         self._signals = Signals("", chosen["measured"], (), chosen["hidden"])
         keys = (key for names in chosen.values() for key in Reader(space, names, source=source).keys)
         self._keys = tuple(dict.fromkeys(keys))
-        InputReader(env.action_space, acting(env.action_space), source=source)  # an error now, not after hours
         self._played, self._steps = deque[_Steps](), 0
         self._under_way: _Steps | None = None
         self._to_keep = math.inf if keep is None else integer("keep", keep, 1)

@@ -1,10 +1,10 @@
 """Recorded motions: files, data sets, or rollouts of an environment, in which the hidden signals were seen."""
 
+import contextlib
 import functools
 import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from observers import Artifact, Equations, KKLObserver, LinearFilter
 from training.config import Config
 from training.maps.coordinates import SETTLED, settling_time
-from training.records import check_dt, check_memory, check_signals, jitter, median_step, sampling_interval
+from training.records import check_dt, check_signals, jitter, median_step, sampling_interval
 from training.records.record import ROLES, Record, Windows, pieces, resampled
 from training.seeds import Stream, generator
 from training.sources import OF_MEDIAN, Increments, Pairs, Report, Runs, TooFewRunsError
@@ -61,8 +61,6 @@ class RecordedSource:
         Records that are not trained on; by default a share of ``records``.
     C : ndarray, shape (ny, nx), optional
         The output y = C x, where it is known; by default it is fitted.
-    warn : callable, optional
-        Called with the text of a warning.
 
     Raises
     ------
@@ -78,7 +76,6 @@ class RecordedSource:
         *,
         held_out: Sequence[Record] | None = None,
         C: np.ndarray | None = None,
-        warn: Callable[[str], object] = lambda text: None,
     ) -> None:
         if not records or any(record.x is None for record in records):
             raise ValueError("no hidden states were recorded; name their columns (--hidden), or give equations")
@@ -91,7 +88,6 @@ class RecordedSource:
         self.signals, self.nx, self.ny = signals, len(signals.hidden), len(signals.measured)
         self.nu, self.dt, self.process_noise = len(signals.inputs) * config.inputs, config.dt, 0.0
         self.linear = Spectrum(config.eigenvalues, config.pairs).filter(self.ny, config.dt, self.nu)
-        check_memory(records, settling_time(self.linear), lambda text: warn(f"warning: {text}"))
         self.kept, self.held_out = ([resampled(each, config.dt) for each in some] for some in (records, held_out or ()))
         if held_out is None:
             self.kept, self.held_out = split(self.kept, config.held_out, config.seed)
@@ -110,17 +106,13 @@ class RecordedSource:
         """Arguments of :class:`observers.Artifact`."""
         signals = {role: getattr(self.signals, role) for role in ROLES.values()} | ({} if self.nu else {"inputs": ()})
         facts = {"system": self.name, "parameters": {}, "measurement_noise": 0.0, "signals": signals}
-        facts["u_max"] = self._largest_inputs()
         facts["environment"] = self.records[0].environment
-        try:
-            return facts | {"C": linear_output(self.kept, self.C)[0]}
-        except ValueError:  # tracking() raises it again, with the reason
-            return facts
-
-    def _largest_inputs(self) -> tuple[float, ...] | None:
-        """Largest absolute values of the inputs in all records, None without inputs."""
-        inputs = [np.abs(each.u[:-1]).max(0, initial=0.0) for each in self.records if self.nu and each.u is not None]
-        return tuple(np.max(inputs, 0).tolist()) if inputs else None
+        if self.nu:
+            inputs = [np.abs(each.u[:-1]).max(0, initial=0.0) for each in self.records if each.u is not None]
+            facts["u_max"] = tuple(np.max(inputs, 0).tolist())
+        with contextlib.suppress(ValueError):  # tracking() raises it again, with the reason
+            facts["C"] = linear_output(self.kept, self.C)[0]
+        return facts
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
         """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""
@@ -218,19 +210,14 @@ class RecordedSource:
             "window": max(WINDOW * self.dt, 0.5 * self.pace),
         }
 
-    def described(self) -> list[str]:
-        """The signals, the records and the filter, for people."""
+    def described(self) -> str:
+        """The signals and the records, for people."""
         signals, records = self.signals, self.records
         given = " and ".join(", ".join(names) for names in (signals.measured, signals.inputs) if names)
-        seconds, step, uneven = sum(each.duration for each in records), median_step(*records), max(map(jitter, records))
-        lacking = sum(int(np.isnan(record.y).any(-1).sum()) for record in records)
-        rates = Spectrum(self.config.eigenvalues, self.config.pairs).poles.real
-        return [
-            f"training an observer for {self.name} from recorded states: {', '.join(signals.hidden)} from {given}",
-            f"{len(records)} records of {seconds:.4g} s together, {lacking} rows without an output",
-            f"steps of {step:.4g} s (median), uneven by up to {uneven:.1%}; resampled to {self.dt:g} s",
-            f"{len(rates)} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
-        ]
+        seconds, step = sum(record.duration for record in records), median_step(*records)
+        text = f"training an observer for {self.name} from recorded states: {', '.join(signals.hidden)} from {given}; "
+        steps = f"steps of {step:.4g} s (median), uneven by up to {max(map(jitter, records)):.1%}"
+        return text + f"{len(records)} records of {seconds:.4g} s together, in {steps}; resampled to {self.dt:g} s"
 
 
 def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> Config:
@@ -258,13 +245,8 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
     """
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     chosen: dict[str, Any] = {"dt": sampling_interval(*records), **RECORDED} | given
-    dt, step, environment = chosen["dt"], median_step(*records), records[0].environment
+    dt = chosen["dt"]
     check_dt(records, dt)
-    if environment is not None and not np.isclose(dt, step, rtol=1e-6):
-        raise ValueError(
-            f"dt = {dt:g} s: an observer for {environment['id']} takes a sample at each step, every {step:g} s; leave "
-            "dt out"
-        )
     if records[0].source:
         settled = EPISODE_MEMORIES * SETTLED / float(np.median([len(record.t) for record in records]))
         slowest = min(max(EPISODE_SLOWEST, settled), EPISODE_FASTEST / 4)
@@ -339,7 +321,7 @@ def recorded_errors(
     for record in pieces(records):
         if record.x is not None:
             y = record.y + np.asarray(measurement_noise) * rng.standard_normal(record.y.shape)
-            x_hat = estimates(artifact, replace(record, y=y), measurement_noise)
+            x_hat = KKLObserver(artifact, measurement_noise).estimate(y, record.u if artifact.nu else None)
             pairs.append(np.stack([x_hat - record.x, record.x], 1)[first:])
     both = np.concatenate(pairs)
     error, x = np.moveaxis(both[~np.isnan(both).any((1, 2))], 1, 0)
@@ -348,11 +330,6 @@ def recorded_errors(
         return dict.fromkeys(names, math.nan)
     moves = np.ptp(x, 0) > 0  # rounding may leave a standard deviation of what stands still
     return dict(zip(names, (np.sqrt(np.mean(error**2, 0)) / np.where(moves, x.std(0), np.nan)).tolist()))
-
-
-def estimates(artifact: Artifact, record: Record, measurement_noise: float | tuple[float, ...] = 0.0) -> np.ndarray:
-    """An observer's estimates (n, nx) along a record without gaps on its grid."""
-    return KKLObserver(artifact, measurement_noise).estimate(record.y, record.u if artifact.nu else None)
 
 
 def linear_output(records: Sequence[Record], known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,6 @@ from training.trajectories.motions import Controller
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
 EVERY = "all"  # in the place of a parameter's name
-MAX_BIAS = 10.0  # of an output's range in X, far more than a network of its scale resolves
 ROOM = 1e6  # half-widths of its range that a parameter may lie from the middle
 
 Ranges = Mapping[str, tuple[float, float]]
@@ -53,19 +52,19 @@ def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False
     states are derivatives by parameters as well. In training a share of the motions has the system's own parameters,
     which are the likeliest; those of the others are more often near the ends of their ranges, where errors are largest.
     """
-    for name, limits in ranges.items():
-        if name not in system.parameters:
-            raise ValueError(f"{system.name} has no parameter {shown(name)}; it has {', '.join(system.parameters)}")
-        if not limits[0] < limits[1]:
-            raise ValueError(f"the range of {name} must go from low to high, got {shown(limits)}")
+    if not ranges:
+        return system
 
     def model(x: Components) -> System:
         changed = object.__new__(type(system))  # past the class's own check, which asks for floats
         changed.__dict__.update(system.__dict__, **dict(zip(ranges, x[system.nx :], strict=True)))
         return changed
 
+    def h(x: Components) -> Components:
+        return model(x).h(x[: system.nx])
+
     own = {name: getattr(system, name) for name in ranges}
-    return _with_constants(system, ranges, own, model, in_training=in_training) if ranges else system
+    return _with_constants(system, system.name, ranges, own, model, h, in_training=in_training)
 
 
 def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
@@ -74,11 +73,6 @@ def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
     if len(given) not in (1, system.ny):
         raise ValueError(f"bias must be one number, or one of each of {system.ny} outputs, got {half_widths}")
     widths = np.broadcast_to(given, (system.ny,)).tolist()
-    for i, (width, size) in enumerate(zip(widths, system.output_range, strict=True)):
-        if width > MAX_BIAS * size:
-            raise ValueError(
-                f"a bias of up to {width:g} is more than {MAX_BIAS:g} times the range {size:.3g} of y{i + 1}"
-            )
     biased = [i for i, width in enumerate(widths) if width]
     ranges = {f"y{i + 1}_bias": (-widths[i], widths[i]) for i in biased}
 
@@ -88,21 +82,21 @@ def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
             values[i] = values[i] + bias
         return values
 
-    own, name = dict.fromkeys(ranges, 0.0), f"{system.name} with a bias"
-    return _with_constants(system, ranges, own, lambda x: system, outputs=h, title=name)
+    own = dict.fromkeys(ranges, 0.0)
+    return _with_constants(system, f"{system.name} with a bias", ranges, own, lambda x: system, h)
 
 
 def _with_constants(
     system: System,
+    title: str,
     ranges: Ranges,
     own: Mapping[str, float],
     model: Callable[[Components], System],
+    outputs: Callable[[Components], Components],
     *,
-    outputs: Callable[[Components], Components] | None = None,
-    title: str = "",
     in_training: bool = False,
 ) -> System:
-    """A system with further states that stand still, and the equations of ``model(x)``."""
+    """A system with further states that stand still, the equations of ``model(x)`` and the outputs ``outputs(x)``."""
     nx, limits = system.nx, [(float(low), float(high)) for low, high in ranges.values()]
     low, high = np.transpose(limits)
     middle, room = (low + high) / 2, ROOM * (high - low)
@@ -110,7 +104,7 @@ def _with_constants(
     constant = bool(system.nu) and type(system).g is System.g and not system.discrete
 
     class WithConstants(System):
-        name = title or system.name
+        name = title
         state_names: ClassVar[tuple[str, ...]] = (*system.state_names, *ranges)
         X: ClassVar[Box] = (*system.X, *limits)
         X_centre: ClassVar[tuple[float, ...]] = (*system.X_centre, *middle.tolist())
@@ -136,7 +130,7 @@ def _with_constants(
             return (*system.target, *own.values())
 
         def h(self, x: Components) -> Components:
-            return model(x).h(x[:nx]) if outputs is None else outputs(x)
+            return outputs(x)
 
         def rate(self, x: Components) -> Any:
             return system.rate(x[:nx])  # near enough, and a formula for it may decide on its parameters

@@ -105,9 +105,11 @@ def test_from_records_to_an_observer_that_tracks(capsys):
     )
     main([*command, "--hidden", "position,speed"])
     printed = lines(capsys)
-    assert printed[0] == "training an observer for spring from recorded states: position, speed from position and force"
-    assert printed[1] == "5 records of 49.75 s together, 0 rows without an output"
-    assert re.fullmatch(r"steps of 0.050\d+ s \(median\), uneven by up to 19.\d%; resampled to 0.05 s", printed[2])
+    start = (
+        "training an observer for spring from recorded states: position, speed from position and force; 5 records of"
+    )
+    assert printed[0].startswith(f"{start} 49.75 s together, in steps of 0.05")
+    assert re.search(r"\(median\), uneven by up to 19.\d%; resampled to 0.05 s$", printed[0])
     assert "it tracks by a learned flow; T_inv initialises it" in printed
     assert printed[-2].startswith("rms error over standard deviation on held-out records: position ")
     assert printed[-1].startswith(f"wrote {path} ")

@@ -11,7 +11,7 @@ import linear_system
 import numpy as np
 import pytest
 from discrete_systems import Sampled
-from linear_system import Autonomous, Oscillator
+from linear_system import Oscillator
 
 import kkl_gym.compiled
 import training.diagnosis.system
@@ -52,7 +52,6 @@ def test_a_system_that_ships():
     assert "problem" not in {one.verdict for one in found}
     assert {one.check for one in found} == set(CHECKS)
     assert all(bool(one.advice) == (one.verdict != "ok") for one in found)
-    assert found[0].found == "van_der_pol: 2 states (x1, x2); 1 input up to 5; parameters mu = 3"
 
 
 def test_the_page_explains_every_line_of_its_example():
@@ -95,7 +94,7 @@ def test_discrete_time_and_starts_of_its_own():
     system = made(Sampled, draw_starts=on_a_circle)
     found = {one.check: one for one in findings(system)}
     assert "problem" not in {one.verdict for one in found.values()}
-    assert found["equations"].found.startswith("step and h work on floats, arrays, tensors, symbols")
+    assert found["equations"].found == "step and h work on floats, arrays, symbols"
     assert found["observability"].found.startswith("x2: at best an error of ")
     with pytest.raises(ValueError, match="no others"):
         findings(system, dt=0.2)
@@ -119,9 +118,8 @@ def test_an_if_on_the_state_is_a_problem_and_ends_the_command_with_status_1(caps
         main(["diagnose", f"{__file__}:Branching", "--parameters", "gain=2", "--json", str(tmp_path / "found.json")])
     assert end.value.code == 1
     shown = capsys.readouterr().out
-    assert "gain = 2" in shown
     assert "→ as it is, batches, training and evaluation do not run" in shown
-    assert shown.splitlines()[-1] == "1 problem, 3 notes"
+    assert shown.splitlines()[-1] == "1 problem, 2 notes"
     found = json.loads((tmp_path / "found.json").read_text())
     (wrong,) = (one["found"] for one in found if one["verdict"] == "problem")
     assert wrong in shown  # square brackets are no markup
@@ -170,25 +168,15 @@ BLIND = NO_INPUT | {
 @pytest.mark.parametrize(
     ("name", "verdict", "changes", "options", "found", "advice"),
     [
-        ("equations", "problem", {"f": lambda self, x: (x[1], -sqrt(x[0] + 0.5))}, {}, " % of X and ",
+        ("equations", "problem", {"f": lambda self, x: (x[1], -sqrt(x[0] + 0.5))}, {}, " % of 2X, such as",
          "draw the bounds, and X, where the equations hold, or change the equations"),
-        ("inputs", "problem", {"u_max": (1.0, 1.0), "G": ((0.0, 0.0), (1.0, 0.0))}, {}, "input 2 moves no state",
-         "give column 2 of G"),
-        ("inputs", "ok", {"g": lambda self, x: ((0.0,), (2.0 + 0.0 * x[0],))}, {}, "moves x2 by 1 per second", ""),
-        ("sampling", "problem", {"rate": lambda self, x: 0.01 + 0.0 * x[0]}, {"duration": 20.0},
-         "rate(x) is 0.01/s at the median over X", "leave rate(x) out, or raise it"),
         ("bounds", "problem", UPRIGHT, LONG, "50 of 50 free and 50 of 50 driven leave them",
-         "train with --policy controller, under which 100 of 100 stay"),
-        ("bounds", "problem", UPRIGHT | {"u_max": (0.01,)}, LONG, "leave them", "--policy script.py:function"),
+         "widen the bounds, shrink X, or take a policy"),
         ("sampling", "note", {}, {"dt": 0.7, "duration": 60.0}, "dt = 0.7 s", "samples are few: take dt = 0.1 s"),
         ("sampling", "problem", {}, {"dt": 1.5, "duration": 60.0}, "dt = 1.5 s",
          "the motion between samples is lost: take dt = 0.1 s"),  # 2 pi / 0.1: some sixty samples a period
-        ("sampling", "note", {}, {"duration": 0.5}, "motions of 0.5 s",
-         "motions end before the slow part has moved: take a duration of 5 s"),
         ("output", "problem", {"h": lambda self, x: (x[0], 0.0 * x[0] + 2.5)}, {}, "y2 is 2.5 everywhere in X",
          "let h measure something that moves, or leave this output out"),
-        ("output", "note", {"measurement_noise": 1.0}, {}, "noise 1 by default",
-         "set measurement_noise: 0.1 is 5 % of the range"),
         ("observability", "problem", BLIND, {}, "y does not determine bias", "let h measure bias too, or"),
         ("observability", "problem", BLIND | {"f": lambda self, x: (x[1] + x[2], 0.0 * x[0], 0.0 * x[0])}, {},
          "y does not determine a combination of x2 and bias", "let h measure x2 or bias too"),
@@ -203,23 +191,11 @@ def test_what_is_wrong_is_found_and_how_to_change_it(name, verdict, changes, opt
     assert bool(said.advice) == (verdict != "ok")
 
 
-def test_bounds_that_are_too_narrow():
-    elongated = {"f": lambda self, x: (4.0 * x[1], -0.25 * x[0])}  # x1 swings four times as far as x2
-    found = one(made(Autonomous, bounds=((-1.3, 1.3), (-3, 3)), **elongated), "bounds", dt=0.1, duration=20.0)
-    assert "leave them" in found.found
-    low, high = map(float, found.advice.removeprefix("widen the bounds of x1 to (").removesuffix(")").split(","))
-    assert -4.6 < low < -4.0  # sqrt(17) and some room
-    assert 4.0 < high < 4.6
-    wide = made(Autonomous, bounds=((1.2 * low, 1.2 * high), (-3, 3)), **elongated)
-    assert one(wide, "bounds", "ok", dt=0.1, duration=20.0)
-
-
 def test_a_system_that_only_a_policy_holds():
     upright = made(**UPRIGHT)
     assert findings(upright, "bounds", policy=controller(upright), **LONG)[0].verdict == "ok"
     found = one(upright, "bounds", policy=lambda x: np.zeros((len(x), 1)), **LONG)
     assert "100 of 100 under the policy leave them" in found.found
-    assert found.advice.startswith("let the policy hold the system")
 
 
 def test_starts_of_another_shape_end_the_check():
@@ -247,5 +223,5 @@ class ThroughThird(Lorenz):
 def test_a_symmetry_is_no_poor_observability():
     found = findings(ThroughThird(), "observability", duration=6.0)
     assert [one.verdict for one in found] == ["problem", "ok"]
-    assert found[0].found.startswith("x1, x2: y determines them near each state, but not globally: (")
+    assert found[0].found.startswith("x1, x2: y determines them near each state, but distant states")
     assert not any("near each state" in one.found for one in findings(Lorenz(), "observability", duration=6.0))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from training.records import Record, check_dt, check_memory, jitter, median_step, pieces, resampled, sampling_interval
+from training.records import Record, check_dt, jitter, median_step, pieces, resampled, sampling_interval
 
 DT = 0.02
 T = 3.0 + DT * np.arange(500)
@@ -74,14 +74,6 @@ def test_dt_that_does_not_fit():
     for dt in (DT / 4, DT * 40):
         with pytest.raises(ValueError, match=r"a: column t: steps of 0.02 s do not fit dt = .* seconds"):
             check_dt([record(T)], dt)
-
-
-def test_memory():
-    warnings, records = [], [record(T), record(T[:20])]
-    check_memory(records, 5.0, warnings.append)
-    assert warnings == ["a: column t, row 20: the record ends after 0.38 s, but the filter remembers 5 s"]
-    with pytest.raises(ValueError, match="and no other is longer"):
-        check_memory(records, 50.0, warnings.append)
 
 
 def test_the_sampling_interval_has_no_digits_by_chance():

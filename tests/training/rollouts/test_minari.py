@@ -1,14 +1,11 @@
 """Minari data sets: written whole, and read again."""
 
 import json
-import os
-import time
 
 import gymnasium as gym
 import pytest
 
 from observers import Artifact
-from observers.storage import UNFINISHED
 from training.cli import main
 from training.records import Signals, read_records
 from training.records.episodes import is_dataset, read_dataset, write_dataset
@@ -16,7 +13,6 @@ from training.rollouts import make, policy_of, roll_out
 
 minari = pytest.importorskip("minari")
 pytest.importorskip("h5py")
-MinariStorage = pytest.importorskip("minari.dataset.minari_storage").MinariStorage
 
 
 @pytest.fixture(autouse=True)
@@ -26,7 +22,6 @@ def datasets(tmp_path, monkeypatch):
 
 
 NAME = "cart/random-v0"
-PENDULUM = {"env_id": "Pendulum-v1", "measured": ["0", "1"], "hidden": ["2"]}
 
 
 def rollouts(name=NAME, env_id="CartPole-v1", **changes):
@@ -49,7 +44,7 @@ def test_what_is_written_is_read(datasets):
     assert folder == datasets / "cart" / "random-v0"
     assert [path.name for path in folder.parent.iterdir() if path.name.startswith(".")] == []
     expected = [record.fingerprint for record in found.records()]
-    for name in ("minari:cart/random-v0", folder, folder / "data"):
+    for name in ("minari:cart/random-v0", folder):
         assert is_dataset(name)
         records = read_records([name], warn=told.append)
         assert [record.fingerprint for record in records] == expected
@@ -76,39 +71,11 @@ def test_dicts_and_infos_are_kept(register):
 
     keyed = register("Keyed-v0", Keyed)
     found = rollouts(env_id=keyed, measured=["a"], hidden=["b", "info[speed][1]"], steps=20)
-    folder = write_dataset(found, policy="random")
-    said = json.loads((folder / "data" / "metadata.json").read_text())["env_spec"]
-    assert json.loads(said)["entry_point"].endswith("<locals>.Keyed")
+    write_dataset(found, policy="random")
     assert found.spec.entry_point is Keyed
     read = read_dataset("minari:cart/random-v0", print).records()
     assert read[0].signals.inputs == ("action[0]", "action[1]", "action[2]")
     assert [record.fingerprint for record in read] == [record.fingerprint for record in found.records()]
-
-
-def test_what_killed_processes_left_is_removed_after_an_hour(datasets):
-    old, new = (datasets / "cart" / f"{UNFINISHED}{name}" for name in ("old", "new"))
-    for folder in (old, new):
-        (folder / "data").mkdir(parents=True)
-    for path in (old, old / "data"):
-        os.utime(path, (time.time() - 3700.0,) * 2)
-    write_dataset(rollouts(), policy="random")
-    assert not old.exists()
-    assert new.exists()  # a process may be at work there
-
-
-def test_two_at_once_write_one(datasets, monkeypatch):
-    found = rollouts()
-    update = MinariStorage.update_metadata
-
-    def slower(storage, metadata):
-        monkeypatch.setattr(MinariStorage, "update_metadata", update)
-        write_dataset(found, policy="random")
-        update(storage, metadata)
-
-    monkeypatch.setattr(MinariStorage, "update_metadata", slower)
-    with pytest.raises(ValueError, match="there is a data set cart/random-v0 already"):
-        write_dataset(found, policy="random")
-    assert sorted(path.name for path in (datasets / "cart").iterdir()) == ["namespace_metadata.json", "random-v0"]
 
 
 def test_what_is_no_data_set():
@@ -131,32 +98,20 @@ def test_what_is_no_data_set():
         read_records([folder])
 
 
-@pytest.mark.parametrize(("env_id", "dt"), [("Pendulum-v1", 0.05), ("Other-v1", 1.0), (None, 1.0)])
-def test_sampling_intervals_of_data_sets_of_others(env_id, dt):
-    folder, heard = write_dataset(rollouts(**PENDULUM), policy="random"), []
-
-    def change(metadata):
-        del metadata["kkl_gym"]
-        spec = metadata.pop("env_spec")
-        if env_id is not None:
-            metadata["env_spec"] = spec.replace("Pendulum-v1", env_id, 1)
-
-    rewrite(folder, change)
+def test_data_sets_of_others():
+    folder, heard = write_dataset(rollouts(), policy="random"), []
+    rewrite(folder, lambda metadata: [metadata.pop(key) for key in ("kkl_gym", "env_spec")])
     read = read_dataset(folder, heard.append)
-    assert (read.dt, read.environment is None) == (dt, env_id is None)
-    assert ["has no sampling interval: a step counts as 1 s" in text for text in heard] == [True] * (dt == 1.0)
+    assert (read.dt, read.environment, len(heard)) == (1.0, None, 1)
+    assert "has no sampling interval: a step counts as 1 s" in heard[0]
     with pytest.raises(ValueError, match="name the measured entries of the observation"):
         read.records()
     minari.load_dataset(NAME).storage.update_metadata({"kkl_gym": {"dt": 0.02}})
     assert read_dataset(folder, pytest.fail).dt == 0.02
 
 
-def test_record_and_train(tmp_path, capsys, monkeypatch):
+def test_record_and_train(tmp_path, capsys):
     record = ["record", "Pendulum-v1", "--measured", "0,1", "--hidden", "2", "--episodes", "6", "--env-kwargs", "g=9"]
-    with monkeypatch.context() as patch:
-        patch.setattr("os.access", lambda path, mode: False)
-        with pytest.raises(SystemExit, match="Permission denied"):
-            main(record)  # before anything is played
     main(record)
     said = " ".join(capsys.readouterr().out.split())
     assert "6 episodes of 200 to 200 steps of 0.05 s" in said

@@ -131,10 +131,10 @@ def test_policies_are_functions_or_agents_of_stable_baselines3(tmp_path, drift):
     env, path = make("CartPole-v1"), tmp_path / "agent.zip"
     assert policy_of(right, env) is right
     sb3.PPO("MlpPolicy", env, device="cpu", n_steps=16, batch_size=16, seed=0).save(path)
-    policy = policy_of(f"ppo:{path.with_suffix('')}", env)
+    policy = policy_of(f"ppo:{path}", env)
     assert roll_out(env, policy, measured=["0"], hidden=["1"], episodes=1).episodes[0].actions.shape[0] > 3
     for wrong, env_id, message in (
-        (f"ppo:{path}", "Pendulum-v1", "trained on the observation space"),
+        (f"ppo:{path}", "Pendulum-v1", "Observation spaces do not match"),
         (f"clever:{path}", "CartPole-v1", "'clever' is not an algorithm"),
         ("ppo:none.zip", "CartPole-v1", "there is no file"),
         (3, "CartPole-v1", "a policy is random"),
@@ -155,8 +155,6 @@ def test_modes_follow_steps_and_the_length_of_episodes(drift):
 
 def test_records_that_nothing_is_learned_from(drift):
     records = played(make(drift)).records()
-    with pytest.raises(ValueError, match=r"dt = 0\.3 s: an observer for Drift-v0 takes a sample .*, every 0\.1"):
-        recorded_preset(records, {"dt": 0.3})
     with pytest.raises(ValueError, match=r"goal\[0\], goal\[1\] never changes: leave it out"):
         recorded_preset(played(make(drift), measured=["place", "goal"]).records())
     other = dataclasses.replace(records[0], environment={"id": "Drift-v0", "kwargs": {"text": False}})
