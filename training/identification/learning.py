@@ -14,7 +14,7 @@ from kkl_gym.system import System
 from observers import Artifact
 from observers.checks import check_dt
 from training.config import Config, override, settings_of
-from training.files import claimed_job, describe, refuse_checkpoints, write
+from training.files import claimed_job, refuse_checkpoints, write
 from training.identification.identify import Identified, Limits, estimate_parameters
 from training.identification.report import write_report
 from training.lessons import Result, train
@@ -22,6 +22,7 @@ from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars
 from training.records import Record, check_signals, resampled, sampling_interval
 from training.records import check_dt as check_steps
+from training.trajectories.equations import describe
 
 NOISE_RANGE = 2.0  # largest measurement noise that the observer is trained for, over that of the records
 LEAST_NOISE = 0.002  # the least of it, over the output's range

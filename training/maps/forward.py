@@ -11,10 +11,10 @@ from torch import nn
 
 from kkl_gym.equations import components
 from kkl_gym.system import Components, System
-from observers import Artifact, ForwardMap, LinearFilter
+from observers import ForwardMap, LinearFilter
 from training.config import Config
 from training.maps.coordinates import StateScale, spread
-from training.maps.networks import Network, compiled, from_mlp, tensor
+from training.maps.networks import Network, tensor
 
 SOLVED = 20_000  # pairs, and points, from which the output layer is solved for in the end
 RIDGE = 1e-5  # of the least squares for it, over the mean column of their matrix
@@ -23,12 +23,11 @@ RIDGE = 1e-5  # of the least squares for it, over the mean column of their matri
 def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
     """A system's f or h, which take and give components, on states (n, nx), as (n, components)."""
     values = components(equations, x.unbind(-1))
-    # A number becomes a tensor by a sum: a copy from the host would not be allowed in a CUDA graph.
     return torch.stack([(x.new_zeros(len(x)) + value).to(x.dtype) for value in values], -1)
 
 
 def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Values of a network at x and their derivatives along f; by hand, as torch.compile has no forward mode."""
+    """Values of a network at x and their derivatives along f."""
     for layer in network:
         if isinstance(layer, nn.Linear):
             x, f = layer(x), f @ layer.weight.T
@@ -74,8 +73,6 @@ class ForwardProblem(nn.Module):
     Shapes: ``pairs`` (n, nx) and (n, nz), ``points`` (m, nx).
     """
 
-    capturable = True
-
     def __init__(
         self,
         system: System,
@@ -97,22 +94,17 @@ class ForwardProblem(nn.Module):
         self._x, self._z = tensor(self.scale(x), device), tensor((z - self.z_offset) / self.z_scale, device)
         self._points = tensor(points, device)
         self._rates = tensor(np.linalg.norm(linear.A, axis=1), device)
-        self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """The risk on a batch of pairs and as many collocation points."""
         shape, device = (self.config.batch,), self._x.device
         rows = torch.randint(len(self._x), shape, generator=generator, device=device)
         points = torch.randint(len(self._points), shape, generator=generator, device=device)
-        loss, data, physics = self._risk(self._x[rows], self._z[rows], self._points[points])
-        return {"loss": loss, "data": data.detach(), "physics": physics.detach(), "error": data.detach().sqrt()}
-
-    def risk(self, x: torch.Tensor, z: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The risk, and the terms of pairs and of points that it is made of."""
-        data = ((self.network(x) - z) ** 2).mean()
-        residual, speed = self.equation.residual(self.network, points)
+        data = ((self.network(self._x[rows]) - self._z[rows]) ** 2).mean()
+        residual, speed = self.equation.residual(self.network, self._points[points])
         physics = ((residual / self.equation.z_scale / (speed[:, None] + self._rates)) ** 2).mean()
-        return data + self.config.physics_weight * physics, data, physics
+        risk = data + self.config.physics_weight * physics
+        return {"loss": risk, "data": data, "physics": physics, "error": data.sqrt()}
 
     @torch.no_grad()
     def solve_output_layer(self, rng: np.random.Generator, report: Callable[[int], object] = lambda done: None) -> None:
@@ -156,17 +148,6 @@ class ForwardProblem(nn.Module):
     def forward_map(self) -> ForwardMap:
         """The learned map for NumPy."""
         return ForwardMap(self.network.export(), self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
-
-
-def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
-    """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x): (n, nz)."""
-    T = artifact.forward
-    if T is None:
-        raise ValueError("this observer holds no forward map T")
-    scales = (T.x_offset, T.x_scale, T.z_offset, T.z_scale)
-    equation = Equation(system, *map(torch.tensor, (artifact.filter.A, artifact.filter.B, *scales)))
-    P, _ = equation.residual(from_mlp(T.mlp, dtype=torch.float64), torch.tensor(x))
-    return np.asarray(P.numpy())
 
 
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:

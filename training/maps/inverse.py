@@ -17,7 +17,7 @@ from training.maps.coordinates import (
     settling_time,
     stationary_covariance,
 )
-from training.maps.networks import Network, compiled, tensor
+from training.maps.networks import Network, tensor
 from training.trajectories.motions import Pairs
 
 MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
@@ -233,8 +233,6 @@ class ForwardMapSampler(Sampler):
 class InverseProblem(nn.Module):
     """The inverse network with the running mean square error of each cell."""
 
-    capturable = True
-
     def __init__(self, network: Network, sampler: Sampler, device: torch.device) -> None:
         super().__init__()
         self.network = network
@@ -244,17 +242,10 @@ class InverseProblem(nn.Module):
         self.register_buffer("visited", torch.zeros(cells, dtype=torch.bool, device=device))
         self.error: torch.Tensor
         self.visited: torch.Tensor
-        self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, each cell relative to its own running error."""
-        loss, error = self._risk(*self.sampler(generator))
-        return {"loss": loss, "error": error}
-
-    def risk(
-        self, inputs: torch.Tensor, x: torch.Tensor, weight: torch.Tensor, cell: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The loss of a batch, and the geometric mean of the cells' running errors."""
+        """Mean square error of a batch, each cell relative to its own running error; geometric mean of these errors."""
+        inputs, x, weight, cell = self.sampler(generator)
         apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
         square = weight * apart[:, :nx].mean(-1)
         if self.sampler.parameters:  # cells of their own, for they are as hard where states are easy
@@ -267,6 +258,6 @@ class InverseProblem(nn.Module):
         keep = torch.where(count > 0, 0.99, 1.0)
         self.error.mul_(keep).add_((1 - keep) * mean)
         self.visited.logical_or_(count > 0)
-        # Cells without data do not count; sums keep the shapes, which a CUDA graph asks for.
+        # Cells without data do not count.
         error = (torch.where(self.visited, self.error.log(), 0.0).sum() / self.visited.sum()).exp().sqrt()
-        return (square / self.error[cell]).mean(), error
+        return {"loss": (square / self.error[cell]).mean(), "error": error}

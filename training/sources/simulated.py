@@ -10,12 +10,11 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact, Equations, LinearFilter
 from training.config import Config
-from training.files import describe
 from training.maps.coordinates import spread
 from training.presets import named_policy
 from training.seeds import Stream, generator
 from training.sources import Increments, Pairs, Runs
-from training.trajectories.equations import field_expression, output_expression, output_facts, output_matrix
+from training.trajectories.equations import describe, field_expression, output_expression, output_facts, output_matrix
 from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, policy_fingerprint, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
@@ -54,9 +53,10 @@ class SimulatedSource:
         self.policy = None if config.policy is None else blind(named_policy(system, config.policy), system.nx)
         if np.any(config.bias):
             system = with_bias(system, config.bias)
-        self.model = system
-        self.ranges = relative_ranges(system, config.uncertain)
-        self.plant = with_parameters(system, self.ranges, in_training=True)
+        self.ranges, self.model, self.plant = {}, system, system
+        if config.uncertain:
+            self.ranges = relative_ranges(system, config.uncertain)
+            self.plant = with_parameters(system, self.ranges, in_training=True)
         self.estimated = tuple(self.ranges) if config.estimate_parameters else ()
         self.name = self.system.name
         self.nx, self.ny, self.dt, self.pace = system.nx, system.ny, config.dt, system.pace
@@ -118,7 +118,7 @@ class SimulatedSource:
     def runs(self, *, report: Report = lambda done: None) -> Runs:
         """Motions with the system's process noise, and as many without; of each a third from 2X, the others from X."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed), max(1, round(RUN * self.pace / self.dt))
-        plant, n = with_parameters(self.model, self.ranges), self.config.runs
+        plant, n = with_parameters(self.model, self.ranges) if self.ranges else self.model, self.config.runs
         how: dict[str, Any] = SOUND | {"levels": (0.0, self.process_noise), "box_factor": BEYOND}
         motions = Motions(plant, self.dt, steps, **how, policy=self.policy).with_inputs(self.nu)
         x, u, noise, usual = motions.drawn(n, rng, lambda done: report(done / n))

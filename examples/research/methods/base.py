@@ -15,10 +15,10 @@ from kkl_gym.system import System
 from observers import storage
 from observers.estimator import Estimator
 from training.evaluation.levels import Level
-from training.files import describe
 from training.progress import progress_bars
 from training.run import Loss, Stage, optimise
 from training.seeds import Stream, generator
+from training.trajectories.equations import describe
 from training.trajectories.motions import Motions, recording_ages
 
 _KEY = "kkl-gym-method"
