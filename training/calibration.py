@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -110,8 +111,9 @@ class _Calibration:
         if artifact.motion is not None:
             groups = (~self.noisy, self.noisy) if self.noisy.any() else (~self.noisy,)
             usual = self.runs.usual
-            factors = [[self.by_knot(each, usual & group, self.factor) for each in distances] for group in groups]
-            table = Factors(np.array(LEVELS), self.knots * self.dt, np.array(factors))
+            find = partial(_excess, degrees=artifact.nx)
+            factors = [[self.by_knot(each, usual & group, find) for each in distances] for group in groups]
+            table = Factors(np.array(LEVELS), self.knots * self.dt, np.clip(factors, 1e-6, 1e6))
             artifact = replace(artifact, motion=replace(artifact.motion, factors=table))
         return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
 
@@ -142,13 +144,10 @@ class _Calibration:
             covariance = ErrorCovariance(np.array(LEVELS), self.knots * self.dt, np.array(table))
             return dataclasses.replace(inverse, error_covariance=covariance)
 
-        if artifact.free_inverse is None:
-            return dataclasses.replace(artifact, inverse=with_table(artifact.inverse, finite))
-        return dataclasses.replace(
-            artifact,
-            inverse=with_table(artifact.inverse, finite & moved),
-            free_inverse=with_table(artifact.free_inverse, finite & ~moved),
-        )
+        free = artifact.free_inverse
+        if free is not None:  # a map of its own for what no input has moved
+            free, finite = with_table(free, finite & ~moved), finite & moved
+        return dataclasses.replace(artifact, inverse=with_table(artifact.inverse, finite), free_inverse=free)
 
     def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
         """Squared distances (levels, ages, n) of the estimates' errors; extremes (3, levels, n, ny) of residuals."""
@@ -183,10 +182,6 @@ class _Calibration:
             raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out")
         entries = {i: find(values[cells[i]]) for i in enough}
         return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
-
-    def factor(self, distances: np.ndarray) -> float:
-        """The factor with which regions of 90 % hold 90 % of the errors."""
-        return float(np.clip(_excess(distances, self.artifact.nx), 1e-6, 1e6))
 
     def limits(self, extremes: np.ndarray) -> Limits:
         """Limits that a sound motion exceeds with a sixth of the probability, and of an output's share in it, each."""

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -165,9 +164,8 @@ class Config:
             )
         if (self.pipeline == "spinn") != (self.forward_steps > 0):
             raise ValueError(f"pipeline {self.pipeline!r} does not go with forward_steps = {self.forward_steps}")
-        own = ("collocation", "box_factor", "solved_output_layer", "transients")
-        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(self) if one.name in own}
-        changed = [f"{name} = {value!r}" for name, value in values.items() if value != getattr(Config, name)]
+        own = {name: getattr(self, name) for name in ("collocation", "box_factor", "solved_output_layer", "transients")}
+        changed = [f"{name} = {value!r}" for name, value in own.items() if value != getattr(Config, name)]
         if changed and self.pipeline != "spinn":
             raise ValueError(f"{', '.join(changed)}: settings of the pipeline 'spinn', not {self.pipeline!r}")
         return self
@@ -179,7 +177,7 @@ def setting_types() -> dict[str, Any]:
 
 
 def read_changes(path: Path) -> dict[str, Any]:
-    """Settings from a TOML or JSON file, for :func:`override`."""
+    """Settings from a TOML or JSON file."""
     language, loads = ("TOML", tomllib.loads) if path.suffix == ".toml" else ("JSON", json.loads)
     try:
         settings = loads(path.read_text(encoding="utf-8"))
@@ -218,8 +216,3 @@ def _validated(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
         except ValidationError as error:
             raise ValueError(f"{where}: {name} = {value!r}: {error.errors()[0]['msg']}") from None
     return checked
-
-
-def override(config: Config, changes: Mapping[str, Any]) -> Config:
-    """The configuration with some settings changed."""
-    return replace(config, **{name: value for name, value in changes.items() if value is not None})

@@ -14,6 +14,7 @@ from filelock import FileLock, Timeout
 
 from observers.storage import UNFINISHED, replacing
 
+CHECKPOINTS = "[!.]*.checkpoint.*"  # of a run or an agent, without those that are being written
 ABANDONED = 3600.0  # seconds after which no process writes to a temporary file any more
 
 
@@ -79,7 +80,7 @@ def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Ite
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)
-        elif _has_checkpoints(folder):
+        elif any(folder.glob(CHECKPOINTS)):
             check_identity(folder / "config.json", described, "a run of another configuration")
         write(folder / "config.json", json.dumps(described, indent=2) + "\n")
         yield
@@ -87,15 +88,11 @@ def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Ite
 
 def refuse_checkpoints(folder: Path) -> None:
     """Raise ValueError if a folder holds the checkpoints of a run."""
-    if _has_checkpoints(folder):
+    if any(folder.glob(CHECKPOINTS)):
         raise ValueError(
             f"{folder} holds the checkpoints of a run: go on with it (resume=True, --resume), remove it, or take "
             "another folder (--out)"
         )
-
-
-def _has_checkpoints(folder: Path) -> bool:
-    return any(folder.glob("[!.]*.checkpoint.*"))
 
 
 def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:

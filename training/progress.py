@@ -41,11 +41,6 @@ class ProgressBars(Progress):
         self._log, self._logged, self._ended = log, False, threading.Event()
         self._due: dict[TaskID, float] = {}
 
-    def bar(self, description: str, total: float | None = None) -> Callable[[float], None]:
-        """Begin a phase."""
-        task = self.add_task(description, total=total)
-        return lambda done: self.update(task, completed=done)
-
     @contextmanager
     def phase(self, description: str, total: float = 1) -> Iterator[Callable[[float], None]]:
         """Show a phase for as long as the context lasts."""

@@ -180,7 +180,7 @@ class Train:
         rates = spectrum.poles.real
         progress.say(
             f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
-            f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s"
+            f"{len(rates)} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s"
         )
         if ranges := relative_ranges(system, config.uncertain):
             others = 100 * (1 - nominal_share(ranges))

@@ -13,7 +13,7 @@ from rich.console import Console
 from kkl_gym.system import System
 from observers import Artifact
 from observers.checks import check_dt
-from training.config import Config, override, settings_of
+from training.config import Config, settings_of
 from training.files import claimed_job, refuse_checkpoints, write
 from training.identification.identify import Identified, Limits, estimate_parameters
 from training.identification.report import write_report
@@ -156,7 +156,7 @@ def adapt(
     ValueError
         As for :func:`identify`, and if the observer's settings are not those of a training, or it estimates a bias.
     """
-    config = override(settings_of(observer.training), settings or {})
+    config = settings_of(observer.training, **(settings or {}))
     if np.any(config.bias):
         raise ValueError(
             f"this observer estimates a bias of up to {config.bias}, which identification does not: pass bias = 0, or "

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -43,25 +42,6 @@ def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[tor
     return x, f
 
 
-class Equation(NamedTuple):
-    """T's equation, dT/dx f(x) = A T(x) + B h(x), for a network between scaled states and scaled z."""
-
-    system: System
-    A: torch.Tensor
-    B: torch.Tensor
-    x_offset: torch.Tensor
-    x_scale: torch.Tensor
-    z_offset: torch.Tensor
-    z_scale: torch.Tensor
-
-    def residual(self, network: nn.Sequential, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The residual (n, nz) in units of z per second, and the speed |f| in scaled states (n,), at x (n, nx)."""
-        f, h = on_tensors(self.system.f, x) / self.x_scale, on_tensors(self.system.h, x)
-        value, derivative = along(network, (x - self.x_offset) / self.x_scale, f)
-        T, derivative = self.z_offset + self.z_scale * value, self.z_scale * derivative
-        return derivative - T @ self.A.T - h @ self.B.T, f.norm(dim=-1)
-
-
 class ForwardProblem(nn.Module):
     """The physics-informed risk R_S1(theta) (paper, eq. emp-risk-theta) of a forward network.
 
@@ -89,8 +69,9 @@ class ForwardProblem(nn.Module):
         self.system, self.linear, self.config = system, linear, config
         self.scale = StateScale.of(points, config.scaling)
         self.z_offset, self.z_scale = z.mean(0), spread(z)
-        scales = (self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
-        self.equation = Equation(system, *(tensor(each, device) for each in (linear.A, linear.B, *scales)))
+        self._A, self._B = tensor(linear.A, device), tensor(linear.B, device)
+        self._x_offset, self._x_scale = tensor(self.scale.offset, device), tensor(self.scale.scale, device)
+        self._z_offset, self._z_scale = tensor(self.z_offset, device), tensor(self.z_scale, device)
         self._x, self._z = tensor(self.scale(x), device), tensor((z - self.z_offset) / self.z_scale, device)
         self._points = tensor(points, device)
         self._rates = tensor(np.linalg.norm(linear.A, axis=1), device)
@@ -101,10 +82,17 @@ class ForwardProblem(nn.Module):
         rows = torch.randint(len(self._x), shape, generator=generator, device=device)
         points = torch.randint(len(self._points), shape, generator=generator, device=device)
         data = ((self.network(self._x[rows]) - self._z[rows]) ** 2).mean()
-        residual, speed = self.equation.residual(self.network, self._points[points])
-        physics = ((residual / self.equation.z_scale / (speed[:, None] + self._rates)) ** 2).mean()
+        residual, speed = self.residual(self._points[points])
+        physics = ((residual / self._z_scale / (speed[:, None] + self._rates)) ** 2).mean()
         risk = data + self.config.physics_weight * physics
         return {"loss": risk, "data": data, "physics": physics, "error": data.sqrt()}
+
+    def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """dT/dx f - A T - B h (n, nz), in units of z per second, and |f| in scaled states (n,), at x (n, nx)."""
+        f, h = on_tensors(self.system.f, x) / self._x_scale, on_tensors(self.system.h, x)
+        value, derivative = along(self.network, (x - self._x_offset) / self._x_scale, f)
+        T, derivative = self._z_offset + self._z_scale * value, self._z_scale * derivative
+        return derivative - T @ self._A.T - h @ self._B.T, f.norm(dim=-1)
 
     @torch.no_grad()
     def solve_output_layer(self, rng: np.random.Generator, report: Callable[[int], object] = lambda done: None) -> None:
@@ -120,7 +108,7 @@ class ForwardProblem(nn.Module):
         features, linear, device = nn.Sequential(*hidden), self.linear, self._x.device
         some = torch.as_tensor(rng.permutation(len(self._x))[:SOLVED])
         at = torch.as_tensor(rng.permutation(len(self._points))[:SOLVED])
-        x, offset, scale = self._points.cpu()[at].double(), self.equation.x_offset.cpu(), self.equation.x_scale.cpu()
+        x, offset, scale = self._points.cpu()[at].double(), self._x_offset.cpu(), self._x_scale.cpu()
         f, h = on_tensors(self.system.f, x) / scale, on_tensors(self.system.h, x).numpy()
         value, derivative = (each.numpy() for each in along(features, (x - offset) / scale, f))
         phi = np.column_stack([value, np.ones(len(at))])

@@ -1,6 +1,7 @@
 """Motions of a system that is simulated."""
 
 import functools
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -14,8 +15,8 @@ from training.maps.coordinates import spread
 from training.presets import named_policy
 from training.seeds import Stream, generator
 from training.sources import Increments, Pairs, Runs
-from training.trajectories.equations import describe, field_expression, output_expression, output_facts, output_matrix
-from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, policy_fingerprint, recording_ages
+from training.trajectories.equations import describe, digest, field_expression, output_facts
+from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
@@ -76,12 +77,15 @@ class SimulatedSource:
         if self.ranges:
             identity["nominal_share"] = nominal_share(self.ranges)
         if self.policy:
-            identity["policy_actions"] = policy_fingerprint(self.policy, self.model)
+            actions = self.policy(self.model.draw_starts(np.random.default_rng(0), 20))
+            identity["policy_actions"] = digest(np.round(actions, 6).tolist())  # the same on every machine
         return identity
 
     def facts(self) -> dict[str, Any]:
         """Arguments of :class:`observers.Artifact`."""
-        system = self.model
+        system, output = self.model, dict[str, Any]()
+        with suppress(ValueError):  # which `tracking` raises again
+            output = output_facts(system)
         return {
             "system": self.name,
             "parameters": self.system.parameters,
@@ -89,7 +93,7 @@ class SimulatedSource:
             "u_max": tuple(map(float, system.u_max)),
             "parameter_ranges": self.ranges,
             "estimated_parameters": self.estimated,
-            **output_facts(system),
+            **output,
         }
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
@@ -170,8 +174,7 @@ class SimulatedSource:
         system = self.model
         if self.ranges:
             raise ValueError(f"a motion is of one plant, not of a range of {', '.join(self.ranges)}")
-        if output_matrix(system) is None:
-            output_expression(system)  # raises ValueError if none can be written
+        output_facts(system)  # raises ValueError if an artifact cannot hold the output
         low, high = np.array(system.bounds, dtype=float).T
         offset, scale = self._scale
         mean, covariance = unknown_start(system)

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,8 +40,13 @@ def describe(system: System) -> dict[str, Any]:
         "X": system.X,
         "bounds": system.bounds,
         "u_max": system.u_max,
-        "equations": hashlib.sha256(json.dumps(equations).encode()).hexdigest()[:16],
+        "equations": digest(equations),
     }
+
+
+def digest(values: Sequence[Any]) -> str:
+    """Hash of numbers in lists."""
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:
@@ -80,13 +85,9 @@ def output_matrix(system: System) -> np.ndarray | None:
 
 
 def output_facts(system: System) -> dict[str, Any]:
-    """The output of an artifact: C where h(x) = C x, else h as an expression, nothing where it cannot be written."""
-    if (C := output_matrix(system)) is not None:
-        return {"C": C}
-    try:
-        return {"h": output_expression(system)}
-    except ValueError:  # calibration raises it again, with the reason
-        return {}
+    """The output as an artifact takes it: C where h(x) = C x, else h as an expression, or ValueError."""
+    C = output_matrix(system)
+    return {"h": output_expression(system)} if C is None else {"C": C}
 
 
 def output_expression(system: System) -> Expression:
