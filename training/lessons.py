@@ -75,7 +75,7 @@ def train(
     config : Config, optional
         How; by default the system's preset "fast", or that of the source.
     folder : Path, optional
-        Where checkpoints, a log and TensorBoard scalars go, created if missing; by default nothing is kept.
+        Where checkpoints and a log go, created if missing; by default nothing is kept.
     resume : bool, default False
         Whether to go on from the checkpoints in ``folder`` if there are any; without it they are an error.
     device : torch.device, optional

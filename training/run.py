@@ -10,7 +10,7 @@ import time
 import zipfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import torch
 from rich.progress import Progress
 from torch import nn
 
-from observers.storage import naming, replacing
+from observers.storage import replacing
 from training.config import Config, Optimiser
 from training.files import claimed_run
 from training.progress import LOG, ProgressBars, progress_bars
@@ -32,9 +32,6 @@ WARM_UP = 0.01  # part of a stage in which the learning rate rises
 # A batch is drawn with the generator it is given and nothing else, so that a resumed run goes on as it would have.
 Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
 
-Log = Callable[[str, float, int], object]
-"""Takes the name of a scalar, its value and the number of the batch."""
-
 
 @dataclass
 class Run:
@@ -46,7 +43,6 @@ class Run:
     progress: ProgressBars
     device: torch.device
     resume: bool = False
-    log: Log | None = None
     losses: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     samples: dict[str, int] = field(default_factory=dict)  # distinct ones of each stage
@@ -63,25 +59,19 @@ class Run:
         device: torch.device | None = None,
         resume: bool = False,
     ) -> Iterator["Run"]:
-        """Begin in a folder, which is locked, with a log and TensorBoard's scalars; without one nothing is kept."""
+        """Begin in a folder, which is locked, with a log; without one nothing is kept."""
         described = json.dumps(identity or {}, sort_keys=True)
         torch.manual_seed(config.seed)
         with ExitStack() as stack:
-            log: Log | None = None
             lines = None if folder is None else folder / LOG
             if folder is None:
                 folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             else:
                 stack.enter_context(claimed_run(folder, identity or {}, resume))
-                with suppress(ImportError):  # TensorBoard is an extra
-                    from torch.utils.tensorboard import SummaryWriter
-
-                    stack.enter_context(naming(folder))
-                    log = stack.enter_context(SummaryWriter(folder)).add_scalar
             progress = stack.enter_context(progress_bars(console, lines))
             device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
             fingerprint = hashlib.sha256(described.encode()).hexdigest()[:16]
-            yield cls(config, folder, fingerprint, progress, device, resume, log)
+            yield cls(config, folder, fingerprint, progress, device, resume)
 
     def minimise(
         self, name: str, problem: nn.Module, loss: Loss, steps: int, *, share: float = 1.0, **settings: Any
@@ -93,7 +83,7 @@ class Run:
         where: dict[str, Any] = {"folder": self.folder, "fingerprint": self.fingerprint, "cpu_seconds": seconds}
         stage = Stage(name=name, steps=steps, **{**where, **usual, **settings})
         with self.timed(name):
-            self.losses[name] = optimise(stage, problem, loss, self.progress, log=self.log, resume=self.resume)
+            self.losses[name] = optimise(stage, problem, loss, self.progress, resume=self.resume)
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
@@ -147,7 +137,7 @@ class Stage:
 
 
 def optimise(
-    stage: Stage, module: nn.Module, loss: Loss, progress: Progress, *, log: Log | None = None, resume: bool
+    stage: Stage, module: nn.Module, loss: Loss, progress: Progress, *, resume: bool
 ) -> list[tuple[int, float]]:
     """Minimise a loss over the parameters of a module, with checkpoints.
 
@@ -181,9 +171,6 @@ def optimise(
             raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {stage.step}")
         total.zero_()
         stage.history.append((stage.step, mean))
-        if log is not None:
-            for name, value in terms.items():
-                log(f"{stage.name}/{name}", float(value.detach()), stage.step)
         expected = round(stage.step / done)  # batches by the time the clock ends the stage
         progress.update(task, completed=stage.step, total=expected, description=f"{stage.name} (error {mean:.3g})")
         if done >= 1 or time.monotonic() - saved_at > CHECKPOINT_SECONDS:

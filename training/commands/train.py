@@ -54,8 +54,7 @@ class Train:
 
     kkl-gym train lorenz: a shipped system. kkl-gym train script.py: the one that the script defines. kkl-gym train
     NAME --data run*.csv: from recorded states. The folder runs/NAME receives NAME.safetensors (T_inv, the motion that
-    it tracks by, covariances, a monitor's limits), report.png, checkpoints, log.txt with all lines printed and, where
-    TensorBoard is installed, its scalars.
+    it tracks by, covariances, a monitor's limits), report.png, checkpoints, and log.txt with all lines printed.
     """
 
     system: Annotated[

@@ -84,8 +84,7 @@ class ForwardProblem(nn.Module):
         data = ((self.network(self._x[rows]) - self._z[rows]) ** 2).mean()
         residual, speed = self.residual(self._points[points])
         physics = ((residual / self._z_scale / (speed[:, None] + self._rates)) ** 2).mean()
-        risk = data + self.config.physics_weight * physics
-        return {"loss": risk, "data": data, "physics": physics, "error": data.sqrt()}
+        return {"loss": data + self.config.physics_weight * physics, "error": data.sqrt()}
 
     def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """dT/dx f - A T - B h (n, nz), in units of z per second, and |f| in scaled states (n,), at x (n, nx)."""
