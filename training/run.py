@@ -110,30 +110,9 @@ class Stage:
     began: float = field(default_factory=lambda: time.process_time())
 
     @property
-    def checkpoint(self) -> Path:
-        """The file that a resumed stage goes on from."""
-        return self.folder / f"{self.name}{CHECKPOINT}"
-
-    @property
     def part(self) -> float:
         """Share of the stage that is done, by steps or by CPU time."""
         return max(self.step / self.steps, min(1.0, (time.process_time() - self.began) / self.cpu_seconds))
-
-    def save(self, parts: Mapping[str, Any], generator: torch.Generator) -> None:
-        """Write a checkpoint."""
-        state = {name: part.state_dict() for name, part in parts.items()} | {"generator": generator.get_state()}
-        own = {"step": self.step, "seconds": time.process_time() - self.began, "history": self.history}
-        save_checkpoint(self.checkpoint, state | own, fingerprint=self.fingerprint)
-
-    def restore(self, parts: Mapping[str, Any], generator: torch.Generator) -> None:
-        """Go on from the checkpoint."""
-        state = load_checkpoint(self.checkpoint, fingerprint=self.fingerprint)
-        with restoring(self.checkpoint):
-            for name, part in parts.items():
-                part.load_state_dict(state[name])
-            generator.set_state(state["generator"])
-            self.history = [(int(step), float(error)) for step, error in state["history"]]
-            self.step, self.began = operator.index(state["step"]), time.process_time() - float(state["seconds"])
 
 
 def optimise(
@@ -148,8 +127,15 @@ def optimise(
     generator = torch.Generator(next(module.parameters()).device).manual_seed(stage.seed)
     optimiser = _optimiser(stage, module)
     parts: dict[str, Any] = {"module": module, "optimiser": optimiser}
-    if resume and stage.checkpoint.exists():
-        stage.restore(parts, generator)
+    checkpoint = stage.folder / f"{stage.name}{CHECKPOINT}"
+    if resume and checkpoint.exists():
+        state = load_checkpoint(checkpoint, fingerprint=stage.fingerprint)
+        with restoring(checkpoint):
+            for name, part in parts.items():
+                part.load_state_dict(state[name])
+            generator.set_state(state["generator"])
+            stage.history = [(int(step), float(error)) for step, error in state["history"]]
+            stage.step, stage.began = operator.index(state["step"]), time.process_time() - float(state["seconds"])
     task = progress.add_task(stage.name, total=stage.steps, completed=stage.step)
     total, saved_at, done = torch.zeros((), device=generator.device), time.monotonic(), stage.part
     while done < 1:
@@ -174,7 +160,9 @@ def optimise(
         expected = round(stage.step / done)  # batches by the time the clock ends the stage
         progress.update(task, completed=stage.step, total=expected, description=f"{stage.name} (error {mean:.3g})")
         if done >= 1 or time.monotonic() - saved_at > CHECKPOINT_SECONDS:
-            stage.save(parts, generator)
+            state = {name: part.state_dict() for name, part in parts.items()} | {"generator": generator.get_state()}
+            state |= {"step": stage.step, "seconds": time.process_time() - stage.began, "history": stage.history}
+            save_checkpoint(checkpoint, state, fingerprint=stage.fingerprint)
             saved_at = time.monotonic()
     return stage.history
 

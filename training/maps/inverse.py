@@ -238,10 +238,8 @@ class InverseProblem(nn.Module):
         self.network = network
         self.sampler = sampler
         cells = sampler.cells * (2 if sampler.parameters else 1)
-        self.register_buffer("error", torch.ones(cells, device=device))
-        self.register_buffer("visited", torch.zeros(cells, dtype=torch.bool, device=device))
-        self.error: torch.Tensor
-        self.visited: torch.Tensor
+        self.error = nn.Buffer(torch.ones(cells, device=device))
+        self.visited = nn.Buffer(torch.zeros(cells, dtype=torch.bool, device=device))
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Mean square error of a batch, each cell relative to its own running error; geometric mean of these errors."""
