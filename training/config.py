@@ -21,15 +21,18 @@ NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 # One for all outputs, or one for each. The names appear in error messages.
+EACH = Discriminator(lambda value: "each" if isinstance(value, list | tuple) else "all")
 Levels = Annotated[
-    Annotated[Positive, Tag("all")] | Annotated[tuple[Positive, ...], Field(min_length=1), Tag("each")],
-    Discriminator(lambda value: "each" if isinstance(value, list | tuple) else "all"),
+    Annotated[Positive, Tag("all")] | Annotated[tuple[Positive, ...], Field(min_length=1), Tag("each")], EACH
+]
+Biases = Annotated[
+    Annotated[NotNegative, Tag("all")] | Annotated[tuple[NotNegative, ...], Field(min_length=1), Tag("each")], EACH
 ]
 
-STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
-
-@dataclass(frozen=True, config=STRICT)
+@dataclass(
+    frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+)
 class Config:
     """A training run; together with the system it determines the artifact.
 
@@ -129,7 +132,7 @@ class Config:
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
     values, as a part of these; "all" stands for each that is not named. Some motions keep the values themselves."""
-    bias: float | tuple[float, ...] = 0.0
+    bias: Biases = 0.0
     """Largest constant bias of all outputs, or of each, which become states (input-aware, no uncertain parameters)."""
     estimate_parameters: bool = False
     """Whether the map gives the uncertain parameters too."""
@@ -149,12 +152,9 @@ class Config:
                 raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
         if self.uncertain and self.pipeline != "input-aware":
             raise ValueError(f"uncertain = {self.uncertain!r} needs the pipeline 'input-aware', not {self.pipeline!r}")
-        biases = self.bias if isinstance(self.bias, tuple) else (self.bias,)
-        if min(biases, default=-1.0) < 0 or (any(biases) and (self.uncertain or self.pipeline != "input-aware")):
-            raise ValueError(
-                f"bias = {self.bias!r} must be a number that is not negative, or one of each output, and needs the "
-                "pipeline 'input-aware' without uncertain parameters"
-            )
+        biased = any(self.bias) if isinstance(self.bias, tuple) else self.bias
+        if biased and (self.uncertain or self.pipeline != "input-aware"):
+            raise ValueError(f"bias = {self.bias!r} needs the pipeline 'input-aware' without uncertain parameters")
         if self.estimate_parameters and not any(self.uncertain.values()):
             raise ValueError(f"estimate_parameters needs uncertain parameters, got uncertain = {self.uncertain!r}")
         if self.policy is not None and (self.pipeline != "input-aware" or not self.inputs):

@@ -102,8 +102,6 @@ def train(
         raise ValueError("a source has a configuration of its own: pass config with a System alone")
     config = source.config
     noise_levels("measurement_noise_max", config.measurement_noise_max, source.ny)
-    if config.pipeline == "spinn" and isinstance(source, SimulatedSource):
-        check_continuous(source.system)
     identity = {**source.identity(), **dataclasses.asdict(config)}
     began = time.process_time()
     with Run.begin(config, folder, identity=identity, console=console, device=device, resume=resume) as run:
@@ -204,6 +202,7 @@ def _papers_maps(source: Source, linear: LinearFilter, run: Run) -> Maps:
     """T, trained on motions and on its equation, and T_inv on z = T(x)."""
     if not isinstance(source, SimulatedSource):
         raise ValueError("the pipeline 'spinn' needs the equations of a system; train with 'input-aware'")
+    check_continuous(source.system)
     config, system, ages, progress = run.config, source.system, source.ages, run.progress
     settled = ages >= truncation_step(  # the filter's start no longer matters
         system, linear, steps=source.steps, epsilon=config.truncation, box_factor=config.box_factor

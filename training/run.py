@@ -60,7 +60,6 @@ class Run:
         resume: bool = False,
     ) -> Iterator["Run"]:
         """Begin in a folder, which is locked, with a log; without one nothing is kept."""
-        described = json.dumps(identity or {}, sort_keys=True)
         torch.manual_seed(config.seed)
         with ExitStack() as stack:
             lines = None if folder is None else folder / LOG
@@ -70,6 +69,7 @@ class Run:
                 stack.enter_context(claimed_run(folder, identity or {}, resume))
             progress = stack.enter_context(progress_bars(console, lines))
             device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+            described = json.dumps(identity or {}, sort_keys=True)
             fingerprint = hashlib.sha256(described.encode()).hexdigest()[:16]
             yield cls(config, folder, fingerprint, progress, device, resume)
 

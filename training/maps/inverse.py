@@ -40,9 +40,9 @@ class Batch(NamedTuple):
 class Sampler(Protocol):
     """Batches for T_inv, in cells whose errors are made equally small, and the map that a network on them makes."""
 
-    cells: int
-    kinds_of_plant: int
-    parameters: int
+    cells: int = 1
+    kinds_of_plant: int = 1
+    parameters: int = 0
     _map: dict[str, Any]
 
     def __call__(self, generator: torch.Generator) -> Batch:
@@ -121,15 +121,14 @@ class TrajectorySampler(Sampler):
         self._level_max, self._level_unit = (tensor(values[:, None], device) for values in (largest, unit))
         # Noise in units of the stationary one, so that its covariances are well conditioned.
         relative = whiten / np.where(gain > 0, gain, 1.0)[:, None]
-        late = int(np.ceil(2 * settling_time(linear) / linear.dt))
-        saturated = np.minimum(data.ages, late)
+        saturated = np.minimum(data.ages, int(np.ceil(2 * settling_time(linear) / linear.dt)))
         self._noise_root = tensor(root(relative @ noise_covariance(linear, saturated) @ relative.T), device)
         self._error_root = None if error is None else tensor(root(whiten @ error @ whiten.T), device)
         self._age = torch.log1p(tensor(data.ages * linear.dt, device).clamp(max=age_max) / age_unit)
         position = np.log1p(data.ages) / np.log1p(data.ages[-1])
         age_cell = np.minimum((position * self.AGE_CELLS).astype(int), self.AGE_CELLS - 1)
         self._age_cell = torch.as_tensor(age_cell, device=device)
-        trajectory_cell, self._trajectory_cells, self.kinds_of_plant = np.zeros(n, int), 1, 1
+        trajectory_cell, self._trajectory_cells = np.zeros(n, int), 1
         self._process: torch.Tensor | None = None
         if process_noise_max:
             part = data.process_noise / process_noise_max
@@ -198,8 +197,6 @@ class ForwardMapSampler(Sampler):
 
     Shapes: ``error`` (nz, nz), its covariance, ``points`` (n, nx).
     """
-
-    cells, kinds_of_plant, parameters = 1, 1, 0
 
     def __init__(
         self, T: ForwardMap, error: np.ndarray, config: Config, *, points: np.ndarray, device: torch.device
