@@ -177,7 +177,7 @@ def preset(
     size : {"default", "large"}
         Of an input-aware T_inv: large is one that stands alone, for use without a model.
     changes : mapping of str to object, optional
-        Settings that are to differ; of None they do not. A spectrum that is not given suits them.
+        Settings that are to differ, but for those of None. A spectrum that is not given suits them.
 
     Returns
     -------

@@ -48,9 +48,8 @@ class Network(nn.Sequential):
         )
 
 
-def averaged(networks: Sequence[Network]) -> MLP:
+def averaged(members: Sequence[MLP]) -> MLP:
     """The mean of some networks of one shape, as one network: their hidden layers stand side by side."""
-    members = [network.export() for network in networks]
     first, *hidden, last = zip(*(member.weights for member in members), strict=True)
     *biases, offsets = zip(*(member.biases for member in members), strict=True)
     return MLP(

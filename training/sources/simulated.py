@@ -19,17 +19,19 @@ from training.trajectories.equations import describe, digest, field_expression, 
 from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
-LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
-BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned
+LEAD_IN_SHARE = 0.4  # share of the free motions that start where inputs have led
+BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and a flow is learned
 # Of runs for calibration: every other one is driven, or under its policy alone.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
-LEAST_NOISE = 0.001  # that a tracker assumes, of the usual
-LEAST_PROCESS_NOISE = 0.005  # that filters assume, at the system's pace: a tenth of the environments' default
-WINDOW, RUN = 0.5, 20.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
-SUBSTEPS, INTEGRATION_ERROR = 64, 2e-5  # at most, of scaled states in a sample: no more than the noise assumed
-TOO_FAR_OFF = 0.01  # of scaled states, where a jump in f leaves more than that at any number of steps
-INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share that judges a flow
-DEVIATIONS = (1e-4, 0.3)  # of these pairs from motions, in standard deviations of the states, log-uniform
+LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, over the usual
+# Least process noise that filters assume, at the system's pace: a tenth of the environments' default.
+LEAST_PROCESS_NOISE = 0.005
+WINDOW, RUN = 0.5, 20.0  # a tracker's window and a calibration run, in seconds at the shipped systems' pace
+# Most Runge-Kutta steps in a sample, and the error of scaled states at which more are taken, below the noise assumed.
+SUBSTEPS, INTEGRATION_ERROR = 64, 2e-5
+TOO_FAR_OFF = 0.01  # error of scaled states at SUBSTEPS, as a jump in f leaves, above which a flow is learned
+INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share of them that judges a flow
+DEVIATIONS = (1e-4, 0.3)  # log-uniform distances of these pairs from motions, in standard deviations of the states
 
 
 class SimulatedSource:

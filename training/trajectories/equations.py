@@ -25,7 +25,7 @@ _NAMES = {
 
 
 def describe(system: System) -> dict[str, Any]:
-    """What identifies a system, its equations included: they are sampled at points of the training box."""
+    """Return the identity of a system, with its equations sampled at points of the training box."""
     rng = np.random.default_rng(0)
     x = system.draw_starts(rng, 20)
     if system.discrete:
