@@ -13,7 +13,7 @@ from observers import MLP, Artifact
 from training.commands.options import NoiseLevel, Observers, OwnSystem, read_observers
 from training.evaluation.errors import unseen_trajectories
 from training.evaluation.levels import Level, beyond, level_for
-from training.export.torch_parts import Network
+from training.maps.networks import from_mlp
 from training.trajectories.motions import filter_states
 
 # Least and greatest slope of each activation, rounded outwards; those of x sigmoid(x) are where its second derivative
@@ -82,9 +82,9 @@ def along_motions(artifact: Artifact, system: System) -> np.ndarray:
 
 def lipschitz_lower(mlp: MLP, z: np.ndarray) -> float:
     """Bound a network's Lipschitz constant from below, by its Jacobians at points (n, inputs)."""
-    network = Network(mlp, torch.float64)
-    derivative = torch.func.vmap(torch.func.jacrev(lambda row: network(row[None])[0]), chunk_size=CHUNK)
-    return float(torch.linalg.matrix_norm(derivative(torch.as_tensor(z, dtype=torch.float64)), 2).max().detach())
+    network = from_mlp(mlp, dtype=torch.float64)
+    derivative = torch.func.vmap(torch.func.jacrev(network), chunk_size=CHUNK)
+    return float(torch.linalg.matrix_norm(derivative(torch.as_tensor(z, dtype=torch.float64)), 2).max())
 
 
 def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:

@@ -62,3 +62,13 @@ def averaged(members: Sequence[MLP]) -> MLP:
 def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
     """A float32 tensor on ``device``."""
     return torch.as_tensor(np.ascontiguousarray(x, dtype=np.float32), device=device)
+
+
+def from_mlp(mlp: MLP, *, dtype: torch.dtype = torch.float32) -> nn.Sequential:
+    """Put a multilayer perceptron for NumPy into torch, not to be trained further."""
+    layers: list[nn.Module] = []
+    for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
+        layer = nn.Linear(weight.shape[1], weight.shape[0], dtype=dtype)
+        layer.weight.data, layer.bias.data = (torch.as_tensor(values, dtype=dtype) for values in (weight, bias))
+        layers += [layer, ACTIVATIONS[mlp.activation]()]
+    return nn.Sequential(*layers[:-1]).requires_grad_(False)

@@ -18,7 +18,7 @@ from kkl_gym.system import on_states
 from observers import Artifact, LinearFilter
 from observers.names import resolve
 from training.maps.forward import ForwardProblem, along, on_tensors, transients, truncation_step
-from training.maps.networks import Network
+from training.maps.networks import Network, from_mlp
 from training.spectrum import Spectrum
 from training.trajectories.motions import filter_states
 
@@ -139,3 +139,11 @@ def test_the_residual_is_that_of_the_equation():
     residual, speed = problem.residual(torch.tensor(x, dtype=torch.float32))
     np.testing.assert_allclose(residual.detach(), expected, atol=2e-3)
     np.testing.assert_allclose(speed.detach(), np.linalg.norm(f / problem.scale.scale, axis=1), rtol=1e-5)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_networks_come_back_from_numpy(activation):
+    network, x = Network(3, 2, width=8, depth=2, activation=activation), torch.randn(10, 3)
+    again = from_mlp(network.export())
+    assert not any(parameter.requires_grad for parameter in again.parameters())
+    np.testing.assert_array_equal(again(x), network(x).detach())
