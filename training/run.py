@@ -10,7 +10,7 @@ import time
 import zipfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -60,18 +60,15 @@ class Run:
         resume: bool = False,
     ) -> Iterator["Run"]:
         """Begin in a folder, which is locked, with a log; without one nothing is kept."""
+        described = json.dumps(identity or {}, sort_keys=True)
+        fingerprint = hashlib.sha256(described.encode()).hexdigest()[:16]
+        device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
         torch.manual_seed(config.seed)
-        with ExitStack() as stack:
-            lines = None if folder is None else folder / LOG
-            if folder is None:
-                folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            else:
-                stack.enter_context(claimed_run(folder, identity or {}, resume))
-            progress = stack.enter_context(progress_bars(console, lines))
-            device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
-            described = json.dumps(identity or {}, sort_keys=True)
-            fingerprint = hashlib.sha256(described.encode()).hexdigest()[:16]
-            yield cls(config, folder, fingerprint, progress, device, resume)
+        place: AbstractContextManager[Any] = (
+            tempfile.TemporaryDirectory() if folder is None else claimed_run(folder, identity or {}, resume)
+        )
+        with place as temporary, progress_bars(console, folder and folder / LOG) as progress:
+            yield cls(config, folder or Path(temporary), fingerprint, progress, device, resume)
 
     def minimise(
         self, name: str, problem: nn.Module, loss: Loss, steps: int, *, share: float = 1.0, **settings: Any
