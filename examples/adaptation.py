@@ -22,7 +22,7 @@ from kkl_gym.simulate import simulate
 from observers import Artifact
 from observers.names import resolve
 from training import train
-from training.config import override, settings_of
+from training.config import settings_of
 from training.evaluation.errors import errors, unseen_trajectories
 from training.identification import adapt
 from training.records import Record
@@ -91,7 +91,7 @@ def main(
         console=console,
     )
     took = time.process_time() - began
-    config = override(settings_of(shipped.training), settings)
+    config = settings_of(shipped.training, **settings)
     trained = train(plant, config, folder / "true", resume=True, console=console).artifact
 
     unseen = unseen_trajectories(plant, plant.dt, n=50, duration=50.0, seed=seed)

@@ -20,7 +20,7 @@ from training.cli import COMMANDS, EXTRAS, read
 
 RESEARCH = "python -m examples.research"
 # Commands of others, which are taken on trust.
-OF_OTHERS = {"cc", "cd", "cp", "printf", "sleep", "srun", "tensorboard", "./van_der_pol"}
+OF_OTHERS = {"cc", "cd", "cp", "printf", "sleep", "srun", "./van_der_pol"}
 
 
 def own(page):

@@ -1,7 +1,8 @@
-"""The lesson of calibration: covariances and limits of a monitor, from one pass of motions nothing was trained on."""
+"""The lesson of calibration: covariances and limits of a monitor, from motions on which nothing was trained."""
 
-import dataclasses
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,10 @@ from training.trajectories.motions import filter_states
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of measurement noise, in multiples of the largest in training
 AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds at the usual pace
 PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
-FEWEST = 50  # errors from which a covariance or a quantile is taken
-LEAST_VARIANCE = 1e-6  # added to that of each state, over its range squared
-WINDOW, WARM_UP = 0.5, 5.0  # seconds of the monitor, likewise
-MARGIN = 1.05  # on limits, which are from finitely many motions
+FEWEST = 50  # least number of errors for a covariance or a quantile
+LEAST_VARIANCE = 1e-6  # added to each state's variance, in squares of its range
+WINDOW, WARM_UP = 0.5, 5.0  # the monitor's window and warm-up, in seconds at the usual pace
+MARGIN = 1.05  # factor on the limits, which rest on finitely many motions
 
 
 def calibrate(
@@ -96,7 +97,6 @@ class _Calibration:
 
     def calibrated(self, motion: Motion | None, progress: ProgressBars) -> Artifact:
         """The artifact with all tables, and with a motion."""
-        replace = dataclasses.replace
         artifact = replace(self.artifact, motion=None, limits=None)
         monitored = artifact.knows_output and self.runs.sound
         if self.informed:
@@ -110,8 +110,9 @@ class _Calibration:
         if artifact.motion is not None:
             groups = (~self.noisy, self.noisy) if self.noisy.any() else (~self.noisy,)
             usual = self.runs.usual
-            factors = [[self.by_knot(each, usual & group, self.factor) for each in distances] for group in groups]
-            table = Factors(np.array(LEVELS), self.knots * self.dt, np.array(factors))
+            find = partial(_excess, degrees=artifact.nx)
+            factors = [[self.by_knot(each, usual & group, find) for each in distances] for group in groups]
+            table = Factors(np.array(LEVELS), self.knots * self.dt, np.clip(factors, 1e-6, 1e6))
             artifact = replace(artifact, motion=replace(artifact.motion, factors=table))
         return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
 
@@ -140,15 +141,12 @@ class _Calibration:
         def with_table(inverse: InverseMap, group: np.ndarray) -> InverseMap:
             table = [self.by_knot(each, group, lambda e: _covariance(e, least)) for each in errors]
             covariance = ErrorCovariance(np.array(LEVELS), self.knots * self.dt, np.array(table))
-            return dataclasses.replace(inverse, error_covariance=covariance)
+            return replace(inverse, error_covariance=covariance)
 
-        if artifact.free_inverse is None:
-            return dataclasses.replace(artifact, inverse=with_table(artifact.inverse, finite))
-        return dataclasses.replace(
-            artifact,
-            inverse=with_table(artifact.inverse, finite & moved),
-            free_inverse=with_table(artifact.free_inverse, finite & ~moved),
-        )
+        free = artifact.free_inverse
+        if free is not None:  # a map of its own for what no input has moved
+            free, finite = with_table(free, finite & ~moved), finite & moved
+        return replace(artifact, inverse=with_table(artifact.inverse, finite), free_inverse=free)
 
     def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
         """Squared distances (levels, ages, n) of the estimates' errors; extremes (3, levels, n, ny) of residuals."""
@@ -183,10 +181,6 @@ class _Calibration:
             raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out")
         entries = {i: find(values[cells[i]]) for i in enough}
         return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
-
-    def factor(self, distances: np.ndarray) -> float:
-        """The factor with which regions of 90 % hold 90 % of the errors."""
-        return float(np.clip(_excess(distances, self.artifact.nx), 1e-6, 1e6))
 
     def limits(self, extremes: np.ndarray) -> Limits:
         """Limits that a sound motion exceeds with a sixth of the probability, and of an output's share in it, each."""

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -22,15 +21,18 @@ NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 # One for all outputs, or one for each. The names appear in error messages.
+EACH = Discriminator(lambda value: "each" if isinstance(value, list | tuple) else "all")
 Levels = Annotated[
-    Annotated[Positive, Tag("all")] | Annotated[tuple[Positive, ...], Field(min_length=1), Tag("each")],
-    Discriminator(lambda value: "each" if isinstance(value, list | tuple) else "all"),
+    Annotated[Positive, Tag("all")] | Annotated[tuple[Positive, ...], Field(min_length=1), Tag("each")], EACH
+]
+Biases = Annotated[
+    Annotated[NotNegative, Tag("all")] | Annotated[tuple[NotNegative, ...], Field(min_length=1), Tag("each")], EACH
 ]
 
-STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
-
-@dataclass(frozen=True, config=STRICT)
+@dataclass(
+    frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+)
 class Config:
     """A training run; together with the system it determines the artifact.
 
@@ -130,7 +132,7 @@ class Config:
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
     values, as a part of these; "all" stands for each that is not named. Some motions keep the values themselves."""
-    bias: float | tuple[float, ...] = 0.0
+    bias: Biases = 0.0
     """Largest constant bias of all outputs, or of each, which become states (input-aware, no uncertain parameters)."""
     estimate_parameters: bool = False
     """Whether the map gives the uncertain parameters too."""
@@ -150,12 +152,9 @@ class Config:
                 raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
         if self.uncertain and self.pipeline != "input-aware":
             raise ValueError(f"uncertain = {self.uncertain!r} needs the pipeline 'input-aware', not {self.pipeline!r}")
-        biases = self.bias if isinstance(self.bias, tuple) else (self.bias,)
-        if min(biases, default=-1.0) < 0 or (any(biases) and (self.uncertain or self.pipeline != "input-aware")):
-            raise ValueError(
-                f"bias = {self.bias!r} must be a number that is not negative, or one of each output, and needs the "
-                "pipeline 'input-aware' without uncertain parameters"
-            )
+        biased = any(self.bias) if isinstance(self.bias, tuple) else self.bias
+        if biased and (self.uncertain or self.pipeline != "input-aware"):
+            raise ValueError(f"bias = {self.bias!r} needs the pipeline 'input-aware' without uncertain parameters")
         if self.estimate_parameters and not any(self.uncertain.values()):
             raise ValueError(f"estimate_parameters needs uncertain parameters, got uncertain = {self.uncertain!r}")
         if self.policy is not None and (self.pipeline != "input-aware" or not self.inputs):
@@ -165,9 +164,8 @@ class Config:
             )
         if (self.pipeline == "spinn") != (self.forward_steps > 0):
             raise ValueError(f"pipeline {self.pipeline!r} does not go with forward_steps = {self.forward_steps}")
-        own = ("collocation", "box_factor", "solved_output_layer", "transients")
-        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(self) if one.name in own}
-        changed = [f"{name} = {value!r}" for name, value in values.items() if value != getattr(Config, name)]
+        own = {name: getattr(self, name) for name in ("collocation", "box_factor", "solved_output_layer", "transients")}
+        changed = [f"{name} = {value!r}" for name, value in own.items() if value != getattr(Config, name)]
         if changed and self.pipeline != "spinn":
             raise ValueError(f"{', '.join(changed)}: settings of the pipeline 'spinn', not {self.pipeline!r}")
         return self
@@ -179,7 +177,7 @@ def setting_types() -> dict[str, Any]:
 
 
 def read_changes(path: Path) -> dict[str, Any]:
-    """Settings from a TOML or JSON file, for :func:`override`."""
+    """Settings from a TOML or JSON file."""
     language, loads = ("TOML", tomllib.loads) if path.suffix == ".toml" else ("JSON", json.loads)
     try:
         settings = loads(path.read_text(encoding="utf-8"))
@@ -218,8 +216,3 @@ def _validated(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
         except ValidationError as error:
             raise ValueError(f"{where}: {name} = {value!r}: {error.errors()[0]['msg']}") from None
     return checked
-
-
-def override(config: Config, changes: Mapping[str, Any]) -> Config:
-    """The configuration with some settings changed."""
-    return replace(config, **{name: value for name, value in changes.items() if value is not None})

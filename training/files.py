@@ -1,8 +1,6 @@
-"""Results: files that appear whole or not at all, locks of folders, and descriptions of their contents."""
+"""Files that appear whole or not at all, and folders that one process works in at a time."""
 
-import hashlib
 import json
-import math
 import os
 import shutil
 import tempfile
@@ -12,13 +10,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from filelock import FileLock, Timeout
 
-from kkl_gym.equations import components, input_matrix
-from kkl_gym.system import System
 from observers.storage import UNFINISHED, replacing
 
+CHECKPOINTS = "[!.]*.checkpoint.*"  # of a run or an agent, without those that are being written
 ABANDONED = 3600.0  # seconds after which no process writes to a temporary file any more
 
 
@@ -30,12 +26,8 @@ def write(path: str | os.PathLike[str], text: str) -> None:
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Lay out a table in Markdown."""
-    lines = [list(header), *map(list, rows)]
-    for line in lines:
-        if len(line) != len(header):
-            raise ValueError(f"the row {line} has {len(line)} cells under the {len(header)} titles {lines[0]}")
-    laid = ["".join(f"| {cell} " if cell else "| " for cell in line) + "|" for line in lines]
-    return [laid[0], "|---" * len(header) + "|", *laid[1:]]
+    first, *others = ("".join(f"| {cell} " if cell else "| " for cell in line) + "|" for line in (header, *rows))
+    return [first, "|---" * len(header) + "|", *others]
 
 
 def require_writable(folder: str | os.PathLike[str]) -> None:
@@ -88,7 +80,7 @@ def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Ite
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)
-        elif _has_checkpoints(folder):
+        elif any(folder.glob(CHECKPOINTS)):
             check_identity(folder / "config.json", described, "a run of another configuration")
         write(folder / "config.json", json.dumps(described, indent=2) + "\n")
         yield
@@ -96,15 +88,11 @@ def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Ite
 
 def refuse_checkpoints(folder: Path) -> None:
     """Raise ValueError if a folder holds the checkpoints of a run."""
-    if _has_checkpoints(folder):
+    if any(folder.glob(CHECKPOINTS)):
         raise ValueError(
             f"{folder} holds the checkpoints of a run: go on with it (resume=True, --resume), remove it, or take "
             "another folder (--out)"
         )
-
-
-def _has_checkpoints(folder: Path) -> bool:
-    return any(folder.glob("[!.]*.checkpoint.*"))
 
 
 def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
@@ -120,29 +108,3 @@ def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
     if changed:
         differences = "; ".join(f"{name} = {there.get(name)} there, {here.get(name)} here" for name in changed)
         raise ValueError(f"{path.parent} holds {what}: {differences}. Take another --out, or remove it")
-
-
-def describe(system: System) -> dict[str, Any]:
-    """What identifies a system, its equations included: they are sampled at points of the training box."""
-    rng = np.random.default_rng(0)
-    x = system.draw_starts(rng, 20)
-    if system.discrete:
-        u = rng.uniform(-1, 1, (system.nu, 20)) * np.array(system.u_max)[:, None]
-        moved = components(system.step, x.T, u)
-    else:
-        moved = [*components(system.f, x.T), *(entry for row in input_matrix(system, x.T) for entry in row)]
-    equations = [_rounded(np.broadcast_to(row, 20)).tolist() for row in (*moved, *system.output(x).T)]
-    return {
-        "system": system.name,
-        "parameters": system.parameters,
-        "X": system.X,
-        "bounds": system.bounds,
-        "u_max": system.u_max,
-        "equations": hashlib.sha256(json.dumps(equations).encode()).hexdigest()[:16],
-    }
-
-
-def _rounded(values: np.ndarray) -> np.ndarray:
-    """Values as they are on every machine: to six decimals, or to more where all are small."""
-    size = np.abs(values).max()
-    return np.round(values, 6 - min(0, math.floor(math.log10(size))) if 0 < size < np.inf else 6)

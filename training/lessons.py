@@ -12,7 +12,7 @@ from rich.console import Console
 
 import kkl_gym
 from kkl_gym.system import System
-from observers import Artifact, Flow, ForwardMap, InverseMap, LinearFilter, Motion
+from observers import MLP, Artifact, Flow, ForwardMap, InverseMap, LinearFilter, Motion
 from observers.checks import noise_levels
 from training.calibration import calibrate
 from training.config import Config
@@ -28,10 +28,10 @@ from training.sources import OF_MEDIAN, Pairs, Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
 from training.spectrum import Spectrum, check_continuous
 
-# Of a flow's network.
+# The flow's network, and its training.
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
-LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative
-LEAST_ERROR = 0.01  # of the increments' size, that is assumed at least
+LEAST = 0.01  # added to the mean square of a scaled increment, so that errors of tiny ones do not dominate
+LEAST_ERROR = 0.01  # least error of a flow that a tracker assumes, over the size of the increments
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def train(
     config : Config, optional
         How; by default the system's preset "fast", or that of the source.
     folder : Path, optional
-        Where checkpoints, a log and TensorBoard scalars go, created if missing; by default nothing is kept.
+        Where checkpoints and a log go, created if missing; by default nothing is kept.
     resume : bool, default False
         Whether to go on from the checkpoints in ``folder`` if there are any; without it they are an error.
     device : torch.device, optional
@@ -102,8 +102,6 @@ def train(
         raise ValueError("a source has a configuration of its own: pass config with a System alone")
     config = source.config
     noise_levels("measurement_noise_max", config.measurement_noise_max, source.ny)
-    if config.pipeline == "spinn" and isinstance(source, SimulatedSource):
-        check_continuous(source.system)
     identity = {**source.identity(), **dataclasses.asdict(config)}
     began = time.process_time()
     with Run.begin(config, folder, identity=identity, console=console, device=device, resume=resume) as run:
@@ -193,7 +191,7 @@ def learn_map(source: Source, run: Run) -> Maps:
     if has_free:
         unforced = spectrum.filter(source.ny, config.dt)
         sampler = _sampler(source, unforced, run, _pairs(source, unforced, run, free=True))
-        free = sampler.inverse_map(_fitted("free", sampler, run, share).export())
+        free = sampler.inverse_map(_fitted("free", sampler, run, share))
     sampler, count = _sampler(source, linear, run, _pairs(source, linear, run)), config.members
     names = ["inverse"] if count == 1 else [f"inverse-{i + 1}" for i in range(count)]
     networks = [_fitted(name, sampler, run, share / count, member) for member, name in enumerate(names)]
@@ -204,6 +202,7 @@ def _papers_maps(source: Source, linear: LinearFilter, run: Run) -> Maps:
     """T, trained on motions and on its equation, and T_inv on z = T(x)."""
     if not isinstance(source, SimulatedSource):
         raise ValueError("the pipeline 'spinn' needs the equations of a system; train with 'input-aware'")
+    check_continuous(source.system)
     config, system, ages, progress = run.config, source.system, source.ages, run.progress
     settled = ages >= truncation_step(  # the filter's start no longer matters
         system, linear, steps=source.steps, epsilon=config.truncation, box_factor=config.box_factor
@@ -228,7 +227,7 @@ def _papers_maps(source: Source, linear: LinearFilter, run: Run) -> Maps:
         sampler = _sampler(source, linear, run, dataclasses.replace(pairs, z=z), covariance)
     else:
         sampler = ForwardMapSampler(T, covariance, config, points=points, device=run.device)
-    return Maps(linear, sampler.inverse_map(_fitted("inverse", sampler, run, 1 / 2).export()), forward=T)
+    return Maps(linear, sampler.inverse_map(_fitted("inverse", sampler, run, 1 / 2)), forward=T)
 
 
 def _pairs(source: Source, linear: LinearFilter, run: Run, free: bool = False) -> Pairs:
@@ -242,18 +241,17 @@ def _sampler(
 ) -> TrajectorySampler:
     """Batches along motions; z may have an error of some covariance beside."""
     with run.progress.phase("preparing batches"):
-        how = source.sampling(linear)
-        return TrajectorySampler(pairs, linear, run.config, device=run.device, error=error, **how)
+        return TrajectorySampler(pairs, linear, run.config, device=run.device, error=error, **source.sampling(linear))
 
 
-def _fitted(name: str, sampler: Sampler, run: Run, share: float, member: int = 0) -> Network:
+def _fitted(name: str, sampler: Sampler, run: Run, share: float, member: int = 0) -> MLP:
     """A network that gives x on the sampler's batches."""
     config, device = run.config, run.device
     inputs, x, *_ = sampler(torch.Generator(device).manual_seed(0))
     network = Network.of(config, inputs.shape[1], x.shape[1]).to(device)
     problem, seed = InverseProblem(network, sampler, device), config.seed * config.members + member
     run.minimise(name, problem, problem.loss, config.inverse_steps, share=share, seed=seed)
-    return network
+    return network.export()
 
 
 def learn_flow(source: Source, run: Run) -> Motion:

@@ -3,7 +3,7 @@
 docs/guides/own_system.md shows how to add a profile.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -66,21 +66,25 @@ def homogeneous(system: System) -> Controller:
     return act
 
 
+def _spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
+    """Eigenvalues as the shipped maps have them."""
+    return tuple(np.round(evenly_spaced(n, slowest, fastest), 6).tolist())
+
+
 PROFILES: dict[str, Profile] = {
     "reverse_duffing": Profile(
-        eigenvalues=evenly_spaced(13, -0.2, -8.0),
+        eigenvalues=_spaced(13, -0.2, -8.0),
         # The paper's: no two of its motions part or fall together.
         spinn_settings={"eigenvalues": tuple(np.linspace(-1.5, -3.0, 5).tolist())},
         controller=homogeneous,
         fault_deadline=10.0,  # about a period at amplitude 1
     ),
     "van_der_pol": Profile(
-        # Fast ones follow the jumps of y, slow ones average its noise. Their number and ends are as measured, by the
-        # errors of trained observers.
-        eigenvalues=evenly_spaced(15, -0.4, -20.0),
+        # Fast ones follow the jumps of y, slow ones average its noise; number and ends by errors of trained observers.
+        eigenvalues=_spaced(15, -0.4, -20.0),
         # Slower modes have a rougher T; more of them average more of the noise.
         spinn_settings={
-            "eigenvalues": evenly_spaced(11, -4.0, -16.0),
+            "eigenvalues": _spaced(11, -4.0, -16.0),
             "noise_free_share": 0.2,
             "high_noise_emphasis": 4.5,
         },
@@ -96,23 +100,21 @@ PROFILES: dict[str, Profile] = {
         fault_deadline=8.9,  # a period
     ),
     "rossler": Profile(
-        eigenvalues=evenly_spaced(13, -0.4, -8.0),
-        # Real modes hardly separate its three parameters under noise; slow pairs at frequencies of y do: with
-        # parameters as states and all of them 10 % off, the error of the best decoder falls from 2.3 to 1.9 % by the
-        # first two. On validation runs short trainings gained a little by the third, and by a wider network. More
-        # batches and twice the trajectories are worth 3 % on plants that are 10 % off.
+        eigenvalues=_spaced(13, -0.4, -8.0),
+        # Real modes hardly separate its three parameters under noise; slow pairs at frequencies of y do. The best
+        # decoder's error on plants 10 % off falls from 2.3 to 1.9 % by two of them; batches and trajectories add 3 %.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
             "inverse_steps": 48_000,
             "trajectories": 8000,
         },
-        spinn_settings={"eigenvalues": evenly_spaced(9, -3.0, -20.0)},
+        spinn_settings={"eigenvalues": _spaced(9, -3.0, -20.0)},
         fault_deadline=2.0,
     ),
     "lorenz": Profile(
-        eigenvalues=evenly_spaced(13, -1.5, -25.0),  # faster than the others', as its flow is
-        spinn_settings={"eigenvalues": evenly_spaced(9, -9.0, -40.0)},
+        eigenvalues=_spaced(13, -1.5, -25.0),  # faster than the others', as its flow is
+        spinn_settings={"eigenvalues": _spaced(9, -9.0, -40.0)},
         settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
         fault_deadline=2.0,
     ),
@@ -140,15 +142,14 @@ def named_policy(system: System, name: str) -> Controller:
         raise ValueError(
             f"unknown policy {name!r}{suggestion(name, ['controller'])}: it is controller, or script.py:function"
         )
-    if name != "controller":
-        return checked_policy(load_function(name), system, name)
     try:
-        return checked_policy(controller(system), system, name)
+        policy = controller(system) if name == "controller" else load_function(name)
     except np.linalg.LinAlgError as error:
         raise ValueError(
             f"no linear-quadratic regulator holds {system.name} at its target {system.target} ({error}): set the "
             "target, or give a policy of your own as script.py:function"
         ) from error
+    return checked_policy(policy, system, name)
 
 
 def preset(
@@ -176,7 +177,7 @@ def preset(
     size : {"default", "large"}
         Of an input-aware T_inv: large is one that stands alone, for use without a model.
     changes : mapping of str to object, optional
-        Settings that are to differ, as for :func:`training.config.override`. A spectrum that is not given suits them.
+        Settings that are to differ, but for those of None. A spectrum that is not given suits them.
 
     Returns
     -------
@@ -209,13 +210,11 @@ def preset(
     else:
         chosen |= PAPER_SPINN if paper else SPINN | dict(own.spinn_settings)
     chosen |= given
-    if "eigenvalues" not in given:
+    if "eigenvalues" not in chosen:
         if pipeline == "input-aware":
             chosen["eigenvalues"] = eigenvalues(system, chosen["dt"])
         elif paper:
             chosen["eigenvalues"] = papers_spectrum(system)
-        elif "eigenvalues" in own.spinn_settings:
-            chosen["eigenvalues"] = _rounded(own.spinn_settings["eigenvalues"])
         else:
             chosen["eigenvalues"] = smooth_spectrum(system, chosen["dt"], chosen["duration"]).eigenvalues
     return Config(pipeline, **chosen)
@@ -228,7 +227,7 @@ def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
     """
     chosen = profile(system).eigenvalues
     if chosen is not None:
-        return _rounded(chosen)
+        return chosen
     fastest = min(1.5 * system.typical_rate, (FASTEST_OF_STEPS if system.discrete else FASTEST_MODE) / dt)
     spaced = evenly_spaced(4 * system.nx + 3, -fastest / 22.5, -fastest)
     return tuple(float(f"{value:.6g}") for value in spaced)
@@ -239,8 +238,3 @@ def _largest_noise(system: System) -> float | tuple[float, ...]:
     usual = zip(np.broadcast_to(system.measurement_noise, system.ny).tolist(), system.output_range, strict=True)
     levels = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]
     return levels[0] if len(set(levels)) == 1 else tuple(levels)
-
-
-def _rounded(eigenvalues: Sequence[float]) -> tuple[float, ...]:
-    """As the shipped maps have them."""
-    return tuple(np.round(eigenvalues, 6).tolist())

@@ -41,11 +41,6 @@ class ProgressBars(Progress):
         self._log, self._logged, self._ended = log, False, threading.Event()
         self._due: dict[TaskID, float] = {}
 
-    def bar(self, description: str, total: float | None = None) -> Callable[[float], None]:
-        """Begin a phase."""
-        task = self.add_task(description, total=total)
-        return lambda done: self.update(task, completed=done)
-
     @contextmanager
     def phase(self, description: str, total: float = 1) -> Iterator[Callable[[float], None]]:
         """Show a phase for as long as the context lasts."""
@@ -118,11 +113,3 @@ def _line(task: Task, passed: float) -> str:
     left = None if task.finished else task.time_remaining
     rest = "" if left is None else f", {timedelta(seconds=round(left))} left"
     return f"{task.description}:{count} {timedelta(seconds=round(passed))} passed{rest}"
-
-
-def duration(seconds: float) -> str:
-    """Seconds in the largest fitting unit: 40 s, 12 min, 3.5 h."""
-    for unit, length, limit in (("s", 1, 90), ("min", 60, 5400)):
-        if seconds < limit:
-            return f"{seconds / length:.3g} {unit}"
-    return f"{seconds / 3600:.3g} h"

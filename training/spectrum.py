@@ -38,24 +38,14 @@ class Spectrum:
     pairs: tuple[tuple[float, float], ...] = ()
 
     @property
-    def modes(self) -> int:
-        """Their number."""
-        return len(self.eigenvalues) + 2 * len(self.pairs)
-
-    @property
     def poles(self) -> np.ndarray:
         """All eigenvalues, complex, (modes,)."""
         above = [complex(a, w) for a, w in self.pairs]
         return np.array([*map(complex, self.eigenvalues), *above, *np.conj(above)])
 
-    @property
-    def A(self) -> np.ndarray:
-        """A for one output, (modes, modes): real eigenvalues on the diagonal, then a block [[a, w], [-w, a]] a pair."""
-        return np.asarray(scipy.linalg.block_diag(*self.eigenvalues, *([[a, w], [-w, a]] for a, w in self.pairs)))
-
     def filter(self, ny: int, dt: float, nu: int = 0) -> LinearFilter:
-        """The filter with these modes for each output, driven by B = 1."""
-        A = self.A
+        """The filter with these modes for each output: real ones, then a block [[a, w], [-w, a]] a pair; B = 1."""
+        A = scipy.linalg.block_diag(*self.eigenvalues, *([[a, w], [-w, a]] for a, w in self.pairs))
         return LinearFilter(np.kron(np.eye(ny), A), np.kron(np.eye(ny), np.ones((len(A), 1))), dt, nu)
 
 

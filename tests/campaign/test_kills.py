@@ -21,10 +21,9 @@ import pytest
 
 from observers import Artifact
 from observers.storage import UNFINISHED
-from training import checkpoints
 from training.agents.agent import Agent
 from training.agents.play import play
-from training.run import LOG_EVERY
+from training.run import CHECKPOINT, LOG_EVERY, load_checkpoint
 
 pytestmark = pytest.mark.long
 
@@ -44,8 +43,8 @@ import_module = training.cli.import_module
 
 def import_and_watch(name):
     module = import_module(name)
-    import training.checkpoints
-    training.checkpoints.SECONDS = -1.0
+    import training.run
+    training.run.CHECKPOINT_SECONDS = -1.0
     if arguments[0] == "train":
         from torch.optim.optimizer import register_optimizer_step_post_hook
         register_optimizer_step_post_hook(lambda *_: os.write(journal, b"."))
@@ -80,7 +79,7 @@ class Train:
             Artifact.read(path)
         for path in out.glob("config.json"):
             json.loads(path.read_text())
-        return sum(checkpoints.load(path)["step"] for path in out.glob(f"[!.]*{checkpoints.SUFFIX}"))
+        return sum(load_checkpoint(path)["step"] for path in out.glob(f"[!.]*{CHECKPOINT}"))
 
     def result(self, out):
         artifact = Artifact.read(out / "van_der_pol.safetensors")
@@ -103,7 +102,7 @@ class TrainAgent:
     def kept(self, out):
         for path in out.glob("agent.safetensors"):
             Agent.read(path)
-        saved = (checkpoints.load(path) for path in out.glob(f"agent{checkpoints.SUFFIX}"))
+        saved = (load_checkpoint(path) for path in out.glob(f"agent{CHECKPOINT}"))
         return sum(state["counters"]["num_timesteps"] // 256 for state in saved)
 
     def result(self, out):

@@ -188,16 +188,15 @@ def trainings():
     """Held-out errors of short trainings: from equations by both ways, from records, from rollouts."""
     import training
     from training.cli import main
-    from training.config import override
 
     found = {}
     sizes = {"trajectories": 100, "duration": 10.0, "width": 20, "depth": 2, "batch": 256, "inverse_steps": 1000}
     system = kkl_gym.get_system("van_der_pol")
     unseen = training.unseen_trajectories(system, DT, n=40, duration=10.0, seed=11)
     for pipeline in ("input-aware", "spinn"):
-        config = override(training.preset(system, pipeline, "fast"), sizes)
+        config = dataclasses.replace(training.preset(system, pipeline, "fast"), **sizes)
         if pipeline == "spinn":
-            config = override(config, {"forward_steps": 1000})
+            config = dataclasses.replace(config, forward_steps=1000)
         with tempfile.TemporaryDirectory() as folder:
             artifact = training.train(system, config, Path(folder) / "run").artifact
         for level in (0.0, NOISE):

@@ -1,5 +1,6 @@
 """Configurations and data of a size for tests."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from kkl_gym import VanDerPol
 from observers import Artifact, LinearFilter
 from training import preset
-from training.config import Config, override
+from training.config import Config
 from training.maps.inverse import TrajectorySampler
 from training.maps.networks import Network
 from training.spectrum import papers_spectrum
@@ -32,7 +33,7 @@ def toy(system, pipeline="input-aware", **changes):
     steps = {"inverse_steps": 200}
     if pipeline == "spinn":  # modes that are forgotten within the 20 s of such runs
         steps |= {"forward_steps": 200, "eigenvalues": papers_spectrum(system)}
-    return override(preset(system, pipeline, "fast"), SIZES | steps | changes)
+    return replace(preset(system, pipeline, "fast"), **SIZES | steps | changes)
 
 
 BATCHES = Config("input-aware", (-1.0,), measurement_noise_max=1.0, batch=4096)

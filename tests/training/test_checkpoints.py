@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from training import checkpoints
+from training import run
 
 STATE = {
     "module": {"weight": torch.arange(600.0).reshape(20, 30), "bias": torch.ones(20, dtype=torch.float64)},
@@ -21,7 +21,7 @@ STATE = {
 @pytest.fixture
 def path(tmp_path):
     found = tmp_path / "inverse.checkpoint.pt"
-    checkpoints.save(found, STATE, fingerprint="mine")
+    run.save_checkpoint(found, STATE, fingerprint="mine")
     return found
 
 
@@ -34,10 +34,10 @@ def same(found):
 
 
 def test_what_is_saved_is_loaded(path):
-    assert same(checkpoints.load(path, fingerprint="mine"))
-    assert same(checkpoints.load(path))
+    assert same(run.load_checkpoint(path, fingerprint="mine"))
+    assert same(run.load_checkpoint(path))
     with pytest.raises(ValueError, match="belongs to another configuration"):
-        checkpoints.load(path, fingerprint="other")
+        run.load_checkpoint(path, fingerprint="other")
 
 
 def damaged(path):
@@ -57,7 +57,7 @@ def test_a_flipped_bit_is_noticed_or_changes_nothing(path):
         flipped[place // 8] ^= 1 << place % 8
         path.write_bytes(flipped)
         try:
-            assert same(checkpoints.load(path, fingerprint="mine"))
+            assert same(run.load_checkpoint(path, fingerprint="mine"))
             assert i < 300
         except ValueError as error:
             said.append(str(error))
@@ -70,7 +70,7 @@ def test_truncated_and_empty_files(path):
     for length in range(0, len(whole), 97):
         path.write_bytes(whole[:length])
         with damaged(path):
-            checkpoints.load(path)
+            run.load_checkpoint(path)
 
 
 class Evil:
@@ -82,13 +82,13 @@ def test_nothing_in_a_checkpoint_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     torch.save({"fingerprint": "mine", "module": Evil()}, path)
     with damaged(path):
-        checkpoints.load(path)
+        run.load_checkpoint(path)
     path.write_bytes(pickle.dumps(Evil()))
     with damaged(path):
-        checkpoints.load(path)
+        run.load_checkpoint(path)
     assert not Path("ran").exists()
 
 
 def test_states_that_do_not_fit(path):
-    with damaged(path), checkpoints.restoring(path):
+    with damaged(path), run.restoring(path):
         raise RuntimeError("size mismatch\n\tof weights")

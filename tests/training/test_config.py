@@ -7,7 +7,7 @@ import pytest
 from linear_system import Oscillator
 
 from training import preset
-from training.config import override, read_changes
+from training.config import read_changes
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_levels_of_noise_of_all_outputs_or_each(tmp_path):
     for written, levels in ((0.2, 0.2), ([0.1, 0.3], (0.1, 0.3))):
         path.write_text(json.dumps({"measurement_noise_max": written}))
         changes = read_changes(path)
-        assert override(preset(Oscillator(), "input-aware", "fast"), changes).measurement_noise_max == levels
+        assert replace(preset(Oscillator(), "input-aware", "fast"), **changes).measurement_noise_max == levels
     path.write_text(json.dumps({"measurement_noise_max": [0.1, -1]}))
     with pytest.raises(ValueError, match="greater than 0"):
         read_changes(path)

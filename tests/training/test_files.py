@@ -21,10 +21,10 @@ from training.files import (
     claimed_job,
     claimed_run,
     clear_unfinished,
-    describe,
     require_writable,
     write,
 )
+from training.trajectories.equations import describe
 
 
 def test_a_folder_that_one_may_not_write_to(tmp_path, monkeypatch):

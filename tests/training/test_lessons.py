@@ -17,8 +17,7 @@ from unstable_system import Falling
 from kkl_gym import KKLObservation, get_system
 from kkl_gym.simulate import simulate
 from observers import Artifact, KKLObserver
-from training import SimulatedSource, checkpoints, errors, preset, train, unseen_trajectories
-from training.config import override
+from training import SimulatedSource, errors, preset, run, train, unseen_trajectories
 from training.evaluation.report import write_report
 
 
@@ -115,16 +114,16 @@ def parts(artifact):
 @pytest.mark.parametrize("kind", KINDS)
 def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypatch, kind, whole):
     system, stage, changes = KINDS[kind]
-    monkeypatch.setattr(checkpoints, "SECONDS", 0.0)
-    save = checkpoints.save
+    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", 0.0)
+    save = run.save_checkpoint
 
     def save_and_stop(path, state, *, fingerprint):
         save(path, state, fingerprint=fingerprint)
-        if path.name.startswith(stage) and checkpoints.load(path)["step"] == 100:
+        if path.name.startswith(stage) and run.load_checkpoint(path)["step"] == 100:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoints, "save", save_and_stop)
+        patch.setattr(run, "save_checkpoint", save_and_stop)
         with pytest.raises(KeyboardInterrupt):
             trained(system, tmp_path, **changes)
     resumed, _ = trained(system, tmp_path, resume=True, **changes)
@@ -220,7 +219,7 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
     system = Oscillator()
     sizes = {"trajectories": 200, "duration": 30.0, "samples": 200, "width": 64, "depth": 2, "batch": 1024}
     steps = {"forward_steps": 12000, "inverse_steps": 50, "learning_rate": 2e-3, "physics_weight": 1.0}
-    config = replace(override(preset(system, "spinn", "fast"), sizes | steps), activation="silu")
+    config = replace(preset(system, "spinn", "fast"), **sizes | steps, activation="silu")
     artifact = train(system, config, tmp_path).artifact
     M = sylvester(np.diag(config.eigenvalues), np.ones((len(config.eigenvalues), 1)))
     x = np.random.default_rng(0).uniform(*system.box(), (1000, 2))

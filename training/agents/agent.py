@@ -18,7 +18,7 @@ from observers.checks import ArtifactError, choice, shown
 from observers.names import matching, resolve
 from training.agents.information import INFORMATION, Information, make
 from training.agents.tasks import Task
-from training.files import describe
+from training.trajectories.equations import describe
 
 FORMAT = 2
 KEY = "kkl-gym-agent"

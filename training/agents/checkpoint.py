@@ -14,7 +14,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from observers.storage import replacing
-from training import checkpoints
+from training import run
 from training.records import Record
 
 CURVE = "curve.csv"
@@ -41,14 +41,14 @@ class Checkpoint(BaseCallback):
         self._curve, self._began = list[tuple[float, ...]](), time.process_time()
         if not resume:
             path.unlink(missing_ok=True)
-        self.saved = checkpoints.load(path, fingerprint=fingerprint) if path.exists() else None
+        self.saved = run.load_checkpoint(path, fingerprint=fingerprint) if path.exists() else None
         self.weights = (self.saved or {}).get("weights")  # of z under noise
 
     def restore(self, model: BaseAlgorithm, steps: int) -> None:
         """Restore the saved training, if there is one."""
         if (saved := self.saved) is None:
             return
-        with checkpoints.restoring(self.path):
+        with run.restoring(self.path):
             model.set_parameters(saved["parameters"], device="cpu")
             for name, value in saved["counters"].items():
                 setattr(model, name, int(value))
@@ -68,14 +68,14 @@ class Checkpoint(BaseCallback):
         """Return the records that were saved, which are ``like`` another one but for their samples."""
         if self.saved is None:
             return []
-        with checkpoints.restoring(self.path):
+        with run.restoring(self.path):
             return [replace(like, **{key: one[key].numpy() for key in _ARRAYS}) for one in self.saved["records"]]
 
     def _on_training_start(self) -> None:
         self._saved_at = time.monotonic()
 
     def _on_rollout_start(self) -> None:
-        if time.monotonic() - self._saved_at > checkpoints.SECONDS:
+        if time.monotonic() - self._saved_at > run.CHECKPOINT_SECONDS:
             self._save()
             self._saved_at = time.monotonic()
 
@@ -110,7 +110,7 @@ class Checkpoint(BaseCallback):
             writer = csv.writer(file)
             writer.writerow(("steps", "seconds", "return"))
             writer.writerows((int(steps), seconds, value) for steps, seconds, value in self._curve)
-        checkpoints.save(self.path, state, fingerprint=self._fingerprint)
+        run.save_checkpoint(self.path, state, fingerprint=self._fingerprint)
 
 
 def _moments(scaling: VecNormalize | None) -> dict[str, Any]:

@@ -34,8 +34,8 @@ from training.agents.observing import OBSERVER, Privileged, estimated_entries, l
 from training.agents.policy import ALGORITHMS, CONTINUOUS, head_of, linear, lstm_in, perceptron
 from training.agents.seeds import agent_training_seed
 from training.agents.tasks import PREFERRED, Task
-from training.checkpoints import SUFFIX
 from training.progress import ProgressBars, progress_bars
+from training.run import CHECKPOINT
 
 RECURRENT = "ppo_lstm"
 # Share of the steps of a training, the first ones, in which there are no estimates yet.
@@ -132,7 +132,7 @@ def learn(
     how = {"algorithm": name, **settings, "seed": seed, "observer_steps": first, "aggregate": aggregate}
     observed = None if observer is None else [observer, fingerprint(observer)]
     identity = json.dumps([asdict(task), information, observed, rules(task), how], sort_keys=True)
-    checkpoint = Checkpoint(folder / f"agent{SUFFIX}", hashlib.sha256(identity.encode()).hexdigest(), resume=resume)
+    checkpoint = Checkpoint(folder / f"agent{CHECKPOINT}", hashlib.sha256(identity.encode()).hexdigest(), resume=resume)
     resumes = checkpoint.saved is not None
     if resumes and (folder / FILE).exists():
         return Agent.read(folder / FILE)  # nothing is left to do

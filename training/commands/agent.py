@@ -144,7 +144,7 @@ class Train:
     def run(self, console: Console) -> None:
         """Train, and play a hundred episodes."""
         from training.agents.learning import learn  # which takes seconds to import
-        from training.checkpoints import SUFFIX
+        from training.run import CHECKPOINT
 
         task = self.options.task(self.name, self.measurement_noise)
         folder = self.folder.out or Path("runs/agents") / f"{task.name}-{self.information}-{self.seed}"
@@ -152,7 +152,7 @@ class Train:
         with locked(folder), progress_bars(console, folder / LOG) as progress:
             if (folder / "agent.safetensors").exists() and not self.folder.resume:
                 raise FileExistsError(f"{folder} holds an agent already; choose another folder with --out")
-            if (folder / f"agent{SUFFIX}").exists() and not self.folder.resume:
+            if (folder / f"agent{CHECKPOINT}").exists() and not self.folder.resume:
                 raise FileExistsError(
                     f"{folder} holds the checkpoint of a training: go on with it (--resume), remove it, or choose "
                     "another folder with --out"

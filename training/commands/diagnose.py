@@ -117,7 +117,7 @@ class Diagnose:
                 raise
             raise ValueError(f"{error}; an environment needs --measured and --hidden") from error
         policy = named_policy(system, self.policy) if self.policy else None
-        progress.bar(f"checking {system.name}")
+        progress.add_task(f"checking {system.name}", total=None)
         levels = self.measurement_noise
         yield from check(system, dt=self.dt, duration=self.duration, policy=policy, measurement_noise=levels)
 

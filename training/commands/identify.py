@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +25,7 @@ from training.commands.options import (
     set_threads,
     system_of,
 )
-from training.progress import LOG, duration, progress_bars
+from training.progress import LOG, progress_bars
 
 FARTHEST = 10.0  # factor by which a parameter without limits may move from its starting value
 
@@ -88,7 +89,7 @@ class Identify:
             path = folder / f"{model.name}.safetensors"
             progress.say(
                 f"wrote {path}, parameters.json, identification.png, report.png and {LOG} beside it, "
-                f"in {duration(time.monotonic() - began)}"
+                f"in {timedelta(seconds=round(time.monotonic() - began))}"
             )
         return path
 

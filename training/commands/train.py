@@ -5,6 +5,7 @@ import shlex
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -27,7 +28,7 @@ from training.commands.options import (
 )
 from training.config import Pipeline
 from training.presets import Preset, Size, preset
-from training.progress import LOG, ProgressBars, duration, progress_bars
+from training.progress import LOG, ProgressBars, progress_bars
 from training.sources.recorded import recorded_preset
 from training.spectrum import Spectrum
 from training.trajectories.parameters import nominal_share, relative_ranges
@@ -54,8 +55,7 @@ class Train:
 
     kkl-gym train lorenz: a shipped system. kkl-gym train script.py: the one that the script defines. kkl-gym train
     NAME --data run*.csv: from recorded states. The folder runs/NAME receives NAME.safetensors (T_inv, the motion that
-    it tracks by, covariances, a monitor's limits), report.png, checkpoints, log.txt with all lines printed and, where
-    TensorBoard is installed, its scalars.
+    it tracks by, covariances, a monitor's limits), report.png, checkpoints, and log.txt with all lines printed.
     """
 
     system: Annotated[
@@ -118,7 +118,7 @@ class Train:
                 write_report(folder / "report.png", result, source)
             for line in summary(result):
                 progress.say(line)
-            size, took = path.stat().st_size / 1e6, duration(time.monotonic() - began)
+            size, took = path.stat().st_size / 1e6, timedelta(seconds=round(time.monotonic() - began))
             progress.say(f"wrote {path} ({size:.2f} MB), report.png and {LOG} beside it, in {took}")
             if system is not None:
                 words = ["kkl-gym", "evaluate", str(path)]
@@ -179,7 +179,7 @@ class Train:
         rates = spectrum.poles.real
         progress.say(
             f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
-            f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s"
+            f"{len(rates)} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s"
         )
         if ranges := relative_ranges(system, config.uncertain):
             others = 100 * (1 - nominal_share(ranges))

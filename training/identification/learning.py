@@ -13,8 +13,8 @@ from rich.console import Console
 from kkl_gym.system import System
 from observers import Artifact
 from observers.checks import check_dt
-from training.config import Config, override, settings_of
-from training.files import claimed_job, describe, refuse_checkpoints, write
+from training.config import Config, settings_of
+from training.files import claimed_job, refuse_checkpoints, write
 from training.identification.identify import Identified, Limits, estimate_parameters
 from training.identification.report import write_report
 from training.lessons import Result, train
@@ -22,6 +22,7 @@ from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars
 from training.records import Record, check_signals, resampled, sampling_interval
 from training.records import check_dt as check_steps
+from training.trajectories.equations import describe
 
 NOISE_RANGE = 2.0  # largest measurement noise that the observer is trained for, over that of the records
 LEAST_NOISE = 0.002  # the least of it, over the output's range
@@ -155,7 +156,7 @@ def adapt(
     ValueError
         As for :func:`identify`, and if the observer's settings are not those of a training, or it estimates a bias.
     """
-    config = override(settings_of(observer.training), settings or {})
+    config = settings_of(observer.training, **(settings or {}))
     if np.any(config.bias):
         raise ValueError(
             f"this observer estimates a bias of up to {config.bias}, which identification does not: pass bias = 0, or "

@@ -9,11 +9,11 @@ import scipy
 from observers import LinearFilter
 from training.config import Scaling
 
-# A mode of z whose variation is smaller than this part of the largest is left out: it holds rounding errors.
+# Modes of z that vary less than this part of the largest are left out, as they hold rounding errors.
 SMALLEST_MODE = 1e-7
-STILL = 1e-12  # of a component's size: a standard deviation below it is rounding
+STILL = 1e-12  # part of a component's size below which its standard deviation is rounding
 SETTLED = np.log(1e3)  # time constants after which a filter has forgotten its start to one part in a thousand
-LEAST = 0.1  # of the mean square of a scaled state, added to it: errors of smaller states are not taken relative
+LEAST = 0.1  # added to the mean square of a scaled state, so that errors of small states do not dominate
 
 
 @dataclass(frozen=True)

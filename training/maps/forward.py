@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,10 +10,10 @@ from torch import nn
 
 from kkl_gym.equations import components
 from kkl_gym.system import Components, System
-from observers import Artifact, ForwardMap, LinearFilter
+from observers import ForwardMap, LinearFilter
 from training.config import Config
 from training.maps.coordinates import StateScale, spread
-from training.maps.networks import Network, compiled, from_mlp, tensor
+from training.maps.networks import Network, tensor
 
 SOLVED = 20_000  # pairs, and points, from which the output layer is solved for in the end
 RIDGE = 1e-5  # of the least squares for it, over the mean column of their matrix
@@ -23,44 +22,22 @@ RIDGE = 1e-5  # of the least squares for it, over the mean column of their matri
 def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
     """A system's f or h, which take and give components, on states (n, nx), as (n, components)."""
     values = components(equations, x.unbind(-1))
-    # A number becomes a tensor by a sum: a copy from the host would not be allowed in a CUDA graph.
     return torch.stack([(x.new_zeros(len(x)) + value).to(x.dtype) for value in values], -1)
 
 
 def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Values of a network at x and their derivatives along f; by hand, as torch.compile has no forward mode."""
+    """Values of a network at x and their derivatives along f."""
     for layer in network:
         if isinstance(layer, nn.Linear):
             x, f = layer(x), f @ layer.weight.T
         elif isinstance(layer, nn.Tanh):
             x = torch.tanh(x)
             f = (1 - x * x) * f
-        elif isinstance(layer, nn.SiLU):
+        else:  # SiLU
             gate = torch.sigmoid(x)
             f = gate * (1 + x * (1 - gate)) * f
             x = gate * x
-        else:
-            raise TypeError(f"no derivative of {type(layer).__name__} is implemented; use Linear, Tanh and SiLU layers")
     return x, f
-
-
-class Equation(NamedTuple):
-    """T's equation, dT/dx f(x) = A T(x) + B h(x), for a network between scaled states and scaled z."""
-
-    system: System
-    A: torch.Tensor
-    B: torch.Tensor
-    x_offset: torch.Tensor
-    x_scale: torch.Tensor
-    z_offset: torch.Tensor
-    z_scale: torch.Tensor
-
-    def residual(self, network: nn.Sequential, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The residual (n, nz) in units of z per second, and the speed |f| in scaled states (n,), at x (n, nx)."""
-        f, h = on_tensors(self.system.f, x) / self.x_scale, on_tensors(self.system.h, x)
-        value, derivative = along(network, (x - self.x_offset) / self.x_scale, f)
-        T, derivative = self.z_offset + self.z_scale * value, self.z_scale * derivative
-        return derivative - T @ self.A.T - h @ self.B.T, f.norm(dim=-1)
 
 
 class ForwardProblem(nn.Module):
@@ -73,8 +50,6 @@ class ForwardProblem(nn.Module):
 
     Shapes: ``pairs`` (n, nx) and (n, nz), ``points`` (m, nx).
     """
-
-    capturable = True
 
     def __init__(
         self,
@@ -92,27 +67,29 @@ class ForwardProblem(nn.Module):
         self.system, self.linear, self.config = system, linear, config
         self.scale = StateScale.of(points, config.scaling)
         self.z_offset, self.z_scale = z.mean(0), spread(z)
-        scales = (self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
-        self.equation = Equation(system, *(tensor(each, device) for each in (linear.A, linear.B, *scales)))
+        self._A, self._B = tensor(linear.A, device), tensor(linear.B, device)
+        self._x_offset, self._x_scale = tensor(self.scale.offset, device), tensor(self.scale.scale, device)
+        self._z_offset, self._z_scale = tensor(self.z_offset, device), tensor(self.z_scale, device)
         self._x, self._z = tensor(self.scale(x), device), tensor((z - self.z_offset) / self.z_scale, device)
         self._points = tensor(points, device)
         self._rates = tensor(np.linalg.norm(linear.A, axis=1), device)
-        self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """The risk on a batch of pairs and as many collocation points."""
         shape, device = (self.config.batch,), self._x.device
         rows = torch.randint(len(self._x), shape, generator=generator, device=device)
         points = torch.randint(len(self._points), shape, generator=generator, device=device)
-        loss, data, physics = self._risk(self._x[rows], self._z[rows], self._points[points])
-        return {"loss": loss, "data": data.detach(), "physics": physics.detach(), "error": data.detach().sqrt()}
+        data = ((self.network(self._x[rows]) - self._z[rows]) ** 2).mean()
+        residual, speed = self.residual(self._points[points])
+        physics = ((residual / self._z_scale / (speed[:, None] + self._rates)) ** 2).mean()
+        return {"loss": data + self.config.physics_weight * physics, "error": data.sqrt()}
 
-    def risk(self, x: torch.Tensor, z: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The risk, and the terms of pairs and of points that it is made of."""
-        data = ((self.network(x) - z) ** 2).mean()
-        residual, speed = self.equation.residual(self.network, points)
-        physics = ((residual / self.equation.z_scale / (speed[:, None] + self._rates)) ** 2).mean()
-        return data + self.config.physics_weight * physics, data, physics
+    def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """dT/dx f - A T - B h (n, nz), in units of z per second, and |f| in scaled states (n,), at x (n, nx)."""
+        f, h = on_tensors(self.system.f, x) / self._x_scale, on_tensors(self.system.h, x)
+        value, derivative = along(self.network, (x - self._x_offset) / self._x_scale, f)
+        T, derivative = self._z_offset + self._z_scale * value, self._z_scale * derivative
+        return derivative - T @ self._A.T - h @ self._B.T, f.norm(dim=-1)
 
     @torch.no_grad()
     def solve_output_layer(self, rng: np.random.Generator, report: Callable[[int], object] = lambda done: None) -> None:
@@ -128,7 +105,7 @@ class ForwardProblem(nn.Module):
         features, linear, device = nn.Sequential(*hidden), self.linear, self._x.device
         some = torch.as_tensor(rng.permutation(len(self._x))[:SOLVED])
         at = torch.as_tensor(rng.permutation(len(self._points))[:SOLVED])
-        x, offset, scale = self._points.cpu()[at].double(), self.equation.x_offset.cpu(), self.equation.x_scale.cpu()
+        x, offset, scale = self._points.cpu()[at].double(), self._x_offset.cpu(), self._x_scale.cpu()
         f, h = on_tensors(self.system.f, x) / scale, on_tensors(self.system.h, x).numpy()
         value, derivative = (each.numpy() for each in along(features, (x - offset) / scale, f))
         phi = np.column_stack([value, np.ones(len(at))])
@@ -156,17 +133,6 @@ class ForwardProblem(nn.Module):
     def forward_map(self) -> ForwardMap:
         """The learned map for NumPy."""
         return ForwardMap(self.network.export(), self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
-
-
-def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
-    """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x): (n, nz)."""
-    T = artifact.forward
-    if T is None:
-        raise ValueError("this observer holds no forward map T")
-    scales = (T.x_offset, T.x_scale, T.z_offset, T.z_scale)
-    equation = Equation(system, *map(torch.tensor, (artifact.filter.A, artifact.filter.B, *scales)))
-    P, _ = equation.residual(from_mlp(T.mlp, dtype=torch.float64), torch.tensor(x))
-    return np.asarray(P.numpy())
 
 
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:

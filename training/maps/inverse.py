@@ -17,7 +17,7 @@ from training.maps.coordinates import (
     settling_time,
     stationary_covariance,
 )
-from training.maps.networks import Network, compiled, tensor
+from training.maps.networks import Network, tensor
 from training.trajectories.motions import Pairs
 
 MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
@@ -40,9 +40,9 @@ class Batch(NamedTuple):
 class Sampler(Protocol):
     """Batches for T_inv, in cells whose errors are made equally small, and the map that a network on them makes."""
 
-    cells: int
-    kinds_of_plant: int
-    parameters: int
+    cells: int = 1
+    kinds_of_plant: int = 1
+    parameters: int = 0
     _map: dict[str, Any]
 
     def __call__(self, generator: torch.Generator) -> Batch:
@@ -121,15 +121,14 @@ class TrajectorySampler(Sampler):
         self._level_max, self._level_unit = (tensor(values[:, None], device) for values in (largest, unit))
         # Noise in units of the stationary one, so that its covariances are well conditioned.
         relative = whiten / np.where(gain > 0, gain, 1.0)[:, None]
-        late = int(np.ceil(2 * settling_time(linear) / linear.dt))
-        saturated = np.minimum(data.ages, late)
+        saturated = np.minimum(data.ages, int(np.ceil(2 * settling_time(linear) / linear.dt)))
         self._noise_root = tensor(root(relative @ noise_covariance(linear, saturated) @ relative.T), device)
         self._error_root = None if error is None else tensor(root(whiten @ error @ whiten.T), device)
         self._age = torch.log1p(tensor(data.ages * linear.dt, device).clamp(max=age_max) / age_unit)
         position = np.log1p(data.ages) / np.log1p(data.ages[-1])
         age_cell = np.minimum((position * self.AGE_CELLS).astype(int), self.AGE_CELLS - 1)
         self._age_cell = torch.as_tensor(age_cell, device=device)
-        trajectory_cell, self._trajectory_cells, self.kinds_of_plant = np.zeros(n, int), 1, 1
+        trajectory_cell, self._trajectory_cells = np.zeros(n, int), 1
         self._process: torch.Tensor | None = None
         if process_noise_max:
             part = data.process_noise / process_noise_max
@@ -199,8 +198,6 @@ class ForwardMapSampler(Sampler):
     Shapes: ``error`` (nz, nz), its covariance, ``points`` (n, nx).
     """
 
-    cells, kinds_of_plant, parameters = 1, 1, 0
-
     def __init__(
         self, T: ForwardMap, error: np.ndarray, config: Config, *, points: np.ndarray, device: torch.device
     ) -> None:
@@ -233,28 +230,17 @@ class ForwardMapSampler(Sampler):
 class InverseProblem(nn.Module):
     """The inverse network with the running mean square error of each cell."""
 
-    capturable = True
-
     def __init__(self, network: Network, sampler: Sampler, device: torch.device) -> None:
         super().__init__()
         self.network = network
         self.sampler = sampler
         cells = sampler.cells * (2 if sampler.parameters else 1)
-        self.register_buffer("error", torch.ones(cells, device=device))
-        self.register_buffer("visited", torch.zeros(cells, dtype=torch.bool, device=device))
-        self.error: torch.Tensor
-        self.visited: torch.Tensor
-        self._risk = compiled(self.risk, device)
+        self.error = nn.Buffer(torch.ones(cells, device=device))
+        self.visited = nn.Buffer(torch.zeros(cells, dtype=torch.bool, device=device))
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, each cell relative to its own running error."""
-        loss, error = self._risk(*self.sampler(generator))
-        return {"loss": loss, "error": error}
-
-    def risk(
-        self, inputs: torch.Tensor, x: torch.Tensor, weight: torch.Tensor, cell: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The loss of a batch, and the geometric mean of the cells' running errors."""
+        """Mean square error of a batch, each cell relative to its own running error; geometric mean of these errors."""
+        inputs, x, weight, cell = self.sampler(generator)
         apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
         square = weight * apart[:, :nx].mean(-1)
         if self.sampler.parameters:  # cells of their own, for they are as hard where states are easy
@@ -267,6 +253,6 @@ class InverseProblem(nn.Module):
         keep = torch.where(count > 0, 0.99, 1.0)
         self.error.mul_(keep).add_((1 - keep) * mean)
         self.visited.logical_or_(count > 0)
-        # Cells without data do not count; sums keep the shapes, which a CUDA graph asks for.
+        # Cells without data do not count.
         error = (torch.where(self.visited, self.error.log(), 0.0).sum() / self.visited.sum()).exp().sqrt()
-        return (square / self.error[cell]).mean(), error
+        return {"loss": (square / self.error[cell]).mean(), "error": error}

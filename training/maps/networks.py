@@ -1,8 +1,8 @@
 """Torch networks and their way into artifacts."""
 
 import itertools
-from collections.abc import Callable, Sequence
-from typing import Any, Self
+from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 import torch
@@ -48,9 +48,8 @@ class Network(nn.Sequential):
         )
 
 
-def averaged(networks: Sequence[Network]) -> MLP:
+def averaged(members: Sequence[MLP]) -> MLP:
     """The mean of some networks of one shape, as one network: their hidden layers stand side by side."""
-    members = [network.export() for network in networks]
     first, *hidden, last = zip(*(member.weights for member in members), strict=True)
     *biases, offsets = zip(*(member.biases for member in members), strict=True)
     return MLP(
@@ -60,23 +59,16 @@ def averaged(networks: Sequence[Network]) -> MLP:
     )
 
 
-def compiled(function: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
-    """A function of tensors, compiled on a GPU."""
-    return torch.compile(function) if device.type == "cuda" else function
-
-
 def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
     """A float32 tensor on ``device``."""
     return torch.as_tensor(np.ascontiguousarray(x, dtype=np.float32), device=device)
 
 
-def from_mlp(mlp: MLP, *, device: torch.device | None = None, dtype: torch.dtype = torch.float32) -> nn.Sequential:
+def from_mlp(mlp: MLP, *, dtype: torch.dtype = torch.float32) -> nn.Sequential:
     """Put a multilayer perceptron for NumPy into torch, not to be trained further."""
     layers: list[nn.Module] = []
     for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
-        layer = nn.Linear(weight.shape[1], weight.shape[0], device=device, dtype=dtype)
-        layer.weight.data, layer.bias.data = (
-            torch.as_tensor(values, device=device, dtype=dtype) for values in (weight, bias)
-        )
+        layer = nn.Linear(weight.shape[1], weight.shape[0], dtype=dtype)
+        layer.weight.data, layer.bias.data = (torch.as_tensor(values, dtype=dtype) for values in (weight, bias))
         layers += [layer, ACTIVATIONS[mlp.activation]()]
     return nn.Sequential(*layers[:-1]).requires_grad_(False)

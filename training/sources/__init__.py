@@ -7,7 +7,8 @@ import numpy as np
 
 from observers import Artifact, Equations, LinearFilter
 from training.config import Config
-from training.trajectories.motions import Pairs, Report
+from training.trajectories.motions import Pairs as Pairs
+from training.trajectories.motions import Report as Report
 
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 
@@ -100,6 +101,3 @@ class Source(Protocol):
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
         """Return errors on motions that are held out, for the artifact's account of its training."""
-
-
-__all__ = ["OF_MEDIAN", "Increments", "Pairs", "Report", "Runs", "Source", "TooFewRunsError"]

@@ -1,6 +1,7 @@
 """Motions of a system that is simulated."""
 
 import functools
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -10,26 +11,27 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact, Equations, LinearFilter
 from training.config import Config
-from training.files import describe
 from training.maps.coordinates import spread
 from training.presets import named_policy
 from training.seeds import Stream, generator
 from training.sources import Increments, Pairs, Runs
-from training.trajectories.equations import field_expression, output_expression, output_facts, output_matrix
-from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, policy_fingerprint, recording_ages
+from training.trajectories.equations import describe, digest, field_expression, output_facts
+from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
-LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
-BEYOND = 2.0  # of X, from which a third of the runs for calibration starts, and a flow is learned
+LEAD_IN_SHARE = 0.4  # share of the free motions that start where inputs have led
+BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and a flow is learned
 # Of runs for calibration: every other one is driven, or under its policy alone.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
-LEAST_NOISE = 0.001  # that a tracker assumes, of the usual
-LEAST_PROCESS_NOISE = 0.005  # that filters assume, at the system's pace: a tenth of the environments' default
-WINDOW, RUN = 0.5, 20.0  # seconds at the pace of the shipped systems: of a tracker's window, and of a run
-SUBSTEPS, INTEGRATION_ERROR = 64, 2e-5  # at most, of scaled states in a sample: no more than the noise assumed
-TOO_FAR_OFF = 0.01  # of scaled states, where a jump in f leaves more than that at any number of steps
-INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share that judges a flow
-DEVIATIONS = (1e-4, 0.3)  # of these pairs from motions, in standard deviations of the states, log-uniform
+LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, over the usual
+# Least process noise that filters assume, at the system's pace: a tenth of the environments' default.
+LEAST_PROCESS_NOISE = 0.005
+WINDOW, RUN = 0.5, 20.0  # a tracker's window and a calibration run, in seconds at the shipped systems' pace
+# Most Runge-Kutta steps in a sample, and the error of scaled states at which more are taken, below the noise assumed.
+SUBSTEPS, INTEGRATION_ERROR = 64, 2e-5
+TOO_FAR_OFF = 0.01  # error of scaled states at SUBSTEPS, as a jump in f leaves, above which a flow is learned
+INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share of them that judges a flow
+DEVIATIONS = (1e-4, 0.3)  # log-uniform distances of these pairs from motions, in standard deviations of the states
 
 
 class SimulatedSource:
@@ -54,9 +56,10 @@ class SimulatedSource:
         self.policy = None if config.policy is None else blind(named_policy(system, config.policy), system.nx)
         if np.any(config.bias):
             system = with_bias(system, config.bias)
-        self.model = system
-        self.ranges = relative_ranges(system, config.uncertain)
-        self.plant = with_parameters(system, self.ranges, in_training=True)
+        self.ranges, self.model, self.plant = {}, system, system
+        if config.uncertain:
+            self.ranges = relative_ranges(system, config.uncertain)
+            self.plant = with_parameters(system, self.ranges, in_training=True)
         self.estimated = tuple(self.ranges) if config.estimate_parameters else ()
         self.name = self.system.name
         self.nx, self.ny, self.dt, self.pace = system.nx, system.ny, config.dt, system.pace
@@ -76,12 +79,15 @@ class SimulatedSource:
         if self.ranges:
             identity["nominal_share"] = nominal_share(self.ranges)
         if self.policy:
-            identity["policy_actions"] = policy_fingerprint(self.policy, self.model)
+            actions = self.policy(self.model.draw_starts(np.random.default_rng(0), 20))
+            identity["policy_actions"] = digest(np.round(actions, 6).tolist())  # the same on every machine
         return identity
 
     def facts(self) -> dict[str, Any]:
         """Arguments of :class:`observers.Artifact`."""
-        system = self.model
+        system, output = self.model, dict[str, Any]()
+        with suppress(ValueError):  # which `tracking` raises again
+            output = output_facts(system)
         return {
             "system": self.name,
             "parameters": self.system.parameters,
@@ -89,7 +95,7 @@ class SimulatedSource:
             "u_max": tuple(map(float, system.u_max)),
             "parameter_ranges": self.ranges,
             "estimated_parameters": self.estimated,
-            **output_facts(system),
+            **output,
         }
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
@@ -118,7 +124,7 @@ class SimulatedSource:
     def runs(self, *, report: Report = lambda done: None) -> Runs:
         """Motions with the system's process noise, and as many without; of each a third from 2X, the others from X."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed), max(1, round(RUN * self.pace / self.dt))
-        plant, n = with_parameters(self.model, self.ranges), self.config.runs
+        plant, n = with_parameters(self.model, self.ranges) if self.ranges else self.model, self.config.runs
         how: dict[str, Any] = SOUND | {"levels": (0.0, self.process_noise), "box_factor": BEYOND}
         motions = Motions(plant, self.dt, steps, **how, policy=self.policy).with_inputs(self.nu)
         x, u, noise, usual = motions.drawn(n, rng, lambda done: report(done / n))
@@ -170,8 +176,7 @@ class SimulatedSource:
         system = self.model
         if self.ranges:
             raise ValueError(f"a motion is of one plant, not of a range of {', '.join(self.ranges)}")
-        if output_matrix(system) is None:
-            output_expression(system)  # raises ValueError if none can be written
+        output_facts(system)  # raises ValueError if an artifact cannot hold the output
         low, high = np.array(system.bounds, dtype=float).T
         offset, scale = self._scale
         mean, covariance = unknown_start(system)

@@ -1,6 +1,9 @@
-"""A system's equations linearised, and written as data that an artifact can hold."""
+"""A system's equations: linearised, identified by samples, and written as data that an artifact can hold."""
 
-from collections.abc import Callable
+import hashlib
+import json
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +22,37 @@ _NAMES = {
     "StrictLessThan": "<", "LessThan": "<=", "StrictGreaterThan": ">", "GreaterThan": ">=",
     "And": "and", "Or": "or", "Not": "not",
 }  # fmt: skip
+
+
+def describe(system: System) -> dict[str, Any]:
+    """Return the identity of a system, with its equations sampled at points of the training box."""
+    rng = np.random.default_rng(0)
+    x = system.draw_starts(rng, 20)
+    if system.discrete:
+        u = rng.uniform(-1, 1, (system.nu, 20)) * np.array(system.u_max)[:, None]
+        moved = components(system.step, x.T, u)
+    else:
+        moved = [*components(system.f, x.T), *(entry for row in input_matrix(system, x.T) for entry in row)]
+    equations = [_rounded(np.broadcast_to(row, 20)).tolist() for row in (*moved, *system.output(x).T)]
+    return {
+        "system": system.name,
+        "parameters": system.parameters,
+        "X": system.X,
+        "bounds": system.bounds,
+        "u_max": system.u_max,
+        "equations": digest(equations),
+    }
+
+
+def digest(values: Sequence[Any]) -> str:
+    """Hash of numbers in lists."""
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """Values as they are on every machine: to six decimals, or to more where all are small."""
+    size = np.abs(values).max()
+    return np.round(values, 6 - min(0, math.floor(math.log10(size))) if 0 < size < np.inf else 6)
 
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -51,13 +85,9 @@ def output_matrix(system: System) -> np.ndarray | None:
 
 
 def output_facts(system: System) -> dict[str, Any]:
-    """The output of an artifact: C where h(x) = C x, else h as an expression, nothing where it cannot be written."""
-    if (C := output_matrix(system)) is not None:
-        return {"C": C}
-    try:
-        return {"h": output_expression(system)}
-    except ValueError:  # calibration raises it again, with the reason
-        return {}
+    """The output as an artifact takes it: C where h(x) = C x, else h as an expression, or ValueError."""
+    C = output_matrix(system)
+    return {"h": output_expression(system)} if C is None else {"C": C}
 
 
 def output_expression(system: System) -> Expression:

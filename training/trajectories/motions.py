@@ -4,8 +4,6 @@ Process noise enters these motions; measurement noise enters the filter's state 
 a batch.
 """
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -307,10 +305,3 @@ def checked_policy(policy: Controller, system: System, name: str) -> Controller:
             f"at x = {x[row].tolist()} it gives {actions[row].tolist()}"
         )
     return act
-
-
-def policy_fingerprint(policy: Controller, system: System) -> str:
-    """Hash of a policy's actions on some states."""
-    actions = policy(system.draw_starts(np.random.default_rng(0), 20))
-    rounded = np.round(np.asarray(actions, dtype=float), 6)  # the same on every machine
-    return hashlib.sha256(json.dumps(rounded.tolist()).encode()).hexdigest()[:16]

@@ -17,8 +17,9 @@ from examples.research.methods import SHIPPED, Budget, Configuration, Task, get_
 from examples.research.resumable import Job
 from kkl_gym.systems import get_system
 from observers.storage import explained
-from training import checkpoints
-from training.files import describe, write
+from training import run
+from training.files import write
+from training.trajectories.equations import describe
 
 FAILED = 200.0  # the largest SMAPE, for a configuration whose training diverges
 REVISION = 9  # rises with every change of the shipped methods: results from before are not reused
@@ -27,9 +28,9 @@ REVISION = 9  # rises with every change of the shipped methods: results from bef
 def seconds_spent(folder: Path) -> float:
     """CPU seconds of all stages whose checkpoints are in a folder, interruptions included."""
     spent = 0.0
-    for path in sorted(folder.glob(f"[!.]*{checkpoints.SUFFIX}")):  # not those that are being written
-        checkpoint = checkpoints.load(path)
-        with checkpoints.restoring(path):
+    for path in sorted(folder.glob(f"[!.]*{run.CHECKPOINT}")):  # not those that are being written
+        checkpoint = run.load_checkpoint(path)
+        with run.restoring(path):
             spent += float(checkpoint["seconds"])
     return spent
 

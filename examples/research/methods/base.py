@@ -15,10 +15,10 @@ from kkl_gym.system import System
 from observers import storage
 from observers.estimator import Estimator
 from training.evaluation.levels import Level
-from training.files import describe
 from training.progress import progress_bars
 from training.run import Loss, Stage, optimise
 from training.seeds import Stream, generator
+from training.trajectories.equations import describe
 from training.trajectories.motions import Motions, recording_ages
 
 _KEY = "kkl-gym-method"
@@ -100,15 +100,9 @@ class Task:
         """Minimise a loss by Adam; goes on from a checkpoint if there is one."""
         self.folder.mkdir(parents=True, exist_ok=True)
         identity = json.dumps([describe(self.system), asdict(self.budget), self.seed], sort_keys=True)
-        stage = Stage(
-            name=name,
-            steps=self.budget.steps,
-            learning_rate=learning_rate,
-            folder=self.folder,
-            fingerprint=identity,
-            seed=self.seed,
-            cpu_seconds=self.budget.cpu_seconds * share,
-        )
+        limits: dict[str, Any] = {"steps": self.budget.steps, "cpu_seconds": self.budget.cpu_seconds * share}
+        where: dict[str, Any] = {"folder": self.folder, "fingerprint": identity, "seed": self.seed}
+        stage = Stage(name=name, learning_rate=learning_rate, **limits, **where)
         with progress_bars(None) as progress:
             optimise(stage, module, loss, progress, resume=True)
 

@@ -85,8 +85,8 @@ class Speed:
         for name, env in envs.items():
             env.action_space.seed(0)
             tasks[name] = environment_task(env, [env.action_space.sample() for _ in range(steps)])
-        report = progress.bar("timing environments", len(tasks) * (self.turns + 1))
-        seconds = in_turns(tasks, self.turns, report)
+        with progress.phase("timing environments", len(tasks) * (self.turns + 1)) as report:
+            seconds = in_turns(tasks, self.turns, report)
         base = np.array(seconds[next(iter(envs))])
         ratios = {name: float(np.median(base / np.array(times))) for name, times in seconds.items()}
         rows = [(name, f"{1e6 * np.median(seconds[name]):,.1f}", f"{ratio:.2f}") for name, ratio in ratios.items()]
@@ -110,8 +110,9 @@ class Speed:
                 for rows, count in counts.items()
                 for what, task in tasks_of(artifact, system, rows=rows, steps=count).items()
             }
-            report = progress.bar(f"timing {name} alone", len(tasks) * (self.turns + 1))
-            medians = {key: f"{1e6 * np.median(of):,.2f}" for key, of in in_turns(tasks, self.turns, report).items()}
+            with progress.phase(f"timing {name} alone", len(tasks) * (self.turns + 1)) as report:
+                seconds = in_turns(tasks, self.turns, report)
+            medians = {key: f"{1e6 * np.median(of):,.2f}" for key, of in seconds.items()}
             kinds = dict.fromkeys(what for what, _ in tasks)
             lines += [(f"{name}, {what}", *(medians.get((what, rows), "") for rows in counts)) for what in kinds]
         if lines:

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import torch
 
-from training import checkpoints
+from training import run
 from training.agents.agent import Agent
 from training.agents.learning import learn
 from training.agents.tasks import HIDDEN_VELOCITIES, control_task
@@ -24,18 +24,18 @@ def saves(monkeypatch):
     class Saves(list):
         stop = None
 
-    saved, save = Saves(), checkpoints.save
+    saved, save = Saves(), run.save_checkpoint
 
     def noted(path, state, **options):
         save(path, state, **options)
         if path.name != "agent.checkpoint.pt":  # an observer's
             return
-        saved.append(checkpoints.load(path))
+        saved.append(run.load_checkpoint(path))
         if len(saved) == saved.stop:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(checkpoints, "SECONDS", -1.0)
-    monkeypatch.setattr(checkpoints, "save", noted)
+    monkeypatch.setattr(run, "CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr(run, "save_checkpoint", noted)
     return saved
 
 
