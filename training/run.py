@@ -166,7 +166,8 @@ def optimise(
 
 def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
     if stage.optimiser == "adam":
-        return torch.optim.Adam(module.parameters(), lr=stage.learning_rate)
+        on_gpu = next(module.parameters()).is_cuda  # where a fused step is one kernel
+        return torch.optim.Adam(module.parameters(), lr=stage.learning_rate, fused=on_gpu)
     from pytorch_optimizer import SOAP
 
     return SOAP(module.parameters(), lr=stage.learning_rate, weight_decay=0.0)

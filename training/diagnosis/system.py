@@ -95,11 +95,10 @@ class Subject:
 def declaration(subject: Subject) -> Iterator[Finding]:
     """States, inputs and parameters."""
     system = subject.system
-    bounds = ", ".join(f"{u_max:g}" for u_max in system.u_max)
+    inputs = ", ".join(f"{u_max:g}" for u_max in system.u_max)
     values = ", ".join(f"{name} = {value:g}" for name, value in system.parameters.items())
-    text = f"{system.name}: {system.nx} state{'s' * (system.nx > 1)} ({', '.join(system.state_names)}); "
-    text += f"{system.nu} input{'s' * (system.nu > 1)} up to {bounds}; " if system.nu else "no inputs; "
-    yield Finding("system", "ok", text + (f"parameters {values}" if values else "no parameters"))
+    text = f"{system.name}: states {', '.join(system.state_names)}; inputs {f'up to {inputs}' if inputs else 'none'}"
+    yield Finding("system", "ok", f"{text}; parameters {values or 'none'}")
 
 
 def equations(subject: Subject) -> Iterator[Finding]:

@@ -13,7 +13,7 @@ from kkl_gym.system import Components, System
 from observers import ForwardMap, LinearFilter
 from training.config import Config
 from training.maps.coordinates import StateScale, spread
-from training.maps.networks import Network, tensor
+from training.maps.networks import Network, compiled, tensor
 
 SOLVED = 20_000  # pairs, and points, from which the output layer is solved for in the end
 RIDGE = 1e-5  # of the least squares for it, over the mean column of their matrix
@@ -26,7 +26,7 @@ def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -
 
 
 def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Values of a network at x and their derivatives along f."""
+    """Values of a network at x and their derivatives along f; by hand, as torch.compile has no forward mode."""
     for layer in network:
         if isinstance(layer, nn.Linear):
             x, f = layer(x), f @ layer.weight.T
@@ -73,16 +73,22 @@ class ForwardProblem(nn.Module):
         self._x, self._z = tensor(self.scale(x), device), tensor((z - self.z_offset) / self.z_scale, device)
         self._points = tensor(points, device)
         self._rates = tensor(np.linalg.norm(linear.A, axis=1), device)
+        self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """The risk on a batch of pairs and as many collocation points."""
         shape, device = (self.config.batch,), self._x.device
         rows = torch.randint(len(self._x), shape, generator=generator, device=device)
         points = torch.randint(len(self._points), shape, generator=generator, device=device)
-        data = ((self.network(self._x[rows]) - self._z[rows]) ** 2).mean()
-        residual, speed = self.residual(self._points[points])
+        risk, error = self._risk(self._x[rows], self._z[rows], self._points[points])
+        return {"loss": risk, "error": error}
+
+    def risk(self, x: torch.Tensor, z: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The risk, and the error of pairs alone."""
+        data = ((self.network(x) - z) ** 2).mean()
+        residual, speed = self.residual(points)
         physics = ((residual / self._z_scale / (speed[:, None] + self._rates)) ** 2).mean()
-        return {"loss": data + self.config.physics_weight * physics, "error": data.sqrt()}
+        return data + self.config.physics_weight * physics, data.sqrt()
 
     def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """dT/dx f - A T - B h (n, nz), in units of z per second, and |f| in scaled states (n,), at x (n, nx)."""

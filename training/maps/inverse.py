@@ -17,7 +17,7 @@ from training.maps.coordinates import (
     settling_time,
     stationary_covariance,
 )
-from training.maps.networks import Network, tensor
+from training.maps.networks import Network, compiled, tensor
 from training.trajectories.motions import Pairs
 
 MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
@@ -237,10 +237,17 @@ class InverseProblem(nn.Module):
         cells = sampler.cells * (2 if sampler.parameters else 1)
         self.error = nn.Buffer(torch.ones(cells, device=device))
         self.visited = nn.Buffer(torch.zeros(cells, dtype=torch.bool, device=device))
+        self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Mean square error of a batch, each cell relative to its own running error; geometric mean of these errors."""
-        inputs, x, weight, cell = self.sampler(generator)
+        risk, error = self._risk(*self.sampler(generator))
+        return {"loss": risk, "error": error}
+
+    def risk(
+        self, inputs: torch.Tensor, x: torch.Tensor, weight: torch.Tensor, cell: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The loss of a batch, and its error."""
         apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
         square = weight * apart[:, :nx].mean(-1)
         if self.sampler.parameters:  # cells of their own, for they are as hard where states are easy
@@ -255,4 +262,4 @@ class InverseProblem(nn.Module):
         self.visited.logical_or_(count > 0)
         # Cells without data do not count.
         error = (torch.where(self.visited, self.error.log(), 0.0).sum() / self.visited.sum()).exp().sqrt()
-        return {"loss": (square / self.error[cell]).mean(), "error": error}
+        return (square / self.error[cell]).mean(), error

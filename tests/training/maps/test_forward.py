@@ -53,6 +53,13 @@ def problem_of_the_oscillator(unit=1.0):
     return ForwardProblem(system, linear, config, pairs=(x, x @ exact.T), points=x, device=CPU), exact
 
 
+def test_the_risk_compiles_to_one_graph():
+    problem, _ = problem_of_the_oscillator()
+    expected = problem.loss(torch.Generator().manual_seed(2))["loss"]
+    problem._risk = torch.compile(problem.risk, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(problem.loss(torch.Generator().manual_seed(2))["loss"], expected)
+
+
 @pytest.mark.parametrize("unit", [1.0, 1e-14])
 def test_solved_output_layer_minimises_the_risk_over_it(unit):
     problem, exact = problem_of_the_oscillator(unit)
