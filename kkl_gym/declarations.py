@@ -24,7 +24,7 @@ def complete(cls: Any, base: Any) -> None:
     if cls.discrete and cls.dt is base.dt:
         raise TypeError(f"{cls.__name__} defines step and must set dt, the sampling interval in seconds")
     _check_inputs(cls, base)
-    if "X" in vars(cls):  # otherwise the parent's box and what was derived from it apply
+    if "X" in vars(cls):  # otherwise the parent's box applies, with the values derived from it
         defaults = {
             "scale": tuple((high - low) / 2 for low, high in cls.X),
             "state_names": tuple(f"x{i + 1}" for i in range(nx)),

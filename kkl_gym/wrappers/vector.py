@@ -414,7 +414,7 @@ def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
-    """The autoreset mode in the metadata of a vector environment, or ValueError if there is none."""
+    """The autoreset mode in the metadata of a vector environment, or ValueError without one."""
     mode = env.metadata.get("autoreset_mode")
     if not isinstance(mode, AutoresetMode):
         raise ValueError(

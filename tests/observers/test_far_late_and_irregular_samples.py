@@ -138,7 +138,7 @@ def test_motions_that_know_whole_samples_alone(by):
     artifact = tracking(by)
     observer, dt = KKLObserver(artifact, 0.1), artifact.filter.dt
     observer.reset(np.zeros(1))
-    with pytest.raises(ValueError, match=r"is carried by whole samples, got a dt of 1\.5 of them"):
+    with pytest.raises(ValueError, match=r"predicts over whole samples, got a dt of 1\.5 samples"):
         observer.step([0.1], dt=1.5 * dt)
     u, twice = np.array([0.2]), copy.copy(observer)
     expected = artifact.motion.step(artifact.motion.step(observer.decode(), u, dt), u, dt)

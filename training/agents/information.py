@@ -22,8 +22,8 @@ from training.trajectories.equations import linearised
 Information = Literal["state", "y", "stacked", "traces", "z", "x_hat", "x_hat_std", "recurrent"]
 INFORMATION: tuple[Information, ...] = get_args(Information)
 ESTIMATED: tuple[Information, ...] = ("x_hat", "x_hat_std")
-OBSERVED: tuple[Information, ...] = (*ESTIMATED, "z")  # what a learned observer may show
-MIN_DEVIATION = 1e-6  # standard deviation over a state's scale, below which agents see no difference
+OBSERVED: tuple[Information, ...] = (*ESTIMATED, "z")  # the information that a learned observer gives
+MIN_DEVIATION = 1e-6  # least standard deviation that agents see, over a state's scale
 
 Values = Mapping[str, np.ndarray]
 Feature = Callable[[Values], np.ndarray]

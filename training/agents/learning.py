@@ -38,13 +38,13 @@ from training.checkpoints import SUFFIX
 from training.progress import ProgressBars, progress_bars
 
 RECURRENT = "ppo_lstm"
-# Share of the steps of a training, the first ones, in which there are no estimates yet.
-PRIVILEGED = 0.9  # without noise: estimates are so near to the truth that the same policy is right
-WANDERED = 0.1  # under noise
-REHEARSAL = 0.05  # of the steps, the last ones, in which the agent acts without exploration and learns no more
+# Share of a training's steps, at its start, in which there are no estimates yet.
+PRIVILEGED = 0.9  # without noise: estimates are so accurate that the same policy suits them
+WANDERED = 0.1  # under noise: random actions
+REHEARSAL = 0.05  # share of the last steps, in which the agent neither explores nor learns
 FILE = "agent.safetensors"
-_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # not of the algorithm
-_OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # what rl-zoo3 makes a system's task of
+_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings of the run
+_OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # from these rl-zoo3 makes a system's task
 
 
 def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:

@@ -1,4 +1,4 @@
-"""Control tasks: an environment, its measured entries and the hold of an action; scores of systems' tasks."""
+"""Control tasks: an environment, its measured entries and the time between actions; scores of systems' tasks."""
 
 import json
 import re
@@ -16,9 +16,9 @@ from observers.checks import LARGEST, flag, integer, is_finite, shown
 from observers.names import matching
 from training.evaluation.levels import Level
 
-MAX_SAMPLES = 100_000  # of an episode: all of them are kept while it is played
-MAX_FRAMES = 1_000  # which may come from a stranger's file
-TOLERANCE = 0.2  # distance from the target over the scale, within which an agent holds it
+MAX_SAMPLES = 100_000  # longest episode, because play stores all its samples
+MAX_FRAMES = 1_000  # bounded, because an untrusted file may set it
+TOLERANCE = 0.2  # an agent holds the target within this distance, over the scale
 
 
 @dataclass(frozen=True)
