@@ -101,7 +101,7 @@ def check_output(
     if warn is None:
         _check_finite("y", y, hint="; outputs may be missing later, but the first sample must be whole")
     elif not artifact.knows_output:
-        warn(f"the map for {artifact.system!r} has no output h(x) to predict a missing output: it holds its last value")
+        warn(f"the map for {artifact.system!r} holds no output h(x): a missing output keeps its last value")
     _check_finite("y", np.where(np.isnan(y), 0.0, y), hint="; NaN marks a missing output")
 
 

@@ -13,7 +13,7 @@ from observers.unscented import add, factor, shift, solved, transformed, whitene
 
 # The limits are normal quantiles. A false alarm of the first loses a good estimate; one of the second only inflates a
 # covariance. Running means are more skewed than the chi-square distribution that the limits assume, so that white
-# innovations exceed the second limit about twenty times as often as its quantile says.
+# innovations exceed the second limit about twenty times as often as its quantile implies.
 _DIVERGED = 6.0  # quantile of 1e-9, for the NIS
 _COLOURED = 4.265  # quantile of 1e-5, for the mean square of the innovations' running mean
 _TREND = 0.25  # time constant of the innovations' running mean, in windows

@@ -211,7 +211,7 @@ def test_wrappers_have_the_gate_and_the_delay_of_their_observers():
 def test_the_first_gap_that_no_map_fills_warns_once():
     observer = KKLObserver(random_artifact())
     observer.reset(np.zeros(1))
-    with pytest.warns(UserWarning, match="it holds its last value") as warned:
+    with pytest.warns(UserWarning, match="a missing output keeps its last value") as warned:
         observer.estimate([[0.0], [0.1]]), observer.step(None), observer.step(None)
     assert len(warned) == 1
     with warnings.catch_warnings():

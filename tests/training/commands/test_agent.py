@@ -61,7 +61,7 @@ def test_an_agent_in_any_environment(information, capsys):
     main(["agent", "evaluate", f"runs/agents/CartPole-v1-{information}-0/agent.safetensors", "--episodes", "3"])
     shown = capsys.readouterr().out
     assert shown.count("return") == 2
-    with pytest.raises(SystemExit, match="holds an agent already"):
+    with pytest.raises(SystemExit, match="already holds an agent"):
         main(["agent", "train", "CartPole-v1", "--information", information])
 
 
