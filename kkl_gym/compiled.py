@@ -96,7 +96,7 @@ def _shared(
         return SamplingStep(plain, f"{system.name} makes its step itself")
     try:
         motion: Any = _motion(system)
-    except Exception as error:  # whatever comes out of a user's equations on symbols
+    except Exception as error:  # a user's equations may raise anything on symbols
         motion = _reason(error)
     of = compile_kernel, type(system), motion
     if of not in _kept:

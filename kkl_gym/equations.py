@@ -125,7 +125,7 @@ def _checked_starts(system: Any) -> np.ndarray:
     n, low, high = 5, *np.array(system.bounds, dtype=float).T
     try:
         starts = np.asarray(system.draw_starts(np.random.default_rng(0), n))
-    except Exception as error:  # whatever a user's code raises
+    except Exception as error:  # a user's code may raise anything
         raise _unfinished(f"draw_starts(rng, n) of {system.name!r}", error) from error
     if starts.shape != (n, system.nx) or starts.dtype.kind not in "iuf":
         wanted = f"an array of numbers of shape (n, {system.nx})"
@@ -140,7 +140,7 @@ def target_of(system: Any) -> Any:
     found, nx = f"target of {system.name!r}", system.nx
     try:
         target = system.target
-    except Exception as error:  # whatever a user's code raises
+    except Exception as error:  # a user's code may raise anything
         raise _unfinished(found, error) from error
     if callable(target):
         raise EquationError(f"{found} is a method: write @property above its def")
@@ -183,7 +183,7 @@ def _called(equations: Equations, *args: Any) -> Any:
         return equations(*args)
     except NotImplementedError:  # its message names the missing method
         raise
-    except Exception as error:  # whatever a user's code raises
+    except Exception as error:  # a user's code may raise anything
         raise failed(error, equations, *args) from error
 
 

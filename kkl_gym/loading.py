@@ -57,7 +57,7 @@ def _imported(where: str, failure: str) -> Any:
     """Import a module or script; ``failure`` begins the message of the ValueError if that fails."""
     try:
         return _module(where)
-    except Exception as error:  # whatever a user's script raises
+    except Exception as error:  # a user's script may raise anything
         line = user_line(error)
         raise ValueError(f"{failure}: {f'{line}: {type(error).__name__}: ' if line else ''}{error}") from error
 

@@ -28,7 +28,7 @@ class Estimates:
         self._running.reset(y0)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
+        """Begin episodes in rows (n,) with their first samples (number of True in rows, ny)."""
         self._running.restart(y0, rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -141,7 +141,7 @@ class KKLEstimator:
         self.observer.reset(y0, x0 if self._known_start else None)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
+        """Begin episodes in rows (n,) with their first samples (number of True in rows, ny)."""
         self.observer.restart(y0, rows, x0 if self._known_start else None)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:

@@ -53,7 +53,7 @@ class NamedEstimator(KKLEstimator):
         self._y, self._held = y0.copy(), y0.copy()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in some rows; see :class:`KKLEstimator`."""
+        """Begin episodes in some rows; see :class:`KKLEstimator`."""
         self._check_start(x0)
         super().restart(y0, rows, x0)
         self._y[rows] = self._held[rows] = y0
