@@ -26,7 +26,7 @@ AFTER = 20  # first steps of each episode, whose errors do not count
 
 
 def wrapped(path: Path) -> gym.Env:
-    """The environment with an observer."""
+    """The environment with an observer around it."""
     return KKLObservation(gym.make(ENV_ID), path)
 
 

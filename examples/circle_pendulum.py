@@ -36,7 +36,7 @@ class CirclePendulum(kkl_gym.System):
     target: ClassVar = (1.0, 0.0, 0.0)
 
     def draw_starts(self, rng, n, factor=1.0):
-        """Any angle; rates in a multiple of X."""
+        """Draw any angle, and rates within a multiple of X."""
         angle = rng.uniform(-np.pi, np.pi, n)
         low, high = self.box(factor)
         return np.stack([np.cos(angle), np.sin(angle), rng.uniform(low[2], high[2], n)], axis=-1)

@@ -50,7 +50,7 @@ class FlexibleJoint(kkl_gym.System):
         return (x[0],)
 
     def reward(self, x, u):
-        """1 where the link rests at its goal."""
+        """1 if the link rests at its goal, and less elsewhere."""
         return 1.0 / (1.0 + 20.0 * (x[2] - self.goal) ** 2 + 0.5 * x[3] ** 2)
 
     def terminated(self, x):

@@ -211,7 +211,7 @@ def trained(records: Sequence[Record], settings: dict, out: Path) -> Artifact:
 
 
 def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> dict[str, list[np.ndarray]]:
-    """Estimates along each training run, by observers and equations that were learned from the other half."""
+    """Estimates along each training run, by observers and equations learned from the other half of the runs."""
     found = {}
     for fold in FOLDS:
         kept = [record for run, record in zip(TRAINING, records, strict=True) if run not in fold]

@@ -36,7 +36,7 @@ from kkl_gym.tracing import Program, in_tuple, program
 
 Values = TypeVar("Values")
 Advance = Callable[[Values, Values, Values, float], Values]
-"""(x, u, w, dt) to the next x."""
+"""Maps (x, u, w, dt) to the next x."""
 
 MAX_OPERATIONS = 500  # longer programs, such as that of a network as f, would take many seconds to compile
 _TRIALS = 200  # states of each kind at which machine code is compared with Python
@@ -104,7 +104,7 @@ def _shared(
             _kept.pop(next(iter(_kept)), None)
         try:
             _kept[of] = motion if isinstance(motion, str) else compile_kernel(system, motion)
-        except Exception as error:  # Python then runs the equations, and raises their errors
+        except Exception as error:  # the step in Python runs the equations and raises their errors
             _kept[of] = _reason(error)
         if isinstance(_kept[of], str):
             logger.info("%s: %s", without, _kept[of])
@@ -190,7 +190,7 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
     def step(x: Components, u: Components, w: Components, dt: float) -> Components:
         try:
             end: Components = kernel(*x, *u, *w, dt)
-        except Exception:  # Python names the equation that failed
+        except Exception:  # the step in Python raises an error that names the equation
             return advance(system, x, u, w, dt)
         return end if end[0] == end[0] else advance(system, x, u, w, dt)
 
@@ -227,7 +227,7 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         "            least, most = most, 2.0 * most",
         f"        for first in range(0, found, {_LANES}):",
         f"            for j in range({_LANES}):",
-        "                at = min(first + j, found - 1)  # lanes that are left over do the last row again",
+        "                at = min(first + j, found - 1)  # unused lanes repeat the last row",
         f"                row, {substeps}, {length}, {error} = order[at], counts[at], dt / counts[at], 0.0",
         *[f"                {lane} = {value}" for lane, value in zip(states, start)],
         f"                {in_tuple(d)} = {pushed}",
@@ -247,7 +247,7 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         f"                    needs[row] = {substeps} * {error} ** 0.1",
         "    return left > 0",
     ]
-    jit: Any = functools.partial(numba.njit, error_model="numpy")  # a division by zero is infinite
+    jit: Any = functools.partial(numba.njit, error_model="numpy")  # a division by zero gives infinity
     inlined = functools.partial(jit, forceinline=True)  # a function call would prevent vectorisation over rows
     kernel = jit(_assembled(motion, lines, inlined))
     u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None] / system.pace

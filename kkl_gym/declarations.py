@@ -1,4 +1,4 @@
-"""What a user declares about a system: class variables, checked and completed as soon as the class is defined."""
+"""The class variables of a user's system: checked and completed when the class is defined."""
 
 import dataclasses
 import inspect

@@ -1,7 +1,7 @@
 """Elementary functions for equations of motion. They take every type of number.
 
 Plain arithmetic and comparisons already work on Python floats, NumPy arrays, torch tensors and sympy expressions alike.
-The ``sin`` of any one library does not, nor does ``if``. Equations that need them import them from here::
+``math.sin``, ``np.sin`` and ``if`` do not. Equations that need such functions import them from here::
 
     from kkl_gym.elementary import sin, where
 
@@ -58,7 +58,7 @@ def _binary(name: str, on_numbers: Callable[[Any, Any], Any], meaning: str) -> C
 
 def _named(function: Any, call: str, meaning: str, on_numbers: Callable[..., Any]) -> Any:
     function.__name__ = function.__qualname__ = call.partition("(")[0]
-    function.on_numbers = on_numbers  # for compilers
+    function.on_numbers = on_numbers  # kkl_gym.compiled compiles this one
     function.__doc__ = f"{call}, {meaning}, for floats, NumPy arrays, torch tensors and sympy expressions."
     return function
 

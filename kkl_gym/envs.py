@@ -216,7 +216,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         w, v = self._next_noise()
         x = self._advance(self._x, u, w, self.plant.dt)
         escaped = not self._inside(x)
-        if escaped:  # or the integrator erred: a finer one decides
+        if escaped:  # or the substeps erred: finer ones decide
             x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
             escaped = not self._inside(x)
         if not escaped:
@@ -258,7 +258,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             self.draw(estimates)
 
     def close(self) -> None:
-        """Close the window, if there is one; the next frame opens another."""
+        """Close the window, if one is open; the next frame opens another."""
         if self._window is not None:
             self._window.close()
             self._window = None
@@ -320,7 +320,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return True
 
     def _observation(self, info: dict[str, Any]) -> np.ndarray:
-        if self.observe == "state":  # within the bounds by construction
+        if self.observe == "state":  # always within the bounds
             obs: np.ndarray = info["x"].astype(_FLOAT32)
         else:
             y = self._y if self._readings is None else self._held

@@ -104,12 +104,12 @@ def check_equations(system: Any) -> None:
     try:
         target_of(system)
     except EquationError as error:
-        if not isinstance(error.__cause__, ValueError):  # environments raise that there is no target
+        if not isinstance(error.__cause__, ValueError):  # there is no target; environments raise this
             raise
 
 
 def _values(system: Any, name: str, x: Any, u: Any) -> list[Any]:
-    """All numbers that an equation returns, checked."""
+    """All numbers that an equation returns, after checks."""
     if name == "g":
         return [value for row in input_matrix(system, x) for value in row]
     if name == "rate":
@@ -155,13 +155,13 @@ def _unfinished(what: str, error: Exception) -> EquationError:
 
 
 def blame(error: Exception, system: Any, *args: Any) -> None:
-    """Raise an EquationError if an exception comes from a system's equations of motion, and return otherwise."""
+    """Raise an EquationError if an exception comes from a system's equations of motion, otherwise return."""
     if isinstance(error, EquationError | NotImplementedError):
         return
     for equations in (system.step, system.f, system.g, system.rate):
         if not _is_default(equations) and steps_within(error, code_of(equations)):
             raise failed(error, equations, *args) from error
-    with np.errstate(all="ignore"):  # the value that the equations returned is the fault
+    with np.errstate(all="ignore"):  # otherwise a returned value is at fault
         if system.discrete:
             components(system.step, *args)
         else:

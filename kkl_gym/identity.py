@@ -1,4 +1,4 @@
-"""What identifies an environment: its id, its arguments and its sampling interval."""
+"""The identity of an environment: its id, its arguments and its sampling interval."""
 
 import json
 import math
@@ -61,7 +61,7 @@ def _identity(spec: Any, env: Env) -> dict[str, Any]:
 
 
 def sampling_interval(env: Env) -> float:
-    """Seconds between the samples of an environment, by its attribute ``dt``; 1 where it has none."""
+    """Seconds between the samples of an environment: its attribute ``dt``, or 1 without this attribute."""
     base: Any = env.unwrapped
     if _of_rows(base):
         dt = base.get_attr("dt")[0] if all(base.call("has_wrapper_attr", "dt")) else None

@@ -25,9 +25,9 @@ class Memory:
     w_k+1 = decay w_k + rise (y_k+1 - y_k). For each input u and time constant of inputs, the memory uses the low-pass
     filter v' = (u - v) / tau itself, with u held between samples.
 
-    The past before the first output is unknown. The memory assumes that y rested until 64 steps before it, and then
-    changed as fast as it has since, in the mean that each filter weighs. After k steps this assumption multiplies w by
-    (1 - decay^(k + 64)) / (1 - decay^k). It also assumes that no input acted.
+    The past before the first output is unknown. The memory assumes that y rested until 64 steps before it, and from
+    then on changed at the mean rate of the steps since, as each filter weights them. After k steps this assumption
+    multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also assumes that no input acted.
 
     For a slow signal every w is nearly tau times its rate. So the memory returns combinations: the slowest w first, and
     of each faster one the part that the slower ones do not explain. These coordinates are uncorrelated and as large as
@@ -162,7 +162,7 @@ def _time_constants(name: str, values: Any) -> tuple[float, ...]:
         raise ValueError(f"{name} must be a sequence of numbers of steps, such as (1, 2, 4, 8), got {shown(values)}")
     found = tuple(array.tolist())
     for value in found:
-        if not SHORTEST <= value <= LONGEST:  # nor is NaN
+        if not SHORTEST <= value <= LONGEST:  # true for NaN
             raise ValueError(f"{name} must be from {SHORTEST:g} to {LONGEST:,.0f} steps each, got {value:g}")
     for one, next_one in pairwise(found):
         if next_one < (1 - 1e-9) * CLOSEST * one:

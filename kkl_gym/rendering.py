@@ -1,4 +1,4 @@
-"""The phase portrait that ``render_mode="rgb_array"`` returns and ``render_mode="human"`` shows in a window."""
+"""Phase portraits: images for ``render_mode="rgb_array"``, and a window for ``render_mode="human"``."""
 
 import math
 from collections import deque

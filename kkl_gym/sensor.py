@@ -99,7 +99,7 @@ class Sensor:
         return bool(np.any(self.coloured_noise) or np.any(self.drop_out))
 
     def columns(self, ny: int) -> dict[str, np.ndarray]:
-        """All parameters by name, one for each output, (ny, 1): no limit is infinite, no time constant is 1."""
+        """All parameters by name, one for each output, (ny, 1). Missing limits are infinite, time constants 1."""
         low, high = (-math.inf, math.inf) if self.saturation is None else self.saturation
         given = vars(self) | {"low": low, "high": high, "time_constant": self.time_constant or 1.0}
         del given["saturation"]
@@ -171,7 +171,7 @@ class Readings:
             lost |= chance < of["drop_out"]
         y[lost] = np.nan
         length = len(self._kept)
-        if length == 1:  # nothing is late
+        if length == 1:  # no delay
             return y
         self._kept[age % length, :, rows] = y.T
         return self._kept[(age - of["delay"]) % length, self._outputs, rows]

@@ -239,7 +239,7 @@ def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, 
 
 
 def _powers(need: np.ndarray) -> np.ndarray:
-    """The least power of two that is not less than ``need``, or 0 beyond MOST_EQUAL. Shapes: (n,) to (n,)."""
+    """The least power of two from ``need`` (n,) on, or 0 beyond MOST_EQUAL; returns (n,)."""
     mantissa, exponent = np.frexp(np.where(need <= MOST_EQUAL, np.maximum(need, 1), 1))
     return np.where(need <= MOST_EQUAL, 1 << (exponent - (mantissa == 0.5)), 0)
 
@@ -301,7 +301,7 @@ def simulate(
     step: Step | None = None,
     report: Callable[[int], object] | None = None,
 ) -> np.ndarray:
-    """Trajectories (steps + 1, n, nx) of starts (n, nx); ``u`` (steps, n, nu), or callable, ``w`` (steps, n, nx)."""
+    """Trajectories (steps + 1, n, nx) from starts (n, nx), under ``u`` (steps, n, nu) or a policy, and ``w``."""
     x0 = np.asarray(x0, dtype=float)
     if x0.ndim != 2 or x0.shape[1] != system.nx or not np.isfinite(x0).all():
         raise ValueError(f"x0 must be finite with shape (n, {system.nx}), got shape {x0.shape}")

@@ -23,7 +23,8 @@ Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol fo
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 DT = 0.01  # s, the default where it suits a system's rate
-SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)  # least and largest rate * dt for DT, each with its value beyond
+# Least and largest rate * dt for which DT suits, each with the rate * dt of the interval that replaces DT beyond it.
+SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)
 PROCESS_NOISE = 0.05  # default, in multiples of a system's scale in one second of its pace
 NOISE_SHARE = 0.05  # default measurement noise as a share of an output's range
 # Attributes of a class with an empty body; Python 3.13 adds the last two.
@@ -52,11 +53,11 @@ class System:
     X : tuple of (float, float), length nx
         Training box, (low, high) of each state: starts are drawn in it, and observers are trained on it.
     X_centre : tuple of float, length nx
-        The point about which multiples of X, such as 2X, grow. The default is the middle of X.
+        The centre of multiples of X, such as 2X. The default is the middle of X.
     bounds : tuple of (float, float), length nx
         Declared bounds, (low, high) of each state: an episode ends where the state leaves them.
     u_max : tuple of float, length nu
-        Bound of each input. The default, none, makes an autonomous system.
+        Bound of each input. The default is an empty tuple, for an autonomous system.
     G : tuple of tuple of float, shape (nx, nu)
         Constant input matrix. Override :meth:`g` where it depends on the state.
     scale : tuple of float, length nx
@@ -236,7 +237,7 @@ class System:
         x : sequence of length nx
             Components of the state at the end of the interval: floats or arrays.
         u : sequence of length nu
-            Components of the input that acted, in its own units.
+            Components of the physical input that acted.
 
         Returns
         -------

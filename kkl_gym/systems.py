@@ -232,7 +232,7 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
             )
         try:
             system = system()
-        except TypeError as error:  # not decorated as a dataclass
+        except TypeError as error:  # it lacks @dataclass
             raise ValueError(str(error)) from error
     if not isinstance(system, System) or type(system) is System:
         hint = "; in a spec's JSON write it as 'script.py:Class'" if isinstance(system, Mapping) else ""

@@ -1,4 +1,4 @@
-"""Many environments at once, simulated as one batch."""
+"""Vector environments that are simulated as one batch."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -245,7 +245,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """The rows' seeds, None where a row has not been used yet."""
+        """The rows' seeds, None for a row that has not been used."""
         return tuple(self._seeds)
 
     def _spread(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
@@ -293,7 +293,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
         escaped = self._outside(x)
-        if escaped.any():  # or the integrator erred: a finer one decides
+        if escaped.any():  # or the substeps erred: finer ones decide
             x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(escaped))
             escaped = self._outside(x)
         if escaped.any():  # these rows keep the last state and output inside the bounds

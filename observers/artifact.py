@@ -214,7 +214,7 @@ class Artifact:
 
     @functools.cached_property  # every step reads it
     def nx(self) -> int:
-        """Number of states estimated."""
+        """Number of estimated states."""
         return len(self.inverse.x_offset) - len(self.estimated_parameters)
 
     @functools.cached_property
@@ -224,7 +224,7 @@ class Artifact:
 
     @functools.cached_property
     def nu(self) -> int:
-        """Number of inputs that the observer takes into account."""
+        """Number of inputs that the observer uses."""
         return self.filter.nu
 
     @functools.cached_property

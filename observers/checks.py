@@ -50,7 +50,7 @@ def all_finite(values: np.ndarray, largest: float = LARGEST) -> bool:
             if not -largest <= value <= largest:  # false for NaN too
                 return False
         return True
-    if np.vdot(values, values) <= largest**2:  # one pass; false for NaN too
+    if np.vdot(values, values) <= largest**2:  # a fast sufficient test; false for NaN
         return True
     return bool((np.abs(values) <= largest).all())
 
@@ -133,7 +133,7 @@ def real_array(name: str, values: Any) -> np.ndarray:
             if array.dtype.kind in "fiu":
                 with np.errstate(over="ignore"):  # callers reject infinite values
                     return array.astype(float)
-    except Exception as error:  # ragged lists, and any exception that __array__ of a foreign object raises
+    except Exception as error:  # ragged lists, and any exception from __array__ of other objects
         raise ValueError(f"{name} must hold real numbers in the shape of an array, got {shown(values)}") from error
     raise ValueError(f"{name} must hold real numbers, got {shown(values)}")
 

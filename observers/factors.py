@@ -30,7 +30,7 @@ class Factors:
     Parameters
     ----------
     levels : ndarray, shape (k,)
-        Levels of measurement noise, rising from 0, in multiples of the largest that the map was trained for.
+        Levels of measurement noise, rising from 0, in multiples of the largest in the map's training.
     ages : ndarray, shape (m,)
         Seconds since reset, rising from 0.
     factors : ndarray, shape (2, k, m)

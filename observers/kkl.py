@@ -43,7 +43,7 @@ class Pending:
 
 
 class KKL(Estimator[np.ndarray]):
-    """The estimator behind :class:`observers.KKLObserver`, for n rows.
+    """The estimator inside :class:`observers.KKLObserver`, for n rows.
 
     A row of the state holds z (size), the last output (ny), the age in samples, which is NaN before the first one, and
     then the rows of the tracker and of the monitor.

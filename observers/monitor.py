@@ -74,8 +74,8 @@ class Limits:
         If some outputs are noisier than others, relative to the largest levels, their noise reaches the estimate and so
         every residual. All outputs then have the upper limits at the relative level of the noisiest output.
 
-        Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each. Squares of limits
-        are interpolated linearly. Raises ValueError if a level is not a number, negative or beyond the last one.
+        Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each, interpolated as
+        variances. Raises ValueError if a level is not a number, negative or beyond the last one.
         """
         ny = self.mean.shape[1]
         level = noise_levels("the noise level", level, ny)
@@ -86,7 +86,7 @@ class Limits:
         part = np.divide(own, last, out=np.zeros(ny), where=last > 0)
         noisiest = np.where(part == part.max(), own, part.max() * last)
 
-        def between(sigma: np.ndarray, limits: np.ndarray) -> np.ndarray:  # linear in squares
+        def between(sigma: np.ndarray, limits: np.ndarray) -> np.ndarray:  # linear in level^2
             each = zip(sigma, levels.T, limits.T, strict=True)
             return np.array([np.interp(one**2, known**2, squares) for one, known, squares in each])
 
@@ -125,7 +125,7 @@ class Monitor:
 
     @property
     def width(self) -> int:
-        """Number of values in a row of the state: running means (ny), running mean squares (ny), samples judged."""
+        """Number of values in a row of the state: running means (ny), running mean squares (ny), number of samples."""
         return 2 * len(self._sound) + 1
 
     def start(self, n: int) -> np.ndarray:

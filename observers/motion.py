@@ -16,7 +16,7 @@ _MAX_SUBSTEPS = 1024
 
 @dataclass(frozen=True)
 class Equations:
-    """x' = f(x) + g(x) u with u held, integrated over a sample; or x_next = field(x, u) in discrete time.
+    """Motion by equations: x' = f(x) + g(x) u under held u, or x_next = field(x, u) in discrete time.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ class Motion:
     def check_samples(self, samples: float) -> None:
         """Raise ValueError if the motion cannot predict over so many samples."""
         continuous = self.equations is not None and self.equations.substeps
-        # Times in seconds since 1970 are rounded to 2e-7 s, and clocks jitter.
+        # A tolerance, because clocks jitter and floats resolve seconds since 1970 only to 2e-7 s.
         if not continuous and abs(samples - max(1, round(samples))) > 1e-3:
             what = "a learned flow" if self.flow is not None else "a motion in discrete time"
             raise ValueError(

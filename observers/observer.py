@@ -304,8 +304,8 @@ class KKLObserver(RecordEstimates):
         u : array_like, shape (..., nu), optional
             The input held since the last sample, by default zero.
         dt : float, optional
-            Seconds since the last sample, by default the map's interval, and at most 1,000 intervals. A learned flow
-            needs a whole multiple of the interval.
+            Seconds since the last sample, by default the map's interval, and at most 1,000 intervals. A learned flow,
+            like a system in discrete time, needs a whole multiple of the interval.
 
         Returns
         -------

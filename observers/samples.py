@@ -57,7 +57,7 @@ def _check_tracks(artifact: Artifact, tracking: bool | None) -> None:
 
 
 def check_replacement(artifact: Artifact, other: Artifact) -> None:
-    """Raise ArtifactError unless an artifact can take the place of another while the filter runs."""
+    """Raise ArtifactError unless an artifact can replace another while the filter runs."""
     if not isinstance(other, Artifact):
         raise ArtifactError(f"an observer is replaced by an observers.Artifact, got {shown(other)}")
     there = _serves(other)

@@ -94,7 +94,7 @@ def save(
 def read(
     path: str | os.PathLike[str], *, key: str, error: type[Exception], what: str
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read what :func:`save` wrote."""
+    """Read a file of :func:`save`; raises ``error``, which calls the file ``what``, if it is invalid."""
     content = _content(path, error)
     try:
         views: list[tuple[str, dict[str, Any]]] = deserialize(content)  # type: ignore[no-untyped-call]
@@ -134,7 +134,7 @@ def read(
 
 
 def checksum(path: str | os.PathLike[str], error: type[Exception]) -> str:
-    """The SHA-256 of a file."""
+    """The SHA-256 of a file; raises ``error`` if it cannot be read."""
     return hashlib.sha256(_content(path, error)).hexdigest()
 
 

@@ -112,8 +112,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         the agent acts on a map without inputs and ``ignore_input`` is false, or if a wrapper inside skips samples. At a
         reset or step, if a wrapper inside changes observations: the observer would not see the change.
     observers.ArtifactError
-        A ValueError: if the file is missing or damaged, or was made for another system, other parameters or another dt;
-        if ``known_start`` needs a forward map or motion that it lacks, or ``uncertainty`` a covariance.
+        If the file is missing or damaged, or was made for another system, other parameters or another dt. If it lacks
+        the forward map or motion for ``known_start``, or the covariance for ``uncertainty``. It is a ValueError.
 
     Examples
     --------

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 
 class SB3VecEnv(VecEnv):
-    """A stable-baselines3 ``VecEnv`` over any Gymnasium ``VectorEnv`` that resets in the same step.
+    """A stable-baselines3 ``VecEnv`` around any Gymnasium ``VectorEnv`` that resets in the same step.
 
     ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` may wrap it. When an episode ends, the row's info holds
     ``terminal_observation`` (the one before the reset), ``TimeLimit.truncated`` and everything that the environment
@@ -123,7 +123,7 @@ class SB3VecEnv(VecEnv):
         return getattr(self.env.unwrapped, how)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Return for each row whether a wrapper of this class is around the vector environment."""
+        """Return for each row whether a wrapper of this class surrounds the vector environment."""
         env: Any = self.env
         while not (wrapped := isinstance(env, wrapper_class)) and hasattr(env, "env"):
             env = env.env

@@ -36,7 +36,7 @@ class Checkpoint(BaseCallback):
         self.path, self._fingerprint, self._curve_path = path, fingerprint, path.with_name(CURVE)
         self.resumed = self.restarts = 0
         self.spent = 0  # random steps before the algorithm's first
-        self.privileged = False  # whether the agent sees hidden signals in place of estimates
+        self.privileged = False  # whether the agent sees true hidden signals instead of estimates
         self.records: Callable[[], Sequence[Record]] = list  # the records to save
         self._curve, self._began = list[tuple[float, ...]](), time.process_time()
         if not resume:
@@ -112,7 +112,7 @@ class Checkpoint(BaseCallback):
 
 
 def _moments(scaling: VecNormalize | None) -> dict[str, Any]:
-    """The running moments of observations and returns."""
+    """The running moments for the normalisation of observations and returns."""
     if scaling is None:
         return {}
     pairs: dict[str, Any] = {name: getattr(scaling, name) for name in ("obs_rms", "ret_rms")}

@@ -30,7 +30,7 @@ class Cost(VectorWrapper):
         self._task = task
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step, and replace the rewards. Shapes: ``actions`` (n, nu)."""
+        """Step the environments, and replace the rewards. Shapes: ``actions`` (n, nu)."""
         obs, total, terminated, truncated, info = self.env.step(actions)
         age = info["final_info"]["sample"] if terminated.any() else info["sample"]
         return obs, paid(self._task, total, age, terminated), terminated, truncated, info

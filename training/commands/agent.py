@@ -77,12 +77,12 @@ Measured = Annotated[tuple[int, ...], _INDICES, hint("the positions, in known en
 
 @dataclass(frozen=True)
 class TaskOptions:
-    """Options of a task; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
+    """Options of a task; annotate fields of this type with ``tyro.conf.OmitArgPrefixes``."""
 
     measured: Measured = ()
     """Entries of the flattened observation that agents may see, as in 0,1. In systems, y is measured."""
     hidden: Annotated[tuple[int, ...], _INDICES, hint("all others")] = ()
-    """Entries that an observer estimates."""
+    """Entries of the flattened observation that an observer estimates."""
     env_kwargs: EnvironmentArguments = ()
     time_constants: Annotated[tuple[float, ...], _STEPS, hint("1,2,4,8")] = ()
     """Time constants of z's memory and of traces, in actions. Without noise, agents may learn more easily with 1 or

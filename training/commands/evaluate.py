@@ -99,7 +99,7 @@ class Subject:
 
     @property
     def on(self) -> str:
-        """The plant, for titles."""
+        """Text on the plant for titles."""
         return f", plant {show_parameters(self.plant)}" if self.plant else ""
 
     def runs(self, **motions: Any) -> dict[str, Any]:

@@ -170,7 +170,7 @@ class RunOptions:
 
 
 def set_threads(threads: int) -> None:
-    """Set torch's threads."""
+    """Set the number of torch's threads."""
     import torch  # torch takes longest to import
 
     if threads < 1:
@@ -180,7 +180,7 @@ def set_threads(threads: int) -> None:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """The recorded data of a command; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
+    """The recorded data of a command; annotate fields of this type with ``tyro.conf.OmitArgPrefixes``."""
 
     data: Annotated[tuple[Path, ...], hint(metavar="FILE [FILE ...]")] = ()
     """Records: .npz or .mat files with arrays t, y and, if recorded, u and x; .csv or .parquet files with named
@@ -297,7 +297,7 @@ def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> C
 
 
 def system_of(artifact: Artifact, given: str | None) -> System:
-    """The system that an artifact was made for, checked against it."""
+    """The system of an artifact, after a check that both match."""
     artifact.require_system()
     if given is None and artifact.system not in SYSTEMS:
         raise ValueError(f"{artifact.system!r} is not a shipped system: name its class with --system script.py:Class")

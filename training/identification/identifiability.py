@@ -1,4 +1,4 @@
-"""Which parameters, products of their powers, and signs are identifiable from outputs."""
+"""Tests of identifiability from outputs: of parameters, of products of their powers, and of signs."""
 
 import itertools
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Identification and training in one: :func:`identify` and :func:`adapt`."""
+"""Identification of a plant and training of its observer: :func:`identify` and :func:`adapt`."""
 
 import dataclasses
 import json
@@ -50,8 +50,8 @@ def identify(
 ) -> Learned:
     """Identify parameters of a plant from records of its outputs, and train an observer for it.
 
-    No state is needed. :func:`training.identification.identify.estimate_parameters` fits the parameters. The observer
-    is trained on simulated motions of the identified plant, for noise up to twice that of the records.
+    No recorded state is needed. :func:`training.identification.identify.estimate_parameters` fits the parameters. The
+    observer is trained on simulated motions of the identified plant, for noise up to twice that of the records.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def identify(
     records : sequence of Record
         Outputs of one plant, and its inputs if they acted.
     folder : Path
-        Receives parameters.json, identification.png, SYSTEM.safetensors, checkpoints and log.txt.
+        Folder for parameters.json, identification.png, SYSTEM.safetensors, checkpoints and log.txt.
     dt : float, optional
         Sampling interval of the observer in seconds; by default that of the records.
     settings : mapping of str to object, optional
@@ -122,7 +122,7 @@ def adapt(
     resume: bool = False,
     console: Console | ProgressBars | None = None,
 ) -> Learned:
-    """Identify a plant that differs from an observer's model, and train the observer again for it.
+    """Identify a plant that differs from an observer's model, and train the observer again for this plant.
 
     The training uses the observer's own settings, including its noise levels.
 

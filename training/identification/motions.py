@@ -18,7 +18,7 @@ FIRST_DAMPING = 1e-3
 BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # shares of windows to which starts are fitted first
 DRAWS, KEPT = 64, 4  # random starts for each window, and the number of best ones that are fitted
 SAMPLES_PER_STATE = 8  # in the shortest beginning, so that noise does not determine the start
-MOST_ROWS = 60_000  # motions simulated at once
+MOST_ROWS = 60_000  # most motions in one simulation
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from training.identification.motions import FIRST_DAMPING, Motions, Problem, Sho
 RESETTLING = 3  # steps of starts after a step of the parameters, in windows that then fit worse
 NONLINEAR = 0.3  # largest rms error of linearised outputs, over the noise, for a change by one standard error
 ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
-SLOW, PATIENCE = 0.1, 3  # fall of the squares, over the noise's, that counts as slow; successive slow steps that end
+SLOW, PATIENCE = 0.1, 3  # a smaller fall of the squares, over the noise's, is slow; three slow steps end the fit
 SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit
 EXACT = 1e-16  # a smaller mean square of residuals, over the outputs' variances, ends the fit
 ROUNDING = 1e-14  # lower bound of the noise, in an output's standard deviations

@@ -136,12 +136,12 @@ def _first_fit(
 
 
 def _cuts(records: Sequence[Record], length: int) -> list[tuple[int, int]]:
-    """Record and first sample of each window of one length."""
+    """Record and first sample of each window of a given length."""
     return [(i, k) for i, record in enumerate(records) for k in range(0, len(record.y) - length, length)]
 
 
 def windows(records: Sequence[Record], starts: Starts, length: int) -> Windows:
-    """Cut windows of one length out of records."""
+    """Cut windows of a given length out of records."""
 
     def cut(values: Sequence[np.ndarray], samples: int) -> np.ndarray:
         return np.stack([values[index][k : k + samples] for index, k in starts], 1)
@@ -160,7 +160,7 @@ class Prediction:
 
 
 def predict(fit: Fit, records: Sequence[Record], rng: np.random.Generator) -> list[Prediction]:
-    """Predict the outputs of the first window of records, each from the first half of it."""
+    """Predict the outputs in the first window of each record, with a start fitted to the window's first half."""
     length, theta = len(fit.windows.u), fit.theta
     chosen = [record for record in records if len(record.y) > length]
     if not chosen:

@@ -1,4 +1,4 @@
-"""Neural networks on the sequence of outputs: one training and one observer for several cells.
+"""Neural networks on sequences of outputs: several cells share one training and one observer.
 
 A cell maps the features of samples and its state before them to a hidden vector for each sample and its new state.
 """
