@@ -26,7 +26,7 @@ _KEY = "kkl-gym"
 
 @dataclass(frozen=True)
 class Artifact:
-    """An observer as its file stores it.
+    """An observer as its file stores it. Raises ArtifactError if its parts do not fit each other.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ class Expression:
     A component is a number, a state ``["x", index]``, an input ``["u", index]``, or a list of a name and its arguments,
     such as ``["*", 2.0, ["sin", ["x", 0]]]``. Names are arithmetic operators (``+``, ``*``, ``**``, ``%``), functions
     of ``kkl_gym.elementary``, and comparisons (``<``, ``<=``, ``>``, ``>=``, ``and``, ``or``, ``not``) for the first
-    argument of ``where``.
+    argument of ``where``. Raises ValueError if a component has another form.
 
     Parameters
     ----------

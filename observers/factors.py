@@ -22,7 +22,7 @@ def _check_grid(levels: np.ndarray, ages: np.ndarray) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Factors:
-    """Calibration factors of a filter's covariance P.
+    """Calibration factors of a filter's covariance P. Raises ArtifactError if they are invalid.
 
     With them, 90 % of the errors have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of the chi-square
     distribution with nx degrees of freedom. Factors are interpolated between levels and ages, and constant beyond.
@@ -64,7 +64,7 @@ class Factors:
 class ErrorCovariance:
     """The covariance of x - T_inv(z), by level of measurement noise and age since reset.
 
-    It is calibrated as in :class:`Factors`.
+    It is calibrated as in :class:`Factors`. Raises ArtifactError if it is invalid.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ class LinearFilter:
     The integration takes the output as linear between samples, a first-order hold. This is causal, because z_k+1 is
     computed when y_k+1 is known; a zero-order hold would delay the output by half a sample. The input is constant
     between samples. A filter of output and input is the functional KKL observer (Buisson-Fenet et al., TMLR 2023). For
-    u = 0 it is the paper's filter (sec. 3, eq. kkl_observer).
+    u = 0 it is the paper's filter (sec. 3, eq. kkl_observer). Raises ValueError if A, B, dt or nu is invalid.
 
     The filter's state is ``z = [z_y, z_u of the first input, ...]``, of size ``nz * (1 + nu)``, and
     z_k+1 = transition z_k + early_y y_k + late_y y_k+1 + held_u u_k.

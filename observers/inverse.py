@@ -21,7 +21,7 @@ class ForwardMap:
     Parameters
     ----------
     mlp : MLP
-        The network, with nx inputs and nz outputs.
+        The network, with nx inputs and nz outputs. Raises ArtifactError if the scaling does not fit it.
     x_offset, x_scale : ndarray, shape (nx,)
         Scaling of the states.
     z_offset, z_scale : ndarray, shape (nz,)
@@ -57,7 +57,7 @@ class InverseMap:
       system's scale per second, as in environments;
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
-    The output is x_offset + x_scale * mlp(inputs).
+    The output is x_offset + x_scale * mlp(inputs). Raises ArtifactError if the parts do not fit each other.
 
     A map for several outputs may take a level for each. ``noise_gain`` then has a row for each output, and the squares
     of its rows add up. ``measurement_noise_unit`` and ``measurement_noise_max`` are then tuples.

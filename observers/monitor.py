@@ -15,6 +15,7 @@ class Limits:
 
     :func:`training.calibrate` simulates runs of ``duration`` seconds under white noise of each level, the environments'
     process noise and random inputs. Such a run exceeds one of the limits with probability ``false_alarms``.
+    Raises ValueError if shapes or values are invalid.
 
     Parameters
     ----------

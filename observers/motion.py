@@ -23,7 +23,7 @@ class Equations:
     field : Expression
         f(x) + g(x) u, or the next state in discrete time; nx components.
     substeps : int, default 1
-        Fourth-order Runge-Kutta steps in a sample, at most 1024; 0 for a system in discrete time.
+        Fourth-order Runge-Kutta steps in a sample, 0 for a system in discrete time. Beyond 1024 raises ArtifactError.
     """
 
     field: Expression
@@ -61,7 +61,7 @@ class Flow:
     Parameters
     ----------
     mlp : MLP
-        A network with nx + nu inputs and nx outputs.
+        A network with nx + nu inputs and nx outputs. Raises ArtifactError if the other arrays do not fit it.
     linear : ndarray, shape (nx, 1 + nx + nu)
         The affine part.
     gain : ndarray, shape (nx,)
@@ -94,7 +94,7 @@ class Motion:
     """The model of a tracker: the motion of states, its uncertainty and its calibration.
 
     Scaled states are s = (x - x_offset) / x_scale. Standard deviations of states are in scaled units, those of outputs
-    in the outputs' units.
+    in the outputs' units. Raises ArtifactError if the parts do not fit each other.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"tanh": _tanh, "si
 
 @dataclass(frozen=True)
 class MLP:
-    """A multilayer perceptron in float32.
+    """A multilayer perceptron in float32. Raises ValueError if shapes do not fit, or numbers are not finite.
 
     Parameters
     ----------

@@ -179,7 +179,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._of.show(obs, self._flat, shown), reward, terminated, truncated, info
 
     def learn_weights(self, steps: int = 4_000, *, seed: int = 0) -> list[list[float]]:
-        """Learn from random actions how the memory predicts later outputs; returns ``weights`` for the wrappers.
+        """Learn from random actions how the memory predicts later outputs.
 
         All environments of an agent need the same weights. This method resets the environment.
 
@@ -189,6 +189,16 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             Steps with random actions; more are needed under strong noise or with short episodes.
         seed : int
             Seed of the environment and of the actions.
+
+        Returns
+        -------
+        list of list of float
+            The argument ``weights`` of the wrappers.
+
+        Raises
+        ------
+        ValueError
+            If the episodes have too few samples for the fit.
         """
         env = KKLMemory(self.env, **self._of.arguments | {"weights": ()})  # records the features
         memory, actions = cast(PredictiveMemory, env._of.memory), copy.deepcopy(self.action_space)

@@ -138,9 +138,9 @@ def test_a_level_beyond_the_maps_range_is_left_out_and_named(saved):
     (smape, _), below = printed(path, measurement_noise=(0.0, 1.0, 1.5), **small)
     assert [row[1] for row in smape[1:]] == ["0", "1", "0", "1"]
     assert f"{path}, left out: measurement noise 1.5 is beyond the map's range, 0 to 1" in below
-    with pytest.raises(ValueError, match="nothing is left"):
+    with pytest.raises(ValueError, match="nothing to evaluate"):
         printed(path, measurement_noise=(1.5,), **small)
-    with pytest.raises(ValueError, match="this one takes none"):
+    with pytest.raises(ValueError, match="this one has no inputs"):
         printed(path, policy="controller")
 
 
