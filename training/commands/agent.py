@@ -182,7 +182,7 @@ class Evaluate:
     episodes: int = 500
     """Number of episodes."""
     seed: int = 0
-    """Seed of the episodes. No seed repeats episodes of a training."""
+    """Seed of the episodes. They differ from those of every training."""
     trust: Trust = None
 
     def run(self, console: Console) -> None:

@@ -59,12 +59,12 @@ FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median d
 class Motions:
     """The trajectories and their plant, which may differ from the observer's model."""
 
-    trajectories: Annotated[int | None, hint("100, with --faults 500")] = None
-    """Number of trajectories from each domain."""
+    trajectories: Annotated[int | None, hint("100, or 500 with --faults")] = None
+    """Number of trajectories from each region of starts."""
     duration: Seconds = None
     """Length of each trajectory in seconds; 50 for the systems that ship."""
     seed: int = 0
-    """Seed of the trajectories and the noise. No seed repeats trajectories of a training."""
+    """Seed of the trajectories and the noise. They differ from those of every training."""
     process_noise: float = 0.0
     """Level of the process noise, in multiples of the system's scale per second. Environments have 0.05 by default."""
     plant: Plant = ()
