@@ -1,11 +1,11 @@
-"""A shipped observer adapted to a plant that is not its model, from outputs alone, checked against the true plant.
+"""Adapt a shipped observer to a plant that differs from its model, from outputs only, and test it on the plant.
 
-Every parameter of the plant is 10 % larger than the observer's model has it. The records hold t and y, nothing else::
+Every parameter of the plant is 10 % larger than in the observer's model. The records hold only t and y::
 
     python examples/adaptation.py lorenz --noise 0.5
 
-Three observers are compared on the plant: the shipped one as it is, the one that :func:`training.identification.adapt`
-makes from it, and one that is trained on the true parameters by the same settings.
+The example compares three observers on the plant: the shipped one, the one that
+:func:`training.identification.adapt` makes from it, and one that is trained on the true parameters with equal settings.
 docs/results/identification.md has a table.
 """
 
@@ -37,9 +37,9 @@ class Compared:
     Parameters
     ----------
     shipped, adapted, trained : float
-        Of the shipped observer, the adapted one, and the one trained on the true parameters.
+        Errors of the shipped observer, the adapted one, and the one trained on the true parameters.
     parameters : dict of str to float
-        Errors of the parameters found, in % of the plant's.
+        Errors of the identified parameters, in % of the plant's.
     """
 
     shipped: float
@@ -58,17 +58,17 @@ def main(
     inverse_steps: int | None = None,
     trajectories: int | None = None,
 ) -> Compared:
-    """Simulate records of a plant that is not an observer's model, adapt the observer, and print its errors.
+    """Simulate records of a plant that differs from an observer's model, adapt the observer, and print its errors.
 
     Args:
         system: reverse_duffing, van_der_pol, rossler or lorenz.
         noise: standard deviation of the measurement noise.
-        records: their number.
-        seconds: length of each.
-        seed: of the records; any will do.
-        out: the runs' folder.
-        inverse_steps: batches of both trainings, fewer than the shipped observer had for a quick look.
-        trajectories: simulated for them, the same.
+        records: number of records.
+        seconds: length of each record.
+        seed: seed of the records.
+        out: folder of the runs.
+        inverse_steps: batches of both trainings; by default as many as the shipped observer had.
+        trajectories: simulated trajectories of both trainings, with the same default.
     """
     console, model = Console(), get_system(system)
     plant = model.replace({name: WRONG * value for name, value in model.parameters.items()})

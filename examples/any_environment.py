@@ -1,6 +1,6 @@
-"""An observer for an environment of others: its rollouts, their hidden signals, and the observer around it.
+"""Learn an observer for any Gymnasium environment: play rollouts, learn the hidden signals, wrap the environment.
 
-The policies are simple ones. An agent of yours does as well: ``kkl-gym record ENV_ID --policy ppo:agent.zip``.
+The policies here are simple. Your own agent may act instead: ``kkl-gym record ENV_ID --policy ppo:agent.zip``.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from training.agents.environments import MeasurementNoise
 from training.rollouts import make, roll_out
 from training.sources.recorded import recorded_errors
 
-AFTER = 20  # steps, of which errors are left out
+AFTER = 20  # first steps of each rollout, whose errors do not count
 GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # a linear-quadratic regulator of the double pendulum
 
 
@@ -40,7 +40,7 @@ def balance(obs: np.ndarray) -> int:
 
 
 def climb(obs: np.ndarray) -> np.ndarray:
-    """Pushes MountainCarContinuous-v0 the way that it goes."""
+    """Pushes MountainCarContinuous-v0 in its direction of motion."""
     return np.float32([1.0 if obs[1] >= 0 else -1.0])
 
 
@@ -60,7 +60,7 @@ CASES: dict[str, tuple[list[int], list[int], Callable]] = {
 
 
 def exploring(policy: Callable, env: gym.Env, seed: int) -> Callable:
-    """A policy of which now none, now a part and now all actions are random, for a hundred steps each."""
+    """A policy that draws a share of random actions for every hundred steps: none, some or all."""
     rng, calls = np.random.default_rng(seed), 0
     env.action_space.seed(seed)
     share = 0.0
@@ -76,7 +76,7 @@ def exploring(policy: Callable, env: gym.Env, seed: int) -> Callable:
 
 
 def under_noise(env_id: str, artifact: Artifact | None, noise: float, seed: int, episodes: int = 20) -> float:
-    """Let the controller act on estimates, or on the truth without an observer; returns the mean return."""
+    """Let the policy act on estimates, or on the true signals without an observer; returns the mean return."""
     measured, _, policy = CASES[env_id]
     returns, apart = list[float](), list[np.ndarray]()
     env: gym.Env = MeasurementNoise(make(env_id), measured, noise)
@@ -112,17 +112,17 @@ def main(
     noise: float = 0.0,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Learn an observer for an environment; returns errors of held-out rollouts.
+    """Learn an observer for an environment; returns its errors on held-out rollouts.
 
     Args:
         env_id: one of Pendulum-v1, CartPole-v1, MountainCarContinuous-v0 and, with MuJoCo, InvertedDoublePendulum-v5.
-        steps: that are played for the training.
-        held_out: steps of other episodes, in which the policy does not explore.
-        batches: of the training, for each network.
-        members: networks that are trained and averaged.
+        steps: steps to play for the training.
+        held_out: steps of the held-out rollouts, played once with and once without exploration.
+        batches: training batches of each network.
+        members: number of networks, whose outputs are averaged.
         noise: standard deviation of the measurement noise. With noise the observer estimates all signals, and
-            tracks. The controller then acts on its estimates, on those of T_inv alone, and on the truth.
-        seed: of everything random.
+            tracks. The policy then acts on its estimates, on those of T_inv alone, and on the true signals.
+        seed: seed of all random numbers.
     """
     measured, hidden, policy = CASES[env_id]
     if noise:

@@ -1,8 +1,8 @@
-"""Data where the agent goes: PPO learns to balance CartPole-v1 on estimates, in three ways with as many steps each.
+"""Learn an observer where the agent goes: PPO balances CartPole-v1 on estimates, in three ways with equally many steps.
 
-Positions are measured, velocities hidden, but a simulator shows them in training. The observer is from random steps;
-or it is refitted while the agent learns; or the agent learns on the true velocities first, and the observer is from
-what it does then.
+Positions are measured. Velocities are hidden, but a simulator shows them in training. In the first way, the observer is
+learned from random steps. In the second, it is also refitted while the agent learns. In the third, the agent first
+learns on the true velocities, and the observer is learned from the agent's own steps.
 """
 
 import tempfile
@@ -21,30 +21,30 @@ from kkl_gym import KKLObservation
 from observers import Artifact, KKLObserver
 
 ENV_ID, MEASURED, HIDDEN = "CartPole-v1", [0, 2], [1, 3]
-ORDER = MEASURED + HIDDEN  # in which KKLObservation shows them
-AFTER = 20  # steps, of which errors are left out
+ORDER = MEASURED + HIDDEN  # the order in KKLObservation's observations
+AFTER = 20  # first steps of each episode, whose errors do not count
 
 
 def wrapped(path: Path) -> gym.Env:
-    """The environment with an observer."""
+    """The environment with an observer around it."""
     return KKLObservation(gym.make(ENV_ID), path)
 
 
 def with_hidden() -> gym.Env:
-    """The environment with the truth where estimates will be."""
+    """The environment with the true velocities in place of estimates."""
     env = gym.make(ENV_ID)
     space = gym.spaces.Box(env.observation_space.low[ORDER], env.observation_space.high[ORDER])
     return gym.wrappers.TransformObservation(env, lambda obs: obs[ORDER], space)
 
 
 def beginner(make: Callable[[], gym.Env], seed: int) -> PPO:
-    """An agent that has learned nothing yet."""
+    """An untrained agent."""
     envs = make_vec_env(make, 4, seed=seed)
     return PPO("MlpPolicy", envs, n_steps=256, batch_size=256, learning_rate=1e-3, seed=seed, device="cpu")
 
 
 def own_episodes(agent: PPO, env: gym.Env, episodes: int, seed: int) -> list[tuple[np.ndarray, ...]]:
-    """Outputs, inputs and hidden signals of an agent's episodes, as info gives them."""
+    """Outputs, inputs and hidden signals of an agent's episodes, from info."""
     played = []
     for episode in range(episodes):
         obs, info = env.reset(seed=seed + episode)
@@ -58,7 +58,7 @@ def own_episodes(agent: PPO, env: gym.Env, episodes: int, seed: int) -> list[tup
 
 
 def errors(artifact: Artifact, episodes: list[tuple[np.ndarray, ...]]) -> np.ndarray:
-    """Root mean square errors over standard deviations, of each hidden signal."""
+    """Root mean square error over standard deviation of each hidden signal."""
     observer = KKLObserver(artifact)
     apart = np.concatenate([(observer.estimate(y, u) - x)[AFTER:] for y, u, x in episodes])
     return np.sqrt(np.mean(apart**2, 0)) / np.concatenate([x[AFTER:] for *_, x in episodes]).std(0)
@@ -75,12 +75,12 @@ def main(
     """Train the agents; returns the larger error of the two hidden signals on the agent's own episodes.
 
     Args:
-        observer_steps: from which the first observer is learned: random ones, or the trained agent's.
-        members: networks of the first observer, which are averaged.
-        timesteps: of the agents, beside those.
-        every: steps from refit to refit, and on estimates of an agent that learned on the truth first.
-        batches: of each fit.
-        seed: of everything random.
+        observer_steps: steps for the first observer, random ones or the trained agent's.
+        members: number of networks of the first observer, whose outputs are averaged.
+        timesteps: further steps, in which the agents learn.
+        every: steps between refits; also the steps on estimates of the third agent.
+        batches: training batches of each fit.
+        seed: seed of all random numbers.
     """
     found = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -114,7 +114,7 @@ def main(
 
 
 def report(label: str, agent: PPO, observers: dict[str, Artifact], path: Path, seed: int) -> float:
-    """Say how long an agent balances on estimates of the last observer, and how good these are."""
+    """Print how long an agent balances on the last observer's estimates, and the observers' errors."""
     env = wrapped(path)
     env.replace_observer([*observers.values()][-1])
     episodes = own_episodes(agent, env, 20, seed + 10_000)

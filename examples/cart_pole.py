@@ -1,11 +1,11 @@
-"""An unstable plant: CartPole's cart-pole. Its observer is trained under a policy; another one acts on the estimate.
+"""An unstable plant, the cart-pole. Its observer is trained under one policy; another policy acts on the estimate.
 
 The same from the command line::
 
     kkl-gym train examples/cart_pole.py:CartPole --policy controller
     kkl-gym evaluate runs/cart_pole/cart_pole.safetensors --system examples/cart_pole.py:CartPole
 
-See docs/guides/your_system.md for such plants.
+docs/guides/your_system.md explains such plants.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class CartPole(kkl_gym.System):
     measurement_noise: ClassVar = 0.02  # m and rad
 
     def _terms(self, x):
-        """Total mass, the pole's moment, and what both accelerations are divided by."""
+        """Total mass, the pole's moment, and the denominator of both accelerations."""
         mass, moment = self.cart + self.pole, self.pole * self.length
         return mass, moment, self.length * (4.0 / 3.0 - self.pole * cos(x[2]) ** 2 / mass)
 
@@ -62,7 +62,7 @@ class CartPole(kkl_gym.System):
 
 
 def balance(x: np.ndarray) -> np.ndarray:
-    """A policy of one's own, other than that of the training below: states (n, 4) to actions (n, 1) in [-1, 1]."""
+    """A policy that differs from that of the training below: maps states (n, 4) to actions (n, 1) in [-1, 1]."""
     return np.clip(x @ [[0.3], [0.5], [4.0], [1.0]], -1.0, 1.0)
 
 
@@ -84,7 +84,7 @@ def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("r
     x_hat, info = env.reset(seed=0)
     errors = []
     for _ in range(1000):
-        x_hat, _, fallen, _, info = env.step(balance(x_hat[None])[0])  # which knows the estimate alone
+        x_hat, _, fallen, _, info = env.step(balance(x_hat[None])[0])  # sees only the estimate
         errors.append(x_hat - info["x"])
         if fallen:
             break

@@ -1,10 +1,10 @@
-"""An angle on a circle: Pendulum's pendulum, which turns over. The state holds the angle's cosine and sine.
+"""An angle on a circle: a pendulum that can turn over. The state holds the cosine and sine of its angle.
 
 The same from the command line::
 
     kkl-gym train examples/circle_pendulum.py:CirclePendulum
 
-See docs/guides/your_system.md for such plants.
+docs/guides/your_system.md explains such plants.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from training import preset, train
 
 @dataclass(frozen=True)
 class CirclePendulum(kkl_gym.System):
-    """Pendulum-v1's pendulum, whose angle from above is given by its cosine and sine; its rate is hidden."""
+    """Pendulum-v1's pendulum: cosine and sine of its angle are measured, its rate is hidden. Upright is 0."""
 
     gravity: float = 10.0  # m/s^2
     mass: float = 1.0  # kg
@@ -32,11 +32,11 @@ class CirclePendulum(kkl_gym.System):
     X: ClassVar = ((-1.0, 1.0), (-1.0, 1.0), (-8.0, 8.0))
     bounds: ClassVar = ((-1.5, 1.5), (-1.5, 1.5), (-25.0, 25.0))
     u_max: ClassVar = (2.0,)  # N m
-    process_noise: ClassVar = 0.0  # which would push the state off the circle
+    process_noise: ClassVar = 0.0  # noise would push states off the circle
     target: ClassVar = (1.0, 0.0, 0.0)
 
     def draw_starts(self, rng, n, factor=1.0):
-        """Any angle; rates in a multiple of X."""
+        """Draw any angle, and rates within a multiple of X."""
         angle = rng.uniform(-np.pi, np.pi, n)
         low, high = self.box(factor)
         return np.stack([np.cos(angle), np.sin(angle), rng.uniform(low[2], high[2], n)], axis=-1)
@@ -75,7 +75,7 @@ def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("r
     for _ in range(1000):
         top = 1.5 * system.gravity / system.length  # potential energy at the top, in units of the moment of inertia
         missing = top - x_hat[2] ** 2 / 2 - top * x_hat[0]
-        x_hat, _, _, _, info = env.step(np.clip(missing * x_hat[2:], -1.0, 1.0))  # pumps energy until it is enough
+        x_hat, _, _, _, info = env.step(np.clip(missing * x_hat[2:], -1.0, 1.0))  # pumps energy up to that of the top
         errors.append(x_hat - info["x"])
     print(f"after {len(errors) * env.unwrapped.dt:g} s: x = {info['x'].round(3)}, x_hat = {x_hat.round(3)}")
     late = np.square(errors[len(errors) // 5 :]).mean(0) ** 0.5 / system.scale

@@ -12,7 +12,7 @@ def main(seconds: float = 10.0, seed: int = 0) -> float:
 
     Args:
         seconds: length of the run.
-        seed: of start and noise.
+        seed: seed of start and noise.
     """
     env = kkl_gym.KKLObservation(gym.make("KKLLorenz-v0", measurement_noise=0.5))
     x_hat, info = env.reset(seed=seed)

@@ -1,6 +1,6 @@
-"""From CSV files to an observer inside a control loop: the plant's states are never seen, nor is its parameter known.
+"""From CSV files to an observer in a control loop, without recorded states and with an unknown parameter.
 
-The middle part from the command line, with the names and units of your own columns::
+The identification from the command line, with the names and units of your own columns::
 
     kkl-gym identify van_der_pol --data runs/from_csv/record-*.csv --unknown mu=2 --out runs/from_csv
 """
@@ -20,17 +20,17 @@ from training.identification import identify
 from training.presets import controller
 from training.records import read_records
 
-MU = 3.3  # of the plant; the model's first guess is GUESS
+MU = 3.3  # the plant's parameter; the model begins with GUESS
 GUESS, LIMITS = 2.0, (0.2, 20.0)
 NOISE = 0.1
-STARTS = ((-3.0, 3.0), (-6.0, 6.0))  # from which the controller's input is strong enough
+STARTS = ((-3.0, 3.0), (-6.0, 6.0))  # the controller's input is strong enough from here
 
 Policy = Callable[[np.ndarray, dict[str, np.ndarray]], np.ndarray]
-"""What an environment shows, the state, and its info in; an action out."""
+"""Maps the state and the info of an environment to an action."""
 
 
 def record(env: kkl_gym.KKLEnv, path: Path, *, seconds: float, seed: int) -> None:
-    """Write what a data logger would: times, inputs and noisy outputs, while a random input excites the plant."""
+    """Write times, inputs and noisy outputs, like a data logger, while a random input excites the plant."""
     rng, rows = np.random.default_rng(seed), []
     _, info = env.reset(seed=seed)
     for k in range(round(seconds / env.dt)):
@@ -45,11 +45,11 @@ def record(env: kkl_gym.KKLEnv, path: Path, *, seconds: float, seed: int) -> Non
 def cost(env: kkl_gym.KKLEnv, policy: Policy, *, seconds: float, episodes: int) -> float:
     """Mean of c = mean(((x - target) / scale)^2) over time and episodes, which differ in start and noise."""
     costs = []
-    for seed in range(100, 100 + episodes):  # other starts than those of the records
+    for seed in range(100, 100 + episodes):  # starts that differ from those of the records
         x, info = env.reset(seed=seed)
         for _ in range(round(seconds / env.dt)):
             x, reward, _, _, info = env.step(policy(x, info))
-            costs.append((1.0 / reward - 1.0) / 4.0)  # as the reward is 1 / (1 + 4 c)
+            costs.append((1.0 / reward - 1.0) / 4.0)  # the reward is 1 / (1 + 4 c)
     return float(np.mean(costs))
 
 
@@ -61,15 +61,15 @@ def main(
     out: Path = Path("runs/from_csv"),
     seed: int = 0,
 ) -> tuple[float, float, float]:
-    """Record, identify, control; returns mu as found, and the costs with x_hat and with the true state.
+    """Record, identify, control; returns the identified mu, and the costs with x_hat and with the true state.
 
     Args:
-        runs: number of files to write; of five or more, one is left out of the fit, to test predictions.
-        seconds: length of each.
+        runs: number of files to write; with five or more, one is held out of the fit, to test predictions.
+        seconds: length of each record.
         inverse_steps: batches of the observer's training.
-        trajectories: simulated trajectories of the plant found, to train on.
+        trajectories: simulated trajectories of the identified plant, for the training.
         out: the run's folder.
-        seed: of everything random.
+        seed: seed of all random numbers.
     """
     plant = kkl_gym.KKLEnv(
         "van_der_pol", parameters={"mu": MU}, process_noise=0.0, measurement_noise=NOISE, start_box=STARTS
@@ -89,23 +89,23 @@ def main(
             "inverse_steps": inverse_steps,
             "trajectories": trajectories,
             "duration": 20.0,
-            "free_inverse": False,  # a second map, for motion without input, which the loop has not
+            "free_inverse": False,  # no second map for motion without input, because the loop always acts
         },
         seed=seed,
         resume=True,
         console=Console(),
     )
 
-    act = controller(learned.identified.system)  # designed for the identified model, since the plant is unknown
+    act = controller(learned.identified.system)  # designed for the identified model, because the plant is unknown
     observer = observers.load(str(out / "van_der_pol.safetensors"), NOISE)
 
     def on_estimate(x: np.ndarray, info: dict[str, np.ndarray]) -> np.ndarray:
-        """Act on what the observer makes of samples and inputs; it is what runs beside a real plant."""
+        """Act on the observer's estimate from samples and inputs, as beside a real plant."""
         x_hat = observer.reset(info["y"]) if info["sample"] == 0 else observer.step(info["y"], info["u"])
         return act(x_hat[None])[0]
 
     def on_state(x: np.ndarray, info: dict[str, np.ndarray]) -> np.ndarray:
-        """Act on the true state, which a real plant does not show."""
+        """Act on the true state, which a real plant would not show."""
         return act(info["x"][None])[0]
 
     found = learned.identified.system.parameters["mu"]

@@ -1,10 +1,10 @@
-"""Parameters and an observer from outputs alone, checked against a plant that is known: a shipped system, simulated.
+"""Identify parameters and train an observer from outputs only, and compare them with the simulated plant.
 
-The records hold t and y, nothing else. First guesses are 30 to 50 % off::
+The records hold only t and y. First guesses are 30 to 50 % off::
 
     python examples/identification.py lorenz --noise 0.5
 
-docs/guides/identification.md explains the method, docs/results/identification.md has a table of what this prints.
+docs/guides/identification.md explains the method, and docs/results/identification.md has a table of results.
 """
 
 import time
@@ -25,24 +25,24 @@ from training.records import Record
 from training.trajectories.motions import draw_process_noise
 
 FIRST_GUESSES = {
-    "reverse_duffing": {"b": 0.6},  # beside a, which y does not tell from b
+    "reverse_duffing": {"b": 0.6},  # y determines only one of a and b
     "van_der_pol": {"mu": 1.5},
     "rossler": {"a": 0.13, "b": 0.28, "c": 4.0},
     "lorenz": {"sigma": 7.0, "rho": 20.0, "beta": 2.0},
 }
-TRANSIENT = 3.0  # s
+TRANSIENT = 3.0  # s at the start of each run, which do not count in errors
 
 
 @dataclass(frozen=True)
 class Found:
-    """What came out.
+    """The errors of the identification and of its observer.
 
     Parameters
     ----------
     parameters : dict of str to (float, float)
         Error of each parameter in % of its true value, and in standard errors.
     smape, smape_of_default : float
-        Median SMAPE in % after 3 s on unseen trajectories, of the observer found and of the default map, which was
+        Median SMAPE in % after 3 s on unseen trajectories, of the trained observer and of the default map, which was
         trained on the exact model.
     """
 
@@ -66,12 +66,12 @@ def main(
     Args:
         system: reverse_duffing, van_der_pol, rossler or lorenz.
         noise: standard deviation of the measurement noise.
-        process_noise: its level in the records; 0.05 is that of the environments.
-        records: their number.
-        seconds: length of each.
-        seed: of the records; any will do.
+        process_noise: level of process noise in the records; environments have 0.05.
+        records: number of records.
+        seconds: length of each record.
+        seed: seed of the records.
         out: the run's folder.
-        inverse_steps: batches of the observer's training, fewer than by default for a quick look.
+        inverse_steps: batches of the observer's training; fewer than the default are enough for a quick look.
     """
     began, console = time.monotonic(), Console()
     plant, guesses = get_system(system), FIRST_GUESSES[system]

@@ -1,6 +1,6 @@
-"""Show an environment and its observer in a window, with sliders for noise and input, faults of the sensor, and keys.
+"""Show an environment and its observer in a window, with sliders for noise and input, sensor faults, and keys.
 
-For a system of yours: ``python examples/live.py --system script.py --observer runs/NAME/NAME.safetensors``.
+For your own system: ``python examples/live.py --system script.py --observer runs/NAME/NAME.safetensors``.
 """
 
 import time
@@ -19,14 +19,14 @@ from training.evaluation.faults import BIAS, FAULTS, Fault
 from training.evaluation.levels import Level
 from training.figures import ALARM, ESTIMATE, MEASURED, TRUTH, style
 
-SECONDS = 12.0  # that are shown, by a clock on which slow and fast systems move at the pace of those that ship
-FRAME = 0.04  # seconds from one to the next
-MOST = 100  # samples of a frame: what a window could not keep up with is not made up for
+SECONDS = 12.0  # seconds shown, on a clock whose second is the system's pace
+FRAME = 0.04  # seconds between frames
+MOST = 100  # samples in a frame; a slow window drops the rest of its delay
 KEYS = "space: pause   n: new start   left, right: input   up, down: noise   f: next fault"
 
 
 class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
-    """Adds noise and faults to the outputs of an environment without noise; ``level`` and ``fault`` may be changed."""
+    """Adds noise and faults to the outputs of a noise-free environment; ``level`` and ``fault`` may be changed."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], level: Level, *, seed: int) -> None:
         super().__init__(env)
@@ -39,13 +39,13 @@ class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
         self._bias = BIAS * np.ptp(plant.system.output(starts), axis=0)
 
     def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        """As the environment's, with a sound first sample."""
+        """Reset the environment; the first sample has no fault."""
         obs, info = self.env.reset(**options)
         self._last = self._noisy(info["y"])
         return obs, info | {"y": self._last}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
-        """As the environment's, with the sensor's reading in place of the output."""
+        """Step the environment; ``info["y"]`` is the sensor's reading."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         y = self._noisy(info["y"])
         self._last = {"none": y, "bias": y + self._bias, "drop-out": 0.0 * y, "freeze": self._last}[self.fault]
@@ -56,10 +56,10 @@ class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
 
 
 class Live:
-    """An environment with its observer, drawn on a figure that is redrawn again and again.
+    """An environment with its observer, on a figure that is redrawn continuously.
 
-    ``clock`` is the seconds that a sample takes in the window; ``history`` holds x, x_hat, y and score of the samples
-    that are drawn.
+    ``clock`` is the time of a sample in the window, in seconds; ``history`` holds x, x_hat, y and score of the samples
+    in the drawing.
     """
 
     def __init__(self, figure: Any, environment: Shown, measurement_noise: Level | None, *, seed: int) -> None:
@@ -85,14 +85,14 @@ class Live:
         self.restart()
 
     def restart(self) -> None:
-        """Begin a motion elsewhere."""
+        """Begin a motion at a new start."""
         _, info = self.env.reset(seed=self._seed)
         self._seed = None
         self.history.clear()
         self._remember(info)
 
     def advance(self, samples: int) -> None:
-        """Go on by some samples; a motion that leaves the system's bounds begins elsewhere."""
+        """Advance by some samples; a motion that leaves the system's bounds restarts."""
         for _ in range(samples):
             _, _, terminated, _, info = self.env.step(self._action)
             self._remember(info)
@@ -100,7 +100,7 @@ class Live:
                 self.restart()
 
     def draw(self) -> list[Any]:
-        """Bring the drawing up to date."""
+        """Update the drawing, and return its changed parts."""
         x, x_hat, y, score = (np.array(column) for column in zip(*self.history, strict=True))
         t = (np.arange(len(x)) - len(x) + 1) * self.dt
         i, j = self.system.portrait
@@ -137,7 +137,7 @@ class Live:
 
     def _layout(self, figure: Any) -> None:
         system = self.system
-        figure.suptitle(f"{system.name.replace('_', ' ')}: the observer is given the output and the input alone")
+        figure.suptitle(f"{system.name.replace('_', ' ')}: the observer sees only the output and the input")
         outer, controls = figure.subfigures(2, height_ratios=[6, 1])
         left, right = outer.subfigures(1, 2, width_ratios=[4, 5])
         portrait = left.subplots()
@@ -183,7 +183,7 @@ class Live:
         figure.text(0.02, 0.05, KEYS, size="small")
 
     def _set_noise(self, level: float) -> None:
-        observer = self.env.observer  # its map may assume less noise on some outputs than on others
+        observer = self.env.observer  # the map may limit the level of each output
         self.sensor.level = observer.measurement_noise = observer.artifact.inverse.within(float(level))
 
     def _set_input(self, share: float) -> None:
@@ -222,7 +222,7 @@ def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> A
 
         manager = figure.canvas.manager
         if manager is not None and manager.key_press_handler_id is not None:
-            figure.canvas.mpl_disconnect(manager.key_press_handler_id)  # its keys, such as f for the whole screen
+            figure.canvas.mpl_disconnect(manager.key_press_handler_id)  # matplotlib's own keys
         figure.canvas.mpl_connect("key_press_event", lambda event: live.press(event.key))
         animation = FuncAnimation(figure, frame, interval=1000 * FRAME, blit=True, cache_frame_data=False)
         plt.show()
@@ -230,7 +230,7 @@ def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> A
 
 
 def _pair(ax: Any, *styles: str) -> list[list[Any]]:
-    """Lines for the truth and for the estimate, in each of the styles."""
+    """Lines for the true state and for the estimate, in each of the styles."""
     looks = ({"color": TRUTH, "lw": 3.5, "ms": 9.0}, {"color": ESTIMATE, "lw": 1.3, "ms": 5.0})
     return [[ax.plot([], [], style, animated=True, **look)[0] for style in styles] for look in looks]
 
@@ -247,10 +247,10 @@ def main(
     """Show a system until the window is closed.
 
     Args:
-        system: a shipped system, or yours as script.py:Class.
+        system: a shipped system, or your own as script.py:Class.
         observer: a shipped map or a .safetensors file; by default the one that ships for the system.
         measurement_noise: standard deviation of the noise on each sample of y, by default the system's.
-        seed: of starts and noise.
+        seed: seed of starts and noise.
     """
     (environment,) = shown(system, observer)
     if not environment.observed:

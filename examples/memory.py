@@ -1,4 +1,4 @@
-"""A memory around an environment of others: SAC swings a pendulum up whose rate is not measured."""
+"""A memory around a Gymnasium environment: SAC swings up a pendulum whose rate is not measured."""
 
 import gymnasium as gym
 import numpy as np
@@ -24,13 +24,13 @@ class Positions(gym.ObservationWrapper):
 
 
 def main(steps: int = 10_000, noise: float = 0.0, episodes: int = 20, seed: int = 0) -> dict[str, float]:
-    """Train SAC with and without a memory; returns the mean returns of the evaluation episodes.
+    """Train SAC with and without a memory; returns the mean return of each agent's evaluation episodes.
 
     Args:
-        steps: environment steps that each agent learns from, in half a minute.
+        steps: environment steps of each agent's training, which take half a minute.
         noise: standard deviation of the noise added to each measurement.
         episodes: evaluation episodes, which training has not seen.
-        seed: of everything random.
+        seed: seed of all random numbers.
     """
     wrappers = {
         "positions alone": lambda env: Positions(env, noise),

@@ -1,6 +1,6 @@
-"""A task of your own, from plant to agent: a motor brings a link that hangs on a spring, unmeasured, to an angle.
+"""Your own task, from plant to agent: through a spring, a motor turns a link, which is not measured, to an angle.
 
-From the command line, see docs/guides/own_task.md::
+The same from the command line, as docs/guides/own_task.md explains::
 
     kkl-gym train examples/own_task.py
     kkl-gym agent train examples/own_task.py --observer runs/flexible_joint/flexible_joint.safetensors
@@ -24,10 +24,10 @@ from training.agents.tasks import get_task
 
 @dataclass(frozen=True)
 class FlexibleJoint(kkl_gym.System):
-    """A motor turns a link by a spring, under gravity; the motor's angle is measured. SI units."""
+    """A motor turns a link through a spring, under gravity; only the motor's angle is measured. SI units."""
 
     stiffness: float = 10.0  # N m/rad
-    gravity: float = 2.0  # N m, on the link when it is level
+    gravity: float = 2.0  # N m, on the level link
     damping: float = 0.2  # N m s/rad, of motor and link
     goal: float = 0.6  # rad
 
@@ -50,23 +50,23 @@ class FlexibleJoint(kkl_gym.System):
         return (x[0],)
 
     def reward(self, x, u):
-        """1 where the link rests at its goal."""
+        """1 if the link rests at its goal, and less elsewhere."""
         return 1.0 / (1.0 + 20.0 * (x[2] - self.goal) ** 2 + 0.5 * x[3] ** 2)
 
     def terminated(self, x):
-        """The link hits a stop."""
+        """Whether the link hits a stop."""
         return abs(x[2]) > 2.0
 
 
 def main(
     timesteps: int = 400_000, inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/own_task")
 ) -> dict[str, float]:
-    """Train an observer, and an agent each on the estimate and on the measurement; returns their mean returns.
+    """Train an observer, an agent on its estimate and an agent on the measurement; returns the agents' mean returns.
 
     Args:
-        timesteps: actions that an agent learns from.
+        timesteps: actions in the training of each agent.
         inverse_steps: batches of the observer's training.
-        trajectories: simulated trajectories that it is trained on.
+        trajectories: simulated trajectories of the observer's training.
         out: the run's folder.
     """
     system, path = FlexibleJoint(), out / "flexible_joint.safetensors"

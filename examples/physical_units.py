@@ -1,6 +1,6 @@
 """Three plants in physical units: minutes and seconds, kelvin and mol/l, volts and amperes.
 
-Scales, sampling and noise are left to their defaults, which follow from the equations and the training box::
+Scales, sampling and noise have their defaults, which follow from the equations and the training box::
 
     kkl-gym diagnose examples/physical_units.py:StirredTank
     kkl-gym train examples/physical_units.py:StirredTank
@@ -57,7 +57,7 @@ class StirredTank(System):
 
 @dataclass(frozen=True)
 class HeatedTank(System):
-    """A tank that water flows through, with a heater; the temperature is measured, the level is not. SI units.
+    """A heated tank with a flow of water; the temperature is measured, the level is not. SI units.
 
     level' = (inflow - outlet sqrt(level)) / area, T' = (inflow (T_in - T) + (power + u) / 4.18e6) / (area level).
     """

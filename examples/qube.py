@@ -1,8 +1,8 @@
-"""Real hardware: the pendulum of a Quanser Qube Servo 2, estimated from the angle of its arm alone.
+"""Real hardware: estimate the pendulum of a Quanser Qube Servo 2 from the angle of its arm only.
 
-The first observer gets no equation: it is fitted to eight recorded runs and tested on four others. Beside
-it stand an extended Kalman filter, with the device's published model and with one that is fitted to the same eight
-runs, and the finite differences that a control engineer would begin with::
+The first observer has no equations: it is fitted to eight recorded runs and tested on four others. It is compared with
+an extended Kalman filter on the device's published model, with one on a model fitted to the same eight runs, and with
+finite differences, which a control engineer would try first::
 
     python examples/qube.py PATH
 
@@ -11,19 +11,19 @@ time (s): the twelve free runs that come with Buisson-Fenet, Bahr, Morgenthaler,
 numerical KKL observers" (2023), repository Centre-automatique-et-systemes/learn_observe_KKL, MIT licence.
 docs/results/qube.md has the results.
 
-Given about the device, beside the records: left and right are alike, and the arm has no angle of its
-own. Each run is therefore learned from twice, once mirrored, with the signs of both angles changed; and the map sees
-how the arm's angle changes, not where it is.
+Two facts about the device are used besides the records: left and right are symmetric, and no angle of the arm is
+special. So the observer learns from each run twice, once mirrored, with the signs of both angles changed. And the map
+sees changes of the arm's angle, not the angle itself.
 
-Eight runs hold few of the swings that a pendulum can do. A second observer therefore learns from motions of the
-device's equations as well, with the parameters that were fitted to the same eight runs, released from anywhere.
+Eight runs contain few of the possible swings of a pendulum. So a second observer also learns from simulated motions of
+the device's equations, released from random states, with parameters that were fitted to the same eight runs.
 
-When the arm sticks, its angle carries no information, and the pendulum swings on by its equation. So the second
-observer starts a Kalman filter as well, whose arm can stick, and takes it back where the two disagree.
+While the arm sticks, its angle carries no information, and the pendulum swings on by its equation. So a third estimator
+is a Kalman filter with a model whose arm can stick. The second observer starts it, and restarts it when both disagree.
 
-The recorded velocities are no measurements. They follow from the recorded angles exactly, sample by sample, as
-v_k+1 = 0.8 v_k + 50 (angle_k+1 - angle_k): a derivative behind a low-pass of 55.79 rad/s. Estimates of angles are taken
-through the same formula where they are compared with them.
+The recorded velocities are not measurements. They follow exactly from the recorded angles, sample by sample, as
+v_k+1 = 0.8 v_k + 50 (angle_k+1 - angle_k): a derivative after a low-pass filter of 55.79 rad/s. Estimated angles pass
+through the same formula before their velocities are compared.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,19 +51,19 @@ from training.records import Record, Signals, read_records, resampled
 from training.sources.recorded import RecordedSource, recorded_preset
 
 SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))
-MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # what these signals are multiplied with in the mirror
+MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # factors of these signals in the mirror image
 TRAINING, HELD_OUT = (1, 2, 4, 5, 7, 8, 10, 11), (3, 6, 9, 12)
-# Of the training runs, those that swing far and those that do not. Either half is left out by --cross-validate, for the
-# runs that are held out swing less than any of them.
+# Training runs with large and with small swings. --cross-validate holds out each half in turn, because the test runs
+# swing less than any training run.
 FOLDS = ((1, 4, 7, 10), (2, 5, 8, 11))
-DT = 0.004  # s, as the device samples
-TRANSIENT = 1.0  # s that are left out of all errors
-RELEASED = 0.5  # s after which the fitted equations follow the runs; at their beginning they do not
+DT = 0.004  # s, the device's sampling interval
+TRANSIENT = 1.0  # s at the start of each run, which do not count in errors
+RELEASED = 0.5  # s at the start of each run, which the fitted equations do not follow
 
-# In 1/s, evenly spaced on a logarithmic scale, but for 55.79, that of the recorded velocities.
+# In 1/s, evenly spaced on a logarithmic scale except for 55.79, the rate of the recorded velocities.
 RATES = (2.5, 3.245, 4.212, 5.467, 7.096, 9.21, 11.95, 15.52, 20.14, 26.14, 33.93, 44.04, 55.79, 74.2, 96.3, 125.0)
 
-# Chosen by --cross-validate, among the training runs alone.
+# Chosen by --cross-validate, on the training runs only.
 SETTINGS = {
     "eigenvalues": tuple(-rate for rate in RATES),
     "arbitrary_zero": ("theta",),
@@ -73,7 +73,7 @@ SETTINGS = {
     "members": 4,
 }
 
-# First guesses of the fitted parameters. The mass is given: without an input, all forces may be larger by one factor.
+# First guesses of the fitted parameters. The mass is fixed: without an input, a common factor of all forces is free.
 GUESSES = {
     "arm_length": 0.085,
     "arm_inertia": 5.72e-5,
@@ -87,17 +87,18 @@ GUESSES = {
 ALONE, BOTH = "KKL, recorded states", "KKL, recorded states and the fitted model's motions"
 DIFFERENCES = "finite differences"
 GUIDED = "Kalman filter, fitted model with an arm that sticks, started by the second KKL"
-# Of estimators in the figure.
+# Line styles of estimators in the figure.
 LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", ESTIMATE), ("-", RIVAL), ("-", TARGET)
-SHOWN, AVERAGED = 4.0, 125  # s of each run in the figure, and samples of which an error there is the root mean square
-WINDOW, FITTED = 125, 9.0  # samples of a motion that is fitted; s of each run, after which it rests
-# Of the equations' motions: how many, how long in s, and what they are released with at most: rad of the arm beside any
-# angle of the pendulum, and rad/s. The eight runs begin with the arm up to 0.85 rad from the middle. The number was
-# chosen by --cross-validate among 8, 24 and 72.
+SHOWN, AVERAGED = 4.0, 125  # s of each run in the figure, and samples over which its errors are averaged
+WINDOW, FITTED = 125, 9.0  # samples of a fitted window; s of each run, after which the pendulum rests
+# The simulated motions: their number, chosen by --cross-validate among 8, 24 and 72; their duration in s; and the
+# largest angle of the arm in rad and the largest rates in rad/s at their release. The pendulum's angle is arbitrary.
+# The eight runs begin with the arm up to 0.85 rad from the middle.
 MOTIONS, LASTING, TURNED, MOVING = 24, 11.0, 0.9, (0.3, 0.5)
-ENCODER = 2 * np.pi / 2048  # rad, a step of either angle
-# Of the filter that is guided, chosen on the training runs: samples of a motion that its model is fitted to; s at which
-# the observer starts it, how sure it is then, and how far apart, on the unit circle, the two may be.
+ENCODER = 2 * np.pi / 2048  # rad, resolution of both angles
+# For the filter that the observer starts, chosen on the training runs: samples of a window for the fit of its model; s
+# up to which the observer restarts it; its standard deviations then; and the distance of both estimates on the unit
+# circle from which the observer restarts it.
 LONGER, STARTED, SURE, APART = 250, 0.3, (0.002, 0.3, 1.0, 4.0, 1.0), 0.5
 PUSHED = 1.0  # 0.1 mN m, standard deviation of the unknown torque on the arm
 
@@ -115,17 +116,17 @@ def main(
     path
         Folder with run01.csv to run12.csv.
     out
-        Folder of the runs, which go on from their checkpoints; receives qube.safetensors, table.md and estimates.png.
+        Folder of the runs, which resume from their checkpoints; receives qube.safetensors, table.md and estimates.png.
     cross_validate
-        Judge the settings on the training runs instead: leave either half out once, and look at none of the others.
+        Evaluate the settings on the training runs instead: hold out each half of them once, and do not read the tests.
     inverse_steps
-        Batches for each network.
+        Training batches of each network.
 
     Returns
     -------
     dict of str to ndarray, shape (4,)
         By estimator, root mean square errors of cos alpha, sin alpha, alpha_dot and theta_dot over their standard
-        deviations, all runs together, after the transient; NaN for what it does not estimate.
+        deviations, over all runs after the transient; NaN for signals that it does not estimate.
     """
     settings = {**SETTINGS, "dt": DT, "held_out": 0.0, "inverse_steps": inverse_steps}
     training = read(path, TRAINING)
@@ -157,13 +158,13 @@ def main(
 
 
 def read(path: Path, runs: Sequence[int]) -> list[Record]:
-    """Records of some runs, on the device's grid."""
+    """Records of some runs, resampled at the device's interval."""
     records = read_records([path / f"run{run:02d}.csv" for run in runs], signals=SIGNALS)
     return [resampled(record, DT) for record in records]
 
 
 def fitted(records: Sequence[Record], model: BothAngles | None = None) -> BothAngles:
-    """The device with parameters for which its motions follow those recorded, each for half a second, or LONGER."""
+    """The device's model, fitted to windows of the records: half a second, or LONGER samples for a given model."""
     model, window, noise = (
         (BothAngles(), WINDOW, None) if model is None else (model, LONGER, (ENCODER / 2, ENCODER / 2))
     )
@@ -182,7 +183,7 @@ def fitted(records: Sequence[Record], model: BothAngles | None = None) -> BothAn
 
 
 def released(model: BothAngles) -> list[Record]:
-    """Motions of the equations, recorded as the device records its own."""
+    """Simulated motions of the equations, with signals as the device records them."""
     rng = np.random.default_rng(0)
     theta, alpha = rng.uniform(-TURNED, TURNED, MOTIONS), rng.uniform(0, 2 * np.pi, MOTIONS)
     x0 = np.stack([theta, alpha, *rng.uniform(-1, 1, (2, MOTIONS)) * np.array(MOVING)[:, None]], -1)
@@ -197,7 +198,7 @@ def released(model: BothAngles) -> list[Record]:
 
 
 def learned(records: Sequence[Record], model: BothAngles, settings: dict, out: Path) -> tuple[Artifact, Artifact]:
-    """Observers from records alone, and from records and motions of the equations."""
+    """Two observers: from records only, and from records and simulated motions."""
     return trained(records, settings, out / "records"), trained([*records, *released(model)], settings, out / "both")
 
 
@@ -210,7 +211,7 @@ def trained(records: Sequence[Record], settings: dict, out: Path) -> Artifact:
 
 
 def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> dict[str, list[np.ndarray]]:
-    """Estimates along each training run, by observers and equations that were learned from the other half."""
+    """Estimates along each training run, by observers and equations learned from the other half of the runs."""
     found = {}
     for fold in FOLDS:
         kept = [record for run, record in zip(TRAINING, records, strict=True) if run not in fold]
@@ -228,14 +229,14 @@ def estimates(observer: Artifact, record: Record) -> np.ndarray:
 
 
 def rest(records: Sequence[Record]) -> float:
-    """Where the recorded pendulum comes to rest on average, in rad from where a pendulum hangs."""
+    """Mean angle at which the recorded pendulum comes to rest, in rad from hanging straight down."""
     return float(np.mean([np.arcsin(-record.x[-round(1.0 / DT) :, 1]).mean() for record in records]))
 
 
 def guided(observer: Artifact, model: Sticking, zero: float, records: Sequence[Record]) -> list[np.ndarray]:
-    """Estimates of a Kalman filter that the observer starts, and starts again where both are far apart.
+    """Estimates of a Kalman filter that the observer starts, and restarts when both are far apart.
 
-    The arm's angle is measured and not estimated. Where the pendulum comes to rest is zero, in rad from where it hangs.
+    The arm's angle is measured, not estimated. ``zero`` is the pendulum's angle at rest, in rad from the vertical.
     """
     y = padded([record.y for record in records])
     signals = padded([estimates(observer, record) for record in records])
@@ -259,13 +260,13 @@ def guided(observer: Artifact, model: Sticking, zero: float, records: Sequence[R
 
 
 def padded(values: Sequence[np.ndarray]) -> np.ndarray:
-    """Signals (n, k) of several records as one array, of which the last samples of shorter ones are repeated."""
+    """Signals (n, k) of several records as one array; the last samples of shorter records are repeated."""
     longest = max(len(each) for each in values)
     return np.stack([np.pad(each, ((0, longest - len(each)), (0, 0)), mode="edge") for each in values], 1)
 
 
 def recorded_signals(angles: np.ndarray, records: Sequence[Record]) -> list[np.ndarray]:
-    """Angles theta and alpha, (n, runs, 2), as the records have them, each as long as its record."""
+    """The recorded signals that follow from angles theta and alpha, (n, runs, 2), each as long as its record."""
     each = [np.unwrap(angles[: len(record.t), i], axis=0).T for i, record in enumerate(records)]
     return [
         np.stack([np.cos(alpha), np.sin(alpha), recorded_velocity(alpha), recorded_velocity(theta)], -1)
@@ -274,9 +275,9 @@ def recorded_signals(angles: np.ndarray, records: Sequence[Record]) -> list[np.n
 
 
 def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
-    """Estimates of an extended Kalman filter, whose noise was chosen on the training runs.
+    """Estimates of an extended Kalman filter; its noise covariances were chosen on the training runs.
 
-    It begins with a pendulum that hangs, give or take 1.8 rad, and velocities of 4 and 12 rad/s.
+    It starts with a hanging pendulum at rest, with standard deviations of 1.8 rad, and of 4 and 12 rad/s.
     """
     y = padded([record.y for record in records])
     kalman_filter = ExtendedKalmanFilter(
@@ -290,13 +291,13 @@ def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
 
 
 def differences(record: Record) -> np.ndarray:
-    """The arm's velocity as the device computes it. Differences of theta do not contain the pendulum's rate."""
+    """The arm's velocity by the device's own formula; differences of theta do not give the pendulum's signals."""
     nothing = np.full(len(record.t), np.nan)
     return np.stack([nothing, nothing, nothing, recorded_velocity(record.y[:, 0])], -1)
 
 
 def recorded_velocity(angle: np.ndarray) -> np.ndarray:
-    """The derivative of an angle, (n,), behind the low-pass of the recorded velocities."""
+    """The derivative of an angle, (n,), with the low-pass filter of the recorded velocities."""
     velocity = np.zeros(len(angle))
     for k in range(1, len(angle)):
         velocity[k] = 0.8 * velocity[k - 1] + 50.0 * (angle[k] - angle[k - 1])
@@ -304,7 +305,7 @@ def recorded_velocity(angle: np.ndarray) -> np.ndarray:
 
 
 def errors(x_hat: Sequence[np.ndarray], records: Sequence[Record]) -> np.ndarray:
-    """Root mean square errors over standard deviations, (4,), all runs together, after the transient."""
+    """Root mean square errors over standard deviations, (4,), over all runs after the transient."""
     late = round(TRANSIENT / DT)
     truth = np.concatenate([record.x[late:] for record in records])
     apart = np.concatenate([each[late:] for each in x_hat]) - truth
@@ -314,10 +315,10 @@ def errors(x_hat: Sequence[np.ndarray], records: Sequence[Record]) -> np.ndarray
 def draw(
     path: Path, estimators: Mapping[str, Sequence[np.ndarray]], records: Sequence[Record], titles: Sequence[str]
 ) -> None:
-    """Draw the first seconds of the runs, each in a column: one recorded signal, and errors of two."""
+    """Draw the first seconds of the runs, one in each column: a recorded signal, and the errors of two signals."""
     names, shown, smooth = ("sin(alpha)", "alpha_dot"), slice(0, round(SHOWN / DT)), np.ones(AVERAGED) / AVERAGED
     of = [SIGNALS.hidden.index(name) for name in names]
-    drawn = {name: x_hat for name, x_hat in estimators.items() if name != DIFFERENCES}  # they do not estimate alpha
+    drawn = {name: x_hat for name, x_hat in estimators.items() if name != DIFFERENCES}  # without estimates of alpha
     with drawing(path, 2.6 * len(records), 6.5) as figure:
         axes = figure.subplots(1 + len(names), len(records), squeeze=False, sharex=True, sharey="row")
         for column, (record, title) in enumerate(zip(records, titles, strict=True)):

@@ -1,4 +1,4 @@
-"""The equations of a Quanser Qube Servo 2, with friction of several kinds, for qube.py beside it."""
+"""The equations of a Quanser Qube Servo 2 for qube.py, with several kinds of friction."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,13 +13,13 @@ KEPT = 0.1  # s, correlation time of the unknown torque
 
 @dataclass(frozen=True)
 class Qube(kkl_gym.System):
-    """The device without motor input: x = (theta, alpha, theta', alpha'), alpha from above, y = theta.
+    """The device without motor input: x = (theta, alpha, theta', alpha'), alpha from upright, y = theta.
 
-    Without dry friction and the spring of the arm's cable it is as published.
+    The defaults are the published model, without dry friction and without the spring of the arm's cable.
 
-    Lengths, masses and inertias are those of Quanser's script qube2_rotpen_param.m (that of the arm as published,
-    mass length^2 / 12). It has much more damping than these runs show; the two coefficients are those of
-    BlueRiverTech's quanser-openai-driver, file qube_simulator.py. The motor's terminals are open.
+    Lengths, masses and inertias are those of Quanser's script qube2_rotpen_param.m; the arm's inertia is its published
+    mass length^2 / 12. The script's damping is much larger than in these runs. So both damping coefficients are those
+    of BlueRiverTech's quanser-openai-driver, file qube_simulator.py. The motor's terminals are open.
     """
 
     gravity: float = 9.81  # m/s^2
@@ -33,7 +33,7 @@ class Qube(kkl_gym.System):
     pendulum_inertia: float = 0.024 * 0.129**2 / 3  # kg m^2, about its joint
     pendulum_damping: float = 0.00005  # N m s
     pendulum_friction: float = 0.0  # N m
-    arm_slip: float = 0.1  # rad/s, about which dry friction changes its sign
+    arm_slip: float = 0.1  # rad/s, width of the change of sign of dry friction
     pendulum_slip: float = 0.8  # rad/s
 
     name: ClassVar[str] = "qube"
@@ -67,7 +67,7 @@ class Qube(kkl_gym.System):
 
 @dataclass(frozen=True)
 class BothAngles(Qube):
-    """The same with both angles measured, as in the runs that its parameters are fitted to."""
+    """The same model with both angles measured, for the fit of its parameters to runs."""
 
     name: ClassVar[str] = "qube-both-angles"
 
@@ -78,7 +78,7 @@ class BothAngles(Qube):
 
 @dataclass(frozen=True)
 class Sticking(BothAngles):
-    """The same with friction so dry that the arm stands still until it is pushed."""
+    """The same model with friction so dry that the arm sticks until it is pushed."""
 
     arm_slip: float = 0.004
     pendulum_slip: float = 0.2
@@ -86,15 +86,15 @@ class Sticking(BothAngles):
     name: ClassVar[str] = "qube-sticking"
 
     def rate(self, x):
-        """Two substeps for each sample, with which the method is stable where the arm sticks."""
+        """A rate that gives two substeps for each sample, which keep the method stable while the arm sticks."""
         return 150.0 + 0.0 * x[0]
 
 
 @dataclass(frozen=True)
 class Pushed(Sticking):
-    """The same, y = theta, pushed by a torque on the arm that stands for all that friction does otherwise.
+    """The same model with y = theta, and with an unknown torque on the arm for the errors of the friction model.
 
-    It is a fifth state, in 0.1 mN m, which fades while noise renews it (an Ornstein-Uhlenbeck process).
+    The torque is a fifth state, in 0.1 mN m: an Ornstein-Uhlenbeck process.
     """
 
     name: ClassVar[str] = "qube-pushed"

@@ -1,7 +1,7 @@
-"""An id for all that takes one: the agent sees x_hat and acts every 0.05 s.
+"""Register an environment id with its wrappers: the agent sees x_hat and acts every 0.05 s.
 
-CleanRL, TorchRL and many others make environments of an id alone. With this file in the working directory they take
-"registered:VanDerPolEstimated-v0"; a copy of it with a system and wrappers of your own is an id of your own.
+CleanRL, TorchRL and many others make an environment from its id only. With this file in the working directory they take
+"registered:VanDerPolEstimated-v0". For your own id, copy the file and change the system and the wrappers.
 """
 
 import gymnasium as gym

@@ -1,6 +1,6 @@
-"""PPO or SAC from RLlib on the estimate x_hat: two env runners, each with a batch of environments and one observer.
+"""PPO or SAC from RLlib on the estimate x_hat, with two env runners; each has a batch of environments and one observer.
 
-It needs `pip install "ray[rllib]" torch tyro` beside kkl-gym, and no extra of kkl-gym.
+It needs `pip install "ray[rllib]" torch tyro` and kkl-gym without extras.
 """
 
 from typing import Any, Literal
@@ -20,8 +20,8 @@ import kkl_gym
 def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
     """Batched environments with their observer inside: 20 s long, an action every 0.05 s.
 
-    RLlib calls this in each env runner. So only names travel there: the runner itself imports kkl_gym and reads the
-    observer's file.
+    RLlib calls this function in each env runner and sends it only names. The runner itself imports kkl_gym and reads
+    the observer's file.
     """
     envs = gym.make_vec(
         config["env_id"],
@@ -35,7 +35,7 @@ def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
 
 
 def configuration(algorithm: Literal["ppo", "sac"]) -> AlgorithmConfig:
-    """What differs between the two."""
+    """The settings of an algorithm."""
     if algorithm == "ppo":
         return PPOConfig().training(
             lr=1e-3, gamma=0.99, train_batch_size_per_learner=4096, minibatch_size=512, num_epochs=5
@@ -48,7 +48,7 @@ def configuration(algorithm: Literal["ppo", "sac"]) -> AlgorithmConfig:
             alpha_lr=1e-3,
             gamma=0.98,
             train_batch_size_per_learner=256,
-            training_intensity=16.0,  # samples learned from for each that is gathered
+            training_intensity=16.0,  # samples in training batches for each sample gathered
             num_steps_sampled_before_learning_starts=1000,
         )
         .reporting(min_sample_timesteps_per_iteration=1000)
@@ -64,16 +64,16 @@ def main(
     runners: int = 2,
     seed: int = 0,
 ) -> tuple[int, float]:
-    """Train for a while; returns the actions taken and the mean episode reward of the last ones.
+    """Train for a while; returns the number of actions and the mean reward of the last episodes.
 
     Args:
         algorithm: the algorithm to train.
         env_id: one of the package's environments.
         observer: a shipped map's name, or a .safetensors file that every runner can read.
-        steps: actions to learn from, in all environments together.
-        num_envs: environments side by side in each runner.
+        steps: number of actions in the training, over all environments.
+        num_envs: environments in each runner.
         runners: processes that gather experience.
-        seed: of everything random.
+        seed: seed of all random numbers.
     """
     register_env("estimated", make_envs)
     config = (
@@ -82,7 +82,7 @@ def main(
         .env_runners(
             num_env_runners=runners,
             num_envs_per_env_runner=num_envs,
-            gym_env_vectorize_mode="vector_entry_point",  # one batch, not num_envs environments in a row
+            gym_env_vectorize_mode="vector_entry_point",  # one batched environment instead of num_envs single ones
             env_to_module_connector=lambda *_args, **_options: MeanStdFilter(),
         )
         .debugging(seed=seed)

@@ -24,16 +24,16 @@ def main(env_id: str = "KKLVanDerPol-v0", steps: int = 20_480, num_envs: int = 1
 
     Args:
         env_id: one of the package's environments.
-        steps: environment steps to learn from; learning well takes a million (a minute or two).
-        num_envs: environments side by side.
-        seed: of everything random.
+        steps: environment steps of the training; a good agent takes a million (a minute or two).
+        num_envs: environments in the batch.
+        seed: seed of all random numbers.
     """
     envs = VecNormalize(VecMonitor(make_envs(env_id, num_envs)), norm_reward=False)
     envs.seed(seed)
     agent = PPO("MlpPolicy", envs, n_steps=128, batch_size=256, gamma=0.99, seed=seed, device="cpu")
     agent.learn(steps)
-    envs.training = False  # the scaling stays as it was learned
-    envs.seed(seed + 1000)  # episodes that training has not seen
+    envs.training = False  # keeps the learned scaling
+    envs.seed(seed + 1000)  # unseen episodes
     reward, spread = evaluate_policy(agent, envs, n_eval_episodes=num_envs)
     print(f"mean episode reward {reward:.1f} ± {spread:.1f} of at most {400 * 5}")
     envs.close()

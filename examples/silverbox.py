@@ -1,7 +1,7 @@
-"""The Silverbox, the standard benchmark of nonlinear identification: an electronic Duffing oscillator, measured.
+"""The Silverbox, a standard benchmark of nonlinear identification: measurements of an electronic Duffing oscillator.
 
-The data are not part of this project: nonlinearbenchmark.org has them, as SNLS80mV.csv with columns V1 (input) and V2
-(output), 131,072 samples at 610.35 Hz. See docs/results/silverbox.md for assumptions and results::
+The data are not part of this project. nonlinearbenchmark.org offers SNLS80mV.csv, with columns V1 (input) and V2
+(output) and 131,072 samples at 610.35 Hz. docs/results/silverbox.md has assumptions and results::
 
     python examples/silverbox.py SNLS80mV.csv
 """
@@ -28,10 +28,10 @@ from training.records import Record
 DT = 2**14 / 1e7  # s
 FILE = "SNLS80mV.csv"
 SAMPLES = 131_072
-FREE = 50  # first samples of each test, from which its start may be found, and which do not count
-TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)  # three quarters and one of the multisine records
-ARROW, ARROW_INSIDE = (100, 40_575), (100, 32_100)  # up to there it stays within the outputs of the training part
-RECORDS, LENGTH = 8, 2_048  # taken from the training part; one is left out, to test predictions
+FREE = 50  # first samples of each test, for the fit of its start; they do not count
+TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)  # three quarters of the multisine, and the last one
+ARROW, ARROW_INSIDE = (100, 40_575), (100, 32_100)  # the part within the training's range of outputs
+RECORDS, LENGTH = 8, 2_048  # records from the training part; one is held out, to test predictions
 LIMITS = {
     "damping": (6.0, 600.0),
     "stiffness": (3e4, 3e6),
@@ -49,9 +49,9 @@ PUBLISHED = {"NARX (SysIdentPy)": (7.73, 4.15, 2.23), "SUBNET, nx = 4": (None, 6
 class Silverbox(kkl_gym.System):
     """A forced Duffing oscillator, y'' = -damping y' - (stiffness + square y + cube y^2) y + offset + gain u(t).
 
-    The generator's input is smooth between samples. Held over an interval, as here, a weighted sum of three samples
-    acts as it does: inputs are V1 before, at and after the interval's first sample. For signals that are slow against
-    sampling the weights before = -1/6 and after = 1/3 are right to second order.
+    The generator's input is smooth between samples, but the simulation holds its input over an interval. A weighted sum
+    of three samples of V1, before, at and after the interval's first sample, has the same effect. For slow signals the
+    weights before = -1/6 and after = 1/3 are right to second order.
     """
 
     damping: float = 60.0  # 1/s
@@ -60,12 +60,12 @@ class Silverbox(kkl_gym.System):
     cube: float = 4e5  # 1/(V^2 s^2)
     offset: float = 0.0  # V/s^2
     gain: float = 1.2e5  # 1/s^2
-    before: float = 0.0  # weights of the neighbours of the sample itself, which has the rest
+    before: float = 0.0  # weights of the neighbouring samples; the sample itself has the rest
     after: float = 0.0
 
     name: ClassVar[str] = "silverbox"
     state_names: ClassVar = ("position in V", "velocity in V/s")
-    X: ClassVar = ((-0.3, 0.3), (-130.0, 130.0))  # what the outputs and their differences show
+    X: ClassVar = ((-0.3, 0.3), (-130.0, 130.0))  # the range of the outputs and their differences
     bounds: ClassVar = ((-3.0, 3.0), (-1300.0, 1300.0))
     u_max: ClassVar = (0.15, 0.15, 0.15)  # V
     dt: ClassVar[float] = DT
@@ -99,13 +99,13 @@ def read(path: Path) -> np.ndarray:
 
 
 def part(data: np.ndarray, begin: int, end: int) -> Record:
-    """Some samples as a record, whose inputs are those before, at and after each sample."""
+    """Some samples as a record, with the inputs before, at and after each sample."""
     u = np.stack([data[begin + shift : end + shift, 0] for shift in (-1, 0, 1)], axis=-1)
     return Record(f"[{begin}:{end}]", DT * np.arange(end - begin), data[begin:end, 1:], u)
 
 
 def simulated(system: Silverbox, record: Record) -> np.ndarray:
-    """Outputs (n,) of a motion that sees inputs alone; its start is the one that fits the first samples best."""
+    """Outputs (n,) of a simulation from inputs only; its start is fitted to the first samples."""
     theta = np.array([system.parameters[name] for name in LIMITS])
     first = {(0, 0): np.array([record.y[0, 0], 0.0])}
     shooting = Shooting(system, DT, LIMITS, np.ones(len(theta)))
@@ -125,7 +125,7 @@ def main(path: Annotated[Path, tyro.conf.Positional], out: Path = Path("runs/sil
     Args:
         path: SNLS80mV.csv, or the folder that holds it.
         out: the run's folder.
-        seed: of the random starts.
+        seed: seed of the random starts.
     """
     data, console = read(path), Console()
     out.mkdir(parents=True, exist_ok=True)
@@ -152,7 +152,7 @@ def main(path: Annotated[Path, tyro.conf.Positional], out: Path = Path("runs/sil
 
 
 def draw(path: Path, tests: dict[str, Record], residuals: dict[str, Any]) -> None:
-    """Draw measured outputs, and what simulated ones leave of them."""
+    """Draw the measured outputs, and their residuals after the simulated ones."""
     with drawing(path, 10, 5) as figure:
         axes = figure.subplots(2, len(tests), sharex="col", sharey="row")
         for (above, below), (name, record) in zip(axes.T, tests.items(), strict=True):

@@ -14,14 +14,14 @@ from kkl_gym.wrappers.vector import KKLVectorObservation, VectorActionRepeat
 
 __version__ = "0.1.0"
 
-OWN_ID = "kkl_gym/Own-v0"  # takes a system of the user's
+OWN_ID = "kkl_gym/Own-v0"  # takes the user's own system
 ENV_IDS = {cls.name: f"KKL{cls.__name__}-v0" for cls in SYSTEMS.values()}
 
-# About nine tenths of what the shipped agents reach on x_hat. Without acting it is 1,850 to 2,700.
+# About nine tenths of the shipped agents' returns on x_hat. Without actions, returns are 1,850 to 2,700.
 _REWARD_THRESHOLDS = {"reverse_duffing": 4100.0, "van_der_pol": 3900.0, "rossler": 4300.0, "lorenz": 4400.0}
 
 for _name, _id in [*ENV_IDS.items(), (None, OWN_ID)]:
-    if _id not in gym.registry:  # a second import, as after importlib.reload, changes nothing
+    if _id not in gym.registry:  # a second import, as by importlib.reload, changes nothing
         gym.register(
             _id,
             entry_point="kkl_gym.envs:KKLEnv",

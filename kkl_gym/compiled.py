@@ -1,8 +1,9 @@
-"""Sampling intervals as machine code, where Numba is installed and a system's equations can be written as a program.
+"""Machine code for a sampling interval, where Numba is installed and can compile a system's equations.
 
-The equations run once on symbols (:mod:`kkl_gym.tracing`); the program is put into the Runge–Kutta step of Python and
-NumPy, and compiled in a second. A single state's step is Python's to the last bit, in a tenth of the time; equations
-with powers, which compilers round in their own way, are compiled for batches alone.
+The equations run once on symbols, which record them as a program (:mod:`kkl_gym.tracing`). Numba compiles this program
+within the Runge–Kutta step, in about a second. The compiled step of a single state equals Python's to the last bit and
+takes a tenth of the time. Compilers round powers in their own way, so equations with powers are compiled only for
+batches.
 """
 
 import functools
@@ -35,44 +36,44 @@ from kkl_gym.tracing import Program, in_tuple, program
 
 Values = TypeVar("Values")
 Advance = Callable[[Values, Values, Values, float], Values]
-"""(x, u, w, dt) to the next x."""
+"""Maps (x, u, w, dt) to the next x."""
 
-MAX_OPERATIONS = 500  # of a program; beyond, such as for a network as f, compiling takes many seconds
-_TRIALS = 200  # states of each kind at which machine code is compared
-_MAX_TRIAL_SUBSTEPS = 64  # of a single state that is compared: Python would take long for more
-_LANES = 32  # rows that make a step together: a few of the processor's vectors
-_KEPT = 64  # kernels
-_kept: dict[Any, Any] = {}  # kernels, or the obstacle to one, by their programs
+MAX_OPERATIONS = 500  # longer programs, such as that of a network as f, would take many seconds to compile
+_TRIALS = 200  # states of each kind at which machine code is compared with Python
+_MAX_TRIAL_SUBSTEPS = 64  # trial states that need more are skipped, because Python is slow on them
+_LANES = 32  # rows that are stepped together; they fill a few of the processor's vector registers
+_KEPT = 64  # compiled kernels in the cache
+_kept: dict[Any, Any] = {}  # by program: its kernel, or the reason why it has none
 
 logger = logging.getLogger("kkl_gym")
 
 
 @dataclass(frozen=True)
 class SamplingStep(Generic[Values]):
-    """One sampling interval, called as ``step(x, u, w, dt)``, and the obstacle to machine code, if it is Python."""
+    """The step over one sampling interval; ``obstacle`` is the reason why it is not compiled, None if it is."""
 
     advance: Advance[Values]
     obstacle: str | None = None
 
     def __call__(self, x: Values, u: Values, w: Values, dt: float) -> Values:
-        """Take the step, for arrays of a batch (nx, n) and (nu, n), or for sequences of floats."""
+        """Return the next state. Shapes: sequences of floats, or arrays (nx, n) and (nu, n) of a batch."""
         return self.advance(x, u, w, dt)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Programs of a system: x' = field(x) + push(u, w), or x' = field(x, u) + push(w), and its rate if a formula."""
+    """A system's programs: x' = field(x) + push(u, w) or x' = field(x, u) + push(w), and a formula for its rate."""
 
     field: Program
     push: Program
     rate: Program | None
-    units: tuple[float, ...]  # one over the tolerances of states, and zeros for inputs that the field depends on
+    units: tuple[float, ...]  # 1 / tolerance of each state, then a 0 for each input that the field depends on
 
 
 def single_step(system: System) -> SamplingStep[Components]:
-    """One sampling interval of a single state: compiled if Numba is there and takes the equations, else in Python.
+    """The step of a single state: compiled if Numba is installed and can compile the equations, else in Python.
 
-    Numbers that the equations read besides are as they were at this call.
+    A compiled step keeps the present values of globals and other numbers that the equations read.
     """
     return _shared(system, single_kernel, _single, advance, f"single steps of {system.name} stay in Python")
 
@@ -89,13 +90,13 @@ def _shared(
     otherwise: Callable[..., Values],
     without: str,
 ) -> SamplingStep[Values]:
-    """The step of a system around a kernel that is compiled once for all systems of the same programs."""
+    """The step of a system; systems with the same programs share one compiled kernel."""
     plain = functools.partial(otherwise, system)
     if system.discrete:
         return SamplingStep(plain, f"{system.name} makes its step itself")
     try:
         motion: Any = _motion(system)
-    except Exception as error:  # whatever comes out of a user's equations on symbols
+    except Exception as error:  # a user's equations may raise anything on symbols
         motion = _reason(error)
     of = compile_kernel, type(system), motion
     if of not in _kept:
@@ -103,7 +104,7 @@ def _shared(
             _kept.pop(next(iter(_kept)), None)
         try:
             _kept[of] = motion if isinstance(motion, str) else compile_kernel(system, motion)
-        except Exception as error:  # Python then runs the equations, and raises their errors
+        except Exception as error:  # the step in Python runs the equations and raises their errors
             _kept[of] = _reason(error)
         if isinstance(_kept[of], str):
             logger.info("%s: %s", without, _kept[of])
@@ -112,13 +113,13 @@ def _shared(
 
 
 def _reason(error: Exception) -> str:
-    """What went wrong, in one line: Numba writes a page, in colours, of which a line names what it cannot take."""
+    """The first informative line of an error; Numba's messages fill a page, in colours."""
     line = re.search(r"^(?!Failed in ).*\S.*", re.sub(r"\x1b\[\d*m", "", str(error)), re.MULTILINE)
     return f"{type(error).__name__}: {line[0] if line else ''}"
 
 
 def _motion(system: System) -> Motion:
-    """The programs of a system; ValueError if they are long, or not the same each time."""
+    """The programs of a system; ValueError if they are too long, or differ from one call to the next."""
     nx, nu, constant = system.nx, system.nu, type(system).g is System.g
 
     def field(x: Any, u: Any = ()) -> Any:
@@ -131,7 +132,7 @@ def _motion(system: System) -> Motion:
     letters = [("x", nx)] if constant else [("x", nx), ("u", nu)]
     traced = program(field, *letters)
     if traced != program(field, *letters):
-        raise ValueError(f"{system.name}: the equations are not the same each time they are asked for")
+        raise ValueError(f"{system.name}: the equations differ from one call to the next")
     rate = None
     if type(system).rate is not System.rate:
         rate = program(lambda x: (rate_at(system, x),), ("x", nx))
@@ -142,7 +143,7 @@ def _motion(system: System) -> Motion:
 
 
 def single_kernel(system: System, motion: Motion) -> Any:
-    """The compiled step of a single state, NaN where substeps of one length err too much."""
+    """The compiled step of a single state; it returns NaN where equal substeps are not accurate enough."""
     import numba
 
     if not (motion.field.exact and motion.push.exact):
@@ -165,8 +166,8 @@ def single_kernel(system: System, motion: Motion) -> Any:
         "        need = n * error**0.1",
         f"    return {in_tuple(['nan'] * nx)}",
     ]
-    jit: Any = functools.partial(numba.njit, error_model="python")  # which raises where Python does
-    # Of floats alone: a bound of the input that is written as an integer must not compile it again.
+    jit: Any = functools.partial(numba.njit, error_model="python")  # raises where Python raises
+    # The signature has floats only, so that an input bound given as an integer does not compile the kernel again.
     kernel = jit((numba.float64,) * (nx + nu + nx + 1))(_assembled(motion, lines, jit))
     rng = np.random.default_rng(0)
     u_max, scale = np.array(system.u_max), np.array(system.scale) / system.pace
@@ -178,7 +179,7 @@ def single_kernel(system: System, motion: Motion) -> Any:
                 if not rate_under(system, at, held) * system.dt * PER_RATE <= _MAX_TRIAL_SUBSTEPS:
                     continue
                 end = kernel(*at, *held, *noise, system.dt)
-            except Exception:  # Python takes the step
+            except Exception:  # at run time Python then takes the step
                 continue
             if end[0] == end[0] and tuple(end) != tuple(advance(system, at, held, noise, system.dt)):
                 raise ValueError(f"it rounds otherwise than Python at x = {list(at)}")
@@ -189,7 +190,7 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
     def step(x: Components, u: Components, w: Components, dt: float) -> Components:
         try:
             end: Components = kernel(*x, *u, *w, dt)
-        except Exception:  # Python names the equation that failed
+        except Exception:  # the step in Python raises an error that names the equation
             return advance(system, x, u, w, dt)
         return end if end[0] == end[0] else advance(system, x, u, w, dt)
 
@@ -197,11 +198,11 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
 
 
 def batch_kernel(system: System, motion: Motion) -> Any:
-    """The compiled step of a batch: substeps of one length for each row, in groups of rows that need as many."""
+    """The compiled step of a batch: rows that need equally many substeps are stepped in groups."""
     import numba
 
-    # Components and lanes are written out, and lie in one array at distances that the compiler knows, which lets it
-    # use the processor's vectors.
+    # Components and lanes are written out and lie in one array, at offsets that the compiler knows. So it can use the
+    # processor's vector registers.
     nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
     lanes = [f"s[{i * _LANES} + j]" for i in range(size + nx + 3)]
     states, d, (substeps, length, error) = lanes[:size], lanes[size:-3], lanes[-3:]
@@ -226,7 +227,7 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         "            least, most = most, 2.0 * most",
         f"        for first in range(0, found, {_LANES}):",
         f"            for j in range({_LANES}):",
-        "                at = min(first + j, found - 1)  # lanes that are left over do the last row again",
+        "                at = min(first + j, found - 1)  # unused lanes repeat the last row",
         f"                row, {substeps}, {length}, {error} = order[at], counts[at], dt / counts[at], 0.0",
         *[f"                {lane} = {value}" for lane, value in zip(states, start)],
         f"                {in_tuple(d)} = {pushed}",
@@ -246,8 +247,8 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         f"                    needs[row] = {substeps} * {error} ** 0.1",
         "    return left > 0",
     ]
-    jit: Any = functools.partial(numba.njit, error_model="numpy")  # a division by zero is infinite
-    inlined = functools.partial(jit, forceinline=True)  # a call would keep rows from going through together
+    jit: Any = functools.partial(numba.njit, error_model="numpy")  # a division by zero gives infinity
+    inlined = functools.partial(jit, forceinline=True)  # a function call would prevent vectorisation over rows
     kernel = jit(_assembled(motion, lines, inlined))
     u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None] / system.pace
     rounding = 1e-9 * np.ptp(system.X, axis=1)[:, None]
@@ -256,7 +257,7 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         at = points.T.copy(), u_max * rng.uniform(-1, 1, (nu, n)), scale * rng.uniform(-1, 1, (nx, n)), system.dt
         found, expected = np.empty((nx, n)), equal_substeps(system, *at)[0]
         kernel(*at, found)
-        expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan  # what escapes may be either
+        expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan  # motions that escape may give either
         if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
             raise ValueError(f"{system.name}: the equations return something else for symbols than for numbers")
     return kernel
@@ -266,7 +267,7 @@ def _batch(system: System, kernel: Any) -> Advance[np.ndarray]:
     def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
         out = np.empty(x.shape)
         lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
-        if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):  # motions that ended stay so
+        if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):  # NaN stays NaN
             out[:, rows] = advance_batch(system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out
 
@@ -274,7 +275,7 @@ def _batch(system: System, kernel: Any) -> Advance[np.ndarray]:
 
 
 def _assembled(motion: Motion, lines: list[str], jit: Callable[..., Any]) -> Any:
-    """The function ``kernel`` that some lines define, around compiled programs of a motion."""
+    """The function ``kernel`` that ``lines`` define; they call the compiled programs of a motion."""
     namespace: dict[str, Any] = {"inf": math.inf, "nan": math.nan, "np": np}
     for name, function in vars(elementary).items():
         if on_numbers := getattr(function, "on_numbers", None):
@@ -293,7 +294,7 @@ def _assembled(motion: Motion, lines: list[str], jit: Callable[..., Any]) -> Any
 
 
 def _trial_states(system: System, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """States at which machine code is compared with Python and NumPy, (400, nx) and (600, nx)."""
+    """States at which machine code is compared with Python, (400, nx), and also with NumPy, (600, nx)."""
     n, (low, high) = _TRIALS, np.array(system.bounds, dtype=float).T
     random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])
     ends = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])

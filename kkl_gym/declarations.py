@@ -1,4 +1,4 @@
-"""What a user declares about a system: class variables, checked and completed as soon as the class is defined."""
+"""The class variables of a user's system: checked and completed when the class is defined."""
 
 import dataclasses
 import inspect
@@ -15,7 +15,7 @@ _SIZES = {"nx": "X", "nu": "u_max", "ny": "h(x)", "parameters": "the fields"}
 
 
 def complete(cls: Any, base: Any) -> None:
-    """Check the class variables of a system, write their numbers as tuples, and fill in those that follow."""
+    """Check a system's class variables, convert their numbers to tuples, and derive those that were not set."""
     _check_names(cls, base)
     _read_box(cls)
     nx = len(cls.X)
@@ -24,7 +24,7 @@ def complete(cls: Any, base: Any) -> None:
     if cls.discrete and cls.dt is base.dt:
         raise TypeError(f"{cls.__name__} defines step and must set dt, the sampling interval in seconds")
     _check_inputs(cls, base)
-    if "X" in vars(cls):  # otherwise the parent's box and its numbers hold
+    if "X" in vars(cls):  # otherwise the parent's box applies, with the values derived from it
         defaults = {
             "scale": tuple((high - low) / 2 for low, high in cls.X),
             "state_names": tuple(f"x{i + 1}" for i in range(nx)),
@@ -48,15 +48,15 @@ def complete(cls: Any, base: Any) -> None:
 
 
 def _check_names(cls: Any, base: Any) -> None:
-    """Raise TypeError if a name is missing, or means something else than its user thinks."""
+    """Raise TypeError if a name is missing, or if its definition does not do what the user probably intended."""
     missing = [name for name in ("name", "X", "bounds") if not hasattr(cls, name)]
     if missing:
         raise TypeError(f"{cls.__name__} must set the class variables name, X and bounds; it lacks {missing[0]}")
     name = cls.name
     if not isinstance(name, str) or not name.strip() or {"/", "\\", ":"} & set(name):
-        raise _wrong(cls, "name", "a text without slash and colon, for it names files")
+        raise _wrong(cls, "name", "a text without slash and colon, because it names files")
     if "name" not in vars(cls) and {"f", "g", "h", "step", "X"} & vars(cls).keys():
-        raise TypeError(f"{cls.__name__} is another system than {name!r} and needs a name of its own")
+        raise TypeError(f"{cls.__name__} differs from the system {name!r} and needs a name of its own")
     variables = inspect.get_annotations(base)
     for name, kind in inspect.get_annotations(cls).items():
         if "ClassVar" not in str(kind) and (name in variables or hasattr(base, name)):
@@ -67,10 +67,10 @@ def _check_names(cls: Any, base: Any) -> None:
     makers = [each for each in cls.__mro__ if "__init__" in vars(each) and each not in (base, object)]
     if any("__dataclass_fields__" not in vars(each) for each in makers):
         raise TypeError(
-            f"{cls.__name__} defines __init__, and would be copied without what that sets: write its parameters as "
-            "annotated fields under @dataclass(frozen=True), and what follows from them as properties"
+            f"{cls.__name__} defines __init__, and a copy would lack what __init__ sets: write the parameters as "
+            "annotated fields under @dataclass(frozen=True), and values derived from them as properties"
         )
-    for name in (field.name for field in dataclasses.fields(cls)):  # its own come with the decorator, later
+    for name in (field.name for field in dataclasses.fields(cls)):  # inherited: the decorator adds its own later
         first = next((each for each in cls.__mro__ if name in vars(each)), base)
         if first is not base and name not in inspect.get_annotations(first):
             raise TypeError(
@@ -119,8 +119,8 @@ def _read(
     above: float = -math.inf,
     least: float = -math.inf,
 ) -> None:
-    """Check numbers of this shape and within these limits, and write them as tuples."""
-    if isinstance(getattr(cls, name), property):  # follows from others
+    """Check that a class variable has this shape and lies within these limits, and convert it to tuples."""
+    if isinstance(getattr(cls, name), property):  # derived from others
         return
     try:
         numbers = _numbers(getattr(cls, name), shape)
@@ -133,7 +133,7 @@ def _read(
 
 
 def _numbers(value: Any, shape: tuple[int | None, ...]) -> Any:
-    """Numbers as nested tuples; ValueError unless they are finite and of this shape, in which None is any length."""
+    """Numbers as nested tuples; ValueError unless they are finite and have this shape (None: any length)."""
     if not shape:
         if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not math.isfinite(value):
             raise ValueError
@@ -145,12 +145,12 @@ def _numbers(value: Any, shape: tuple[int | None, ...]) -> Any:
 
 
 def _is_row(value: Any, length: int | None, kind: Any = object) -> bool:
-    """Whether a value is a sequence of this length, None being any, and of entries of this kind."""
+    """Whether a value is a sequence of this length (None: any) with entries of this kind."""
     return is_sequence(value) and length in (None, len(value)) and all(isinstance(entry, kind) for entry in value)
 
 
 def _size(value: Any) -> int:
-    """How many entries there are in a value or in its rows."""
+    """Number of entries in a value, or in all of its rows."""
     return np.array(value, dtype=object).size
 
 

@@ -1,12 +1,12 @@
-"""Elementary functions for equations of motion, which serve every number type.
+"""Elementary functions for equations of motion. They take every type of number.
 
-Plain arithmetic and comparisons already work on Python floats, NumPy arrays, torch tensors and sympy expressions alike;
-``sin`` and its kind do not, nor does ``if``. A system whose equations need them takes them from here::
+Plain arithmetic and comparisons already work on Python floats, NumPy arrays, torch tensors and sympy expressions alike.
+``math.sin``, ``np.sin`` and ``if`` do not. Equations that need such functions import them from here::
 
     from kkl_gym.elementary import sin, where
 
-Numbers may stand beside arrays, tensors or expressions. Everywhere exp(1000) is infinite, log(0) minus infinite and
-sqrt(-1) not a number, without a warning. ``docs/guides/your_system.md`` has a table of the functions.
+Arguments may mix numbers with arrays, tensors or expressions. For every type exp(1000) is inf, log(0) is -inf and
+sqrt(-1) is NaN, without a warning. ``docs/guides/your_system.md`` has a table of the functions.
 """
 
 import builtins
@@ -26,7 +26,7 @@ _SYMPY_NAMES = {"abs": "Abs", "maximum": "Max", "minimum": "Min"}
 
 def _unary(name: str, on_numbers: Callable[[Any], Any], meaning: str) -> Callable[[Any], Any]:
     on_arrays = getattr(np, name)
-    if name in ("exp", "log", "sqrt"):  # the others warn of infinite arguments only, and silence takes time
+    if name in ("exp", "log", "sqrt"):  # the others warn only of infinite arguments, and np.errstate takes time
         on_arrays = np.errstate(all="ignore")(on_arrays)
 
     def function(x: Any) -> Any:
@@ -58,13 +58,13 @@ def _binary(name: str, on_numbers: Callable[[Any, Any], Any], meaning: str) -> C
 
 def _named(function: Any, call: str, meaning: str, on_numbers: Callable[..., Any]) -> Any:
     function.__name__ = function.__qualname__ = call.partition("(")[0]
-    function.on_numbers = on_numbers  # for compilers
+    function.on_numbers = on_numbers  # kkl_gym.compiled compiles this one
     function.__doc__ = f"{call}, {meaning}, for floats, NumPy arrays, torch tensors and sympy expressions."
     return function
 
 
 def _elsewhere(name: str, *args: Any) -> Any:
-    """A function of symbols or tensors, by the library that they are of."""
+    """Evaluate a function of tensors or symbols with torch or sympy."""
     for arg in args:
         if isinstance(arg, Symbol):
             return arg.call(name, *args)
@@ -77,13 +77,13 @@ def _elsewhere(name: str, *args: Any) -> Any:
 
 
 def _library(name: str, kind: str, args: tuple[Any, ...]) -> Any:
-    """The library if one of the arguments is of it; only if the caller has imported it already."""
+    """The library, if one of the arguments is of this type of it; the library is never imported here."""
     library = sys.modules.get(name)
     return library if library is not None and any(isinstance(arg, getattr(library, kind)) for arg in args) else None
 
 
 def _as_tensors(torch: Any, args: tuple[Any, ...]) -> list[Any]:
-    """Arguments as tensors; numbers take the type of the tensors beside them."""
+    """Arguments as tensors; numbers take the dtype of the tensors among the arguments."""
     tensors = [arg for arg in args if isinstance(arg, torch.Tensor)]
     dtype = next((tensor.dtype for tensor in tensors if tensor.is_floating_point()), torch.float64)
     device = tensors[0].device
@@ -91,11 +91,11 @@ def _as_tensors(torch: Any, args: tuple[Any, ...]) -> list[Any]:
 
 
 def _sign(x: Any) -> float:
-    return 1.0 if x > 0 else -1.0 if x < 0 else 0.0 * x  # of NaN, NaN
+    return 1.0 if x > 0 else -1.0 if x < 0 else 0.0 * x  # NaN for NaN
 
 
 def _maximum(a: Any, b: Any) -> Any:
-    return a if a >= b or a != a else b  # NaN wins, as with arrays
+    return a if a >= b or a != a else b  # NaN if one of them is, as for arrays
 
 
 def _minimum(a: Any, b: Any) -> Any:
@@ -109,7 +109,7 @@ exp = _unary("exp", math.exp, "e to the power of x")
 log = _unary("log", math.log, "the natural logarithm")
 sqrt = _unary("sqrt", math.sqrt, "the square root")
 tanh = _unary("tanh", math.tanh, "the hyperbolic tangent")
-abs = _unary("abs", builtins.abs, "the absolute value, as Python's own")
+abs = _unary("abs", builtins.abs, "the absolute value, like Python's own")
 sign = _unary("sign", _sign, "-1, 0 or 1")
 atan2 = _binary("atan2", math.atan2, "the angle of the point (b, a) in rad")
 minimum = _binary("minimum", _minimum, "the smaller of the two")
@@ -117,30 +117,30 @@ maximum = _binary("maximum", _maximum, "the larger of the two")
 
 
 def clip(x: Any, low: Any, high: Any) -> Any:
-    """clip(x, low, high), x within bounds, for floats, NumPy arrays, torch tensors and sympy expressions."""
+    """clip(x, low, high), x limited to bounds, for floats, NumPy arrays, torch tensors and sympy expressions."""
     return minimum(maximum(x, low), high)
 
 
 def where(condition: Any, a: Any, b: Any) -> Any:
-    """where(condition, a, b), a where the condition holds, else b: in place of ``if``, for arrays and symbols, too.
+    """where(condition, a, b), a where the condition holds, else b. It replaces ``if``, also for arrays and symbols.
 
     Parameters
     ----------
-    condition : bool, or array, tensor or sympy expression of that
-        A comparison such as ``x[0] > 0``. Several are combined by ``&`` and ``|``, each in parentheses. ``~`` means
-        something else to Python's own True and False: write the opposite comparison.
+    condition : bool, or boolean array, tensor or sympy expression
+        A comparison such as ``x[0] > 0``. Combine several by ``&`` and ``|``, each in parentheses. Do not negate by
+        ``~``, which is bitwise on Python's True and False: write the opposite comparison.
     a, b : float, array, tensor or sympy expression
-        Both are evaluated everywhere; what the one that is not taken makes of its arguments is of no concern.
+        Both are evaluated everywhere; infinite or NaN values of the one that is not taken do no harm.
 
     Returns
     -------
     float, array, tensor or sympy expression
-        Of the kind of the arguments.
+        Of the arguments' type.
 
     Raises
     ------
     TypeError
-        If the condition is no comparison.
+        If the condition is not a comparison.
     """
     if isinstance(condition, bool | np.bool_):
         return a if condition else b

@@ -25,39 +25,39 @@ from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, Components, System, reward_of
 from observers.checks import integer, mapping, real_array, shown
 
-SOON = 1000  # single samples, after which a simulation goes on for long enough to be compiled
-_KEYS = (("a", "d"), ("s", "w"))  # for people who play: low and high end of the first inputs
+SOON = 1000  # samples after which the step is compiled: the simulation is then long enough for it to pay
+_KEYS = (("a", "d"), ("s", "w"))  # keyboard keys for the low and the high end of the first two inputs
 _INTEGER, _FLOAT32 = np.dtype(np.int64), np.dtype(np.float32)
-_ACTIONS = (_FLOAT32, np.dtype(np.float64))  # that a step takes as they are
+_ACTIONS = (_FLOAT32, np.dtype(np.float64))  # dtypes that a step takes without a conversion
 
 
 class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
-    r"""One system, seen through noise.
+    r"""Environment with one system under process noise and measurement noise.
 
-    x' = f(x) + g(x) u + w, y_k = h(x(t_k)) + v_k, simulated with the input and the process noise held over each
+    x' = f(x) + g(x) u + w, y_k = h(x(t_k)) + v_k. The simulation holds the input and the process noise over each
     sampling interval (paper, sec. 7, eq. sys-noisy).
 
     **Timing.** ``reset`` returns the sample y_0 = h(x_0) + v_0; ``step(a_k)`` holds u_k and w_k over [t_k, t_k+1]
     and returns the sample y_k+1.
 
-    **Action.** ``Box(-1, 1, (nu,))``, multiplied by the system's input bounds; values outside are clipped. Action 0 is
-    the autonomous system.
+    **Action.** ``Box(-1, 1, (nu,))``, multiplied by the system's input bounds; values outside are clipped. Under action
+    0 the system is autonomous.
 
-    **Observation.** float32: the true state x (``observe="state"``) or the noisy output y (``observe="output"``),
-    clipped to the system's declared bounds (for y, to the outputs that those bounds allow, widened by six standard
-    deviations of the noise). Where the ``sensor`` has no sample, y is the last one.
+    **Observation.** float32: the true state x (``observe="state"``) or the noisy output y (``observe="output"``). x is
+    clipped to the system's declared bounds, y to the outputs that those bounds allow, widened by six standard
+    deviations of the noise. Where the ``sensor`` delivers no sample, the observation repeats the last y.
 
-    **Info.** Arrays, of the same keys at reset and at steps: ``y`` the noisy output, NaN where the ``sensor`` has no
-    sample, ``x`` the true state and ``u`` the physical input that acted, zero at reset; float64, never clipped.
-    ``sample``, an integer of shape (), counts the sampling intervals since reset. ``escaped``, boolean of shape (),
-    is whether the state left its declared bounds.
+    **Info.** The same keys at reset and at steps. ``y`` is the noisy output, NaN where the ``sensor`` delivers no
+    sample, ``x`` the true state, and ``u`` the physical input that acted, zero at reset. These arrays are float64 and
+    never clipped. ``sample``, an integer of shape (), counts the sampling intervals since reset. ``escaped``, a bool
+    of shape (), is true if the state left its declared bounds.
 
-    **Reward.** What the system's ``reward(x, u)`` is at the new state. By default 1 / (1 + 4 c) in (0, 1] with
+    **Reward.** The system's ``reward(x, u)`` at the new state x. The default is 1 / (1 + 4 c) in (0, 1] with
     c = mean(((x - target) / scale)^2): 1 at the system's target.
 
-    **Ends.** ``terminated`` where the system's ``terminated(x)`` is true, and with ``info["escaped"]`` where the state
-    leaves its declared bounds; the last state and output inside them are then returned. The registered ids truncate
-    after 5,000 steps.
+    **Ends.** An episode is ``terminated`` where the system's ``terminated(x)`` is true, and where the state leaves its
+    declared bounds (``info["escaped"]``). In the second case the last state and output inside the bounds are returned.
+    The registered ids truncate after 5,000 steps.
 
     Parameters
     ----------
@@ -69,27 +69,27 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         Bound of the uniform noise w, as a multiple of the system's ``scale`` per second:
         \|w_i\| <= process_noise * scale_i. None takes the system's own default.
     measurement_noise : float or sequence of float, length ny, optional
-        Standard deviation of the Gaussian noise v on each sample, of all outputs or one of each. None takes the
+        Standard deviation of the Gaussian noise v on each sample: one for all outputs, or one for each. None takes the
         system's own: 0.5 for those that ship, and by default 5 % of the range of each output over X.
     observe : {"state", "output"}
-        What the agent sees.
+        Whether the agent sees the state x or the output y.
     parameters : mapping of str to float, optional
         Physical parameters of the system, by name, where they differ from its defaults.
     start_box : tuple of (float, float), length nx, optional
-        (low, high) of each state, where episodes start; None is the system's training box, or where the system draws
-        its starts.
+        (low, high) of each state: episodes start in this box. None takes the system's own starts, by default its
+        training box.
     sensor : Sensor or mapping of its parameters, optional
-        What becomes of the output on the way to the observer. None is an ideal sensor, but for the measurement noise.
+        Sensor between the output and the observer. None is an ideal sensor, apart from the measurement noise.
     render_mode : {None, "rgb_array", "human"}
-        Whether :meth:`render` draws. With "human" a window shows the motion as fast as it is, from :meth:`reset` on
-        until :meth:`close`; it needs the extra ``human``. An observer around the environment shows its estimate there.
+        What :meth:`render` does: nothing, return an image, or draw in a window. "human" needs the extra ``human``. Its
+        window shows the motion in real time, from :meth:`reset` until :meth:`close`. An observer around the
+        environment draws its estimate there, too.
 
     Raises
     ------
     ValueError
-        On an unknown system or parameter, dt <= 0, a noise level that is negative or beyond 1e12, an unknown
-        ``observe`` or ``render_mode``, an invalid ``sensor``, and a ``start_box`` that does not lie within the declared
-        bounds.
+        If the system, a parameter, ``observe`` or ``render_mode`` is unknown, dt <= 0, a noise level is negative or
+        beyond 1e12, the ``sensor`` is invalid, or ``start_box`` does not lie within the declared bounds.
 
     Examples
     --------
@@ -133,46 +133,47 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         self.observe = observe
         self.observation_space, self.action_space = self.plant.observation_space, self.plant.action_space
 
-        # What every step reads, as Python numbers
+        # Every step reads these; Python numbers are faster here than arrays.
         self._nu = self.system.nu
-        self._sample = self._samples = 0  # since reset, and before it, of this system
+        self._sample = self._samples = 0  # samples since the reset, and those of this system before it
         self._advance: Callable[..., Components]
         self._exchanged()
         self._bounds, self._u_max = self.system.bounds, self.system.u_max
         self._limits = [*zip(self.observation_space.low.tolist(), self.observation_space.high.tolist(), strict=True)]
         self._noise: list[tuple[list[float], list[float]]] = []
         self._readings = None if self.sensor is None else Readings(self.sensor, self.plant.ny, self.plant.dt, 1)
-        self._held: list[float] = []  # the last samples that the sensor has delivered
+        self._held: list[float] = []  # the last sample of each output that the sensor delivered
         self._x: tuple[float, ...] | None = None
-        self._u: list[float] | None = None  # kept, as the trail is, for rendering
+        self._u: list[float] | None = None  # kept for rendering, like the trail
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
-        self.emitted = b""  # the last observation, as observers around it compare what reaches them
-        self.drawn_by = 0  # the observer around it, by number, that draws the window; 0 is the environment itself
+        self.emitted = b""  # the last observation; an observer outside compares it with the one that it receives
+        self.drawn_by = 0  # number of the observer outside that draws the window; 0: the environment itself
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; observation and info are as described above.
+        """Start an episode, and return its first observation and info, which the class describes.
 
         Parameters
         ----------
         seed : int, optional
-            Of starts and noise; None goes on with the generator as it is.
+            Seed of starts and noise. None continues with the present generator.
         options : dict, optional
-            ``"x0"``, shape (nx,), is the start, which is otherwise drawn in ``start_box``.
+            ``"x0"``, shape (nx,), is the start. Without it the start is drawn in ``start_box``.
 
         Raises
         ------
         ValueError
-            If x0 has the wrong shape, is not finite, lies outside the declared bounds, if ``options`` is no mapping or
-            holds an unknown key, or if the seed is no integer or negative. The environment is then as it was.
+            If x0 has the wrong shape, is not finite or lies outside the declared bounds, if ``options`` is not a
+            mapping or holds an unknown key, or if the seed is not an integer or is negative. The environment is then
+            unchanged.
         """
         start = None
         for key, value in mapping("options", options).items():
             if key != "x0":
-                raise ValueError(f'unknown reset option {shown(key)}; the one there is is "x0"')
+                raise ValueError(f'unknown reset option {shown(key)}; the only one is "x0"')
             start = None if value is None else self.plant.start(value)
         if seed is not None:
             seed = integer("seed", seed, 0)
@@ -195,17 +196,17 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return self._observation(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold the input over one sampling interval; what comes back is described above.
+        """Hold the input over one sampling interval, and return what the class describes.
 
         Parameters
         ----------
         action : array_like, shape (nu,)
-            Inputs over their bounds; values outside [-1, 1] are clipped.
+            Inputs divided by their bounds; values outside [-1, 1] are clipped.
 
         Raises
         ------
         ValueError
-            If the action has the wrong shape, or holds NaN or anything but numbers. The environment is then as it was.
+            If the action has the wrong shape, or holds NaN or non-numbers. The environment is then unchanged.
         gymnasium.error.ResetNeeded
             Before :meth:`reset`.
         """
@@ -215,7 +216,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         w, v = self._next_noise()
         x = self._advance(self._x, u, w, self.plant.dt)
         escaped = not self._inside(x)
-        if escaped:  # unless that is but an error of the method
+        if escaped:  # or the substeps erred: finer ones decide
             x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
             escaped = not self._inside(x)
         if not escaped:
@@ -232,11 +233,11 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return self._observation(info), float(reward), escaped or bool(ended), False, info
 
     def render(self) -> np.ndarray | None:
-        """Draw the phase portrait so far: a uint8 image (height, width, 3), or None without one or in a window."""
+        """Draw the phase portrait so far. Returns a uint8 image (height, width, 3) for "rgb_array", otherwise None."""
         return self.draw()
 
     def draw(self, estimates: Collection[Sequence[float]] = ()) -> np.ndarray | None:
-        """Draw the phase portrait as :meth:`render`, with estimates so far, the latest last, beside the states."""
+        """Draw what :meth:`render` draws, and the estimates so far, in order of time, beside the states."""
         if self.render_mode is None:
             return None
         if self._x is None:
@@ -252,20 +253,20 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return None
 
     def animate(self, estimates: Collection[Sequence[float]] = ()) -> None:
-        """Draw the window's next frame, if one is due at this sample, with estimates as :meth:`draw` takes them."""
+        """Draw the window's next frame, if one is due at this sample; ``estimates`` are those of :meth:`draw`."""
         if self._sample % samples_a_frame(self.dt) == 0:
             self.draw(estimates)
 
     def close(self) -> None:
-        """Close the window, if there is one; the next frame opens another."""
+        """Close the window, if one is open; the next frame opens another."""
         if self._window is not None:
             self._window.close()
             self._window = None
 
     def get_keys_to_action(self) -> dict[tuple[int, ...], np.ndarray]:
-        """Keys for :func:`gymnasium.utils.play.play`: a and d are the ends of the first input, s and w of the second.
+        """Keys for :func:`gymnasium.utils.play.play`: a and d for the ends of the first input, s and w for the second.
 
-        ``play`` wants ``noop=np.zeros(nu, np.float32)`` beside them, the action while no key is pressed.
+        Pass ``noop=np.zeros(nu, np.float32)`` to ``play`` as well, the action while no key is pressed.
         """
         actions = {}
         for ends in itertools.product(*((("", 0), (low, -1), (high, 1)) for low, high in _KEYS[: self._nu])):
@@ -276,13 +277,13 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return actions
 
     def __getstate__(self) -> dict[str, Any]:
-        # What cannot be copied is made again when it is used, or at a reset.
+        # Windows and compiled steps cannot be copied; they are made again at their next use, or at a reset.
         return {**self.__dict__, "_canvas": None, "_window": None, "_advance": partial(advance, self.system)}
 
     def _exchanged(self) -> None:
         self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
-        self._samples = -self._sample  # a system that stays for an episode is not worth to be compiled
+        self._samples = -self._sample  # counts from here: a system that changes every episode is not worth compiling
 
     def _input(self, action: np.ndarray) -> list[float]:
         if type(action) is not np.ndarray or action.dtype not in _ACTIONS:
@@ -301,7 +302,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         try:
             y = [float(hi + vi) for hi, vi in zip(self.system.h(self._x), white)]  # type: ignore[arg-type]
         except Exception:
-            components(self.system.h, self._x)  # raises an EquationError
+            components(self.system.h, self._x)  # raises an EquationError that names the fault
             raise
         if self._readings is None:
             return y
@@ -319,7 +320,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return True
 
     def _observation(self, info: dict[str, Any]) -> np.ndarray:
-        if self.observe == "state":  # within the bounds by construction
+        if self.observe == "state":  # always within the bounds
             obs: np.ndarray = info["x"].astype(_FLOAT32)
         else:
             y = self._y if self._readings is None else self._held

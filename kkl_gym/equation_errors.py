@@ -1,4 +1,4 @@
-"""What went wrong in the equations that a user wrote, in words: system, equation, file and line, argument, way out."""
+"""Messages for errors in a user's equations: they name the system, the equation, its line, its argument and a fix."""
 
 import inspect
 import re
@@ -17,7 +17,7 @@ from kkl_gym.user_lines import line_of, path_of, steps_within, text_of
 
 METHODS = ("f", "g", "h", "rate", "step", "reward", "terminated")
 _SERVING = "floats, arrays, tensors and symbols"
-# Functions that fail on some kinds of numbers: what other modules call them, and what kkl_gym.elementary does.
+# Functions of other modules that fail on some types of numbers, and their names in kkl_gym.elementary.
 _FUNCTIONS = {name: name for name in vars(elementary) if not name.startswith("_")} | {
     "max": "maximum", "fmax": "maximum", "amax": "maximum", "Max": "maximum", "min": "minimum", "fmin": "minimum",
     "amin": "minimum", "Min": "minimum", "fabs": "abs", "absolute": "abs", "Abs": "abs", "arctan2": "atan2",
@@ -29,15 +29,15 @@ Equations = Callable[..., Any]
 
 
 class EquationError(ValueError):
-    """A user's equations failed, or returned what they must not.
+    """A user's equations failed, or returned an invalid value.
 
-    The message names the system, the equation, file and line, the argument and the way out. The exception that the
-    equations raised, if they raised one, is the cause.
+    The message names the system, the equation, its file and line, the argument and a fix. If the equations raised an
+    exception, it is the cause.
     """
 
 
 def failed(error: Exception, equations: Equations, *args: Any) -> EquationError:
-    """Say that equations raised an exception."""
+    """The error for equations that raised an exception."""
     what, x = f"{type(error).__name__}: {error}", args[0]
     steps = steps_within(error, code_of(equations))
     if not steps:
@@ -49,19 +49,19 @@ def failed(error: Exception, equations: Equations, *args: Any) -> EquationError:
     frame = steps[0].tb_frame
     local = frame.f_locals.get(next(iter(frame.f_code.co_varnames[1:2]), ""))
     if isinstance(local, tuple | list | np.ndarray) and len(local) == len(x):
-        x = local  # where it failed, which need not be the start of a step
+        x = local  # the state where the equations failed, which may lie inside a step
     return EquationError(
         f"{label(equations)} failed in {line_of(steps[-1])}: {what}; {held(x)}{_hint(error, steps[-1], x)}"
     )
 
 
 def returned(equations: Equations, wanted: str, found: str) -> EquationError:
-    """Say that equations returned something else than they must."""
+    """The error for equations that returned something invalid."""
     return EquationError(f"{_defined(equations)} must return {wanted}; it returned {found}")
 
 
 def label(equations: Equations) -> str:
-    """Name and argument of equations, and whose they are."""
+    """Name, arguments and system of equations."""
     system = getattr(getattr(equations, "__self__", None), "name", None)
     return signature(equations) + ("" if system is None else f" of {system!r}")
 
@@ -72,7 +72,7 @@ def signature(equations: Equations, first: str = "") -> str:
 
 
 def name_of(equations: Equations) -> str:
-    """The name of a method, which may have been assigned from a function of another name."""
+    """The name of a method, also if it was assigned from a function with another name."""
     function, kind = getattr(equations, "__func__", None), type(getattr(equations, "__self__", None))
     names = (name for name in METHODS if function and getattr(kind, name, None) is function)
     return next(names, getattr(equations, "__name__", "equations"))
@@ -84,7 +84,7 @@ def code_of(equations: Equations) -> CodeType | None:
 
 
 def held(x: Any) -> str:
-    """What the components of a state were."""
+    """A text with the components of a state."""
     first = x[0]
     for library, kind, plural in (("torch", "Tensor", "tensors"), ("numpy", "ndarray", "arrays")):
         if is_of(library, kind, first):
@@ -96,7 +96,7 @@ def held(x: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value, but of an array its shape."""
+    """A value as text; for an array its shape."""
     if isinstance(value, np.ndarray) or is_of("torch", "Tensor", value):
         return f"an array of shape {tuple(value.shape)}" if value.ndim else repr(value.item())
     return reprlib.repr(value)
@@ -110,7 +110,7 @@ def is_sequence(value: Any) -> bool:
 
 
 def is_of(library: str, kind: str, value: Any) -> bool:
-    """Whether a value is of a library's type, which then has been imported already."""
+    """Whether a value is of this type of a library; the library is not imported for it."""
     module = sys.modules.get(library)
     return module is not None and isinstance(value, getattr(module, kind))
 
@@ -124,7 +124,7 @@ def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     on_floats = isinstance(x[0], Real)
     called = re.findall(r"(?:(?:math|cmath|np|numpy|torch|sympy)\.|(?<![\w.]))(\w+)\(", text_of(step))
     known = [_FUNCTIONS[name] for name in called if name in _FUNCTIONS]
-    # On floats, math.sqrt(-1) fails; abs of the whole state does so for another reason.
+    # math.sqrt(-1) fails on floats, and the hint helps. A TypeError on floats, as of abs(x), has another reason.
     if known and not (on_floats and isinstance(error, TypeError)):
         return f": use kkl_gym.elementary.{known[0]}, which serves {_SERVING}"
     if "truth value" in str(error) or "Boolean value" in str(error):

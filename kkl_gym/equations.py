@@ -1,4 +1,4 @@
-"""Equations that a user wrote, called with a check of what they return; fast loops call :func:`blame` on errors."""
+"""Calls of a user's equations that check the returned values; fast loops call :func:`blame` after an error."""
 
 import math
 from numbers import Real
@@ -26,7 +26,7 @@ _POWERS = "take fractional powers of negative numbers by kkl_gym.elementary.sqrt
 
 
 def components(equations: Equations, *args: Any) -> Any:
-    """Call a system's f, h or step with nx floats (``step``: and nu), and check what comes back."""
+    """Call a system's f, h or step with nx floats (``step``: and nu), and check the returned components."""
     values, x = _called(equations, *args), args[0]
     if name_of(equations) in ("f", "step"):
         n, wanted = len(x), f"{len(x)} components, one for each state"
@@ -37,7 +37,7 @@ def components(equations: Equations, *args: Any) -> Any:
 
 
 def input_matrix(system: Any, x: Any) -> Any:
-    """Call a system's g, and check what comes back. Shapes: ``x`` of length nx; returns (nx, nu)."""
+    """Call a system's g, and check the returned matrix. Shapes: ``x`` of length nx; returns (nx, nu)."""
     rows, nx, nu = _called(system.g, x), len(x), system.nu
     wanted = f"{nx} rows, one for each state, of {nu} components, one for each input"
     if not is_sequence(rows) or len(rows) != nx:
@@ -48,12 +48,12 @@ def input_matrix(system: Any, x: Any) -> Any:
 
 
 def rate_at(system: Any, x: Any) -> Any:
-    """Call a system's rate, and check what comes back. Shapes: ``x`` of length nx."""
+    """Call a system's rate, and check the returned number. Shapes: ``x`` of length nx."""
     return _number_at(system.rate, "one number in 1/s for each state x", x)
 
 
 def check_task(system: Any, x: Any, u: Any) -> list[Any]:
-    """Call a system's reward and terminated, and check what comes back. Shapes: ``x`` and ``u`` of length nx and nu."""
+    """Call a system's reward and terminated, and check the returned values. Shapes: ``x`` (nx,), ``u`` (nu,)."""
     wanted = "a bool or a comparison such as x[0] > 1 for each state x"
     ended = _number_at(system.terminated, wanted, x)
     if np.asarray(ended).dtype.kind != "b":
@@ -69,7 +69,7 @@ def _number_at(equations: Equations, wanted: str, *args: Any) -> Any:
 
 
 def check_equations(system: Any) -> None:
-    """Check what a system's equations return at a few starts, one by one on floats and all at once on arrays."""
+    """Check the values of a system's equations at a few starts, one by one on floats and all at once on arrays."""
     names = ["step", "h", "rate"] if system.discrete else ["f", "h", "g", "rate"]
     names += ["reward", "terminated"] if system.states_task else []
     for name in names[:2]:
@@ -81,7 +81,7 @@ def check_equations(system: Any) -> None:
         each = [_values(system, name, x, [0.0] * system.nu) for x in map(tuple, starts.tolist())]
         for value in each[0]:
             if isinstance(value, np.floating) and value.itemsize < 8:
-                found = f"{value!r}, and would make a whole motion that coarse: write constants as Python's numbers"
+                found = f"{value!r}, whose precision a whole motion would inherit: write constants as Python's numbers"
                 raise returned(equations, "floats of double precision", found)
         alone = np.array(each, dtype=float)
         wrong = ~np.isfinite(alone).all(1) | ((alone < 0).any(1) if name == "rate" else False)
@@ -104,12 +104,12 @@ def check_equations(system: Any) -> None:
     try:
         target_of(system)
     except EquationError as error:
-        if not isinstance(error.__cause__, ValueError):  # no target at these parameters: environments raise
+        if not isinstance(error.__cause__, ValueError):  # there is no target; environments raise this
             raise
 
 
 def _values(system: Any, name: str, x: Any, u: Any) -> list[Any]:
-    """All numbers that an equation returns, checked."""
+    """All numbers that an equation returns, after checks."""
     if name == "g":
         return [value for row in input_matrix(system, x) for value in row]
     if name == "rate":
@@ -125,7 +125,7 @@ def _checked_starts(system: Any) -> np.ndarray:
     n, low, high = 5, *np.array(system.bounds, dtype=float).T
     try:
         starts = np.asarray(system.draw_starts(np.random.default_rng(0), n))
-    except Exception as error:  # whatever a user's code raises
+    except Exception as error:  # a user's code may raise anything
         raise _unfinished(f"draw_starts(rng, n) of {system.name!r}", error) from error
     if starts.shape != (n, system.nx) or starts.dtype.kind not in "iuf":
         wanted = f"an array of numbers of shape (n, {system.nx})"
@@ -136,11 +136,11 @@ def _checked_starts(system: Any) -> np.ndarray:
 
 
 def target_of(system: Any) -> Any:
-    """A system's target, checked."""
+    """Return a system's target after a check."""
     found, nx = f"target of {system.name!r}", system.nx
     try:
         target = system.target
-    except Exception as error:  # whatever a user's code raises
+    except Exception as error:  # a user's code may raise anything
         raise _unfinished(found, error) from error
     if callable(target):
         raise EquationError(f"{found} is a method: write @property above its def")
@@ -155,25 +155,25 @@ def _unfinished(what: str, error: Exception) -> EquationError:
 
 
 def blame(error: Exception, system: Any, *args: Any) -> None:
-    """Raise an EquationError if an exception comes from a system's equations of motion, and return otherwise."""
+    """Raise an EquationError if an exception comes from a system's equations of motion, otherwise return."""
     if isinstance(error, EquationError | NotImplementedError):
         return
     for equations in (system.step, system.f, system.g, system.rate):
         if not _is_default(equations) and steps_within(error, code_of(equations)):
             raise failed(error, equations, *args) from error
-    with np.errstate(all="ignore"):  # what they return then did not go through
+    with np.errstate(all="ignore"):  # otherwise a returned value is at fault
         if system.discrete:
             components(system.step, *args)
         else:
             components(system.f, args[0])
             input_matrix(system, args[0])
             rate_at(system, args[0])
-    if isinstance(error, TypeError) and "complex" in str(error):  # numbers that cannot be compared
+    if isinstance(error, TypeError) and "complex" in str(error):  # complex numbers cannot be compared
         raise complex_motion(system, args[0]) from error
 
 
 def complex_motion(system: Any, x: Any) -> EquationError:
-    """Say that a motion left the real numbers, as ``x ** 0.5`` does for floats below zero."""
+    """The error for a motion that became complex, as ``x ** 0.5`` does for negative floats."""
     found = f"complex ones on the way from {held(x)}: {_POWERS}"
     return returned(system.step if system.discrete else system.f, "real numbers", found)
 
@@ -183,7 +183,7 @@ def _called(equations: Equations, *args: Any) -> Any:
         return equations(*args)
     except NotImplementedError:  # its message names the missing method
         raise
-    except Exception as error:  # whatever a user's code raises
+    except Exception as error:  # a user's code may raise anything
         raise failed(error, equations, *args) from error
 
 
@@ -202,7 +202,7 @@ def _check_components(equations: Any, values: Any, n: int | None, *, like: Any, 
 
 
 def _fits(value: Any, like: Any) -> bool:
-    """Whether a value is a number, or of the kind of a component of the state."""
+    """Whether a value is a number, or has the type of a component of the state."""
     if isinstance(value, Real | np.bool_):
         return True
     if is_of("torch", "Tensor", like):

@@ -1,4 +1,4 @@
-"""What identifies an environment: its id, its arguments and its sampling interval."""
+"""The identity of an environment: its id, its arguments and its sampling interval."""
 
 import json
 import math
@@ -12,18 +12,18 @@ from kkl_gym.sensor import Sensor
 from observers import Artifact, ArtifactError
 from observers.checks import is_finite, shown
 
-# Arguments that change nothing of the plant; the last three are those of vectors.
+# Arguments that do not change the plant; the last three belong to vector environments.
 APPEARANCE = ("render_mode", "max_episode_steps", "num_envs", "vectorization_mode", "autoreset_mode")
 Env = gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]
 
 
 def source_of(env: Any) -> str:
-    """What messages call an environment: its id, or its class."""
+    """The name of an environment in messages: its id, or its class."""
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
 
 
 def check_autoreset(env: Any) -> None:
-    """Raise ValueError if a wrapper inside begins the next episode by itself, at a step."""
+    """Raise ValueError if a wrapper inside starts the next episode by itself, at a step."""
     base = env.unwrapped
     for one in base.envs if isinstance(base, gym.vector.SyncVectorEnv) else [env]:
         while isinstance(one, gym.Wrapper):
@@ -46,7 +46,7 @@ def identity(env: Env) -> dict[str, Any]:
 def _identity(spec: Any, env: Env) -> dict[str, Any]:
     if spec is None:
         raise ValueError(
-            f"{shown(env)} has no specification, which is what identifies an environment: register it, and make it by "
+            f"{shown(env)} has no specification, and only that identifies an environment: register it, and make it by "
             "gym.make(ID)"
         )
     kwargs = {name: value for name, value in spec.kwargs.items() if name not in APPEARANCE}
@@ -61,7 +61,7 @@ def _identity(spec: Any, env: Env) -> dict[str, Any]:
 
 
 def sampling_interval(env: Env) -> float:
-    """Seconds between the samples of an environment, by its attribute ``dt``; 1 where it has none."""
+    """Seconds between the samples of an environment: its attribute ``dt``, or 1 without this attribute."""
     base: Any = env.unwrapped
     if _of_rows(base):
         dt = base.get_attr("dt")[0] if all(base.call("has_wrapper_attr", "dt")) else None
@@ -71,12 +71,12 @@ def sampling_interval(env: Env) -> float:
 
 
 def _of_rows(base: Any) -> bool:
-    """Whether it is a vector of environments, which can be asked one by one."""
+    """Whether an environment is a vector whose environments can be called one by one."""
     return isinstance(base, gym.vector.SyncVectorEnv | gym.vector.AsyncVectorEnv)
 
 
 def check_identity(artifact: Artifact, env: Env) -> None:
-    """See that an observer was made for an environment."""
+    """Raise ArtifactError unless an observer was made for an environment."""
     made: Mapping[str, Any] = artifact.environment or {}
     found = identity(env)
 
@@ -96,7 +96,7 @@ def check_identity(artifact: Artifact, env: Env) -> None:
 
 
 def how_to_make_one(name: str) -> str:
-    """What makes an observer for an environment, for messages."""
+    """The commands that make an observer for an environment, for messages."""
     return (
         f"an observer is learned by `kkl-gym record {name} --measured ... --hidden ...` and `kkl-gym train NAME --data "
         "minari:DATASET`; kkl_gym.KKLMemory needs none"

@@ -1,4 +1,4 @@
-"""Finding a user's class by where it is written."""
+"""Load a user's class or function from ``module:Name`` or ``script.py:Name``."""
 
 import contextlib
 import hashlib
@@ -16,7 +16,7 @@ Class = TypeVar("Class")
 
 
 def load_class(name: str, base: type[Class]) -> type[Class]:
-    """Find a subclass by where it is written; a script that defines one alone needs no name of it."""
+    """Load a subclass of ``base``; a script that defines only one needs no class name."""
     where, _, class_name = name.rpartition(":") if ":" in name else (name, "", "")
     failure = f"cannot load the {base.__name__.lower()} {name!r}"
     module = _imported(where, failure)
@@ -34,7 +34,7 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
 
 
 def load_function(name: str) -> Callable[..., Any]:
-    """Find a function by where it is written."""
+    """Load a function."""
     where, _, called = name.rpartition(":")
     failure = f"cannot load the function {name!r}"
     function = getattr(_imported(where, failure), called, None)
@@ -44,7 +44,7 @@ def load_function(name: str) -> Callable[..., Any]:
 
 
 def _is_own(value: Any, base: type, module: str) -> bool:
-    """Whether a value is a subclass that a module, or a package's part, defines itself."""
+    """Whether a value is a subclass that a module, or a submodule of it, defines itself."""
     return (
         inspect.isclass(value)
         and issubclass(value, base)
@@ -54,10 +54,10 @@ def _is_own(value: Any, base: type, module: str) -> bool:
 
 
 def _imported(where: str, failure: str) -> Any:
-    """The module at a place, or a ValueError that begins with what failed for it."""
+    """Import a module or script; ``failure`` begins the message of the ValueError if that fails."""
     try:
         return _module(where)
-    except Exception as error:  # whatever a user's script raises
+    except Exception as error:  # a user's script may raise anything
         line = user_line(error)
         raise ValueError(f"{failure}: {f'{line}: {type(error).__name__}: ' if line else ''}{error}") from error
 
@@ -65,10 +65,10 @@ def _imported(where: str, failure: str) -> Any:
 def _module(where: str) -> Any:
     if not where.endswith(".py"):
         if not where or where.startswith("."):
-            raise ImportError(f"{where!r} is no absolute module name")
+            raise ImportError(f"{where!r} is not an absolute module name")
         with _importing_from(Path.cwd()):
             found = importlib.import_module(where)
-        vars(found).setdefault("__kkl_gym_script__", where)  # worker processes look where this one did
+        vars(found).setdefault("__kkl_gym_script__", where)  # worker processes load the same file
         return found
     path = Path(where).resolve()
     key = f"_kkl_gym_script_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"
@@ -90,7 +90,7 @@ def _module(where: str) -> Any:
 
 @contextlib.contextmanager
 def _importing_from(folder: Path) -> Iterator[None]:
-    """Let imports find modules beside the one imported, as python does for a script it runs."""
+    """Let a script import modules from its own folder, as Python does for a script that it runs."""
     sys.path.insert(0, str(folder))
     try:
         yield

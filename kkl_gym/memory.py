@@ -1,4 +1,4 @@
-"""A linear memory of signals at equal steps: what outputs and inputs were, in a few numbers for each."""
+"""A linear memory of sampled signals: a few numbers for each output and input summarise its past."""
 
 import math
 from collections.abc import Sequence
@@ -12,34 +12,34 @@ from observers import LinearFilter
 from observers.checks import real_array, shown
 
 SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
-CLOSEST = 1.5  # ratio of neighbouring ones; closer ones hold the same, and their coordinates would be rounding errors
-IMAGINED = 64  # steps before the first output
-SMALL = 200  # coordinates, up to which one product advances a single row faster than several calls of NumPy do
-FILLED = 20  # longest time constants, after which e^-20 of the past is left
+CLOSEST = 1.5  # ratio of neighbouring ones; the coordinates of closer ones would be rounding errors
+IMAGINED = 64  # steps before the first output in which the outputs are assumed to have changed
+SMALL = 200  # up to so many coordinates, one product advances a single row faster than several calls of NumPy
+FILLED = 20  # in longest time constants: after so many, only e^-20 of the past is left
 TURN = 2 * math.pi
 
 
 class Memory:
     """Exact first-order filters of signals, in coordinates that are uncorrelated and as large as the signals.
 
-    For each output y and time constant tau the low-pass z' = (y - z) / tau is integrated exactly, y being linear
-    between samples. What counts is w = y - z, which is 0 where y rests, whatever its value:
-    w_k+1 = decay w_k + rise (y_k+1 - y_k). For each input u and time constant of inputs it is the low-pass
-    v' = (u - v) / tau itself, u being held.
+    For each output y and time constant tau, the low-pass filter z' = (y - z) / tau is integrated exactly, with y linear
+    between samples. The memory uses w = y - z, which is 0 where y rests, whatever its value:
+    w_k+1 = decay w_k + rise (y_k+1 - y_k). For each input u and time constant of inputs, the memory uses the low-pass
+    filter v' = (u - v) / tau itself, with u held between samples.
 
-    The past before the first output is unknown. y is taken to have rested until 64 steps before it, and then
-    to have changed as fast as since, in the mean as each filter weighs it. At the age of k steps this multiplies w by
-    (1 - decay^(k + 64)) / (1 - decay^k). No input is taken to have acted.
+    The past before the first output is unknown. The memory assumes that y rested until 64 steps before it, and from
+    then on changed at the mean rate of the steps since, as each filter weights them. After k steps this assumption
+    multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also assumes that no input acted.
 
-    For a slow signal all w are nearly tau times its rate. So the memory holds combinations of them: the slowest first,
-    and of each faster one the part that slower ones lack. They are uncorrelated and as large as y if y
-    wanders as an Ornstein-Uhlenbeck process does, with a correlation time from twice the shortest time constant to
-    eight times the longest. White noise on y is amplified at most threefold in the end, and more at first, where a rate
-    rests on few samples: by the default time constants 22-fold in the first step, and fourfold in the fifth.
+    For a slow signal every w is nearly tau times its rate. So the memory returns combinations: the slowest w first, and
+    of each faster one the part that the slower ones do not explain. These coordinates are uncorrelated and as large as
+    y if y is an Ornstein-Uhlenbeck process with a correlation time from twice the shortest time constant to eight times
+    the longest. In the long run they amplify white noise on y at most threefold. At first they rest on few samples and
+    amplify it more: with the default time constants 22-fold in the first step, and fourfold in the fifth.
 
-    Of an angle that is measured by its cosine and its sine, the angle itself is filtered, unwrapped. It is taken to
-    turn by less than half a turn from one sample to the next, and to rest where cosine and sine are both 0. Memories of
-    angles come after those of the other outputs.
+    If an angle is measured by its cosine and its sine, the memory filters the unwrapped angle itself. It assumes that
+    the angle turns by less than half a turn from one sample to the next, and rests where cosine and sine are both 0.
+    Memories of angles come after those of the other outputs.
 
     Shapes: ``angles``, indices of cosines and sines, (number of angles, 2); ``decay``, ``rise`` (m,), ``mixing``
     (m, m), ``input_decay`` (k,); outputs, inputs and the coordinates returned (..., ny), (..., nu), (..., size).
@@ -66,12 +66,12 @@ class Memory:
         self._cosines, self._sines = pairs.T
         self._others = np.setdiff1d(np.arange(ny), pairs)
         self._ny, self._nu = ny, nu
-        self.size = ny + (len(self._others) + len(pairs)) * m + nu * len(self.input_decay)  # of the coordinates
+        self.size = ny + (len(self._others) + len(pairs)) * m + nu * len(self.input_decay)  # number of coordinates
         ages = np.arange(FILLED * math.ceil(self.time_constants[-1]))[:, None]
         with np.errstate(under="ignore"):
             self._with_past = (1 - self.decay ** (ages + IMAGINED)) / (1 - self.decay ** np.maximum(ages, 1))
-        self._y: np.ndarray | None = None  # (..., ny); there are w, (m, ..., signals), and v, (k, ..., nu)
-        self._row: np.ndarray | None = None  # [signals, w, v] of a single small one, of which the three are views
+        self._y: np.ndarray | None = None  # (..., ny); w has the shape (m, ..., signals), v (k, ..., nu)
+        self._row: np.ndarray | None = None  # of a single small memory: [signals, w, v], which are views of it
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +88,7 @@ class Memory:
         return update, combine
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Forget all, as if outputs (..., ny) had rested at ``y0`` and no input had acted."""
+        """Begin with outputs ``y0`` (..., ny), as if they had rested there and no input had acted."""
         self._y = y0.copy()
         self._signals = self._read(self._y, 0.0)
         self._w = np.zeros((len(self.decay), *self._signals.shape))
@@ -104,7 +104,7 @@ class Memory:
         return self.shown()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Forget the past in rows (n,) of a batch, whose first outputs are ``y0`` (number of True in rows, ny)."""
+        """Begin again in rows (n,) of a batch; their first outputs are ``y0`` (number of True in rows, ny)."""
         if self._y is None:
             raise RuntimeError("reset all environments before some of them")
         self._y[rows], self._signals[rows] = y0, self._read(y0, 0.0)
@@ -112,7 +112,7 @@ class Memory:
         return self.shown(rows)
 
     def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """Take in the next outputs (..., ny), and the inputs (..., nu) that led to them, in some rows or in all."""
+        """Add the next outputs (..., ny), and the inputs (..., nu) that led to them, in some rows or in all."""
         if self._row is not None:
             self._y, self._ages = y.copy(), self._ages + 1
             signals = self._read(y, self._signals[len(self._others) :])
@@ -138,14 +138,14 @@ class Memory:
             raise RuntimeError("reset the environment before its first step")
 
     def _read(self, y: np.ndarray, before: np.ndarray | float) -> np.ndarray:
-        """The signals that are filtered: the other outputs, then the angles."""
+        """The signals that are filtered: first the outputs that measure no angle, then the angles."""
         if not len(self._cosines):
             return y
         angles = turned(y.take(self._cosines, -1), y.take(self._sines, -1), before)
         return np.concatenate((y.take(self._others, -1), angles), axis=-1)
 
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """The outputs and the memory of them and of the inputs, (..., size), of all rows or some."""
+        """Outputs, their memory and that of the inputs, (..., size), in all rows or some."""
         self._check_begun()
         w, filled = self._w, len(self._with_past)
         if self._row is not None:
@@ -166,17 +166,17 @@ class Memory:
 
 
 def turned(cosines: np.ndarray, sines: np.ndarray, before: np.ndarray | float) -> np.ndarray:
-    """Angles in rad within half a turn of those before, which stay where cosine and sine are both 0."""
+    """Unwrapped angles in rad, within half a turn of those before; unchanged where cosine and sine are both 0."""
     angles = np.arctan2(sines, cosines)
     nearest = angles - TURN * np.rint((angles - before) / TURN)
     return np.where((cosines == 0) & (sines == 0), before, nearest)
 
 
 def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Gram's and Schmidt's, from the slowest w on, for the mean covariance of w over correlation times of y."""
+    """Gram-Schmidt matrix from the slowest w on, for the covariance of w averaged over correlation times of y."""
     covariance = np.zeros((len(decay), len(decay)))
     for correlation in np.geomspace(2 * time_constants[0], 8 * time_constants[-1], 6):
-        forgotten = -math.expm1(-1 / correlation)  # of y, whose variance is 1, in a step
+        forgotten = -math.expm1(-1 / correlation)  # the share of y, of variance 1, that decorrelates in a step
         with_y = (
             rise * forgotten / (1 - decay * (1 - forgotten))
         )  # E[w y], and E[w (y_k+1 - y_k)] is -forgotten times it
@@ -188,7 +188,7 @@ def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray
 
 
 def output_time_constants(name: str, values: Any) -> tuple[float, ...]:
-    """Return time constants of outputs as floats; raises ValueError if they are not as :class:`Memory` takes them."""
+    """Return time constants of outputs as floats; ValueError unless :class:`Memory` takes them."""
     found = _time_constants(name, values)
     if not found:
         raise ValueError(f"{name} must name at least one, in steps, such as (1, 2, 4, 8)")
@@ -202,7 +202,7 @@ def _time_constants(name: str, values: Any) -> tuple[float, ...]:
         raise ValueError(f"{name} must be a sequence of numbers of steps, such as (1, 2, 4, 8), got {shown(values)}")
     found = tuple(array.tolist())
     for value in found:
-        if not SHORTEST <= value <= LONGEST:  # nor is NaN
+        if not SHORTEST <= value <= LONGEST:  # true for NaN
             raise ValueError(f"{name} must be from {SHORTEST:g} to {LONGEST:,.0f} steps each, got {value:g}")
     for one, next_one in pairwise(found):
         if next_one < (1 - 1e-9) * CLOSEST * one:

@@ -28,7 +28,7 @@ def observed(space: Space) -> tuple[str, ...]:
 
 
 def acting(space: Space) -> tuple[str, ...]:
-    """Names of the inputs of a flattened action, ``action[0]`` and so on; those of discrete ones are one-hot."""
+    """Names of the inputs of a flattened action, ``action[0]`` and so on; discrete actions count as one-hot."""
     return tuple(f"action[{i}]" for i in range(_size(space)))
 
 
@@ -40,7 +40,7 @@ def _size(space: Space) -> int:
 
 
 def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str) -> tuple[str, ...]:
-    """Full names of signals."""
+    """Full names of signals, as in ``obs[2]`` for 2; ValueError if one is unknown."""
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise ValueError(f"{role} must be a sequence of names or indices, such as [0, 1], got {shown(names)}")
     there, found = observed(space), list[str]()
@@ -59,7 +59,7 @@ def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str
 
 
 def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]:
-    """The entries that a name without a function stands for; empty if it names no entry."""
+    """The entries that a name without cos or sin stands for; empty if it names no entry."""
     if name in there or _INFO.fullmatch(name):
         return (name,)
     if index := _INDEX.fullmatch(name):
@@ -71,7 +71,7 @@ def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]
 
 
 class Reader:
-    """Reads named signals from observations and ``info``; they may be NaN if ``missing``. Shapes: ``low`` (n,)."""
+    """Reads named signals from observations and ``info``. With ``missing`` they may be NaN. Shapes: ``low`` (n,)."""
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str, missing: bool = False) -> None:
         there, self._source = observed(space), source
@@ -84,7 +84,7 @@ class Reader:
         columns = [there[i] for i in chosen]
         self._outputs = None
         low, high = np.zeros(0), np.zeros(0)
-        if chosen and isinstance(space, spaces.Dict):  # of the keys that are read alone: others may be images
+        if chosen and isinstance(space, spaces.Dict):  # only the keys that are read: others may be images
             owners = [key for key, part in space.items() for _ in range(_size(part))]
             read = spaces.Dict({key: space[key] for key in dict.fromkeys(owners[i] for i in chosen)})
             space, chosen = read, [observed(read).index(column) for column in columns]
@@ -127,7 +127,7 @@ class Reader:
 
 
 def _info(entry: str) -> tuple[str, int | None]:
-    """The key in ``info``, and the index in its value."""
+    """The key in ``info``, and the index within its value, or None."""
     found = _INFO.fullmatch(entry)
     if found is None:
         raise ValueError(f"there is no entry {entry!r}")
@@ -145,7 +145,7 @@ class InputReader:
         self._take = np.array([there.index(name) for name in names], dtype=int)
 
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The inputs, (*batch, n): bounded boxes scaled to [-1, 1] and cut there, discrete actions one-hot."""
+        """The inputs, (*batch, n): bounded boxes scaled to [-1, 1] and clipped, discrete actions one-hot."""
         return self._inputs(action, batch)[..., self._take]
 
 

@@ -1,4 +1,4 @@
-"""A system sampled under noise: what single and vector environments share."""
+"""The plant of single and vector environments: a system that is sampled under noise."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -14,12 +14,12 @@ from kkl_gym.system import Box, Components, System
 from kkl_gym.systems import get_system
 from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
-_MOST_POINTS = 1000  # at which outputs are evaluated for their bounds, of each kind
-NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single draws cost more than the simulation
+_MOST_POINTS = 1000  # of each kind, at which h is evaluated to bound the outputs
+NOISE_BLOCK = 256  # samples whose noise is drawn at once, because single draws cost more than the simulation
 
 
 class Plant:
-    """A system, its sampling interval, its noise and the spaces that follow."""
+    """A system, its sampling interval, its noise, its sensor and the spaces that follow from them."""
 
     def __init__(
         self,
@@ -54,10 +54,10 @@ class Plant:
         self.output_space = _float32_box(*(self.sensor.bounds(low, high, noise) if self.sensor else (low, high)))
         self.observation_space = self.state_space if observe == "state" else self.output_space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.system.nu,), np.float32)
-        self.ny = self.system.ny  # kept, as the property evaluates h
+        self.ny = self.system.ny  # stored, because the property evaluates h
         self._v_scale = np.broadcast_to(noise, (self.ny,))
         self._random = self.sensor is not None and self.sensor.is_random
-        if self._random:  # of what a sensor draws nothing is scaled
+        if self._random:  # the sensor's own draws are not scaled
             self._v_scale = np.append(self._v_scale, np.ones(2 * self.ny))
         self.nv = len(self._v_scale)
         self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)
@@ -66,7 +66,7 @@ class Plant:
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Draw samples, (NOISE_BLOCK, nx) and (NOISE_BLOCK, nv), which :meth:`noise` scales."""
-        # A sensor draws from a generator of its own, so that motions and noise of a seed are the same without it.
+        # A sensor draws from its own generator, so that a seed gives the same motions and noise with and without it.
         n, ny = NOISE_BLOCK, self.ny
         w = rng.random((n, len(self._w_range)), out=w)
         if not self._random:
@@ -81,14 +81,14 @@ class Plant:
         return (drawn_w - 0.5) * self._w_range, drawn_v * self._v_scale
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
-        """A start drawn uniformly in ``start_box``, or by the system where it has no box; shape (nx,)."""
+        """A random start, (nx,): uniform in ``start_box``, or by the system's ``draw_starts`` if no box was given."""
         if self._draws:
             return self.start(self.system.draw_starts(rng, 1)[0])
         low, high = self.start_box
         return rng.uniform(low, high)
 
     def start(self, x0: Any) -> np.ndarray:
-        """The start that a user asks for. Shapes: ``x0`` (nx,); returns (nx,)."""
+        """A start that the user gave, after a check. Shapes: ``x0`` (nx,); returns (nx,)."""
         start = real_array("x0", x0)
         low, high = np.array(self.system.bounds).T
         if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():
@@ -97,14 +97,14 @@ class Plant:
 
 
 class OfPlant:
-    """The plant of single and vector environments."""
+    """Base of single and vector environments: their plant and its properties."""
 
     plant: Plant
     _reward: Callable[[Components, Components], Any]
 
     @property
     def system(self) -> System:
-        """The system. Between two steps another may take its place, as ``env.system.replace(...)`` makes it."""
+        """The system. Between two steps it may be exchanged: ``env.system = env.system.replace({...})``."""
         return self.plant.system
 
     @system.setter
@@ -120,11 +120,11 @@ class OfPlant:
             raise
 
     def _exchanged(self) -> None:
-        """Take over what follows from another system."""
+        """Update everything that depends on the system after an exchange."""
         raise NotImplementedError
 
     def _judged(self, x: Components, u: Components) -> tuple[Any, Any]:
-        """Rewards of intervals that ended at x under u, and whether episodes end there: of floats or arrays."""
+        """Rewards of intervals that ended at x under u, and whether episodes end there, of floats or arrays."""
         system = self.plant.system
         try:
             reward, ended = self._reward(x, u), system.terminated(x)
@@ -142,7 +142,7 @@ class OfPlant:
 
 
 def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]:
-    ends = real_array("start_box", system.X if box is None else box).copy()  # it is kept
+    ends = real_array("start_box", system.X if box is None else box).copy()  # a copy, because the plant stores it
     low, high = np.array(system.bounds).T
     if ends.shape != (system.nx, 2):
         raise ValueError(f"start_box must be (low, high) for each of {system.nx} states, got {shown(box)}")
@@ -154,9 +154,10 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
 
 
 def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the output h(x) over the declared bounds of the state, exact if it is monotone in each state."""
-    # At random states, and at corners, faces' centres and the centre, which must have an output. For more than six
-    # states only some of these, and for each output the two corners to which it rises and falls from the centre.
+    """Bounds of h(x) over the declared bounds of the state; exact if h is monotone in each state."""
+    # h is evaluated at random states, and at the corners, the centres of faces and the centre, where it must not be
+    # NaN. For more than six states only some of these are taken, with the two corners towards which each output rises
+    # and falls from the centre.
     low, high = np.array(system.bounds, dtype=float).T
     rng, nx = np.random.default_rng(0), system.nx
     if 3**nx <= _MOST_POINTS:

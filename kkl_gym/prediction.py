@@ -1,4 +1,4 @@
-"""A memory under noise: of the filters it keeps what predicts the next outputs, by least squares on random steps."""
+"""A memory for noisy outputs: combinations of filters that predict later outputs, fitted on random steps."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,16 +8,16 @@ import numpy as np
 from kkl_gym.memory import Memory
 from observers.checks import real_array
 
-CHANCE = 3.0  # variance of a prediction that is kept, in multiples of what as many features predict of mere noise
-SAMPLES = 10  # that the fit needs for each feature
+CHANCE = 3.0  # least variance of a direction to keep, in multiples of the variance that a fit to pure noise would have
+SAMPLES = 10  # least number of samples for each feature of the fit
 
 
 class PredictiveMemory(Memory):
-    """Shows the outputs as expected in the next step, and combinations of the filters that predict later ones.
+    """A memory that returns the outputs expected in the next step, and predictions of later ones.
 
-    The filters are those of :class:`Memory`, over all outputs and angles: cosine and sine stand for a torque
-    that depends on the angle. ``weights``, (features, width), multiply the features [signals, w, v, 1]. The first
-    columns give the expected change of each output or angle, the others are shown as they are.
+    The filters are those of :class:`Memory`, over all outputs and angles. They include cosine and sine themselves, on
+    which a torque may depend. ``weights``, (features, width), multiply the features [signals, w, v, 1]. Their first
+    columns give the expected change of each output or angle, the others the further predictions.
     """
 
     def __init__(
@@ -36,11 +36,11 @@ class PredictiveMemory(Memory):
         self.size = ny + self.weights.shape[1] - len(self._targets)
 
     def features(self) -> np.ndarray:
-        """Signals, filters and a one. Shapes: returns (..., features)."""
+        """Signals, filters and a constant 1. Shapes: returns (..., features)."""
         return np.concatenate([self._signals, *self._w, *self._v, np.ones((*self._ages.shape, 1))], axis=-1)
 
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """The expected outputs and further predictions, (..., size), of all rows or some."""
+        """The expected outputs and the further predictions, (..., size), of all rows or some."""
         self._check_begun()
         predicted = self.features() @ self.weights
         n, plain = len(self._targets), len(self._plain)
@@ -52,9 +52,10 @@ class PredictiveMemory(Memory):
         return out if rows is None else out[rows]
 
     def fit(self, episodes: Sequence[np.ndarray]) -> np.ndarray:
-        """Fit the weights by least squares; shapes of each episode: (samples, features).
+        """Fit the weights by least squares. Shapes: each episode (samples, features).
 
-        Of predictions beyond the next step those directions are kept that stand out of their errors, at unit variance.
+        From the predictions beyond the next step, the fit keeps the directions whose variance exceeds that of their
+        errors clearly, scaled to unit variance.
         """
         horizons = sorted({1, 2, *np.ceil(self.time_constants).astype(int).tolist()})  # in steps
         last = horizons[-1]
@@ -62,7 +63,7 @@ class PredictiveMemory(Memory):
         n, features = x.shape
         if n < SAMPLES * features:
             raise ValueError(
-                f"{n} samples have {last} more after them in their episode, {SAMPLES * features} are needed: take more "
+                f"{n} samples are followed by {last} more in their episode, {SAMPLES * features} are needed: take more "
                 "steps or shorter time constants"
             )
         signals = [episode[:, self._targets] for episode in episodes]
@@ -73,7 +74,7 @@ class PredictiveMemory(Memory):
         weights = np.linalg.lstsq(x / size, change, rcond=1e-9)[0] / size[:, None]
         to_next, to_later = weights[:, : len(self._targets)], weights[:, len(self._targets) :]
         predicted = x @ to_later
-        floor = np.maximum(1e-9 * later.var(0), 1e-12)  # of errors, in a signal that is predicted exactly
+        floor = np.maximum(1e-9 * later.var(0), 1e-12)  # least error variance, for exact predictions
         error = np.atleast_2d(np.cov((later - predicted).T, bias=True)) + np.diag(floor)
         to_white = to_later @ np.linalg.inv(np.linalg.cholesky(error)).T
         mean = (x @ to_white).mean(0)

@@ -1,4 +1,4 @@
-"""The phase portrait that ``render_mode="rgb_array"`` returns and ``render_mode="human"`` shows in a window."""
+"""Phase portraits: images for ``render_mode="rgb_array"``, and a window for ``render_mode="human"``."""
 
 import math
 from collections import deque
@@ -10,28 +10,28 @@ import numpy as np
 from kkl_gym.system import Box, System
 from observers.checks import shown
 
-ESTIMATE, TARGET = "C3", "C2"  # of matplotlib's cycle; states are drawn as text is
+ESTIMATE, TARGET = "C3", "C2"  # colours of matplotlib's cycle; states have the colour of text
 TRAIL = 1000  # samples that a phase portrait shows
-FRAMES = 100  # a second at most, about what players and screens keep up with
-DRAWN = 50  # frames a second at most that a window is drawn, whose time is that of the motion
+FRAMES = 100  # most frames a second in a video, about what players can show
+DRAWN = 50  # most frames a second in a window, which runs in real time
 ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 
 
 def render_metadata(dt: float, modes: Collection[str], render_mode: str | None = None) -> dict[str, Any]:
-    """The modes and the frames a second that show a motion as it is; ValueError if a mode is not among them."""
+    """Metadata with the modes and the real-time frame rate; ValueError if ``render_mode`` is not among the modes."""
     if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
         raise ValueError(f"render_mode must be None or one of {[*modes]}, got {shown(render_mode)}")
     return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
 
 
 class Trails:
-    """The last ``TRAIL`` states of each row of a vector environment, since its episode began."""
+    """The last ``TRAIL`` states of the present episode in each row of a vector environment."""
 
     def __init__(self, num_envs: int) -> None:
         self.rows: list[deque[list[float]]] = [deque(maxlen=TRAIL) for _ in range(num_envs)]
 
     def add(self, states: np.ndarray, samples: np.ndarray) -> None:
-        """Take in one state of each row, (num_envs, nx); sample 0 begins a trail."""
+        """Append one state to each row's trail, (num_envs, nx); sample 0 begins a new trail."""
         for trail, state, sample in zip(self.rows, states.tolist(), samples.tolist(), strict=True):
             if sample == 0:
                 trail.clear()
@@ -59,7 +59,7 @@ class Canvas:
         ax, *below = figure.subplots(len(heights), height_ratios=heights, squeeze=False)[:, 0]
         names = [system.state_names[i] for i in self._states]
         (left, right), (bottom, top) = ((box or system.X)[i] for i in self._states)
-        wide, tall = 0.3 * (right - left), 0.3 * (top - bottom)  # driven or not, motions leave the training box
+        wide, tall = 0.3 * (right - left), 0.3 * (top - bottom)  # margin, because motions leave the training box
         ax.set(xlim=(left - wide, right + wide), ylim=(bottom - tall, top + tall), xlabel=names[0], ylabel=names[1])
         ax.set_title(system.name.replace("_", " ") if title is None else title)
         (target,) = ax.plot(*(system.target[i] for i in self._states), "+", color=TARGET, markersize=12, label="target")
@@ -73,7 +73,7 @@ class Canvas:
         for bar_ax in below:
             bar_ax.set(xlim=(-1, 1), xticks=[-1, 0, 1], yticks=[], xlabel="u / u_max")
             self._bars = bar_ax.barh(range(system.nu), np.zeros(system.nu), color="C0", animated=True)
-        # What does not move is drawn once and kept as an image, so that a frame takes milliseconds.
+        # The background is drawn once and stored as an image, so that a frame takes only milliseconds.
         self._canvas.draw()  # type: ignore[no-untyped-call]
         self._still = self._canvas.copy_from_bbox(figure.bbox)  # type: ignore[no-untyped-call]
 
@@ -83,7 +83,7 @@ class Canvas:
         estimates: Iterable[Sequence[float]] = (),
         u: Sequence[float] | np.ndarray | None = None,
     ) -> np.ndarray:
-        """Draw one frame, (height, width, 3), of states and estimates so far and of the last input."""
+        """Draw one frame, (height, width, 3), with the states and estimates so far and the last input."""
         self._canvas.restore_region(self._still)
         for states, artists in zip((trail, estimates), self._lines, strict=True):
             points = np.array(list(states)).reshape(-1, self._nx)[:, self._states]
@@ -98,7 +98,7 @@ class Canvas:
 
 
 class Window:
-    """A window on the screen that shows a motion as fast as it is: frames that a screen could not show are left out."""
+    """A window that shows a motion in real time; it skips frames that a screen could not show."""
 
     def __init__(self, title: str, dt: float) -> None:
         try:
@@ -111,7 +111,7 @@ class Window:
         self._clock = pygame.time.Clock()
 
     def show(self, frame: np.ndarray) -> None:
-        """Show a frame (height, width, 3) as soon as it is due; opens the window at the first one."""
+        """Show a frame (height, width, 3) when it is due; the first call opens the window."""
         pygame = self._pygame
         if not self._open():
             pygame.display.init()
@@ -129,10 +129,10 @@ class Window:
         self._screen = None
 
     def _open(self) -> bool:
-        """Whether the window is there: a process has one, which another environment or the user may have closed."""
+        """Whether the window is open: a process has only one, and another environment or the user may close it."""
         return self._screen is not None and self._pygame.display.get_surface() is self._screen
 
 
 def samples_a_frame(dt: float) -> int:
-    """How many sampling intervals of ``dt`` seconds there are from one frame of a window to the next."""
+    """Number of sampling intervals of ``dt`` seconds between two frames of a window."""
     return max(1, math.ceil(1.0 / (dt * DRAWN) - 1e-9))

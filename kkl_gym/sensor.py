@@ -1,4 +1,4 @@
-"""A sensor between a system's output and those who read it."""
+"""A sensor between a system's output and its observer or agent."""
 
 import dataclasses
 import math
@@ -11,17 +11,17 @@ import numpy as np
 from kkl_gym.equation_errors import is_sequence
 from observers.checks import integer, is_finite, noise_level, shown
 
-MAX_SAMPLES = 10_000  # of a delay, which are kept for each environment, and from one sample to the next
+MAX_SAMPLES = 10_000  # largest delay and gap between samples, in steps; each environment stores a delay's samples
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """What a sensor makes of an output: y = range(round(gain h(x) + bias + c + v)), late, and not at every step.
+    """A sensor with faults: y = clip(round(gain h(x) + bias + c + v)), possibly delayed or missing at some steps.
 
-    c is coloured noise, first-order: its autocorrelation over t seconds is exp(-t / time_constant). v is the white
-    ``measurement_noise`` of the environment. Every value is a number for all outputs, or a sequence with one for each.
-    A sample that the sensor does not deliver is NaN in ``info["y"]``, where an observer coasts; an observation that
-    shows the output holds the last one. The first sample of an episode is always there.
+    c is first-order coloured noise: its autocorrelation over t seconds is exp(-t / time_constant). v is the white
+    ``measurement_noise`` of the environment. Every parameter is one number for all outputs, or a sequence with one for
+    each. A sample that the sensor does not deliver is NaN in ``info["y"]``, and the observer then predicts without
+    correction. An observation of the output repeats the last sample. The first sample of an episode is never missing.
 
     Parameters
     ----------
@@ -32,22 +32,22 @@ class Sensor:
     coloured_noise : float or sequence of float, length ny
         Standard deviation of c.
     time_constant : float or sequence of float, length ny, optional
-        Of c, in seconds; needed where there is coloured noise.
+        Time constant of c in seconds; required with coloured noise.
     quantum : float or sequence of float, length ny
         Resolution: y is rounded to multiples of it. 0 does not round.
     saturation : tuple of (low, high), optional
-        Limits that y does not leave, each a number or a sequence of length ny.
+        Limits to which y is clipped, each a number or a sequence of length ny.
     delay : int or sequence of int, length ny
-        Steps by which samples arrive late. Before the first one has arrived, the sensor reads what it read at reset.
+        Steps by which samples arrive late. Before the first one has arrived, the sensor repeats its reading at reset.
     drop_out : float or sequence of float, length ny
         Probability, below 1, with which a sample is lost, independently of others.
     every : int or sequence of int, length ny
-        Only every so many-th step has a sample.
+        Number of steps from one sample to the next; 1 has a sample at every step.
 
     Raises
     ------
     ValueError
-        If a value is not as described.
+        If a parameter is not as described.
 
     Examples
     --------
@@ -99,7 +99,7 @@ class Sensor:
         return bool(np.any(self.coloured_noise) or np.any(self.drop_out))
 
     def columns(self, ny: int) -> dict[str, np.ndarray]:
-        """All values by name, one for each output, (ny, 1); without limits infinite, without time constant 1."""
+        """All parameters by name, one for each output, (ny, 1). Missing limits are infinite, time constants 1."""
         low, high = (-math.inf, math.inf) if self.saturation is None else self.saturation
         given = vars(self) | {"low": low, "high": high, "time_constant": self.time_constant or 1.0}
         del given["saturation"]
@@ -112,7 +112,7 @@ class Sensor:
         return {name: np.broadcast_to(np.array(value), ny)[:, None] for name, value in given.items()}
 
     def bounds(self, low: np.ndarray, high: np.ndarray, noise: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of y for bounds (ny,) of h(x), widened by six standard deviations of all noise."""
+        """Bounds of y for bounds (ny,) of h(x), widened by six standard deviations of the total noise."""
         of = {name: column[:, 0] for name, column in self.columns(len(low)).items()}
         ends = of["gain"] * np.stack([low, high]) + of["bias"]
         margin = 6.0 * np.hypot(noise, of["coloured_noise"]) + of["quantum"] / 2
@@ -120,7 +120,7 @@ class Sensor:
 
 
 def sensor_of(value: Any) -> Sensor | None:
-    """The sensor that is given as one or as a mapping, or None."""
+    """A Sensor from a Sensor, a mapping of its parameters, or None."""
     if value is None or isinstance(value, Sensor):
         return value
     names = [field.name for field in dataclasses.fields(Sensor)]
@@ -133,7 +133,7 @@ def sensor_of(value: Any) -> Sensor | None:
 
 
 class Readings:
-    """What the sensors of n environments read, and what they keep for that: coloured noise, and late samples."""
+    """The sensors of n environments at run time, with their coloured noise and their delayed samples."""
 
     def __init__(self, sensor: Sensor, ny: int, dt: float, n: int) -> None:
         self._of = of = sensor.columns(ny)
@@ -142,15 +142,15 @@ class Readings:
         self._fresh = np.sqrt(-np.expm1(-2 * dt / of["time_constant"]))
         self._rounded = bool(of["quantum"].any())
         self._quantum = np.where(of["quantum"] > 0, of["quantum"], 1.0)
-        self._noise = np.zeros((ny, n))  # of variance 1
+        self._noise = np.zeros((ny, n))  # coloured noise with variance 1
         self._age = np.zeros(n, dtype=np.int64)  # steps since reset
-        self._kept = np.zeros((int(of["delay"].max()) + 1, ny, n))  # the latest samples, at their age modulo its length
+        self._kept = np.zeros((int(of["delay"].max()) + 1, ny, n))  # ring buffer of the latest samples
 
-    @np.errstate(over="ignore", invalid="ignore")  # of states that have escaped
+    @np.errstate(over="ignore", invalid="ignore")  # states that escaped may overflow
     def read(self, h: np.ndarray, v: np.ndarray, rows: np.ndarray | None = None, *, start: bool) -> np.ndarray:
-        """Samples of ``rows`` (m,), at the start of episodes or a step later: (ny, m), NaN where one is missing.
+        """Samples of ``rows`` (m,) at an episode's start or at its next step: (ny, m), NaN where one is missing.
 
-        Shapes: ``h`` (ny, m), ``v`` (ny, m) or (3 ny, m): white noise, and the draws of a random sensor.
+        Shapes: ``h`` (ny, m), ``v`` (ny, m) or, for a random sensor, (3 ny, m): white noise and the sensor's draws.
         """
         rows, of, drawn = self._everyone if rows is None else rows, self._of, len(v) > self._ny
         white, fresh, chance = np.split(v, 3) if drawn else (v, None, None)
@@ -171,7 +171,7 @@ class Readings:
             lost |= chance < of["drop_out"]
         y[lost] = np.nan
         length = len(self._kept)
-        if length == 1:  # nothing is late
+        if length == 1:  # no delay
             return y
         self._kept[age % length, :, rows] = y.T
         return self._kept[(age - of["delay"]) % length, self._outputs, rows]

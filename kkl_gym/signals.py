@@ -1,4 +1,4 @@
-"""The real signals in values of Gymnasium's spaces, one or a batch of them: measured outputs, inputs that act."""
+"""Measured outputs and inputs as rows of real numbers, from values of Gymnasium's spaces, single or in batches."""
 
 import copy
 import math
@@ -16,17 +16,17 @@ Space = gym.Space[Any]
 Entries = Sequence[int] | Sequence[str]
 """Indices in a flattened observation, or keys of a Dict."""
 Angles = Sequence[int | Sequence[int]] | Sequence[str | Sequence[str]]
-"""Entries that are angles, and pairs of entries that are the cosine and the sine of one."""
+"""Entries that are angles, and pairs of entries that are the cosine and the sine of an angle."""
 TURN = 2 * math.pi
-UNITS = 1.0, 2.0, 4.0  # widths of bounds that are as likely in turns or half turns as in rad
+UNITS = 1.0, 2.0, 4.0  # widths of bounds from which the unit is not clear: turns, half turns or rad
 
 
 class Outputs:
     """The measured outputs in an environment's observations.
 
-    Observations are read as :func:`gymnasium.spaces.flatten` writes them: boxes row by row, the parts of a Dict or
-    Tuple one after the other, Discrete ones one-hot. Keys of a Dict that are not measured, and images among those that
-    are, are not read.
+    The order is that of :func:`gymnasium.spaces.flatten`: boxes row by row, the parts of a Dict or Tuple one after the
+    other, and Discrete values one-hot. Keys of a Dict that are not measured are not read, nor are images among its
+    measured keys.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Outputs:
         if self.measured and keys:
             _check_keys("measured", self.measured, self._parts)
             self._parts = {key: part for key, part in self._parts.items() if key in self.measured}
-        # The keys that an agent sees, as they are; None of other observations, and where indices choose signals.
+        # The keys of a Dict that an agent sees unchanged; None for other observations, or if indices choose entries.
         self.keys = dict(self._parts) if isinstance(space, spaces.Dict) and (keys or not self.measured) else None
         if self.keys is not None:
             self._parts = {key: part for key, part in self._parts.items() if not _is_image(part)}
@@ -63,7 +63,7 @@ class Outputs:
         if not owners:
             raise ValueError(f"{self._source} holds no numbers: there is nothing to remember")
         low, high = (np.concatenate(side) for side in zip(*map(_limits, self._parts.values())))
-        self._names = [  # of the entries, for messages
+        self._names = [  # names of the entries in messages
             f"entry {i}" if key is None else f"entry {i - owners.index(key)} of {key!r}" for i, key in enumerate(owners)
         ]
         taken = list(range(len(owners)))
@@ -71,7 +71,7 @@ class Outputs:
             taken = _positions("measured", self.measured, owners)
         each = [angle if isinstance(angle, tuple) else (angle,) for angle in self.angles]
         if keys and each and not isinstance(each[0][0], str):
-            raise ValueError(f"angles must be keys, as measured is, got {self.angles}")
+            raise ValueError(f"angles must be keys, as those of measured are, got {self.angles}")
         at = [tuple(_positions("angles", (entry,), owners) for entry in angle) for angle in each]
         if not {i for angle in at for entry in angle for i in entry} <= set(taken):
             raise ValueError(f"angles must be among the measured entries, {self.measured}, got {self.angles}")
@@ -83,7 +83,7 @@ class Outputs:
         self._whole = self._take.tolist() == list(range(len(owners)))
         self._sines = np.flatnonzero(np.isin(self._take, plain))[1::2]
         self._cosines = self._sines - 1
-        self._units = np.array([units[i] for i in self._take[self._sines]])  # rad in each
+        self._units = np.array([units[i] for i in self._take[self._sines]])  # rad per unit of each angle
         self.pairs = list(zip(self._cosines.tolist(), self._sines.tolist()))  # cosines and sines among the outputs
         place = self._take.tolist().index
         for angle, names in zip(at, each):
@@ -97,10 +97,10 @@ class Outputs:
         self.low, self.high = low[self._take], high[self._take]
         for side in (self._cosines, self._sines):
             self.low[side], self.high[side] = -1.0, 1.0
-        self.unseen = np.sort([*self._cosines, *self._sines]).astype(int)  # outputs that the keys do not show
+        self.unseen = np.sort([*self._cosines, *self._sines]).astype(int)  # outputs that are not in the keys
 
     def _period_of(self, low: float, high: float, name: str) -> float:
-        """A turn of an angle, by its bounds."""
+        """The length of a turn in an angle's own unit, from the angle's bounds."""
         width = high - low
         if np.isinf(width) or (width < 2.01 * TURN and width not in UNITS):
             return TURN
@@ -112,7 +112,7 @@ class Outputs:
         )
 
     def flat(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """An observation, or its measured keys, as one row of numbers. Shapes: returns (*batch, entries)."""
+        """An observation, or its measured keys, flattened. Shapes: returns (*batch, entries)."""
         parts = [
             _signals(self._source, part, observation if key is None else observation[key], batch)
             for key, part in self._parts.items()
@@ -140,7 +140,7 @@ class Outputs:
         return y
 
     def kept(self, observation: Any, flat: np.ndarray) -> dict[str, Any]:
-        """The keys that an agent sees: boxes as in the flat observation, copies of all others."""
+        """The keys that an agent sees: boxes from the flat observation, and copies of all others."""
         kept, at = {key: copy.deepcopy(observation[key]) for key in self.keys or ()}, 0
         for key, part in self._parts.items():
             end = at + spaces.flatdim(part)
@@ -151,14 +151,14 @@ class Outputs:
 
 
 class Inputs:
-    """What of an environment's actions acts, at equal size: bounded boxes in [-1, 1], one-hot where Discrete."""
+    """Inputs from an environment's actions: bounded boxes scaled to [-1, 1], Discrete actions one-hot."""
 
     def __init__(self, space: Space, *, source: str) -> None:
         self._space, self._source = space, f"the action of {source}"
         _check(space, self._source)
         self.low, self.high = _limits(space)
         boxes = [isinstance(leaf, spaces.Box) for leaf in _leaves(space) for _ in range(spaces.flatdim(leaf))]
-        # Bounds that no action may reach, such as the largest float, do not count.
+        # Bounds beyond LARGEST, such as the largest float, are not used as a scale.
         scaled = np.array(boxes, dtype=bool) & (abs(self.low) <= LARGEST) & (abs(self.high) <= LARGEST)
         low, high = np.where(scaled, self.low, -1.0), np.where(scaled, self.high, 1.0)
         self._middle, self._half = (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
@@ -217,7 +217,7 @@ def _check_keys(name: str, keys: Collection[str], known: Collection[Any]) -> Non
 
 
 def _positions(name: str, chosen: tuple[Any, ...], owners: list[Any]) -> list[int]:
-    """Where the chosen entries are among signals that belong to keys."""
+    """Positions of the chosen entries in the flat observation, whose entries have the keys ``owners``."""
     if chosen and isinstance(chosen[0], str):
         _check_keys(name, chosen, dict.fromkeys(owners))
         return [i for i, key in enumerate(owners) if key in chosen]
@@ -230,7 +230,7 @@ def _positions(name: str, chosen: tuple[Any, ...], owners: list[Any]) -> list[in
 
 
 def _leaves(space: Space) -> Iterator[Space]:
-    """The spaces that a space is made of, in the order of the flattened value."""
+    """The elementary spaces within a space, in the order of the flattened value."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         for part in space.values() if isinstance(space, spaces.Dict) else space:
             yield from _leaves(part)
@@ -243,7 +243,7 @@ def _is_image(space: Space) -> bool:
 
 
 def _check(space: Space, source: str) -> None:
-    """Raise ValueError unless all that a space is made of has real signals."""
+    """Raise ValueError unless every elementary space within a space holds real signals."""
     for leaf in _leaves(space):
         if _is_image(leaf):
             raise ValueError(
@@ -259,14 +259,14 @@ def _check(space: Space, source: str) -> None:
 
 def _limits(space: Space) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of a space's signals."""
-    if spaces.flatdim(space) == 0:  # of which Gymnasium makes no box
+    if spaces.flatdim(space) == 0:  # Gymnasium cannot flatten an empty space to a box
         return np.zeros(0), np.zeros(0)
     flat: Any = spaces.flatten_space(space)
     return flat.low.astype(float), flat.high.astype(float)
 
 
 def _signals(source: str, space: Space, value: Any, batch: tuple[int, ...]) -> np.ndarray:
-    """What :func:`gymnasium.spaces.flatten` makes of a value, or of each row of a batch."""
+    """A value, or each row of a batch, as :func:`gymnasium.spaces.flatten` would flatten it."""
     try:
         return _read(space, value, batch)
     except (KeyError, IndexError, TypeError, ValueError) as error:
@@ -277,7 +277,7 @@ def _signals(source: str, space: Space, value: Any, batch: tuple[int, ...]) -> n
 def _read(space: Space, value: Any, batch: tuple[int, ...]) -> np.ndarray:
     if isinstance(space, spaces.Box) and space.dtype != np.bool_:
         return real_array("it", value).reshape(*batch, space.low.size)
-    if isinstance(space, spaces.Box | spaces.MultiBinary):  # of flags
+    if isinstance(space, spaces.Box | spaces.MultiBinary):  # MultiBinary holds flags
         array = value if isinstance(value, np.ndarray) else np.asarray(value)
         flags = array.astype(np.int8) if array.dtype == np.bool_ else value
         return real_array("it", flags).reshape(*batch, spaces.flatdim(space))

@@ -1,6 +1,6 @@
 """Simulation of sampling intervals by a sixth-order Runge–Kutta method, in 1, 2, 4, ... substeps of one length.
 
-An estimate of the error sets their number, or the system's own ``rate(x)``. Single states on Python floats
+The system's own ``rate(x)``, or else an estimate of the error, sets their number. Single states on Python floats
 (:func:`advance`) and batches on arrays (:func:`advance_batch`) agree to rounding, 1e-13 of the state in each step.
 """
 
@@ -15,17 +15,17 @@ from kkl_gym.equations import blame
 from kkl_gym.system import Components, System, dot, rate_under
 from observers.checks import check_dt
 
-# rate * substep stays below this where a system has a formula for its rate. Chosen so that every shipped system keeps
-# the error of 10 s below 1e-5 of the motion's size from anywhere in twice its training box
-# (tests/kkl_gym/test_simulate.py); it is half of that.
+# Largest rate * substep where a system has a formula for its rate. It is half of the largest value at which every
+# shipped system, from anywhere in twice its training box, keeps the error after 10 s below 1e-5 of the motion's size
+# (tests/kkl_gym/test_simulate.py).
 RATE_STEP = 0.4
-# A millionth less, so that rates which rounding takes to either side of a power of two get the same substeps.
+# A millionth less, so that rates on both sides of a power of two, which differ only by rounding, get equal substeps.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
-# Largest estimate of a substep's error, in half-widths of X. The error itself is smaller by a thousand there. With
-# TOLERANCE, stiff systems and the shipped ones without their formulas keep the same 1e-5. ROUGH is for systems with a
-# formula, which is overruled only where it fails, as when something ignites: a hundred times what the shipped reach.
+# Largest estimate of a substep's error, in half-widths of X. The error itself is then a thousand times smaller. With
+# TOLERANCE, stiff systems and the shipped ones without their formulas keep the same 1e-5. ROUGH overrules a system's
+# formula where that fails, as at an ignition; it is a hundred times the largest estimate of the shipped systems.
 TOLERANCE, ROUGH = 3e-6, 0.1
-ATTEMPTS = 3  # at substeps of one length; afterwards, and beyond MOST_EQUAL of them, their length follows the error
+ATTEMPTS = 3  # with equal substeps; after these, or beyond MOST_EQUAL substeps, the step length follows the error
 MOST_EQUAL = 1 << 10
 MAX_SUBSTEPS = 1 << 16
 REPORTED = 50  # intervals between two reports
@@ -42,31 +42,31 @@ STAGES = (
     (9 / 44, -9 / 11, 63 / 44, 18 / 11, 0, -16 / 11),
 )
 WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
-# An estimate of the error, of order h^5 when multiplied by h: the difference of the two slopes halfway. Where the
-# derivative depends on time alone it is zero, so that a little of the fourth divided difference over the interval is
-# added, which is (1, 0, -9, -9, 16, 0, 1).
+# The error estimate is h times the difference of the two slopes halfway, of order h^5. That difference is zero where
+# the derivative depends only on time. So 1/256 of the fourth divided difference over the interval is added, which is
+# (1, 0, -9, -9, 16, 0, 1).
 ERROR = (1 / 256, 0, -9 / 256, -9 / 256, 16 / 256 - 1, 1, 1 / 256)
-# Of the state, of a constant slope and of the slopes of the stages before.
+# Coefficients of the state, of a constant slope and of the slopes of the earlier stages.
 _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
 _ERROR = np.array(ERROR)
 
 VectorField = Callable[[Any], Any]
 Feedback = Callable[[int, np.ndarray], np.ndarray]
-"""(k, x) to the inputs held over interval k, (n, nu)."""
+"""Maps (k, x) to the inputs held over interval k, (n, nu)."""
 Step = Callable[[np.ndarray, np.ndarray, np.ndarray, float], np.ndarray]
-"""(x, u, w, dt) to the next x, as :func:`advance_batch`."""
+"""Maps (x, u, w, dt) to the next x, like :func:`advance_batch`."""
 
 
 class SubstepsError(ValueError):
-    """A sampling interval would need more substeps than MAX_SUBSTEPS: it is too long, or the system too fast."""
+    """A sampling interval needs more than MAX_SUBSTEPS substeps: it is too long, or the system is too fast."""
 
 
 @functools.cache
 def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, float, int, Components], tuple[Any, float]]:
-    """The Runge–Kutta steps of ``STAGES`` and ``WEIGHTS``, written out, which is several times as fast as loops.
+    """A function for the Runge–Kutta steps of ``STAGES`` and ``WEIGHTS``; its unrolled loops are several times faster.
 
-    Of f, x, constants that are added to f, the length h and number n of steps, and one over the tolerances, (nx,), it
-    makes the state after them and the largest estimate of a step's error, in tolerances and squared.
+    It takes f, x, constants that are added to f, the length h and the number n of steps, and 1 / tolerance of each
+    state, (nx,). It returns the state after n steps and the largest squared error of a step, in units of tolerance.
     """
     components = range(nx)
 
@@ -90,7 +90,7 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, float
         weighted = " + ".join(f"{c!r} * k{j}_{i}" for j, c in enumerate(ERROR) if c)
         lines += [f"        e{i} = h * s{i} * ({weighted})"]
     lines += ["        e = " + " + ".join(f"e{i} * e{i}" for i in components)]
-    lines += ["        if not e <= error:", "            error = e"]  # where it is NaN, too
+    lines += ["        if not e <= error:", "            error = e"]  # also if it is NaN
     lines += [f"    return ({unpacked('x')}), error"]
     namespace: dict[str, Any] = {}
     exec("\n".join(lines), namespace)
@@ -98,7 +98,7 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, float
 
 
 def forced(system: System, u: Components, w: Components) -> tuple[VectorField, Components]:
-    """Split x' = f(x) + g(x) u + w, with u and w held, into a vector field and nx constants."""
+    """Split x' = f(x) + g(x) u + w, under held u and w, into a vector field and nx constants."""
     if type(system).g is System.g:
         if len(u) == 0:
             return system.f, w
@@ -114,17 +114,17 @@ def forced(system: System, u: Components, w: Components) -> tuple[VectorField, C
 
 
 def _per_tolerance(kind: type[System], tolerance: float | None = None) -> tuple[float, ...]:
-    """One over the tolerance of each state's error, (nx,), of a class of systems."""
+    """1 / tolerance of each state's error, (nx,), for a class of systems."""
     if tolerance is None:
         tolerance = TOLERANCE if kind.rate is System.rate else ROUGH
     return tuple(2.0 / (high - low) / tolerance for low, high in kind.X)
 
 
-per_tolerance: Callable[..., tuple[float, ...]] = functools.lru_cache(maxsize=256)(_per_tolerance)  # every step asks
+per_tolerance: Callable[..., tuple[float, ...]] = functools.lru_cache(maxsize=256)(_per_tolerance)  # used at every step
 
 
 def advance(system: System, x: Components, u: Components, w: Components, dt: float) -> Components:
-    """One sampling interval from a single state, on Python floats."""
+    """The state after one sampling interval, from a single state, on Python floats."""
     try:
         try:
             if system.discrete:
@@ -141,8 +141,8 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
                 end, error = runge_kutta(len(x))(field, x, d, dt / n, n, per_tolerance(kind))
                 if error <= 1.0:
                     return cast(Components, end)
-                need = n * error**0.1  # as the square of h^5 falls
-        except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
+                need = n * error**0.1  # the squared error falls as h^10
+        except ArithmeticError:  # Python's **, / and math functions raise where arrays return inf
             found = _on_arrays(system, x, u, w, dt)
             if found is not None:
                 return found
@@ -155,7 +155,7 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
 
 def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: float) -> Components | None:
-    """The next state by a batch, where `where` may leave out infinite values; None if it escapes or fails there."""
+    """The next state, computed on arrays, in which `where` may discard infinite values; None if that fails."""
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
         end: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
@@ -165,9 +165,9 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
-    """One sampling interval with substeps whose length follows the error, as long as the motion stays within bounds."""
-    # For motions that change faster and faster, as when something ignites, and to make sure of an escape: steps that
-    # were too long at the end may have led out of the bounds by themselves.
+    """The state after one interval, with substeps whose length follows the error; ``end`` if it leaves the bounds."""
+    # This serves motions that accelerate, as at an ignition. It also verifies an escape: equal substeps may have been
+    # too long at its end and have left the bounds only by their error.
     if system.discrete:
         return end
     left, h, field, d = dt, dt, *forced(system, u, w)
@@ -183,7 +183,7 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
             if error <= 1.0:
                 x = moved
                 left -= h
-            elif h < 1e-15 * dt:  # every step is NaN
+            elif h < 1e-15 * dt:  # steps of any length give NaN
                 return end
             h *= 0.9 * max(1e-6, min(1e8, error)) ** -0.1
     except ArithmeticError:
@@ -192,13 +192,13 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
         blame(error, system, x, u)
         raise
     raise SubstepsError(
-        f"{MAX_SUBSTEPS} substeps are not enough for dt = {dt:g} s of {system.name}, of which {left:.2g} s are left at "
+        f"{MAX_SUBSTEPS} substeps are not enough for dt = {dt:g} s of {system.name}; {left:.2g} s of it are left at "
         f"x = {[float(xi) for xi in x]}: take a smaller dt, or tighten the bounds"
     )
 
 
 def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
-    """One sampling interval from states (nx, n), each with the substeps that :func:`advance` would take."""
+    """The states after one interval, from states (nx, n), each with the substeps that :func:`advance` would take."""
     try:
         if system.discrete:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -215,7 +215,7 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
 
 def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
-    """The ends (nx, n) of substeps of one length for each row, NaN where an error is too large, and whether any is."""
+    """The next states (nx, n) by equal substeps in each row, NaN if its error is too large, and whether any is NaN."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need: Any = 1.0 if type(system).rate is System.rate else system.rate(x) * dt * PER_RATE
         if np.all(need <= 1):
@@ -239,7 +239,7 @@ def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, 
 
 
 def _powers(need: np.ndarray) -> np.ndarray:
-    """The least power of two that is not less than ``need``, or 0 beyond MOST_EQUAL. Shapes: (n,) to (n,)."""
+    """The least power of two from ``need`` (n,) on, or 0 beyond MOST_EQUAL; returns (n,)."""
     mantissa, exponent = np.frexp(np.where(need <= MOST_EQUAL, np.maximum(need, 1), 1))
     return np.where(need <= MOST_EQUAL, 1 << (exponent - (mantissa == 0.5)), 0)
 
@@ -247,7 +247,7 @@ def _powers(need: np.ndarray) -> np.ndarray:
 def _substeps(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: np.ndarray, n: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ends (nx, m) of as many substeps n (m,) of length h (m,), one at least, and the largest of their errors."""
+    """The states (nx, m) after n (m,) substeps of length h (m,), at least one, and each row's largest error."""
     out, error = _step_batch(system, x, u, w, h)
     for k in range(2, n.max(initial=1) + 1):
         rows = np.flatnonzero(n >= k)
@@ -259,10 +259,10 @@ def _substeps(
 def followed_rows(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, *, dt: float, end: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """What :func:`followed` makes of ``rows`` (m,) of a batch that are within bounds; returns (nx, n)."""
+    """``end``, (nx, n), in which :func:`followed` replaced those of ``rows`` (m,) that start within bounds."""
     if len(rows):
         low, high = np.array(system.bounds, dtype=float).T[..., None]
-        with np.errstate(all="ignore"):  # equations that are made of others may be NumPy's even for one state
+        with np.errstate(all="ignore"):  # equations may use NumPy even for a single state
             for row in rows[((x[:, rows] >= low) & (x[:, rows] <= high)).all(0)]:
                 start = [values[:, row].tolist() for values in (x, u, w)]
                 end[:, row] = followed(system, *start, dt=dt, end=end[:, row])
@@ -270,8 +270,8 @@ def followed_rows(
 
 
 def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> tuple[np.ndarray, np.ndarray]:
-    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,), and the squares of its errors, (n,)."""
-    # A stage is one product of its coefficients with x, d and the slopes so far: few, large operations.
+    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,), and its squared errors, (n,)."""
+    # Each stage is one product of its coefficients with x, d and the slopes so far: a few large operations are fast.
     field, d = forced(system, u, w)
     rows = np.empty((2 + len(STAGES), *x.shape))
     rows[0] = x
@@ -301,7 +301,7 @@ def simulate(
     step: Step | None = None,
     report: Callable[[int], object] | None = None,
 ) -> np.ndarray:
-    """Trajectories (steps + 1, n, nx) of starts (n, nx); ``u`` (steps, n, nu), or callable, ``w`` (steps, n, nx)."""
+    """Trajectories (steps + 1, n, nx) from starts (n, nx), under ``u`` (steps, n, nu) or a policy, and ``w``."""
     x0 = np.asarray(x0, dtype=float)
     if x0.ndim != 2 or x0.shape[1] != system.nx or not np.isfinite(x0).all():
         raise ValueError(f"x0 must be finite with shape (n, {system.nx}), got shape {x0.shape}")
@@ -335,13 +335,13 @@ def simulate(
 
 
 def check_duration(duration: float, dt: float) -> None:
-    """Raise ValueError unless ``duration`` is a finite number of seconds, and not shorter than a sample of ``dt``."""
+    """Raise ValueError unless ``duration`` is a finite number of seconds and at least ``dt``."""
     if not dt <= duration < math.inf:
         raise ValueError(f"duration must be finite and at least one sample of dt = {dt} s, got {duration!r}")
 
 
 def check_interval(system: System, dt: float) -> None:
-    """Raise an error if a sampling interval does not suit a system at all."""
+    """Raise ValueError if a system cannot be simulated at a sampling interval."""
     if not system.discrete:
         rate = float(rate_under(system, tuple(np.mean(system.X, axis=1).tolist()), system.u_max))
         if rate * dt * PER_RATE > MAX_SUBSTEPS:
@@ -350,4 +350,4 @@ def check_interval(system: System, dt: float) -> None:
                 f"need more than {MAX_SUBSTEPS} substeps: take dt <= {MAX_SUBSTEPS / PER_RATE / rate:.2g} s"
             )
     elif not math.isclose(dt, system.dt, rel_tol=1e-9):
-        raise ValueError(f"{system.name} makes steps of dt = {system.dt} s, and no others: got dt = {dt}")
+        raise ValueError(f"{system.name} makes only steps of dt = {system.dt} s: got dt = {dt}")

@@ -1,4 +1,4 @@
-"""What a system is: x' = f(x) + g(x) u + w with a measured output y = h(x) + v.
+"""The base class of systems: x' = f(x) + g(x) u + w with a measured output y = h(x) + v.
 
 Every equation is written once, on components, in plain arithmetic. The same method therefore takes Python
 floats (fast single steps), NumPy arrays (batches), torch tensors (derivatives) and sympy symbols (formulas).
@@ -22,11 +22,12 @@ from observers.checks import is_finite, mapping, shown
 Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
-DT = 0.01  # s, where it suits
-SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)  # rate * dt beyond which DT does not suit, and what then does
-PROCESS_NOISE = 0.05  # in multiples of a system's scale in a second of its pace: where none is given
-NOISE_SHARE = 0.05  # of an output's range: measurement noise where none is given
-# Names in a class whose body states nothing; Python 3.13 adds the last two.
+DT = 0.01  # s, the default where it suits a system's rate
+# Least and largest rate * dt for which DT suits, each with the rate * dt of the interval that replaces DT beyond it.
+SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)
+PROCESS_NOISE = 0.05  # default, in multiples of a system's scale in one second of its pace
+NOISE_SHARE = 0.05  # default measurement noise as a share of an output's range
+# Attributes of a class with an empty body; Python 3.13 adds the last two.
 EMPTY = {"__module__", "__qualname__", "__doc__", "__firstlineno__", "__static_attributes__"}
 
 
@@ -35,8 +36,8 @@ class System:
     """A system; its physical parameters are the fields of a frozen dataclass, all of them floats.
 
     A subclass is decorated with ``@dataclass(frozen=True)``, sets the class variables below and defines
-    :meth:`f` and :meth:`h`. See ``examples/own_system.py`` for a complete one. Units are the user's own: what
-    matters is the size of a state relative to ``X``.
+    :meth:`f` and :meth:`h`. See ``examples/own_system.py`` for a complete one. Any units will do: only the size of a
+    state relative to ``X`` matters.
 
     Parameters
     ----------
@@ -50,13 +51,13 @@ class System:
     state_names : tuple of str, length nx
         Names of the states with their units, for plots and documentation. The default is x1, x2, ...
     X : tuple of (float, float), length nx
-        Training box, (low, high) of each state: where starts are drawn and observers are trained.
+        Training box, (low, high) of each state: starts are drawn in it, and observers are trained on it.
     X_centre : tuple of float, length nx
-        The point about which multiples of X, such as 2X, grow. The default is the middle of X.
+        The centre of multiples of X, such as 2X. The default is the middle of X.
     bounds : tuple of (float, float), length nx
         Declared bounds, (low, high) of each state: an episode ends where the state leaves them.
     u_max : tuple of float, length nu
-        Bound of each input. The default, none, makes an autonomous system.
+        Bound of each input. The default is an empty tuple, for an autonomous system.
     G : tuple of tuple of float, shape (nx, nu)
         Constant input matrix. Override :meth:`g` where it depends on the state.
     scale : tuple of float, length nx
@@ -64,11 +65,11 @@ class System:
     portrait : (int, int)
         The two states that a phase portrait shows, by index. The default is the first and the last.
     process_noise : float
-        Default bound of the process noise as a multiple of ``scale`` per second. If it is not set, it is 0.05 at the
-        system's :attr:`pace`.
+        Default bound of the process noise as a multiple of ``scale`` per second. If it is not set, it is 0.05 divided
+        by the system's :attr:`pace`.
     measurement_noise : float or tuple of float, length ny
-        Default standard deviation of the measurement noise, of all outputs or each. If it is not set, it is 5 % of the
-        range of each output over X.
+        Default standard deviation of the measurement noise, one for all outputs or one for each. If it is not set, it
+        is 5 % of the range of each output over X.
     dt : float
         Default sampling interval in seconds. If it is not set, it is 0.01 s where that suits the system's rate, and
         otherwise follows from the rate.
@@ -76,8 +77,8 @@ class System:
     Raises
     ------
     TypeError
-        If a class variable is missing or does not fit the others, as soon as the subclass is defined. If the subclass
-        has parameters and lacks ``@dataclass(frozen=True)``, when an instance is made.
+        When the subclass is defined, if a class variable is missing or does not fit the others. When an instance is
+        made, if the subclass has parameters and lacks ``@dataclass(frozen=True)``.
     ValueError
         If a parameter is not a finite number.
     """
@@ -91,11 +92,11 @@ class System:
     G: ClassVar[tuple[tuple[float, ...], ...]] = ()
     scale: ClassVar[tuple[float, ...]] = ()
     portrait: ClassVar[tuple[int, int]] = (0, -1)
-    discrete: ClassVar[bool] = False  # whether there is a step; kept, as every step of an environment asks
+    discrete: ClassVar[bool] = False  # whether the subclass defines step; environments read it at every step
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if not vars(cls).keys() <= EMPTY:  # cloudpickle fills an empty class with complete attributes
+        if not vars(cls).keys() <= EMPTY:  # cloudpickle makes an empty class, and then sets complete attributes
             complete(cls, System)
 
     def __post_init__(self) -> None:
@@ -111,7 +112,7 @@ class System:
             object.__setattr__(self, name, float(value))
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        # A class from a user's script can be found again, in another process too, by the script's path.
+        # Another process loads a class of a user's script by the script's path.
         script = getattr(sys.modules.get(type(self).__module__), "__kkl_gym_script__", None)
         return _restored, (f"{script}:{type(self).__qualname__}" if script else type(self), self.parameters)
 
@@ -142,14 +143,14 @@ class System:
 
     @property
     def dt(self) -> float:
-        """Sampling interval in seconds of environments and observers where none is given.
+        """Default sampling interval of environments and observers, in seconds.
 
-        0.01 s, unless that is far too long or too short for the rate at which f changes. A class variable of this name
-        takes its place.
+        It is 0.01 s, unless that is far too long or too short for the rate at which f changes. A class variable of this
+        name overrides it.
         """
         try:
             rate = self.typical_rate
-        except ValueError:  # such as of an integrator, for which any interval does
+        except ValueError:  # a rate of 0, as of an integrator, suits any interval
             return DT
         (least, slow), (most, fast) = SHORT_STEP, LONG_STEP
         if least <= rate * DT <= most:
@@ -160,40 +161,40 @@ class System:
 
     @property
     def pace(self) -> float:
-        """Seconds that are to this system what one second is to those that ship: a hundred sampling intervals."""
+        """Time unit of this system in seconds, 100 sampling intervals; the shipped systems have 1 s."""
         return 100.0 * self.dt
 
     @property
     def duration(self) -> float:
-        """Seconds for which motions are followed in training and evaluation, by default."""
+        """Default duration of motions in training and evaluation, in seconds."""
         return 50.0 * self.pace
 
     @property
     def process_noise(self) -> float:
-        """Bound of the process noise where none is given, in multiples of ``scale`` per second."""
+        """Default bound of the process noise, in multiples of ``scale`` per second."""
         return PROCESS_NOISE / self.pace
 
     @property
     def measurement_noise(self) -> float | tuple[float, ...]:
-        """Standard deviation of the measurement noise where none is given, of all outputs or each."""
+        """Default standard deviation of the measurement noise, one for all outputs or one for each."""
         levels = tuple(float(f"{NOISE_SHARE * size:.2g}") for size in self.output_range)
         return levels[0] if len(set(levels)) == 1 else levels
 
     @functools.cached_property
     def output_range(self) -> tuple[float, ...]:
-        """How far each output, without noise, ranges over a thousand starts; 1 where it does not move. Length ny."""
+        """Range of each noise-free output over a thousand starts, length ny; 1 for a constant output."""
         size = np.ptp(self.output(_starts(self)), axis=0)
         return tuple(np.where(size > 0, size, 1.0).tolist())
 
     @functools.cached_property
     def typical_rate(self) -> float:
-        """Median rate of f(x) + g(x) u over a thousand starts and the largest input, in 1/s; ValueError if it is 0."""
+        """Median rate of f(x) + g(x) u, in 1/s, over a thousand starts under the largest input; ValueError if 0."""
         return typical_rate(self, _starts(self))
 
     def f(self, x: Components) -> Components:
-        """Drift f(x): from nx components as many, each of the kind that the components of ``x`` are, or a number.
+        """Drift f(x): takes nx components and returns nx, each a number or of the type of the components of ``x``.
 
-        Components are floats, arrays, tensors or symbols. Every subclass defines it, or :meth:`step`.
+        Components are floats, arrays, tensors or symbols. Every subclass defines this method or :meth:`step`.
         """
         if not self.discrete:
             raise NotImplementedError(f"{type(self).__name__} does not define f")
@@ -203,60 +204,59 @@ class System:
     def step(self, x: Components, u: Components) -> Components:
         """The next state of a system in discrete time, one sampling interval after x under the held input u.
 
-        A system that defines it needs no f and g, sets ``dt``, and is not integrated. Process noise adds w dt to the
-        next state. f then is the mean derivative over the interval, without input. Components are those of :meth:`f`.
+        A system that defines it needs no f and g, must set ``dt``, and is not integrated. Process noise adds w dt to
+        the next state. f is then the mean derivative over the interval without input. Components are those of
+        :meth:`f`.
         """
         raise NotImplementedError(f"{type(self).__name__} is integrated from f; it defines no step")
 
     def draw_starts(self, rng: np.random.Generator, n: int, factor: float = 1.0) -> np.ndarray:
-        """Draw starts; default: uniform in a multiple of the training box.
+        """Draw ``n`` starts, (n, nx), within ``factor`` times X; default: uniform in that box.
 
-        Override it where not every point of X is a state, as with an angle given by its cosine and sine. What it draws
-        must lie within the bounds. Such a system also sets ``process_noise = 0.0``, which would push states off.
-
-        Returns ``n`` states, (n, nx), which lie within ``factor`` times X.
+        Override it where not every point of X is a state, as for an angle given by its cosine and sine. Starts must lie
+        within the bounds. Such a system also sets ``process_noise = 0.0``, because noise would leave the set of states.
         """
         return rng.uniform(*self.box(factor), (n, self.nx))
 
     def g(self, x: Components) -> Sequence[Components]:
-        """Input matrix g(x), (nx, nu) in rows, from components as :meth:`f` takes them; default: the constant ``G``."""
+        """Input matrix g(x), nx rows of nu entries, from the components of :meth:`f`; default: the constant ``G``."""
         return self.G or ((),) * self.nx
 
     def h(self, x: Components) -> Components:
-        """Output map h(x): ny components, from components as :meth:`f` takes them. Every subclass defines it."""
+        """Output map h(x): ny components, from the components of :meth:`f`. Every subclass defines it."""
         raise NotImplementedError(f"{type(self).__name__} does not define h")
 
     def reward(self, x: Components, u: Components) -> Any:
-        """Reward of a sampling interval, as environments pay it; default: 1 at :attr:`target`, and less away from it.
+        """Reward that environments return for a sampling interval; default: 1 at :attr:`target`, and less elsewhere.
 
-        The default is 1 / (1 + 4 c) with c = mean(((x - target) / scale)^2). A system that overrides it, or
-        :meth:`terminated`, states a task of its own, for which ``kkl-gym agent train`` trains.
+        The default is 1 / (1 + 4 c) with c = mean(((x - target) / scale)^2). A system that overrides this method or
+        :meth:`terminated` defines its own task, and ``kkl-gym agent train`` trains for it.
 
         Parameters
         ----------
         x : sequence of length nx
             Components of the state at the end of the interval: floats or arrays.
         u : sequence of length nu
-            Components of the input that acted, in its own units.
+            Components of the physical input that acted.
 
         Returns
         -------
-        float, or of the kind that the components of ``x`` are
+        float, or the type of the components of ``x``
             The reward.
         """
         return nearness(goal_of(self), x, u)
 
     def terminated(self, x: Components) -> Any:
-        """Whether an episode ends at x, from components as :meth:`f` takes them; it also ends beyond ``bounds``."""
+        """Whether an episode ends at x, from the components of :meth:`f`; it ends beyond ``bounds`` in any case."""
         return False
 
     @property
     def states_task(self) -> bool:
-        """Whether the system states a reward or an end of episodes of its own."""
+        """Whether the system defines its own reward or its own end of episodes."""
         return type(self).reward is not System.reward or type(self).terminated is not System.terminated
 
     def output(self, x: np.ndarray) -> np.ndarray:
-        """Outputs h(x), without noise, of many states. Shapes: ``x`` (..., nx); returns (..., ny)."""
+        """Noise-free outputs h(x) of many states. Shapes: ``x`` (..., nx); returns (..., ny)."""
         return on_states(self.h, x)
 
     def drift(self, x: np.ndarray) -> np.ndarray:
@@ -264,16 +264,16 @@ class System:
         return on_states(self.f, x)
 
     def rate(self, x: Components) -> Any:
-        """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the default ``dt`` follows.
+        """How fast f changes along a motion, in 1/s: a norm of df/dx. The default ``dt`` follows from it.
 
-        The default differentiates f numerically, with each state in units of X's half-width, so that it does not depend
-        on the user's units. An estimate of the error then sets the number of substeps. A formula in
-        its place limits them, as where f jumps: a substep lasts 0.4 / rate at most.
+        The default differentiates f numerically, with each state in units of X's half-width, so that the rate does not
+        depend on the user's units. An estimate of the error then sets the number of substeps. A formula that overrides
+        this method sets it instead: a substep then lasts at most 0.4 / rate. That helps where f jumps.
         """
         return slope(self.f, x, self.X)
 
     def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Corners (nx,) of the training box, or of a multiple of it about ``X_centre``, cut at the bounds."""
+        """Lower and upper corner, (nx,), of ``factor`` times the training box about ``X_centre``, cut at the bounds."""
         low, high = np.array(self.X, dtype=float).T
         if factor != 1:
             centre, (lowest, highest) = np.array(self.X_centre), np.array(self.bounds, dtype=float).T
@@ -282,7 +282,7 @@ class System:
         return low, high
 
     def replace(self, parameters: Mapping[str, float]) -> "System":
-        """The same system with some parameters changed; ValueError on unknown names and values that are not finite."""
+        """Return a copy with some parameters changed; ValueError if a name is unknown or a value is not finite."""
         known = self.parameters
         parameters = mapping("parameters", parameters)
         for name in parameters:
@@ -292,7 +292,7 @@ class System:
 
 
 def goal_of(system: System) -> list[tuple[float, float]]:
-    """The target of each state, and the weight of its square in the cost, (nx,)."""
+    """The target of each state, and the weight of its squared distance in the default reward's cost, nx pairs."""
     return [(t, 1.0 / (system.nx * size * size)) for t, size in zip(target_of(system), system.scale, strict=True)]
 
 
@@ -305,14 +305,14 @@ def nearness(goal: Iterable[tuple[float, float]], x: Components, u: Components) 
 
 
 def nearness_of_rows(target: np.ndarray, weight: np.ndarray, x: np.ndarray, u: Components) -> np.ndarray:
-    """The default reward of a batch, in few operations. Shapes: ``target`` and ``weight`` (nx,), ``x`` (nx, n)."""
+    """The default reward of a batch. Shapes: ``target`` and ``weight`` (nx,), ``x`` (nx, n)."""
     deviation = x - target[:, None]
     deviation *= deviation
     return 1.0 / (1.0 + 4.0 * (weight @ deviation))
 
 
 def reward_of(system: System, *, rows: bool = False) -> Callable[[Any, Components], Any]:
-    """The reward of a system, of one state or of rows; the default one reads the target here, once."""
+    """The reward function for one state or for a batch; the default reward reads the target only once, here."""
     if type(system).reward is not System.reward:
         return system.reward
     goal = goal_of(system)
@@ -320,35 +320,35 @@ def reward_of(system: System, *, rows: bool = False) -> Callable[[Any, Component
 
 
 def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> np.ndarray:
-    """Evaluate f or h, which take and give components, on an array of states: (..., nx) to (..., m)."""
+    """Evaluate f or h on an array of states instead of components. Shapes: ``x`` (..., nx); returns (..., m)."""
     values = components(equations, np.moveaxis(x, -1, 0))
     return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in values], axis=-1)
 
 
 def inner_state(system: System) -> tuple[float, ...]:
-    """A state in X for a first look at the equations, off its centre, where some divide by zero."""
+    """A state in X for a first call of the equations; not the centre, where some divide by zero."""
     return tuple(low + (high - low) * ((0.5 + 0.618 * i) % 1.0) for i, (low, high) in enumerate(system.X, 1))
 
 
 def _starts(system: System) -> np.ndarray:
-    """A thousand starts (1000, nx), always the same."""
+    """The same thousand starts (1000, nx) at every call."""
     return system.draw_starts(np.random.default_rng(0), 1000)
 
 
 def dot(row: Iterable[Any], u: Components) -> Any:
     """A row of the input matrix times u. Shapes: ``row``, ``u`` of length nu."""
-    total = 0.0  # and not sum(), which from Python 3.12 on rounds in another way
+    total = 0.0  # sum() rounds in another way from Python 3.12 on
     for gij, uj in zip(row, u, strict=True):
         total = total + gij * uj
     return total
 
 
 def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
-    """A norm of a vector field's derivative, differentiated numerically, with states in units of X's half-widths."""
+    """A norm of a vector field's numerical derivative, with states in units of X's half-widths."""
     units = [5e-7 * (high - low) for low, high in X]  # a millionth of the half-widths
     fx, total = field(x), 0.0
     for j, unit in enumerate(units):
-        step = max(unit, 2e-8 * max(map(abs, X[j])))  # more where X lies so far from zero that floats hardly resolve it
+        step = max(unit, 2e-8 * max(map(abs, X[j])))  # larger where X lies so far from 0 that floats hardly resolve it
         moved = field([*x[:j], x[j] + step, *x[j + 1 :]])
         ratios = ((b - a) / other * (unit / step) for a, b, other in zip(fx, moved, units, strict=True))
         total = total + sum(ratio**2 for ratio in ratios)
@@ -356,15 +356,15 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
 
 
 def rate_under(system: System, x: Components, u: Components) -> Any:
-    """How fast f(x) + g(x) u changes under a held input, in 1/s; its rate if g is constant, or that is a formula."""
+    """How fast f(x) + g(x) u changes under a held input, in 1/s; ``rate(x)`` if g is constant or rate is a formula."""
     if type(system).g is System.g or type(system).rate is not System.rate:
         return system.rate(x)
     return slope(lambda x: [fi + dot(row, u) for fi, row in zip(system.f(x), system.g(x), strict=True)], x, system.X)
 
 
 def typical_rate(system: System, starts: np.ndarray) -> float:
-    """Median over some starts of how fast f changes. Shapes: ``starts`` (n, nx)."""
-    rate_at(system, starts.T)  # or raise an EquationError
+    """Median rate of f over some starts. Shapes: ``starts`` (n, nx)."""
+    rate_at(system, starts.T)  # raises an EquationError if it fails
     rate = float(np.median(np.broadcast_to(rate_under(system, starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:
         raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it with how fast f changes")
@@ -372,5 +372,5 @@ def typical_rate(system: System, starts: np.ndarray) -> float:
 
 
 def _restored(kind: "type[System] | str", parameters: Mapping[str, float]) -> System:
-    """What pickle makes a system from: its class, or where a user's script defines it."""
+    """Rebuild a pickled system from its class, or from ``script.py:Class``."""
     return (load_class(kind, System) if isinstance(kind, str) else kind)(**parameters)

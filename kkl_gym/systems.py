@@ -1,6 +1,6 @@
-"""Equations of the four benchmark systems, and finding a system by its name."""
+"""Equations of the four benchmark systems, and the lookup of a system by its name."""
 
-# ruff: noqa: D102 - what each system overrides is documented on System
+# ruff: noqa: D102 - System documents the methods that each system overrides
 
 import math
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ from observers.names import matching, suggestion
 class ReverseDuffing(System):
     """Reverse Duffing oscillator (paper, sec. 8, eq. rev_duff), y = x1, input on x2.
 
-    x1' = a x2^3, x2' = -b x1 + u. Conservative without input: a x2^4/4 + b x1^2/2 is constant, so motions are
-    periodic, with a period that grows as they shrink. Dimensionless; the origin is a degenerate equilibrium whose
-    linearisation cannot be stabilised. The paper has no parameters; a = b = 1 is its system.
+    x1' = a x2^3, x2' = -b x1 + u. Without input a x2^4/4 + b x1^2/2 is constant, so motions are periodic; small ones
+    have long periods. Dimensionless. The origin is a degenerate equilibrium whose linearisation cannot be stabilised.
+    The paper has no parameters; a = b = 1 is its system.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class ReverseDuffing(System):
         return (x[0],)
 
     def rate(self, x: Components) -> Any:
-        # Above sqrt(3 a b) |x2|, the frequency of the linearised motion. Time runs faster with sqrt(a b).
+        # An upper bound of the linearised motion's frequency, sqrt(3 a b) |x2|. Motions speed up as sqrt(a b).
         return math.sqrt(abs(self.a * self.b)) * (1.0 + 2.0 * abs(x[1]))
 
 
@@ -95,8 +95,8 @@ class Rossler(System):
     """Rössler's system (paper, sec. 8, eq. ross; O. E. Rössler, Phys. Lett. A 57, 1976), y = x2, input on x1.
 
     x1' = -x2 - x3 + u, x2' = x1 + a x2, x3' = b + x3 (x1 - c). Dimensionless; chaotic at the default parameters.
-    Some starts outside the training box escape to infinity. The target is the inner equilibrium, which no static
-    gain on y stabilises through this input.
+    Motions from some starts outside the training box escape to infinity. The target is the inner equilibrium. No static
+    gain from y to this input stabilises it.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class Rossler(System):
 
     name: ClassVar[str] = "rossler"
     X: ClassVar[Box] = ((-10, 10), (-10, 10), (0, 20))
-    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # as in the paper, which multiplies the corners
+    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # the paper multiplies the corners of the box
     bounds: ClassVar[Box] = ((-50, 50), (-70, 70), (-5, 500))
     u_max: ClassVar[tuple[float, ...]] = (2.0,)
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,), (0.0,), (0.0,))
@@ -149,8 +149,8 @@ class Lorenz(System):
     """Lorenz's system (paper, sec. 8, eq. lorenz; E. N. Lorenz, J. Atmos. Sci. 20, 1963), y = x2, input on x2.
 
     x1' = sigma (x2 - x1), x2' = x1 (rho - x3) - x2 + u, x3' = x1 x2 - beta x3. Dimensionless; chaotic at the default
-    parameters. The paper prints the first two parameters swapped (p = 28, q = 10), with which the motion settles on
-    an equilibrium; ``Lorenz(sigma=28, rho=10)`` is that system. The target is the equilibrium C+.
+    parameters. The paper prints the first two parameters swapped (p = 28, q = 10). With these, which are
+    ``Lorenz(sigma=28, rho=10)``, motions settle on an equilibrium. The target is the equilibrium C+.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ class Lorenz(System):
 
     name: ClassVar[str] = "lorenz"
     X: ClassVar[Box] = ((-20, 20), (-30, 30), (0, 50))
-    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # as Rössler's
+    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # as for Rössler
     bounds: ClassVar[Box] = ((-60, 60), (-120, 120), (-50, 160))
     u_max: ClassVar[tuple[float, ...]] = (10.0,)
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,), (0.0,))
@@ -199,7 +199,7 @@ SYSTEMS: dict[str, type[System]] = {cls.name: cls for cls in (ReverseDuffing, Va
 
 
 def get_system(system: "str | System | type[System]", parameters: Mapping[str, float] | None = None) -> System:
-    """The system named by ``system``, with ``parameters`` changed from their defaults.
+    """Return the system that ``system`` names, with ``parameters`` changed from their defaults.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
     ValueError
         If the name is unknown, the class cannot be found, or a parameter is unknown or not finite.
     EquationError
-        If a user's equations fail, or return something else than components.
+        If a user's equations fail or do not return components.
     """
     if isinstance(system, str):
         system = _find(system)
@@ -232,11 +232,11 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
             )
         try:
             system = system()
-        except TypeError as error:  # not decorated as a dataclass
+        except TypeError as error:  # it lacks @dataclass
             raise ValueError(str(error)) from error
     if not isinstance(system, System) or type(system) is System:
         hint = "; in a spec's JSON write it as 'script.py:Class'" if isinstance(system, Mapping) else ""
-        raise ValueError(f"the system must be the name of one or a kkl_gym.System, got {shown(system)}{hint}")
+        raise ValueError(f"the system must be a name or a kkl_gym.System, got {shown(system)}{hint}")
     found = system.replace(mapping("parameters", parameters))
     if type(found) not in SYSTEMS.values():
         check_equations(found)

@@ -1,4 +1,4 @@
-"""Equations written down as a program, one operation after the other, in the order in which Python runs them."""
+"""Records equations as a program: a list of operations in the order in which Python runs them."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -13,29 +13,29 @@ _COMPARISONS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": 
 
 
 class Tape:
-    """The operations so far. They are exact if machine code rounds each of them as Python does."""
+    """The operations recorded so far. They are exact if machine code rounds each of them as Python does."""
 
     def __init__(self) -> None:
-        self.names: dict[str, str] = {}  # of results, by operation
+        self.names: dict[str, str] = {}  # names of results, by operation
         self.exact = True
 
     def write(self, operation: str, *, exact: bool = True) -> "Symbol":
-        """Take in an operation; one that was there before has its result already."""
+        """Record an operation, and return its result; a repeated operation is recorded once."""
         self.exact &= exact
         return Symbol(self, self.names.setdefault(operation, f"t{len(self.names)}"))
 
 
 class Symbol:
-    """A number that is not known yet. Arithmetic on it is written on its tape."""
+    """A number without a value. Arithmetic on it is recorded on its tape."""
 
-    __array_ufunc__ = None  # so that NumPy's numbers leave arithmetic to it
+    __array_ufunc__ = None  # NumPy's numbers then call the operators below
     __hash__ = None  # type: ignore[assignment]
 
     def __init__(self, tape: Tape, name: str) -> None:
         self.tape, self.name = tape, name
 
     def call(self, function: str, *args: Any) -> "Symbol":
-        """Write the call of a function of :mod:`kkl_gym.elementary`."""
+        """Record the call of a function of :mod:`kkl_gym.elementary`."""
         return self.tape.write(f"{function}({', '.join(map(text, args))})")
 
     def __neg__(self) -> "Symbol":
@@ -78,7 +78,7 @@ for _name in ("add", "sub", "mul", "truediv", "mod", "and", "or"):
 
 
 def text(value: Any) -> str:
-    """A symbol or a number as a program names it."""
+    """The text of a symbol or a number in a program."""
     if isinstance(value, Symbol):
         return value.name
     if isinstance(value, bool | np.bool_):
@@ -91,7 +91,7 @@ def text(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Program:
-    """What a function does to its arguments, by name."""
+    """A function as a list of operations on named arguments."""
 
     arguments: tuple[str, ...]
     operations: tuple[str, ...]
@@ -99,7 +99,7 @@ class Program:
     exact: bool
 
     def lines(self, name: str, zeros: int = 0) -> list[str]:
-        """Python of a function of a tuple, which returns so many zeros more."""
+        """Python code of the function: it takes a tuple, and returns its results followed by ``zeros`` zeros."""
         return [
             f"def {name}(values):",
             f"    {in_tuple(self.arguments)} = values",
@@ -109,12 +109,12 @@ class Program:
 
 
 def in_tuple(values: Iterable[str]) -> str:
-    """Python of a tuple."""
+    """Python code of a tuple."""
     return "(" + "".join(f"{value}, " for value in values) + ")"
 
 
 def program(function: Callable[..., Any], *letters: tuple[str, int]) -> Program:
-    """Run a function of groups of components on symbols, each group with a letter and as many of these as it has."""
+    """Run a function on groups of symbols; each group has a letter and a number of components."""
     tape = Tape()
     groups = [[Symbol(tape, f"{letter}{i}") for i in range(n)] for letter, n in letters]
     results = tuple(map(text, function(*groups)))

@@ -1,41 +1,41 @@
-"""Where in a user's code an exception comes from."""
+"""The lines of a user's code from which an exception comes."""
 
 import linecache
 import sys
 from pathlib import Path
 from types import CodeType, TracebackType
 
-# Wherever they are installed; other installed packages are known by their folder.
+# These are recognised by name; other installed packages by their folder.
 _LIBRARIES = sys.stdlib_module_names - {"__main__"} | {"kkl_gym", "observers", "training"}
 _LIBRARIES |= {"mpmath", "numba", "numpy", "sympy", "torch"}
 
 
 def user_line(error: BaseException) -> str | None:
-    """The last line outside of libraries that an exception went through."""
+    """The last line of the traceback that is not in a library."""
     outside = [step for step in _steps(error) if not _of_library(step)]
     return line_of(outside[-1]) if outside else None
 
 
 def steps_within(error: BaseException, code: CodeType | None) -> list[TracebackType]:
-    """The steps of an exception's way through a function and what a user's code called there."""
+    """The traceback's entries in a function, and in the user's code that it called."""
     steps = _steps(error)
     at = [i for i, step in enumerate(steps) if step.tb_frame.f_code is code]
     return [steps[at[-1]], *(step for step in steps[at[-1] + 1 :] if not _of_library(step))] if at else []
 
 
 def line_of(step: TracebackType) -> str:
-    """File, number and text of the line of a step."""
+    """File, number and text of a traceback entry's line."""
     text = text_of(step)
     return f"{path_of(step.tb_frame.f_code)}, line {step.tb_lineno}" + (f" (`{text}`)" if text else "")
 
 
 def text_of(step: TracebackType) -> str:
-    """Text of the line of a step; empty where there is no source."""
+    """Text of a traceback entry's line; empty if there is no source."""
     return linecache.getline(step.tb_frame.f_code.co_filename, step.tb_lineno).strip()
 
 
 def path_of(code: CodeType) -> str:
-    """The file that some code comes from, as a user would write it."""
+    """The file of some code, relative to the current folder if it lies there."""
     path = Path(code.co_filename)
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
@@ -52,5 +52,5 @@ def _of_library(step: TracebackType) -> bool:
     frame = step.tb_frame
     file = frame.f_code.co_filename
     package = frame.f_globals.get("__name__", "").partition(".")[0]
-    # A name in angle brackets is that of a function that a library wrote.
+    # Code that a library generated has a file name in angle brackets.
     return package in _LIBRARIES or file.startswith("<") or "site-packages" in file or "dist-packages" in file

@@ -1,4 +1,4 @@
-"""Many environments at once, simulated as one batch."""
+"""Vector environments that are simulated as one batch."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,36 +21,36 @@ from observers.checks import bool_array, choice, integer, mapping, real_array, s
 Infos = dict[str, Any]
 Rows = np.ndarray | slice
 ALL = slice(None)  # rows: an index by it is a view
-ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for the cache
-MANY_ROWS = 128  # from which on compiling is worth the seconds that it takes
-MOST_ENVS = 1_000_000  # of which 256 samples of noise are kept, some 10 kB each
+ROWS_AT_ONCE = 64  # rows whose noise is drawn and transposed together; they fit the processor's cache
+MANY_ROWS = 128  # from this number on, compiling saves more seconds than it takes
+MOST_ENVS = 1_000_000  # each stores 256 samples of noise, about 10 kB
 
 
 class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """``num_envs`` copies of :class:`KKLEnv` with equal parameters, simulated as one batch.
 
-    Row i behaves as a :class:`KKLEnv` under a time limit and with the same seed would: the same starts and noise, and
-    the same states to rounding. ``info`` holds the same keys, as arrays with a row for each environment, and for each
-    key a mask ``_key`` of the rows for which it was reported, as Gymnasium's own vector environments do.
+    Row i behaves like a :class:`KKLEnv` under a time limit with the same seed: it has the same starts and noise, and
+    the same states to rounding. ``info`` holds the same keys, as arrays with a row for each environment. For each key a
+    mask ``_key`` marks the rows that reported it, as in Gymnasium's own vector environments.
 
     **Autoreset modes.** ``NEXT_STEP``: the step after an episode's end ignores that row's action and resets it.
-    ``SAME_STEP``: the row is reset at once, the episode's last observation and info are in ``info["final_obs"]`` and
-    ``info["final_info"]``. ``DISABLED``: a row that has ended stays as it is, with reward 0 and its flags still set,
-    until ``reset(options={"reset_mask": mask})``. Its ``u`` and ``escaped`` are then not reported.
+    ``SAME_STEP``: the row is reset at once; ``info["final_obs"]`` and ``info["final_info"]`` hold the episode's last
+    observation and info. ``DISABLED``: a row stays at its episode's end, with reward 0 and its flags still set, until
+    ``reset(options={"reset_mask": mask})``. Its ``u`` and ``escaped`` are then not reported.
 
     Parameters
     ----------
     system : str or System
         As for :class:`KKLEnv`.
     num_envs : int
-        How many.
+        Number of environments.
     render_mode : {None, "rgb_array"}
         Whether :meth:`render` draws.
     max_episode_steps : int, optional
-        Steps after which an episode is truncated; None or -1 is never. ``gym.make_vec`` passes the registered number
-        where its caller leaves it out.
+        Steps after which an episode is truncated; None or -1: never. ``gym.make_vec`` passes the registered number by
+        default.
     autoreset_mode : str or gymnasium.vector.AutoresetMode
-        One of Gymnasium's, see above.
+        One of the modes above.
     **options
         ``dt``, ``process_noise``, ``measurement_noise``, ``observe``, ``parameters``, ``start_box`` and ``sensor``, as
         for :class:`KKLEnv`.
@@ -58,8 +58,8 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     Raises
     ------
     ValueError
-        As :class:`KKLEnv`, if ``num_envs`` is not an integer from 1 to a million or ``max_episode_steps`` not a
-        positive one, and if the mode is unknown.
+        As for :class:`KKLEnv`. Also if ``num_envs`` is not an integer from 1 to a million, ``max_episode_steps`` is not
+        a positive integer, or the mode is unknown.
 
     Examples
     --------
@@ -85,7 +85,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         **options: Any,
     ) -> None:
         num_envs = integer("num_envs", num_envs, 1, MOST_ENVS)
-        if max_episode_steps == -1:  # as gym.make has it
+        if max_episode_steps == -1:  # never, as in gym.make
             max_episode_steps = None
         if max_episode_steps is not None:
             max_episode_steps = integer("max_episode_steps", max_episode_steps, 1)
@@ -107,45 +107,45 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._exchanged()
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
-        # A block of noise for each row, not yet scaled, and where in its block the row is; at first, past the end.
+        # A block of unscaled noise for each row, and the number of samples used of it; at first all are used.
         self._w, self._v = (np.empty((NOISE_BLOCK, width, num_envs)) for width in (nx, self.plant.nv))
         self._used = np.full(num_envs, NOISE_BLOCK)
         self._everyone = np.arange(num_envs)
-        self._x = np.full((nx, num_envs), np.nan)  # component first, as everything inside
+        self._x = np.full((nx, num_envs), np.nan)  # component first, like all arrays inside
         self._y = self._held = np.full((ny, num_envs), np.nan)
         self._sample = np.zeros(num_envs, dtype=np.int64)
         self._escaped, self._terminated, self._truncated = np.zeros((3, num_envs), dtype=bool)
         self._ready = False
-        self.emitted = b""  # the last observations, as observers around it compare what reaches them
-        self._u = np.zeros((self.system.nu, num_envs))  # kept, as the trails are, for rendering
+        self.emitted = b""  # the last observations; an observer outside compares them with those that it receives
+        self._u = np.zeros((self.system.nu, num_envs))  # kept for rendering, like the trails
         self._trails = None if render_mode is None else Trails(self.num_envs)
         self._canvas: Canvas | None = None
 
     @property
     def compiled(self) -> bool:
-        """Whether steps run as compiled code (the extra ``fast``); if not, the logger ``kkl_gym`` reports why."""
+        """Whether steps run as compiled code (extra ``fast``). If not, the logger ``kkl_gym`` reports why."""
         return self._advance.obstacle is None
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Start episodes; observations and info are of all rows, with masks of those that were reset.
+        """Start episodes. Returns observations and info of all rows, with masks of the rows that were reset.
 
         Parameters
         ----------
         seed : int or sequence of int or None, length num_envs, optional
-            One for each row, or one number n for n, n + 1, ...; None goes on with the generators as they are.
+            One for each row, or one number n for n, n + 1, ...; None continues with the present generators.
         options : mapping, optional
-            ``"x0"`` is the start, shape (nx,) for all or (num_envs, nx), which is otherwise uniform in ``start_box``.
-            ``"reset_mask"``, boolean of shape (num_envs,), marks the rows to reset, otherwise all.
+            ``"x0"`` is the start, shape (nx,) for all rows or (num_envs, nx). By default starts are drawn in
+            ``start_box``. ``"reset_mask"``, boolean of shape (num_envs,), marks the rows to reset; by default all.
 
         Raises
         ------
         ValueError
-            On unknown options, wrong shapes, wrong seeds and starts outside the declared bounds. The environments are
-            then as they were.
+            If an option is unknown, a shape or a seed is invalid, or a start lies outside the declared bounds. The
+            environments are then unchanged.
         gymnasium.error.ResetNeeded
-            If some rows are to be reset before all have been.
+            If the mask selects some rows before the first reset of all.
         """
         given, mask = with_mask(options, self.num_envs)
         x0 = (given or {}).get("x0")
@@ -174,17 +174,17 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return self._observation(), self._info(mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
-        """Hold the inputs over one sampling interval; rewards are 0 in rows that reset instead, or stay at their end.
+        """Hold the inputs over one sampling interval. Rows that reset instead, or stay at their end, get reward 0.
 
         Parameters
         ----------
         actions : array_like, shape (num_envs, nu)
-            Inputs over their bounds; values outside [-1, 1] are clipped.
+            Inputs divided by their bounds; values outside [-1, 1] are clipped.
 
         Raises
         ------
         ValueError
-            On a wrong shape, NaN and anything but numbers. The environments are then as they were.
+            If the shape is wrong, or an action is NaN or not a number. The environments are then unchanged.
         gymnasium.error.ResetNeeded
             Before :meth:`reset`.
         """
@@ -215,11 +215,11 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return self._observation(), reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Draw the phase portrait of each row so far, as :meth:`KKLEnv.render`; None without ``render_mode``."""
+        """Draw the phase portrait of each row so far, like :meth:`KKLEnv.render`; None without ``render_mode``."""
         return self.draw()
 
     def draw(self, estimates: Trails | None = None) -> tuple[np.ndarray, ...] | None:
-        """Draw the phase portraits with estimated states of each row beside the true ones."""
+        """Draw the phase portraits with the estimated and the true states of each row."""
         if self._trails is None:
             return None
         if not self._ready:
@@ -231,12 +231,12 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return tuple(self._canvas.draw(*row) for row in zip(self._trails.rows, guesses, self._u.T))
 
     def __getstate__(self) -> dict[str, Any]:
-        # What cannot be copied is made again.
+        # Compiled steps and canvases cannot be copied; they are made again at their next use.
         return {**self.__dict__, "_step": None, "_canvas": None}
 
     @property  # type: ignore[override]
     def np_random(self) -> tuple[np.random.Generator, ...]:
-        """The rows' generators; they are seeded by :meth:`reset`."""
+        """The rows' generators; :meth:`reset` seeds them."""
         return tuple(self._rng(row) for row in range(self.num_envs))
 
     @np_random.setter
@@ -245,7 +245,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """The rows' seeds, None where a row has not been used yet."""
+        """The rows' seeds, None for a row that has not been used."""
         return tuple(self._seeds)
 
     def _spread(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
@@ -268,7 +268,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return rng
 
     def _begin(self, rows: np.ndarray, starts: np.ndarray | None = None) -> None:
-        """Start episodes in some rows; the generators are used in the order in which :class:`KKLEnv` uses its own."""
+        """Start episodes in some rows, with draws in the same order as those of :class:`KKLEnv`."""
         if starts is None:
             starts = np.array([self.plant.draw_start(self._rng(row)) for row in rows.tolist()])
         self._x[:, rows] = starts.T
@@ -293,10 +293,10 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
         escaped = self._outside(x)
-        if escaped.any():  # unless that is but an error of the method
+        if escaped.any():  # or the substeps erred: finer ones decide
             x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(escaped))
             escaped = self._outside(x)
-        if escaped.any():  # the last state and output inside
+        if escaped.any():  # these rows keep the last state and output inside the bounds
             x = np.where(escaped, before, x)
             y = np.where(escaped, self._y[:, rows], self._measure(x, v, rows, start=False))
         else:
@@ -308,7 +308,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return reward
 
     def _outside(self, x: np.ndarray) -> np.ndarray:
-        """Which states (nx, n) lie outside their bounds, or are not finite; (n,)."""
+        """A mask (n,) of the states (nx, n) that lie outside the bounds or are not finite."""
         low, high = self._bounds
         return ~((x >= low) & (x <= high)).all(0)
 
@@ -328,14 +328,14 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             self._draw(drawn[used == NOISE_BLOCK])
             used[used == NOISE_BLOCK] = 0
         self._used[rows] = used + 1
-        if rows is ALL and (used == used[0]).all():  # most often
+        if rows is ALL and (used == used[0]).all():  # the usual case, without copies
             w, v = self.plant.noise(self._w[used[0]].T, self._v[used[0]].T)
         else:
             w, v = self.plant.noise(self._w[used, :, drawn], self._v[used, :, drawn])
         return w.T, v.T
 
     def _draw(self, rows: np.ndarray) -> None:
-        """New blocks of noise for some rows: drawn row by row, stored sample by sample, a few rows at a time."""
+        """Draw new blocks of noise for some rows: row by row, stored sample by sample, a few rows at a time."""
         w, v = (np.empty((ROWS_AT_ONCE, *block.shape[:2])) for block in (self._w, self._v))
         for first in range(0, len(rows), ROWS_AT_ONCE):
             some = rows[first : first + ROWS_AT_ONCE]
@@ -346,12 +346,12 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
                 block[:, :, at] = drawn[: len(some)].transpose(1, 2, 0)
 
     def _measure(self, x: np.ndarray, v: np.ndarray, rows: Rows, *, start: bool) -> np.ndarray:
-        # As System.output, component first and in a third of its time, which a step would feel.
+        # This is System.output with the component first; it takes a third of the time.
         white = v if self._readings is None else np.zeros((self.plant.ny, x.shape[1]))
         try:
             y = np.array([hi + vi for hi, vi in zip(self.system.h(x), white, strict=True)])
         except Exception:
-            components(self.system.h, x)  # raises an EquationError
+            components(self.system.h, x)  # raises an EquationError that names the fault
             raise
         return y if self._readings is None else self._readings.read(y, v, self._everyone[rows], start=start)
 
@@ -378,7 +378,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
 
 def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any] | None, np.ndarray]:
-    """A copy of reset options, out of which some environments take the mask, and the mask, (n,)."""
+    """A copy of reset options, because some environments remove the mask from them, and the mask, (n,)."""
     given = dict(mapping("options", options))
     if given.get("reset_mask") is None:
         return None if options is None else given, np.ones(n, dtype=bool)
@@ -389,14 +389,14 @@ def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any]
 
 
 def autoreset_mode_of(mode: str | AutoresetMode) -> AutoresetMode:
-    """One of Gymnasium's autoreset modes, or ValueError if ``mode`` is neither one nor the name of one."""
+    """Gymnasium's autoreset mode from itself or its name, or ValueError."""
     if isinstance(mode, AutoresetMode):
         return mode
     return AutoresetMode(choice("autoreset_mode", mode, [known.value for known in AutoresetMode]))
 
 
 def last_of_episodes(obs: np.ndarray, info: Infos, ended: np.ndarray) -> Infos:
-    """``final_obs`` and ``final_info`` of ``ended`` (n,) with their masks, as Gymnasium's vectors report them."""
+    """``final_obs`` and ``final_info`` of the rows ``ended`` (n,), with masks, as Gymnasium's vectors report them."""
     final_obs = np.full(len(ended), None, dtype=object)
     for row in np.flatnonzero(ended):
         final_obs[row] = obs[row].copy()

@@ -1,4 +1,4 @@
-"""Learned KKL observers at run time: arrays and artifacts, NumPy alone (and Numba for large batches, if installed)."""
+"""Learned KKL observers at run time. They need only NumPy; Numba, if installed, compiles their steps."""
 
 from observers.artifact import Artifact
 from observers.checks import ArtifactError

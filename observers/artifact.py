@@ -1,4 +1,4 @@
-"""One file that holds a whole observer: filter, maps, scaling, and what they were made for."""
+"""One file that holds a whole observer: filter, maps, scaling, and the system for which they were made."""
 
 import functools
 import math
@@ -19,14 +19,14 @@ from observers.motion import Motion
 from observers.network import MLP
 
 FORMAT = 1
-FAR = 10.0  # multiples of the largest input in training beyond which observers warn
-USUAL_NOISE = 0.5  # standard deviation of the measurement noise where no other is given
+FAR = 10.0  # observers warn of inputs beyond this multiple of the largest in training
+USUAL_NOISE = 0.5  # default standard deviation of the measurement noise
 _KEY = "kkl-gym"
 
 
 @dataclass(frozen=True)
 class Artifact:
-    """An observer as it is stored.
+    """An observer as its file stores it. Raises ArtifactError if its parts do not fit each other.
 
     Parameters
     ----------
@@ -39,39 +39,39 @@ class Artifact:
     parameters : mapping of str to float
         The system's physical parameters.
     forward : ForwardMap, optional
-        T, where one was learned.
+        T, if it was learned.
     C : ndarray, shape (ny, nx), optional
-        Where the output is linear, h(x) = C x: what coasting and monitoring need.
+        Matrix of a linear output h(x) = C x. Predictions of missing outputs and the monitor need C or h.
     h : Expression, optional
-        The output h(x), where it is not linear.
+        An output h(x) that is not linear.
     limits : Limits, optional
-        Limits of the residual y - h(x_hat) in sound operation, where they were found.
+        Limits of the residual y - h(x_hat) in normal operation, if they were calibrated.
     free_inverse : InverseMap, optional
-        T_inv of z_y alone, in use as long as no input has acted since reset. Motions without input keep to far fewer
-        states than driven ones, which a map that knows of no input can rely on.
+        T_inv of z_y only, in use until an input acts. Motions without input visit far fewer states than driven ones, so
+        that a map for them alone is more accurate.
     motion : Motion, optional
-        The system's motion, by its equations or by a learned flow. An observer that has it tracks: a Kalman filter on
-        the motion carries the estimate, and T_inv initialises it.
+        The system's motion, by its equations or by a learned flow. An observer with a motion tracks: a Kalman filter
+        on the motion carries the estimate, and T_inv initialises it.
     measurement_noise : float or tuple of float, length ny, default 0.5
-        Standard deviation of the usual noise on each sample, of all outputs or each, which observers assume where none
-        is given. It is cut at the largest in the maps' training.
+        Default standard deviation of the noise on each sample, one for all outputs or one for each. Observers limit it
+        to the largest in the maps' training.
     u_max : tuple of float, length nu, optional
         Largest absolute values of the inputs in training. Observers warn once of inputs beyond ten times these.
     parameter_ranges : mapping of str to (float, float), optional
-        Low and high end of parameters that are not known exactly: the observer was trained for systems with any
-        parameters within.
+        (low, high) of each uncertain parameter: the observer was trained for systems with any parameters within these
+        ranges.
     estimated_parameters : tuple of str, optional
-        Those of them that the maps estimate: their last outputs, in this order, behind the states.
+        The uncertain parameters that the maps estimate. They are the last outputs of T_inv, in this order.
     training : mapping, optional
-        How it was made: method, preset, configuration, seed, measures.
+        Record of the training: method, preset, configuration, seed, measures.
     versions : mapping of str to str, optional
-        Versions of the libraries that made it.
+        Versions of the libraries in the training.
     signals : mapping of str to sequence of str, optional
-        Of an observer that was learned from recorded states, without equations: names of the columns "measured", y,
-        "inputs", u, and "hidden", x.
+        For an observer that was learned from recorded states, without equations: the names of the columns "measured"
+        (y), "inputs" (u) and "hidden" (x).
     environment : mapping of str to object, optional
-        Of an observer that was learned from rollouts of an environment: its "id" and its arguments, "kwargs". It fits
-        that environment alone. Without it, an observer that was learned from recorded states fits none.
+        For an observer that was learned from rollouts of an environment: the "id" of that environment and its arguments
+        "kwargs". It fits only that environment. An observer with signals but without this entry fits none.
     """
 
     filter: LinearFilter
@@ -143,7 +143,7 @@ class Artifact:
             raise ArtifactError(f"limits of {self.limits.mean.shape[1]} residuals need a C or h with as many outputs")
 
     def require_system(self) -> None:
-        """Raise ArtifactError if the observer was learned from recorded states: there is no system behind it then."""
+        """Raise ArtifactError if the observer was learned from recorded states and so has no system."""
         if self.signals is not None:
             names = {role: ", ".join(of) for role, of in self.signals.items()}
             given = " and ".join(of for of in (names["measured"], names["inputs"]) if of)
@@ -156,7 +156,7 @@ class Artifact:
     def _check_free(self, free: InverseMap) -> None:
         nz = len(self.filter.A)
         if "z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu:
-            raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
+            raise ArtifactError(f"a map of free motion must take z_y, {nz} values, and needs one with inputs beside it")
         own = _conditions(self.inverse)
         if differing := [name for name, value in _conditions(free).items() if value != own[name]]:
             raise ArtifactError(f"the maps of free and of driven motion differ in {', '.join(differing)}")
@@ -171,7 +171,7 @@ class Artifact:
         if self.inverse.error_covariance is None or not self.knows_output:
             raise ArtifactError("a motion needs T_inv's covariance and the output h(x) beside it")
         if self.parameter_ranges:
-            raise ArtifactError(f"a motion is of one plant, not of a range of {', '.join(self.parameter_ranges)}")
+            raise ArtifactError(f"a motion has fixed parameters, not ranges of {', '.join(self.parameter_ranges)}")
 
     def _check_signals(self, signals: Mapping[str, Sequence[str]]) -> None:
         counts = {"measured": self.ny, "inputs": self.nu, "hidden": self.nx}
@@ -191,7 +191,7 @@ class Artifact:
             raise ArtifactError(f"an observer for the environment {environment['id']} must name its signals")
 
     def _check_ranges(self) -> None:
-        """Raise an error unless there is a range about each uncertain parameter, and a state beside those estimated."""
+        """Raise an error unless uncertain parameters lie in their ranges, and the maps estimate at least one state."""
         for name, ends in self.parameter_ranges.items():
             if not isinstance(ends, list | tuple) or len(ends) != 2 or not all(map(is_finite, ends)):
                 raise ArtifactError(f"the range of the parameter {name} must be two finite numbers, got {shown(ends)}")
@@ -199,7 +199,7 @@ class Artifact:
                 raise ArtifactError(
                     f"the range {shown(tuple(ends))} of {name} must hold its value; parameters: {dict(self.parameters)}"
                 )
-        tuples = {name: tuple(ends) for name, ends in self.parameter_ranges.items()}  # of what may be JSON's lists
+        tuples = {name: tuple(ends) for name, ends in self.parameter_ranges.items()}  # JSON has lists
         object.__setattr__(self, "parameter_ranges", tuples)
         if not {*self.estimated_parameters} <= {*self.parameter_ranges}:
             raise ArtifactError(
@@ -212,9 +212,9 @@ class Artifact:
                 f"{len(self.estimated_parameters)} parameters"
             )
 
-    @functools.cached_property  # which every step asks for
+    @functools.cached_property  # every step reads it
     def nx(self) -> int:
-        """Number of states estimated."""
+        """Number of estimated states."""
         return len(self.inverse.x_offset) - len(self.estimated_parameters)
 
     @functools.cached_property
@@ -224,17 +224,17 @@ class Artifact:
 
     @functools.cached_property
     def nu(self) -> int:
-        """Number of inputs that the observer takes into account."""
+        """Number of inputs that the observer uses."""
         return self.filter.nu
 
     @functools.cached_property
     def usual_input(self) -> float:
-        """Largest absolute value of an input that is not far beyond those of training, whichever input it is."""
+        """Absolute value up to which no input is far beyond its range in training."""
         return min([LARGEST, *(FAR * each for each in self.u_max or ())])
 
     @property
     def knows_output(self) -> bool:
-        """Whether the artifact holds the output h(x), which :meth:`output` and :meth:`residual` need."""
+        """Whether the artifact holds h(x), as C or as h; :meth:`output` and :meth:`residual` need it."""
         return self.C is not None or self.h is not None
 
     def output(self, x: np.ndarray) -> np.ndarray:
@@ -249,7 +249,7 @@ class Artifact:
         return self.h(x)
 
     def residual(self, y: np.ndarray, x_hat: np.ndarray) -> np.ndarray:
-        """Return y - h(x_hat); 0, as if they fitted, where h is not defined. Shapes and error as :meth:`output`."""
+        """Return y - h(x_hat), and 0 where h is not defined. Shapes and error as in :meth:`output`."""
         apart = y - self.output(x_hat)
         return apart if self.C is not None else np.where(np.isfinite(apart), apart, 0.0)
 
@@ -261,10 +261,10 @@ class Artifact:
         )
 
     def require_known_start(self) -> None:
-        """Raise ArtifactError unless an observer can begin at a known state: by T, or by tracking from there."""
+        """Raise ArtifactError unless an observer can start at a known state, which needs T or a motion."""
         if self.motion is None and self.forward is None:
             self._lacks(
-                "can begin at no known state: it holds neither a motion nor T; kkl-gym train makes one that tracks, "
+                "cannot start at a known state: it holds neither a motion nor T; kkl-gym train makes one that tracks, "
                 "and kkl-gym train SYSTEM --pipeline spinn one with T"
             )
 
@@ -286,18 +286,18 @@ class Artifact:
         return self.inverse.process_noise_max if "process_noise" in self.inverse.features else None
 
     def check(self, system: str, parameters: Mapping[str, float], *, dt: float, ny: int, nu: int) -> None:
-        """Raise ArtifactError, which names both values, unless the observer was made for this system.
+        """Raise an ArtifactError that names both values unless the observer was made for this system.
 
         Parameters
         ----------
         system : str
             Name of the system.
         parameters : mapping of str to float
-            Its physical parameters; those with a range may lie anywhere within.
+            Its physical parameters; one with a range may have any value within.
         dt : float
             Sampling interval in seconds.
         ny, nu : int
-            Numbers of outputs and inputs. An observer that knows of no input serves any number of them.
+            Numbers of outputs and inputs. An observer without inputs fits a system with any number of inputs.
         """
 
         def differ(what: str, here: Any, there: Any) -> None:
@@ -326,19 +326,19 @@ class Artifact:
                 differ(f"the number of {what}", own, given)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the artifact; the file appears whole or not at all.
+        """Write the artifact atomically: an interrupted write leaves no partial file.
 
         Parameters
         ----------
         path : str or PathLike
-            The file, whose name should end in ``.safetensors``; its folder is made.
+            The file, whose name should end in ``.safetensors``. A missing folder is created.
 
         Raises
         ------
         OSError
             If the file cannot be written.
         TypeError, ValueError
-            If JSON cannot hold ``training``, ``versions`` or a number.
+            If JSON cannot represent ``training``, ``versions`` or a number.
         """
         tensors: dict[str, np.ndarray] = {}
         described = {"format": FORMAT, **_put(tensors, "", self)}
@@ -356,13 +356,13 @@ class Artifact:
         Returns
         -------
         Artifact
-            What :meth:`save` wrote.
+            The artifact that :meth:`save` wrote.
 
         Raises
         ------
         ArtifactError
-            If the file is missing, not readable, damaged, foreign, of another format, without checksum, too large or
-            holds no observer.
+            If the file is missing, unreadable, damaged, too large or of another format, or has no checksum or no
+            observer.
         """
         tensors, described = storage.read(path, key=_KEY, error=ArtifactError, what="an observer")
         with storage.explained(path, ArtifactError):
@@ -380,7 +380,7 @@ class Artifact:
 
 
 def _conditions(inverse: InverseMap) -> dict[str, Any]:
-    """What two maps of one artifact must have in common."""
+    """The properties in which two maps of one artifact must agree."""
     process_noise = inverse.process_noise_unit, inverse.process_noise_max
     return {
         "number of outputs": inverse.mlp.outputs,
@@ -391,7 +391,7 @@ def _conditions(inverse: InverseMap) -> dict[str, Any]:
 
 
 def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, Any]:
-    """Add the arrays of a part under names that begin with ``prefix``; returns its other fields, parts nested."""
+    """Add the arrays of a part under names that begin with ``prefix``; returns its other fields, as nested dicts."""
     described: dict[str, Any] = {}
     for entry in fields(part):
         name, value = entry.name, getattr(part, entry.name)
@@ -413,7 +413,7 @@ def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, An
 
 
 def _get(kind: Any, tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> Any:
-    """The part that :func:`_put` took apart; raises KeyError unless all is there that it writes."""
+    """Rebuild a part that :func:`_put` took apart; raises KeyError if an array or a field is missing."""
     left = dict(described)
     values: dict[str, Any] = {}
     for entry in fields(kind):
@@ -429,7 +429,7 @@ def _get(kind: Any, tensors: Mapping[str, np.ndarray], prefix: str, described: M
         elif name in left:
             value = left.pop(name)
             values[name] = tuple(value) if isinstance(value, list) else value
-        elif entry.default not in (None, math.inf):  # which are not written
+        elif entry.default not in (None, math.inf):  # _put does not write these
             raise KeyError(f"{prefix}{name}")
     if left:
         raise ArtifactError(f"unknown metadata keys: {', '.join(f'{prefix}{name}' for name in sorted(left))}")

@@ -1,4 +1,4 @@
-"""Checks of arguments: real numbers, and nothing that Python or NumPy would quietly turn into one."""
+"""Checks of arguments. They reject values that Python or NumPy would silently convert to numbers."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.ma import MaskedArray, is_masked
 
-_FLOAT = np.dtype(float)  # one object: to compare by identity is quick, and a step's cost would be felt
-LARGEST = 1e15  # of an output or input; beyond it float32 would overflow
-_NO_NUMBERS = (bool, np.timedelta64)  # though Python takes one for an integer, and NumPy the other
-_TEXTS = (str, bytes, bytearray, memoryview)  # sequences too
-_LARGEST_LEVEL = 1e12  # of noise; outputs under it stay far within what observers take, and within float32
+_FLOAT = np.dtype(float)  # a comparison by identity is fastest, and every step makes one
+LARGEST = 1e15  # largest output or input; beyond it float32 would overflow
+_NO_NUMBERS = (bool, np.timedelta64)  # Python converts the first to an integer, NumPy the second
+_TEXTS = (str, bytes, bytearray, memoryview)  # these are sequences, but not of numbers
+_LARGEST_LEVEL = 1e12  # largest noise level; outputs under it stay far within LARGEST and float32
 
 
 class ArtifactError(ValueError):
@@ -27,36 +27,36 @@ def check_shapes(owner: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
 
 
 def shown(value: object) -> str:
-    """A value as error messages show it: on one line, and cut where it is long."""
+    """The text of a value for error messages: one line, shortened if it is long."""
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # such as of integers of more than 4,300 digits
+    except Exception:  # repr fails, as for integers of more than 4,300 digits
         return f"a {type(value).__name__}"
     return text if len(text) <= 200 else f"{text[:150]} … {text[-40:]}"
 
 
 def is_finite(value: object) -> bool:
-    """Whether a value is a real number, not a bool or an interval of time, that is finite as a float."""
+    """Whether a value is a finite real number; bools and time intervals are not."""
     try:
         return isinstance(value, Real) and not isinstance(value, _NO_NUMBERS) and math.isfinite(value)
-    except OverflowError:  # an integer beyond every float
+    except OverflowError:  # an integer beyond the range of floats
         return False
 
 
 def all_finite(values: np.ndarray, largest: float = LARGEST) -> bool:
-    """Whether outputs or inputs are numbers, none of them beyond the largest."""
-    if values.ndim == 1:  # a single sample: numpy's own overhead would be felt
-        for value in values.tolist():  # noqa: SIM110 - and a generator's too
+    """Whether outputs or inputs are finite and at most ``largest`` in absolute value."""
+    if values.ndim == 1:  # fast path for one sample
+        for value in values.tolist():  # noqa: SIM110 - a generator is slower
             if not -largest <= value <= largest:  # false for NaN too
                 return False
         return True
-    if np.vdot(values, values) <= largest**2:  # one pass; false for NaN too
+    if np.vdot(values, values) <= largest**2:  # a fast sufficient test; false for NaN
         return True
     return bool((np.abs(values) <= largest).all())
 
 
 def noise_level(name: str, level: Any) -> float:
-    """Return a level of noise as a float."""
+    """Return a noise level as a float, or raise ValueError."""
     if not is_finite(level) or level < 0:
         raise ValueError(f"{name} must be a finite number, not negative, got {shown(level)}")
     level = float(level)
@@ -66,7 +66,7 @@ def noise_level(name: str, level: Any) -> float:
 
 
 def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
-    """Return levels of noise as one float for all outputs, or a tuple of one for each."""
+    """Return noise levels as one float for all outputs or a tuple with one for each, or raise ValueError."""
     if not isinstance(levels, list | tuple | np.ndarray) or (isinstance(levels, np.ndarray) and levels.ndim == 0):
         return noise_level(name, levels)
     if len(levels) != ny:
@@ -76,14 +76,14 @@ def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
 
 
 def check_dt(dt: Any) -> float:
-    """Return a sampling interval as a float."""
+    """Return a sampling interval as a float, or raise ValueError."""
     if not is_finite(dt) or not float(dt) > 0:
         raise ValueError(f"dt must be a positive, finite number of seconds, got {shown(dt)}")
     return float(dt)
 
 
 def integer(name: str, value: Any, least: int, most: int | None = None) -> int:
-    """Return a whole number as an int."""
+    """Return a whole number as an int, or raise ValueError."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, _NO_NUMBERS)
     if not whole or value < least or (most is not None and value > most):
         wanted = "a positive integer" if least == 1 else "an integer, not negative"
@@ -94,21 +94,21 @@ def integer(name: str, value: Any, least: int, most: int | None = None) -> int:
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return a bool; "no" would count as true."""
+    """Return a bool, or raise ValueError; a text such as "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {shown(value)}")
     return bool(value)
 
 
 def choice(name: str, value: Any, options: Collection[str]) -> str:
-    """Return a string that is one of ``options``."""
+    """Return a string that is one of ``options``, or raise ValueError."""
     if not isinstance(value, str) or value not in options:
         raise ValueError(f"{name} must be {' or '.join(repr(option) for option in options)}, got {shown(value)}")
     return value
 
 
 def mapping(name: str, value: Any) -> Mapping[Any, Any]:
-    """Return a mapping, an empty one for None."""
+    """Return a mapping, an empty one for None, or raise ValueError."""
     if value is None:
         return {}
     if not isinstance(value, Mapping):
@@ -117,7 +117,7 @@ def mapping(name: str, value: Any) -> Mapping[Any, Any]:
 
 
 def real_array(name: str, values: Any) -> np.ndarray:
-    """Return numbers as an array of float64."""
+    """Return numbers as an array of float64, or raise ValueError."""
     if type(values) is np.ndarray:
         if values.dtype is _FLOAT:
             return values
@@ -131,15 +131,15 @@ def real_array(name: str, values: Any) -> np.ndarray:
             if array.dtype is _FLOAT:
                 return array
             if array.dtype.kind in "fiu":
-                with np.errstate(over="ignore"):  # larger values become infinite, which callers reject
+                with np.errstate(over="ignore"):  # callers reject infinite values
                     return array.astype(float)
-    except Exception as error:  # ragged lists, and any exception that __array__ of a foreign object raises
+    except Exception as error:  # ragged lists, and any exception from __array__ of other objects
         raise ValueError(f"{name} must hold real numbers in the shape of an array, got {shown(values)}") from error
     raise ValueError(f"{name} must hold real numbers, got {shown(values)}")
 
 
 def _of_numbers(values: Any) -> bool:
-    """Whether all that nested sequences hold are numbers: NumPy takes True for 1 beside floats, and drops masks."""
+    """Whether nested sequences hold only numbers; NumPy would convert True to 1 and drop masks."""
     if type(values) is list or isinstance(values, Sequence):
         if isinstance(values, _TEXTS):
             return False
@@ -153,7 +153,7 @@ def _of_numbers(values: Any) -> bool:
 
 
 def bool_array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array of bools."""
+    """Return an array of bools, or raise ValueError."""
     try:
         array = values if type(values) is np.ndarray else np.asarray(values)
     except Exception as error:  # as in real_array

@@ -1,4 +1,4 @@
-"""A tracker's step as machine code, where Numba is installed: its numbers, as the kernel orders them."""
+"""The compiled step of a tracker, where Numba is installed: it orders the tracker's numbers for the kernel."""
 
 import functools
 from typing import Any, cast
@@ -11,13 +11,13 @@ from observers.filter import LinearFilter
 from observers.tracker import Tracker
 
 _LANES = 8  # rows that are stepped together
-MOST_OPERATIONS = 400  # of expressions; beyond, such as for a network as f, compiling takes many seconds
+MOST_OPERATIONS = 400  # longer expressions, such as a network as f, would take many seconds to compile
 
 
 class CompiledStep:
-    """The step of :class:`observers.kkl.KKL` with a tracker, of rows of its state in place.
+    """The compiled step of :class:`observers.kkl.KKL` with a tracker; it changes rows of the state in place.
 
-    Raises ImportError without Numba, and ValueError where an expression is too long to compile.
+    Raises ImportError without Numba, and ValueError if an expression is too long to compile.
     """
 
     def __init__(self, artifact: Artifact, decoders: Decoders, tracker: Tracker) -> None:
@@ -42,12 +42,12 @@ class CompiledStep:
             *(watch.trend_square_share, watch.trend_gain, watch.trend_limit, tracker.gate),
         )
         self._parts = tuple(of for each in zip(*maps, strict=True) for of in each), (scaling, affine, *network)
-        self._window, self._seen = watch.window, linear.size + ny + 1 + tracker.nis + 2  # the place of samples seen
+        self._window, self._seen = watch.window, linear.size + ny + 1 + tracker.nis + 2  # the column of samples seen
         self._usual, self._first, self._no_record = self._at(linear), np.zeros(1, int), np.empty((1, 0, 0))
         self._one, self._many = self._code(1), cast(Any, None)
 
     def _code(self, W: int) -> Any:
-        """The kernel for W rows at once, with the addresses of the motion and of the output."""
+        """The kernel for groups of W rows, with the addresses of the compiled motion and output."""
         from observers import kernel, kernel_functions
 
         (nx, ny, nu), equations, addresses = self._sizes, self._motion.equations, [0, 0]
@@ -59,9 +59,9 @@ class CompiledStep:
         return functools.partial(kernel.steps(nx, ny, nu, W), tuple(addresses))
 
     def _at(self, linear: LinearFilter) -> tuple[Any, ...]:
-        """All that the kernel takes before rows and samples, at the sampling interval of a filter."""
+        """The kernel's arguments before rows and samples, at the sampling interval of a filter."""
         samples, h, equations = linear.dt / self._linear.dt, 0.0, self._motion.equations
-        substeps = -round(samples)  # of a flow
+        substeps = -round(samples)  # negative: steps of a flow
         if equations is not None:
             substeps = equations.steps(samples)
             h = linear.dt / substeps
@@ -71,11 +71,11 @@ class CompiledStep:
     def __call__(
         self, linear: LinearFilter, rows: np.ndarray, y: np.ndarray, u: np.ndarray, record: Any = None
     ) -> None:
-        """Take samples and inputs, at the interval of a filter, into rows, which a record keeps at each sample.
+        """Advance rows by samples and inputs, at the interval of a filter; ``record`` stores the rows at each sample.
 
         Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu), ``record`` (steps, n, width).
         """
-        # Numba would compile again for arrays that are read-only or have gaps.
+        # Numba would compile again for arrays that are read-only or not contiguous.
         y, u = (each if each.flags.carray else np.array(each, order="C") for each in (y, u))
         model = self._usual if linear is self._linear else self._at(linear)
         given = rows, y, u, self._no_record if record is None else record
@@ -85,19 +85,19 @@ class CompiledStep:
                 self._many = self._code(_LANES)
             settled = rows[:, self._seen] >= self._window
             few, many = few[~settled], few[settled]
-            self._many(*model, many, *given)  # even of no rows: the first batch compiles both, and no later one waits
+            self._many(*model, many, *given)  # even without rows, so that the first batch compiles both kernels
         self._one(*model, few, *given)
 
 
 def _of_map(decoder: Decoder) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, np.ndarray]]:
-    """A map's network, and its covariances by age."""
+    """Network of a map, and its covariances by age."""
     error = decoder.error
-    assert error is not None  # of a map that tracks
+    assert error is not None  # maps that track have a covariance
     return decoder.network, (np.array(error.ages), error.covariance.reshape(len(error.ages), -1).copy())
 
 
 def _of_filter(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gains of z itself and of what drives it, and the few entries of the transition off its diagonal."""
+    """Gains of z, outputs and inputs on z, and the few entries of the transition off its diagonal."""
     diagonal = transition.diagonal()
     places = np.array(np.nonzero(transition - np.diag(diagonal)))
     return np.vstack([diagonal, drive]), places, transition[*places]

@@ -1,4 +1,4 @@
-"""From the filter's state to T_inv's estimate, and to the covariance of its error, at given levels of noise."""
+"""T_inv at given noise levels: estimates and their error covariances from the filter's state."""
 
 import functools
 from typing import Any
@@ -11,7 +11,7 @@ from observers.machine import available
 
 
 class Decoders:
-    """T_inv of driven and of free motion, some of their outputs; each row is decoded by the one that it needs."""
+    """T_inv of driven and of free motion, or some of their outputs. Each row uses the map for its own motion."""
 
     def __init__(self, artifact: Artifact, outputs: slice, **options: Any) -> None:
         free = artifact.free_inverse
@@ -30,7 +30,7 @@ class Decoders:
         driven, free = self.driven, self.free
         if free is None:
             return np.asarray(of(driven, z, age))
-        nz = free.size  # behind it lies z_u, exactly 0 until an input acts
+        nz = free.size  # z_u follows z_y, and is exactly 0 until an input acts
         moved = z[..., nz:].any(-1)
         if moved.all() or not moved.any():
             return np.asarray(of(driven, z, age) if moved.all() else of(free, z[..., :nz], age))
@@ -42,7 +42,7 @@ class Decoders:
 
 
 class Decoder:
-    """T_inv at given levels of noise: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
+    """T_inv at given noise levels: maps z, (..., size), and the age in seconds to x_hat, (..., nx)."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Decoder:
         self._offset = -inverse.z_offset @ self._whiten
         self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
         self._needs_age = inverse.features[-1] == "age"
-        self._machine = compiled is not False  # where there is Numba
+        self._machine = compiled is not False  # if Numba is installed
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the estimate."""
@@ -90,10 +90,10 @@ class Decoder:
 
     @functools.cached_property
     def network(self) -> tuple[np.ndarray, ...]:
-        """What :func:`observers.kernel_functions.decode` takes.
+        """The network in the form of :func:`observers.kernel_functions.decode`.
 
-        The coordinates in which the network sees z are a matrix product, as its first layer is: they are one, in
-        doubles. (They are differences of filter states that are much alike, of which float32 would leave little.)
+        Whitening of z and the first layer are one matrix product, in double precision. In float32 the differences of
+        nearly equal filter states would lose their digits.
         """
         inverse, modes = self._inverse, len(self._offset)
         weight, bias = (part.astype(float) for part in inverse.mlp.layers[0])

@@ -1,4 +1,4 @@
-"""What every estimator of a state does, whatever it is made of."""
+"""The interface of all state estimators."""
 
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -8,7 +8,7 @@ State = TypeVar("State")
 
 
 class Estimate(NamedTuple):
-    """Estimates (n, nx) at one time; covariances of their errors (n, nx, nx) and a monitor's scores (n,), if any."""
+    """Estimates (n, nx) at one time, their error covariances (n, nx, nx) and a monitor's scores (n,), each or None."""
 
     x_hat: np.ndarray
     covariance: np.ndarray | None = None
@@ -16,9 +16,9 @@ class Estimate(NamedTuple):
 
 
 class Estimator(Protocol[State]):
-    """A batch of n rows, of which each is an estimator of its own; the caller keeps its state.
+    """A batch of n independent estimators, one in each row; the caller keeps their state.
 
-    No method changes a state that it is given, so that a state is also a snapshot. A single sample is a batch of one.
+    No method changes a given state, so every state is also a snapshot. A single sample is a batch of one.
     """
 
     def start(self, n: int) -> State:
@@ -27,7 +27,7 @@ class Estimator(Protocol[State]):
     def advance(self, state: State, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> State:
         """Return the state after samples y (n, ny), NaN where missing, and inputs u (n, nu) held for dt before them.
 
-        The first sample of a row, which must be whole, begins it; the input before it is ignored.
+        The first complete sample of a row starts its estimate; the input before it is ignored.
         """
 
     def estimate(self, state: State) -> Estimate:
@@ -35,19 +35,19 @@ class Estimator(Protocol[State]):
 
 
 class Running:
-    """An estimator with its state, sample by sample, in all rows or in some."""
+    """An estimator together with its state."""
 
     def __init__(self, estimator: Estimator[Any]) -> None:
         self.estimator = estimator
         self.state: Any = None
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Begin with first samples (n, ny); returns the estimates (n, nx)."""
+        """Start at first samples (n, ny). Returns the estimates (n, nx)."""
         self.state = self.estimator.advance(self.estimator.start(len(y0)), y0)
         return self.decode()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
-        """Begin again in rows (n,), with their first samples (number of True in rows, ny)."""
+        """Restart rows (n,) at their first samples (number of True in rows, ny)."""
         begun, state = self.estimator.advance(self.estimator.start(len(y0)), y0), []
         for before, after in zip(self.state, begun, strict=True):
             state.append(before.copy())
@@ -55,7 +55,7 @@ class Running:
         self.state = type(self.state)(*state)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
-        """Take in samples (n, ny) after inputs (n, nu), in all rows or in some."""
+        """Process samples (n, ny) after inputs (n, nu), in all rows or some."""
         state = self.estimator.advance(self.state, y, u)
         if rows is not None:
             for before, after in zip(self.state, state, strict=True):
@@ -63,16 +63,16 @@ class Running:
         self.state = state
 
     def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Take in samples and return the estimates (n, nx)."""
+        """Process samples, and return the estimates (n, nx)."""
         self.advance(y, u)
         return self.decode()
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the estimates (n, nx), of all rows or of some."""
+        """Return the estimates (n, nx) of all rows or some."""
         x_hat = self.estimator.estimate(self.state).x_hat
         return x_hat if rows is None else x_hat[rows]
 
     def along(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Return the estimates along records y (steps, n, ny) and inputs u (steps - 1, n, nu); (steps, n, nx)."""
+        """Return estimates (steps, n, nx) along records y (steps, n, ny) and inputs u (steps - 1, n, nu)."""
         first = self.reset(y[0])
         return np.array([first, *(self.step(y[k], None if u is None else u[k - 1]) for k in range(1, len(y)))])

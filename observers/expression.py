@@ -1,4 +1,4 @@
-"""Functions of state and input as data: a file can hold f, g and h, and nothing in it runs."""
+"""Functions of state and input as data, so that a file can store f, g and h without executable code."""
 
 import functools
 import reprlib
@@ -10,19 +10,19 @@ import numpy as np
 
 from observers.checks import is_finite
 
-MOST_LEVELS = 24  # of expressions within one another
-MOST_PARTS = 2000  # of all components together: numbers, states and functions
-_POWERS = 8  # up to which an exponent becomes products
-_MOST_NESTED = 16  # sums and the like within one another
+MOST_LEVELS = 24  # levels of nested expressions
+MOST_PARTS = 2000  # numbers, states and functions in all components together
+_POWERS = 8  # integer exponents up to this become products
+_MOST_NESTED = 16  # nested operators in one source line
 
 
 class _Rule(NamedTuple):
-    """What a name stands for: a function of numbers or conditions, as Python source that NumPy and Numba take."""
+    """The function behind a name: Python source for NumPy and Numba, and the types of its arguments and result."""
 
     source: str
-    takes: tuple[bool, ...]  # for each argument, whether it is a condition
-    more: bool = False  # whether it goes on with any number of arguments like the last
-    gives: bool = False  # whether it is a condition itself
+    takes: tuple[bool, ...]  # whether each argument is a condition
+    more: bool = False  # whether more arguments like the last may follow
+    gives: bool = False  # whether the result is a condition
 
 
 _RULES: dict[str, _Rule] = {
@@ -47,12 +47,12 @@ _RULES: dict[str, _Rule] = {
 
 @dataclass(frozen=True)
 class Expression:
-    """A function of the state and the input, component by component, as JSON can hold it.
+    """A function of the state and the input, as nested lists that JSON can store.
 
     A component is a number, a state ``["x", index]``, an input ``["u", index]``, or a list of a name and its arguments,
-    such as ``["*", 2.0, ["sin", ["x", 0]]]``. The names are those of arithmetic (``+``, ``*``, ``**``, ``%``), of
-    ``kkl_gym.elementary`` and of comparisons (``<``, ``<=``, ``>``, ``>=``, ``and``, ``or``, ``not``), which ``where``
-    takes as its first argument.
+    such as ``["*", 2.0, ["sin", ["x", 0]]]``. Names are arithmetic operators (``+``, ``*``, ``**``, ``%``), functions
+    of ``kkl_gym.elementary``, and comparisons (``<``, ``<=``, ``>``, ``>=``, ``and``, ``or``, ``not``) for the first
+    argument of ``where``. Raises ValueError if a component has another form.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Expression:
         object.__setattr__(self, "components", checked)
 
     def __call__(self, x: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Evaluate it. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., number of components)."""
+        """Evaluate the function. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., number of components)."""
         x = np.asarray(x, dtype=float)
         rows = [x[..., i] for i in range(self.states)]
         rows += [np.asarray(u, dtype=float)[..., j] for j in range(self.inputs)]
@@ -88,37 +88,37 @@ class Expression:
         return namespace["function"]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"components": self.components}  # functions by source cannot be pickled
+        return {"components": self.components}  # compiled source cannot be pickled
 
     def python(self, name: str, nx: int, nu: int) -> str:
-        """Source of a function of nx states and nu inputs, each an argument, that returns a tuple of the components."""
+        """Python source of a function of nx states and nu inputs, one argument each; it returns the components."""
         given = ", ".join([*(f"x{i}" for i in range(nx)), *(f"u{j}" for j in range(nu))])
         return f"def {name}({given}):\n    return ({''.join(_source(part) + ', ' for part in self.components)})"
 
     @property
     def operations(self) -> int:
-        """Number of arguments of all functions."""
+        """Number of operations, counted by the arguments of all functions."""
         named = [part for each in self.components for part in _parts(each) if isinstance(part, tuple)]
         return sum(len(part) - 1 for part in named if part[0] not in ("x", "u"))
 
     @functools.cached_property
     def states(self) -> int:
-        """Number of states that it needs."""
+        """Number of states that the function needs."""
         return self._count("x")
 
     @functools.cached_property
     def inputs(self) -> int:
-        """Number of inputs that it needs."""
+        """Number of inputs that the function needs."""
         return self._count("u")
 
     def _count(self, letter: str) -> int:
-        """One more than the largest index of a letter."""
+        """The largest index of a letter plus one."""
         parts = (part for each in self.components for part in _parts(each))
         return max((int(part[1]) + 1 for part in parts if isinstance(part, tuple) and part[0] == letter), default=0)
 
 
 def _checked(part: Any, condition: bool, levels: int, left: list[int]) -> Any:
-    """A part of an expression as numbers and tuples; ``left`` holds how many parts more there may be."""
+    """Check a part of an expression and return it as numbers and tuples; ``left`` counts the parts still allowed."""
     left[0] -= 1
     if left[0] < 0 or levels < 0:
         raise ValueError(f"an expression has at most {MOST_PARTS} parts, on at most {MOST_LEVELS} levels")
@@ -157,7 +157,7 @@ def _source(part: Any) -> str:
 
 
 def _joined(source: str, sources: list[str], arity: int) -> str:
-    """A function of any number of arguments by one of ``arity``; many are halved, or Python could not nest them."""
+    """Apply a function of ``arity`` arguments to more of them, by halves, because Python limits nesting."""
     if len(sources) > _MOST_NESTED:
         half = len(sources) // 2
         sources = [_joined(source, sources[:half], arity), _joined(source, sources[half:], arity)]

@@ -1,4 +1,4 @@
-"""Covariances by age and level of measurement noise, as calibration on runs finds them."""
+"""Calibrated error covariances, by age and level of measurement noise."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -7,12 +7,12 @@ import numpy as np
 
 from observers.checks import ArtifactError, shown
 
-COVERAGE = 0.9  # of the regions that calibration makes true
+COVERAGE = 0.9  # the share of errors that the calibrated regions hold
 _MAX_FACTOR = 1e12
 
 
 def _check_grid(levels: np.ndarray, ages: np.ndarray) -> tuple[int, int]:
-    """Raise ArtifactError unless levels and ages rise from 0; returns how many there are."""
+    """Return the numbers of levels and ages; ArtifactError unless both rise from 0."""
     for name, values in (("levels", levels), ("ages", ages)):
         rising = values.ndim == 1 and len(values) and values[0] == 0 and (np.diff(values) > 0).all()
         if not rising or not np.isfinite(values).all():
@@ -22,19 +22,19 @@ def _check_grid(levels: np.ndarray, ages: np.ndarray) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Factors:
-    """Factors of a filter's covariance, with which regions of 90 % hold 90 % of the errors.
+    """Calibration factors of a filter's covariance P. Raises ArtifactError if they are invalid.
 
-    Nine errors in ten then have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of the chi-square distribution
-    with nx degrees of freedom. Between levels and ages factors are interpolated, and beyond the last they stay.
+    With them, 90 % of the errors have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of the chi-square
+    distribution with nx degrees of freedom. Factors are interpolated between levels and ages, and constant beyond.
 
     Parameters
     ----------
     levels : ndarray, shape (k,)
-        Levels of measurement noise, rising from 0, in multiples of the largest that the map was trained for.
+        Levels of measurement noise, rising from 0, in multiples of the largest in the map's training.
     ages : ndarray, shape (m,)
         Seconds since reset, rising from 0.
     factors : ndarray, shape (2, k, m)
-        The factors, positive, without process noise, and at the largest level in training; (1, k, m) are for any level.
+        Positive factors without process noise and at its largest level in training; (1, k, m) serves every level.
     """
 
     levels: np.ndarray
@@ -50,11 +50,11 @@ class Factors:
 
     @classmethod
     def ones(cls) -> Self:
-        """Factors of 1, before calibration."""
+        """Factors of 1, for use before calibration."""
         return cls(np.zeros(1), np.zeros(1), np.ones((1, 1, 1)))
 
     def at_levels(self, measurement_noise: float, process_noise: float) -> np.ndarray:
-        """Return the factors at levels in multiples of the largest. Shapes: returns (m,)."""
+        """Return the factors, (m,), at levels in multiples of the largest in training."""
         share = min(process_noise, 1.0)
         table = (1.0 - share) * self.factors[0] + share * self.factors[-1]
         return interpolated(measurement_noise, self.levels, table)
@@ -64,7 +64,7 @@ class Factors:
 class ErrorCovariance:
     """The covariance of x - T_inv(z), by level of measurement noise and age since reset.
 
-    It is scaled so that regions of 90 % hold 90 % of the errors, see :class:`Factors`.
+    It is calibrated as in :class:`Factors`. Raises ArtifactError if it is invalid.
 
     Parameters
     ----------
@@ -91,16 +91,16 @@ class ErrorCovariance:
         return self.covariance.shape[-1]
 
     def at_level(self, level: float) -> Self:
-        """Return the covariances at a level alone, in multiples of the largest."""
+        """Return the covariances at one level, in multiples of the largest in training."""
         return type(self)(np.zeros(1), self.ages, interpolated(level, self.levels, self.covariance)[None])
 
     def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
-        """Return those of the first level at ages (...,), which broadcast to ``shape``; returns (..., nx, nx)."""
+        """Return the covariances (..., nx, nx) of the first level at ages (...,), which broadcast to ``shape``."""
         return interpolated(np.broadcast_to(age, shape or np.shape(age)), self.ages, self.covariance[0])
 
 
 def interpolated(at: np.ndarray | float, points: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate values (k, ...) at rising points (k,) linearly; they stay as they are beyond the ends."""
+    """Interpolate values (k, ...) at rising points (k,) linearly; they are constant beyond the ends."""
     last = len(points) - 1
     i = np.clip(np.searchsorted(points, at, side="right"), min(1, last), last)
     before = np.maximum(i - 1, 0)
@@ -110,7 +110,7 @@ def interpolated(at: np.ndarray | float, points: np.ndarray, values: np.ndarray)
 
 
 def check_positive_definite(covariance: np.ndarray) -> None:
-    """Raise ArtifactError unless covariances (..., n, n) are positive definite, whatever the units of the states."""
+    """Raise ArtifactError unless covariances (..., n, n) are positive definite, in any units of the states."""
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     if (variances > 0).all():
         scale = np.sqrt(variances)

@@ -7,17 +7,17 @@ import numpy as np
 
 from observers.checks import check_dt, integer, real_array
 
-MOST_INPUTS = 64  # that a filter takes; every one of them adds nz values to its state
-MOST_VALUES = 1024  # of its state, and of the output; beyond them memory and the decomposition of A would be felt
+MOST_INPUTS = 64  # each input adds nz values to the filter's state
+MOST_VALUES = 1024  # in the state, and in the output; more would cost much memory and a slow decomposition of A
 
 
 class LinearFilter:
     """z_y' = A z_y + B y and, for each known input, z_u' = A z_u + B 1 u, at the sampling interval ``dt``.
 
-    The output is taken as linear between samples (first-order hold, causal because y_k+1 is at hand when z_k+1 is
-    wanted; a zero-order hold would act as half a sample of delay) and the input as constant (it is). Filtering the
-    input beside the output is the functional KKL observer (Buisson-Fenet et al., TMLR 2023); with u = 0 what remains
-    is the paper's (sec. 3, eq. kkl_observer).
+    The integration takes the output as linear between samples, a first-order hold. This is causal, because z_k+1 is
+    computed when y_k+1 is known; a zero-order hold would delay the output by half a sample. The input is constant
+    between samples. A filter of output and input is the functional KKL observer (Buisson-Fenet et al., TMLR 2023). For
+    u = 0 it is the paper's filter (sec. 3, eq. kkl_observer). Raises ValueError if A, B, dt or nu is invalid.
 
     The filter's state is ``z = [z_y, z_u of the first input, ...]``, of size ``nz * (1 + nu)``, and
     z_k+1 = transition z_k + early_y y_k + late_y y_k+1 + held_u u_k.
@@ -25,30 +25,30 @@ class LinearFilter:
     Parameters
     ----------
     A : ndarray, shape (nz, nz)
-        Hurwitz and diagonalisable, in 1/s. The state may have 1024 values.
+        State matrix in 1/s, Hurwitz and diagonalisable. The filter's state may have at most 1024 values.
     B : ndarray, shape (nz, ny)
-        What the outputs act through, 1 to 1024 of them.
+        Input matrix of the outputs, 1 to 1024 of them.
     dt : float
         Sampling interval in seconds.
     nu : int, default 0
-        Number of known inputs that are filtered, 0 to 64; none make the paper's observer.
+        Number of known inputs to filter, 0 to 64. 0 is the paper's observer.
 
     Attributes
     ----------
     transition : ndarray, shape (size, size)
-        What z_k+1 keeps of z_k.
+        Matrix from z_k to z_k+1.
     early_y, late_y : ndarray, shape (size, ny)
-        What the outputs at the beginning and at the end of an interval add.
+        Matrices from the outputs at the beginning and at the end of an interval to z_k+1.
     held_u : ndarray, shape (size, nu)
-        What the inputs held over an interval add.
+        Matrix from the inputs held over an interval to z_k+1.
     drive : ndarray, shape (2 ny + nu, size)
         early_y, held_u and late_y side by side, transposed.
     equilibrium : ndarray, shape (size, ny)
-        The state that constant outputs lead to.
+        Matrix from constant outputs to the steady state of z.
     """
 
     def __init__(self, A: np.ndarray, B: np.ndarray, dt: float, nu: int = 0) -> None:
-        A, B = real_array("A", A).copy(), real_array("B", B).copy()  # the caller may reuse them
+        A, B = real_array("A", A).copy(), real_array("B", B).copy()  # the caller may reuse its arrays
         if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
             raise ValueError(f"A must be (nz, nz) and B (nz, ny), got {A.shape} and {B.shape}")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
@@ -66,7 +66,7 @@ class LinearFilter:
         if not np.linalg.cond(V) <= 1e12:
             raise ValueError("A must be diagonalisable; separate its repeated eigenvalues")
 
-        A.flags.writeable = B.flags.writeable = False  # what follows from them would not change
+        A.flags.writeable = B.flags.writeable = False  # a later change would not reach the matrices below
         self.A, self.B, self.nu = A, B, nu
         self._poles, self._V, self._V_inverse = poles, V, np.linalg.inv(V)
         with np.errstate(all="ignore"):
@@ -74,7 +74,7 @@ class LinearFilter:
         self._integrate(dt)
 
     def _integrate(self, dt: float) -> None:
-        """Take another sampling interval."""
+        """Compute the matrices for a sampling interval."""
         poles, blocks = self._poles, 1 + self.nu
         with np.errstate(all="ignore"):
             s = poles * dt
@@ -97,7 +97,7 @@ class LinearFilter:
     def _on_z_y(self, matrix: np.ndarray) -> np.ndarray:
         return np.vstack([matrix, np.zeros((self.nu * len(self.A), matrix.shape[1]))])
 
-    @functools.lru_cache(maxsize=64)  # noqa: B019 - intervals of samples that are irregular often come again
+    @functools.lru_cache(maxsize=64)  # noqa: B019 - irregular intervals often recur
     def at(self, dt: float) -> "LinearFilter":
         """Return the same filter at another sampling interval."""
         other = copy.copy(self)
@@ -111,11 +111,11 @@ class LinearFilter:
 
     @property
     def slowest(self) -> float:
-        """Rate in 1/s at which the slowest mode forgets: the least size of a real part of A's eigenvalues."""
+        """Decay rate of the slowest mode in 1/s: the smallest absolute real part of A's eigenvalues."""
         return float(np.abs(np.linalg.eigvals(self.A).real).min())
 
     def start(self, y0: np.ndarray) -> np.ndarray:
-        """Return the state that a constant output leads to: z_y = -A^-1 B y0, z_u = 0.
+        """Return the steady state under a constant output: z_y = -A^-1 B y0, z_u = 0.
 
         Shapes: ``y0`` (..., ny); returns (..., size).
         """
@@ -125,6 +125,6 @@ class LinearFilter:
         """Return the state one sample later.
 
         Shapes: ``z`` (..., size), ``y`` (..., ny) at the same time, ``u`` (..., nu) held until the next sample,
-        ``y_next`` (..., ny) there; returns (..., size). Raises ValueError if they do not go together.
+        ``y_next`` (..., ny) at the next sample; returns (..., size). Raises ValueError if the shapes do not match.
         """
         return np.concatenate((z, y, u, y_next), axis=-1) @ self._update

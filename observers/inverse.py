@@ -1,4 +1,4 @@
-"""T and T_inv: between the state and the filter's state."""
+"""T and T_inv: learned maps from the state to the filter's state and back."""
 
 import math
 from dataclasses import dataclass, replace
@@ -11,17 +11,17 @@ from observers.factors import ErrorCovariance
 from observers.network import MLP
 
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
-_CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
+_CONDITIONS = FEATURES[2:]  # each has a unit and a largest value
 
 
 @dataclass(frozen=True)
 class ForwardMap:
-    """T: x -> z as learned, T(x) = z_offset + z_scale * mlp((x - x_offset) / x_scale).
+    """The learned map T: x -> z, T(x) = z_offset + z_scale * mlp((x - x_offset) / x_scale).
 
     Parameters
     ----------
     mlp : MLP
-        The network, of nx inputs and nz outputs.
+        The network, with nx inputs and nz outputs. Raises ArtifactError if the scaling does not fit it.
     x_offset, x_scale : ndarray, shape (nx,)
         Scaling of the states.
     z_offset, z_scale : ndarray, shape (nz,)
@@ -46,21 +46,21 @@ class ForwardMap:
 
 @dataclass(frozen=True)
 class InverseMap:
-    """T_inv: from the filter's state, levels of noise and age to the state estimate.
+    """T_inv: from the filter's state, the noise levels and the age to the state estimate.
 
-    The network's inputs are, in the order of ``features`` (of which "z_y" comes first and the rest may be missing):
+    The network's inputs follow ``features``, in which "z_y" comes first and the others are optional:
 
-    - ``z_y``, ``z_u``: together ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2: over the training
-      data each has unit variance without measurement noise, so this shrinks it to its linear conditional mean;
-    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), for each output that has a level of its own;
-    - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), the level being that of the
-      environments, a multiple of the system's scale per second;
+    - ``z_y``, ``z_u``: together ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2. Each mode has
+      unit variance over noise-free training data, so the division shrinks a noisy mode to its conditional mean;
+    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), one for each output that has its own level;
+    - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), with the level in multiples of the
+      system's scale per second, as in environments;
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
-    The output is x_offset + x_scale * mlp(inputs).
+    The output is x_offset + x_scale * mlp(inputs). Raises ArtifactError if the parts do not fit each other.
 
-    A map for several outputs may take a level for each: ``noise_gain`` then has a row for each output, whose squares
-    add up, and unit and largest level of the measurement noise are tuples. Other maps take one level for all.
+    A map for several outputs may take a level for each. ``noise_gain`` then has a row for each output, and the squares
+    of its rows add up. ``measurement_noise_unit`` and ``measurement_noise_max`` are then tuples.
 
     Parameters
     ----------
@@ -71,25 +71,25 @@ class InverseMap:
     z_offset : ndarray, shape (size,)
         Mean of the filter's state.
     whiten : ndarray, shape (modes, size)
-        The coordinates of the filter's state that the network sees.
+        Matrix from the filter's state to the modes, which are the network's first inputs.
     noise_gain : ndarray, shape (modes,) or (ny, modes)
-        Standard deviation of each of them per unit of sigma_v, or of that of each of several outputs.
+        Standard deviation of each mode per unit of sigma_v, of all outputs or of each output.
     x_offset, x_scale : ndarray, shape (nx,)
         Scaling of the estimate.
     measurement_noise_unit : float or tuple of float, length ny, default 1
-        Standard deviation that counts as one; a tuple where ``noise_gain`` has rows, which a number becomes.
+        Unit of sigma_v. If ``noise_gain`` has a row for each output, a number becomes a tuple.
     measurement_noise_max : float or tuple of float, length ny, default inf
-        The largest sigma_v in training, likewise. A map without the feature takes any.
+        The largest sigma_v in training, in the same form. A map without the feature takes any level.
     process_noise_unit : float, default 1
-        Level of process noise that counts as one.
+        Unit of the process noise level.
     process_noise_max : float, default inf
         The highest level of process noise in training.
     age_unit : float, default 1
-        Seconds that count as one.
+        Unit of the age in seconds.
     age_max : float, default 0
-        Seconds after which the age no longer matters.
+        Age in seconds beyond which estimates no longer depend on it.
     error_covariance : ErrorCovariance, optional
-        The covariance of the state's error, where it was calibrated.
+        The covariance of the estimation error, if it was calibrated.
     """
 
     mlp: MLP
@@ -139,7 +139,7 @@ class InverseMap:
             raise ArtifactError("a covariance by level of noise needs a map that depends on the level")
 
     def _each(self, name: str) -> tuple[Any, ...]:
-        """A unit or an end: of each output where noise_gain has rows, else the only one there is."""
+        """A unit or largest value: one for each output if noise_gain has rows, else a single one."""
         value = getattr(self, name)
         if self.noise_gain.ndim != 2 or not name.startswith("measurement_noise"):
             return (value,)
@@ -151,21 +151,21 @@ class InverseMap:
         return value
 
     def part(self, outputs: slice) -> "InverseMap":
-        """Return the map with some of its outputs alone, and no covariance; itself if all are meant."""
+        """Return the map with some of its outputs and without covariance; the map itself if all are selected."""
         if range(self.mlp.outputs)[outputs] == range(self.mlp.outputs):
             return self
         x_offset, x_scale = self.x_offset[outputs], self.x_scale[outputs]
         return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, error_covariance=None)
 
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        """Return levels of measurement noise, cut at the largest in training; a float if all are the same.
+        """Return levels of measurement noise, limited to the largest in training; a float if all are equal.
 
-        Raises ValueError if the levels of several outputs differ and the map takes one for all of them.
+        Raises ValueError if the levels of several outputs differ and the map takes one level for all outputs.
         """
         if isinstance(measurement_noise, tuple) and self.noise_gain.ndim == 1 and self.noise_gain.any():
             raise ValueError(
                 f"this map takes one level of measurement noise for all outputs, got {measurement_noise}: pass one "
-                "number, or train it again, which makes a map that takes a level for each"
+                "number, or train again, which makes a map with a level for each"
             )
         if "measurement_noise" not in self.features:
             return measurement_noise
@@ -173,17 +173,17 @@ class InverseMap:
         return levels if isinstance(levels, float) else levels[0] if len({*levels}) == 1 else tuple(levels)
 
     def gain(self, measurement_noise: float | tuple[float, ...]) -> np.ndarray:
-        """What the whitened modes are multiplied with at these standard deviations of the noise, shape (modes,)."""
+        """Factors of the whitened modes, (modes,), at these standard deviations of the noise."""
         sigma = np.reshape(measurement_noise, (-1, 1))
         return 1.0 / (1.0 + ((sigma * np.atleast_2d(self.noise_gain)) ** 2).sum(0))
 
     def shares(self, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0) -> tuple[float, float]:
-        """Return levels in multiples of the largest in training, of the noisiest output."""
+        """Return both noise levels in multiples of the largest in training; that of the noisiest output counts."""
         largest = np.max(np.divide(measurement_noise, self.measurement_noise_max))
         return float(largest), process_noise / self.process_noise_max
 
     def noise_features(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> list[float]:
-        """Return the network's inputs for levels of noise, in the order of the features."""
+        """Return the network's inputs for noise levels, in the order of the features."""
         features = []
         if "measurement_noise" in self.features:
             features += np.atleast_1d(np.log1p(np.divide(measurement_noise, self.measurement_noise_unit))).tolist()
@@ -192,7 +192,7 @@ class InverseMap:
         return features
 
     def age_feature(self, age: Any) -> Any:
-        """The network's input for a time since reset, in seconds; for an array, as many inputs."""
-        if isinstance(age, float):  # a single step: numpy's own overhead would be felt
+        """The network's input for a time since reset in seconds, or for an array of times."""
+        if isinstance(age, float):  # fast path for one sample
             return math.log1p(min(age, self.age_max) / self.age_unit)
         return np.log1p(np.minimum(age, self.age_max) / self.age_unit)

@@ -1,7 +1,7 @@
 """The observer's step as machine code, for one row or many, along one sample or a record. It needs Numba.
 
-One compilation serves all observers of as many states, outputs and inputs, and lies on disk for later processes. What
-differs between systems, a motion and an output that is not linear, is compiled for itself and called by its address.
+One compilation serves all observers with equal numbers of states, outputs and inputs, and is stored on disk for later
+processes. A system's motion and nonlinear output are compiled separately, and the kernel calls them by their address.
 """
 
 import functools
@@ -19,14 +19,14 @@ from observers.machine import kernel, part
 from observers.network import UNROLLED
 from observers.tracker import INFLATION, RELINEARISATIONS
 
-_intrinsic: Any = intrinsic  # whose results take other arguments than the functions that it decorates
+_intrinsic: Any = intrinsic  # Any, because it changes the arguments of the functions that it decorates
 _POINTER = types.CPointer(types.float64)
 _kernel, _part, _inlined = kernel(**OPTIONS), part(**OPTIONS), part(forceinline=True, **OPTIONS)
 
 
 @_intrinsic
 def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any) -> Any:
-    """Call a motion or an output by its address."""
+    """Call a compiled motion or output by its address."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         double = ir.DoubleType()
@@ -39,22 +39,22 @@ def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any)
 
 @functools.cache
 def steps(nx: int, ny: int, nu: int, W: int) -> Any:
-    """The kernel for numbers of states, outputs and inputs, and for as many rows at once.
+    """The kernel for numbers of states, outputs and inputs, and for groups of W rows.
 
-    More than one are rows beyond the first window of a tracker by equations; their matrices hold vectors of a number of
-    each row.
+    W > 1 serves rows beyond the first window of a tracker with equations. Every entry of a matrix is then a vector with
+    a number for each row.
     """
     kappa, points, wide, single = max(3.0 - nx, 0.0), 2 * nx + 1, padded(nx, W), W == 1
     far, other = math.sqrt(nx + kappa), 0.5 / (nx + kappa)
     middle, middle_squares = kappa / (nx + kappa), kappa / (nx + kappa) + 2.0
     square, cross, inputs, turns, inflation = nx * nx, nx * ny, max(nu, 1), RELINEARISATIONS, INFLATION
     of_states, of_outputs, of_innovations, of_network = (nx + nu) * wide, ny * wide, ny * ny, nx + inputs
-    nis = nx + square  # where it lies in a row of the tracker
+    nis = nx + square  # its place in a row of the tracker
     of_row, rejections, trends = nis + 4 + 2 * ny, nis + 4, nis + 4 + ny
 
     @_inlined
     def factorise(P: Any, L: Any, inverse: Any) -> None:
-        """P = L L^T, and what divides by L's diagonal; not finite where there is no L."""
+        """P = L L^T, and the inverse of L's diagonal; not finite if P is not positive definite."""
         for i in range(nx):
             for j in range(i + 1):
                 total = P[i * nx + j]
@@ -90,7 +90,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def spread_out(x: Any, P: Any, L: Any, inverse: Any, at: Any) -> None:
-        """Sigma points (nx, lanes); those that fill the registers are the mean."""
+        """Sigma points (nx, lanes); points beyond 2 nx + 1, which only fill registers, are the mean."""
         factorise(P, L, inverse)
         for i in range(nx):
             for p in range(wide):
@@ -102,7 +102,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def moments(at: Any, n: int, mean: Any, S: Any) -> None:
-        """Mean (n,) and covariance (n, n) of points (n, lanes), which become differences from the mean."""
+        """Mean (n,) and covariance (n, n) of points (n, lanes); subtracts the mean from the points."""
         for i in range(n):
             total = 0.0
             for p in range(1, points):
@@ -118,7 +118,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def together(L: Any, at: Any, n: int, across: Any) -> None:
-        """Covariance (nx, n) of the points' differences (n, lanes) with the points that L spread out."""
+        """Covariance (nx, n) of the sigma points of L with their images, given as differences (n, lanes)."""
         for j in range(n):
             for i in range(nx):
                 total = 0.0
@@ -128,7 +128,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_part
     def flow_step(at: Any, u: Any, flow: Any, scratch: Any) -> None:
-        """A learned motion of the sigma points, in place."""
+        """One step of a learned flow for all sigma points, in place."""
         scaling, linear, packed, shape = flow
         q = stack(of_network, 1)
         for j in range(nu):
@@ -148,25 +148,25 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def clipped(states: Any, s: Any, i: int) -> Any:
-        """A state cut at its bounds."""
+        """A state limited to its bounds."""
         s = choose(states[0, i], s, states[0, i], s)
         return choose(s, states[1, i], states[1, i], s)
 
     @_inlined
     def finite(value: Any) -> Any:
-        """1 where a number is finite, 0 elsewhere."""
+        """1 if a number is finite, else 0."""
         return choose(value, -np.inf, choose(np.inf, value, 1.0, 0.0), 0.0)
 
     @_inlined
     def within(states: Any, at: Any, count: int) -> None:
-        """Cut states (nx, lanes) at their bounds."""
+        """Limit states (nx, lanes) to their bounds."""
         for i in range(nx):
             for p in range(count):
                 at[i * wide + p] = clipped(states, at[i * wide + p], i)
 
     @_inlined
     def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
-        """Mean and covariance a sample later, and the covariance with the state before."""
+        """Mean and covariance one sample later, and the covariance with the earlier state."""
         states, flow, substeps, address, h, share = model
         inverse, at = stack(nx, W), stack(of_states, W)
         spread_out(x, P, L, inverse, at)
@@ -217,7 +217,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
-        """Mark outputs whose innovations are beyond the gate, unless it is open."""
+        """Set outputs to NaN whose innovations are beyond the gate, unless the gate is open."""
         for k in range(ny):
             innovation, count = y[k] - expected[k], now[rejections + k]
             far = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)
@@ -228,7 +228,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
-        """White innovations: V moves the state to x + V white, with the covariance P - V V^T."""
+        """Whiten innovations: the corrected state is x + V white, with the covariance P - V V^T."""
         for k in range(ny):
             white[k] = choose(finite(y[k]), 0.0, y[k] - expected[k], 0.0)
         for k in range(ny):
@@ -259,7 +259,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def track(now: Any, y: Any, u: Any, model: Any, h: Any, r: Any, watched: Any, scratch: Any, expected: Any) -> None:
-        """Predict and correct the state of a row's tracker; outputs that are rejected become NaN."""
+        """Predict and correct the state of a row's tracker; rejected outputs become NaN."""
         window, share, trend_share, square_share, trend_gain, trend_limit, gate = watched
         states = model[0]
         start, spread, mean, moved = stack(nx, W), stack(square, W), stack(nx, W), stack(square, W)
@@ -275,7 +275,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
             spread[i] = now[nx + i]
         for turn in range(last + 1):
             predict(start, spread, u, model, scratch, L, again, again_moved, again_across)
-            if single and turn:  # with the motion linearised about the smoothed start of the step
+            if single and turn:  # linearise the motion about the smoothed start of the step
                 smoothed(spread, L, inverse, again_across, G, True, D)
                 shift(again, -1.0, D, white)
                 add(again_moved, 1.0, D, D)
@@ -322,7 +322,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         weight, each = count / float(ny), 1.0 / choose(count, 0.0, count, 1.0)
         average = now[nis] + share * weight * (squares * each - now[nis])
         square_average = now[nis + 1] + square_share * weight * (trend_gain * raised * each - now[nis + 1])
-        # Beyond the limit, innovations agree with one another.
+        # Beyond the limit, successive innovations are correlated.
         grown = choose(square_average, trend_limit, inflation, 1.0)
         now[nis] = choose(sound, 0.0, average, np.inf)
         now[nis + 1] = choose(some, 0.0, choose(square_average, trend_limit, 1.0, square_average), now[nis + 1])
@@ -336,7 +336,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_part
     def is_driven(z: Any, nz: int) -> bool:
-        """Whether an input has acted, or the system has no input."""
+        """Whether an input has acted; also true if the system has no input."""
         acted = len(z) == nz
         for i in range(nz, len(z)):
             acted = acted or z[i] != 0.0
@@ -345,8 +345,8 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     @_part
     def supervise(now: Any, z: Any, age: float, nz: int, dt: float, window: float, lost: bool, states: Any, maps: Any,
                   scratch: Any, x_hat: Any) -> None:  # fmt: skip
-        """Take T_inv's estimate where it is surer within the first window, or where the tracker diverged."""
-        driven = is_driven(z, nz)  # else T_inv is that of free motion
+        """Take T_inv's estimate if the tracker diverged, or if T_inv has the smaller covariance in the first window."""
+        driven = is_driven(z, nz)  # else use the T_inv of free motion
         ages, table = maps[2] if driven else maps[3]
         seen, at = min(now[nis + 2], window) * dt, 0
         while at < len(ages) - 2 and seen > ages[at + 1]:
@@ -356,7 +356,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         upper = min(at + 1, len(ages) - 1)
         for i in range(square):
             P[i], own[i] = (1.0 - part) * table[at, i] + part * table[upper, i], now[nx + i]
-        larger = 0.0  # the logarithm of the determinants' quotient
+        larger = 0.0  # log of T_inv's determinant over the tracker's
         factorise(P, L, inverse)
         for i in range(nx):
             larger -= math.log(inverse[i])
@@ -377,7 +377,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_part
     def follow(z: Any, before: Any, u: Any, y: Any, linear: Any, out: Any) -> None:
-        """The linear filter, over an interval from the output before to y."""
+        """Advance the linear filter by one interval, from the output ``before`` to y."""
         gains, places, mixing = linear
         size = len(z)
         for i in range(size):
@@ -396,9 +396,9 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         addresses: Any, flags: Any, numbers: Any, states: Any, r: Any, C: Any, linear: Any, maps: Any,
         flow: Any, rows: Any, state: Any, y: Any, u: Any, record: Any
     ) -> None:  # fmt: skip
-        """Samples y (steps, n, ny) and inputs u (steps, n, nu) into some rows of the state (n, width).
+        """Advance some rows of the state (n, width) by samples y (steps, n, ny) and inputs u (steps, n, nu).
 
-        A record (steps, n, width) keeps the rows at each sample; (steps, n, 0) keeps none.
+        A record (steps, n, width) stores the rows at each sample; (steps, n, 0) stores none.
         """
         nz, widest, substeps = flags
         h, samples, dt, limit = numbers[:4]
@@ -413,7 +413,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
             count = min(W, len(rows) - first)
             for k in range(len(y)):
                 for w in range(W):
-                    row = rows[first + min(w, count - 1)]  # lanes that are left over do the last row again
+                    row = rows[first + min(w, count - 1)]  # unused lanes repeat the last row
                     for i in range(ny):
                         ys[i * W + w] = y[k, row, i]
                     for j in range(nu):

@@ -1,4 +1,4 @@
-"""Networks, motions and outputs as machine code, which the kernel calls. It needs Numba."""
+"""Networks, motions and outputs as machine code for the kernel. They need Numba."""
 
 import functools
 import math
@@ -11,17 +11,17 @@ from observers.expression import Expression
 from observers.machine import kernel, part, pointer
 from observers.network import UNROLLED
 
-# NaN and infinity keep their meaning.
+# Fast arithmetic, but without the flags that assume there is no NaN and no infinity.
 OPTIONS: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
 _POINTER = types.CPointer(types.float64)
 _SIGNATURE = types.void(_POINTER, _POINTER, types.int64, types.float64)
 _kernel, _part = kernel(**OPTIONS), part(**OPTIONS)
 
-# tanh(x)/x as a quotient of polynomials in x^2 of the least relative error, 2e-8, or 4e-7 with the rounding of float32.
-# Loops take many values of it at a time.
+# tanh(x)/x as a quotient of polynomials in x^2, with a relative error of 2e-8, or 4e-7 with float32 rounding. The
+# compiler vectorises it.
 _P = tuple(map(np.float32, (2.40733336e-11, -1.48956287e-08, 9.93605136e-06, 2.99177715e-03, 1.29846185e-01, 1.0)))
 _Q = tuple(map(np.float32, (2.38041306e-04, 2.40518041e-02, 4.63179380e-01, 1.0)))
-_END = np.float32(7.90531110763549805)  # beyond which float32 knows no difference to 1
+_END = np.float32(7.90531110763549805)  # beyond this, tanh(x) rounds to 1 in float32
 _HALF, _ZERO = np.float32(0.5), np.float32(0.0)
 
 
@@ -36,7 +36,7 @@ def _tanh(x: Any) -> Any:
 
 @_part
 def _silu(x: Any) -> Any:
-    x = _HALF * x  # as observers.network has it
+    x = _HALF * x  # the same formula as in observers.network
     return x + x * _tanh(x)
 
 
@@ -60,9 +60,9 @@ def _activate(h: Any, kind: int) -> None:
 
 @_part
 def evaluate(x: Any, packed: Any, shape: Any, between: Any, out: Any) -> None:
-    """A network for one sample; its shape is the activation and the widths, and x may lie in ``between``'s first row.
+    """Evaluate a network for one sample. ``shape`` holds its activation and widths; x may be ``between``'s first row.
 
-    Shapes: ``between`` (3, the largest width and UNROLLED more).
+    Shapes: ``between`` (3, largest width + UNROLLED).
     """
     h, into, at = between[0], between[1], 0
     for j in range(len(x)):
@@ -70,7 +70,7 @@ def evaluate(x: Any, packed: Any, shape: Any, between: Any, out: Any) -> None:
     for layer in range(1, len(shape) - 1):
         inputs, width = shape[layer], shape[layer + 1]
         for j in range(inputs, inputs + UNROLLED):
-            h[j] = _ZERO  # beside the rows of zeros
+            h[j] = _ZERO  # multiplies the padding
         for j in range(width):
             into[j] = packed[at + j]
         at += width
@@ -90,7 +90,7 @@ def evaluate(x: Any, packed: Any, shape: Any, between: Any, out: Any) -> None:
 
 @_part
 def decode(z: Any, age: float, network: Any, between: Any, out: Any) -> None:
-    """T_inv of one sample: the first layer on z and age in doubles, and the network behind it."""
+    """T_inv of one sample: the first layer takes z and age in double precision, the others are float32."""
     first, units, ages, packed, shape = network
     width, size = first.shape[1], len(z)
     sums = np.empty(width)
@@ -127,15 +127,15 @@ def decode_one(z: Any, age: float, network: Any, out: Any) -> None:
 
 
 def padded(nx: int, W: int) -> int:
-    """Sigma points of nx states, and for a single row as many more as fill the processor's registers."""
+    """Number of sigma points of nx states, for a single row rounded up to fill the processor's registers."""
     return -(-(2 * nx + 1) // 4) * 4 if W == 1 else 2 * nx + 1
 
 
 @functools.cache
 def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> Any:
-    """The equations' step of all sigma points of W rows, in place, in so many Runge-Kutta steps of h.
+    """Compiled motion by equations: Runge-Kutta steps of length h for all sigma points of W rows, in place.
 
-    States and inputs lie in one array (nx + nu, points, W).
+    States and inputs are in one array (nx + nu, points, W).
     """
     wide, field, inputs = padded(nx, W) * W, expression.python("field", nx, nu), [f"u{j}" for j in range(nu)]
     states = [f"x{i}" for i in range(nx)]
@@ -161,7 +161,7 @@ def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> 
 
 @functools.cache
 def output(expression: Expression, nx: int, W: int) -> Any:
-    """The outputs (ny, points, W) of the first sigma points (nx, points, W) of W rows."""
+    """Compiled outputs (ny, points, W) of the first sigma points (nx, points, W) of W rows."""
     wide, ny = padded(nx, W) * W, len(expression.components)
     function = expression.python("function", nx, 0)
     given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))
@@ -180,7 +180,7 @@ def output(expression: Expression, nx: int, W: int) -> Any:
 
 
 def _function(source: str, name: str, **names: str) -> Any:
-    """A function by its source, and by the sources of those that it calls."""
+    """Build a function from its source and the sources of the functions that it calls."""
     namespace: dict[str, Any] = {"np": np}
     for inner, text in names.items():
         exec(text, namespace)

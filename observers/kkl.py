@@ -1,4 +1,4 @@
-"""The observer itself, with a state that the caller keeps: linear filter, T_inv, tracker and monitor."""
+"""The observer without its own state: linear filter, T_inv, tracker and monitor; the caller keeps the state."""
 
 import functools
 from dataclasses import dataclass
@@ -14,25 +14,25 @@ from observers.filter import LinearFilter
 from observers.monitor import Monitor
 from observers.tracker import Tracker
 
-_MAX_SAMPLES = 1000  # in one step
-_CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
+_MAX_SAMPLES = 1000  # longest step, in sampling intervals
+_CHUNK = 8192  # rows of a record that are decoded together; more would exceed the processor's cache
 
 
 @dataclass(frozen=True)
 class Pending:
-    """The inputs of the last samples, (n, delay, nu), and how many there are, (n,); no method changes either."""
+    """Inputs whose outputs have not arrived yet, (n, delay, nu), and their number, (n,). Instances are immutable."""
 
     inputs: np.ndarray
     count: np.ndarray
 
     def restarted(self, rows: np.ndarray) -> "Pending":
-        """Return the inputs without those of some rows."""
+        """Return a copy without the inputs of some rows."""
         return Pending(self.inputs, np.where(rows, 0, self.count))
 
     def after(self, u: np.ndarray, rows: np.ndarray) -> tuple["Pending", np.ndarray, np.ndarray]:
-        """Return the inputs after those of the next sample, (n, nu), in some rows.
+        """Append the next sample's inputs, (n, nu), in some rows.
 
-        Also those that led to the outputs which now arrive, (n, nu), and in which of the rows one does, (n,).
+        Returns the new object, the inputs that led to the outputs that arrive now, (n, nu), and a mask of rows, (n,).
         """
         delay = self.inputs.shape[1]
         due, first = rows & (self.count == delay), self.inputs[:, 0]
@@ -43,10 +43,10 @@ class Pending:
 
 
 class KKL(Estimator[np.ndarray]):
-    """The estimator behind :class:`observers.KKLObserver`, for n rows.
+    """The estimator inside :class:`observers.KKLObserver`, for n rows.
 
-    A row of the state holds z (size), the output before (ny), the age in samples, which is NaN before the first one,
-    and then what the tracker and the monitor keep of it.
+    A row of the state holds z (size), the last output (ny), the age in samples, which is NaN before the first one, and
+    then the rows of the tracker and of the monitor.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class KKL(Estimator[np.ndarray]):
         self.z, self.y, self.age = slice(size), slice(size, size + ny), size + ny
         end = self.age + 1 + (0 if self.tracker is None else self.tracker.width)
         self.tracked, self.watched = slice(self.age + 1, end), slice(end, None)
-        self._x = slice(self.age + 1, self.age + 1 + artifact.nx)  # of a tracker
+        self._x = slice(self.age + 1, self.age + 1 + artifact.nx)  # the tracker's estimate
         self.width = end + (0 if self.monitor is None else self.monitor.width)
 
     def start(self, n: int) -> np.ndarray:
@@ -80,7 +80,7 @@ class KKL(Estimator[np.ndarray]):
         return np.full((n, self.width), np.nan)
 
     def begin(self, y: np.ndarray, z: np.ndarray, age: Any, x0: np.ndarray | None = None) -> np.ndarray:
-        """Return rows at first samples (n, ny), or at known states (n, nx), of filter states (n, size)."""
+        """Return rows at first samples (n, ny) and filter states (n, size), or at known states ``x0`` (n, nx)."""
         state = np.empty((len(y), self.width))
         state[:, self.z], state[:, self.y], state[:, self.age] = z, y, age
         if self.tracker is not None:
@@ -90,7 +90,7 @@ class KKL(Estimator[np.ndarray]):
         return state
 
     def take_over(self, other: "KKL", state: np.ndarray) -> np.ndarray:
-        """Return rows that go on from another's, whose artifact has the same filter; its tracker may begin here."""
+        """Return rows that continue those of another observer with the same filter; the tracker may start here."""
         y = state[:, other.y]
         new = self.begin(y, state[:, other.z], state[:, other.age])
         if self.tracker is not None and other.tracker is not None:
@@ -111,13 +111,13 @@ class KKL(Estimator[np.ndarray]):
         return state
 
     def step(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
-        """Return rows that have begun after samples (n, ny) and inputs (n, nu)."""
+        """Return started rows after samples (n, ny) and inputs (n, nu)."""
         if self._machine is None:
             new = self._stepped(state, y, u, dt)
         else:
             new = state.copy()
             self._machine(self._filter(dt), new, y[None], u[None])
-        if self.monitor is not None:  # outputs that are rejected count too
+        if self.monitor is not None:  # rejected outputs count, too
             residual = self.artifact.residual(np.where(np.isnan(y), new[:, self.y], y), self.decode(new))
             new[:, self.watched] = self.monitor.update(new[:, self.watched], residual, ~np.isnan(y))
         return new
@@ -156,7 +156,7 @@ class KKL(Estimator[np.ndarray]):
     def _predicted(
         self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, state: np.ndarray, linear: LinearFilter
     ) -> np.ndarray:
-        """Samples with gaps filled by h(T_inv(z)): from the z before, and once more from the z that this leads to."""
+        """Samples with gaps filled by h(T_inv(z)): first for the last z, then for the z that follows from it."""
         z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
         following, age = z, age * self.artifact.filter.dt
         for ahead in (0.0, linear.dt):
@@ -173,7 +173,7 @@ class KKL(Estimator[np.ndarray]):
         return Estimate(self.decode(state), covariance, score)
 
     def ahead(self, state: np.ndarray, u: np.ndarray, waiting: np.ndarray) -> np.ndarray:
-        """Return rows predicted under inputs (n, delay, nu), of which so many act in each row, (n,)."""
+        """Return rows predicted under inputs (n, delay, nu); ``waiting`` (n,) counts the inputs of each row."""
         for k in range(int(waiting.max(initial=0))):
             rows = waiting > k
             missing = np.full((int(rows.sum()), self.artifact.ny), np.nan)
@@ -185,7 +185,7 @@ class KKL(Estimator[np.ndarray]):
         """Return the estimates, (n, nx)."""
         if self.tracker is not None:
             return state[:, self._x].copy()
-        if len(state) == 1:  # the machine code of a batch begins with matrix products
+        if len(state) == 1:  # compiled code decodes a single sample
             return self.decoders(state[0, self.z], state[0, self.age] * self.artifact.filter.dt)[None]
         return self.decoders(state[:, self.z], state[:, self.age] * self.artifact.filter.dt)
 
@@ -206,7 +206,7 @@ class KKL(Estimator[np.ndarray]):
         return self._parameters(state[:, self.z], state[:, self.age] * artifact.filter.dt)
 
     def rejected(self, state: np.ndarray) -> np.ndarray:
-        """Return how many outputs the gate has rejected, (n,)."""
+        """Return the numbers of outputs that the gate has rejected, (n,)."""
         assert self.tracker is not None
         return state[:, self.tracked][:, self.tracker.nis + 3].astype(int)
 
@@ -217,7 +217,7 @@ class KKL(Estimator[np.ndarray]):
     def along(
         self, state: np.ndarray, y: np.ndarray, u: np.ndarray, of: Any, dts: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return what a function of rows returns at each sample of a record that begins with ``state``.
+        """Return the values of a function of rows at each sample of a record that begins with ``state``.
 
         Shapes: ``y`` (steps, n, ny), ``u`` (steps - 1, n, nu), ``dts`` (steps - 1,); returns (steps, n, ...).
         """
@@ -238,9 +238,9 @@ class KKL(Estimator[np.ndarray]):
 
     @functools.cached_property
     def _machine(self) -> CompiledStep | None:
-        """A tracker's step as machine code; None without Numba, or where NumPy is chosen or an expression is too long.
+        """The compiled step of a tracker; None without Numba, with ``compiled=False``, or for a long expression.
 
-        The linear filter alone is a matrix product, which NumPy takes as quickly.
+        The linear filter by itself is a matrix product, which is as fast in NumPy.
         """
         if self._choice is False or self.tracker is None:
             return None
@@ -250,9 +250,9 @@ class KKL(Estimator[np.ndarray]):
             return None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_machine"}  # made again where it goes
+        return {name: value for name, value in vars(self).items() if name != "_machine"}  # built again after unpickling
 
 
 def _filled(y: np.ndarray, gaps: np.ndarray, predicted: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Samples with gaps filled by predicted outputs, or by the outputs before where those are undefined."""
+    """Samples with gaps filled by predicted outputs, or by the last outputs if the predictions are undefined."""
     return np.where(gaps, np.where(np.isfinite(predicted), predicted, before), y)

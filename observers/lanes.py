@@ -1,4 +1,4 @@
-"""Numbers of several rows at once, as a type of Numba's: code for one row then steps as many. It needs Numba."""
+"""A Numba type for the numbers of several rows, so that code for one row steps several. It needs Numba."""
 
 import math
 import operator
@@ -11,13 +11,13 @@ from numba.core.typeconv.castgraph import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 
-_intrinsic: Any = intrinsic  # whose results take other arguments than the functions that it decorates
+_intrinsic: Any = intrinsic  # Any, because it changes the arguments of the functions that it decorates
 _OPERATIONS = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv}
 _IN_PLACE = {"add": operator.iadd, "sub": operator.isub, "mul": operator.imul}
 
 
 class _Lanes(types.Type):
-    """A vector of doubles, one of each row; numbers become one of equal doubles."""
+    """A vector with a double for each row; a number converts to a vector of equal doubles."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -70,13 +70,13 @@ def _define() -> None:
 
 
 def _common(*kinds: Any) -> Any:
-    """The type of a result: of doubles, or of lanes if there are any."""
+    """The type of a result: lanes if an argument has lanes, else double."""
     return next((kind for kind in kinds if isinstance(kind, _Lanes)), types.float64)
 
 
 @_intrinsic
 def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    """``yes`` where a > b, ``no`` elsewhere and where one is NaN."""
+    """``yes`` where a > b, else ``no``, also where a or b is NaN."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">", *arguments[:2]), *arguments[2:])
@@ -87,7 +87,7 @@ def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 @_intrinsic(prefer_literal=True)
 def stack(typing: Any, count: Any, rows: Any) -> Any:
-    """Memory of a constant number of doubles or of lanes, which the compiler may keep in registers."""
+    """Memory for a constant number of doubles or lanes, which the compiler may keep in registers."""
     kind = _Lanes(rows.literal_value) if rows.literal_value > 1 else types.float64
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -99,7 +99,7 @@ def stack(typing: Any, count: Any, rows: Any) -> Any:
 
 @_intrinsic
 def doubles(typing: Any, memory: Any) -> Any:
-    """The same memory as doubles: those of the first lanes, then those of the second."""
+    """The same memory as doubles: first those of the first lanes, then those of the second, and so on."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.bitcast(arguments[0], ir.DoubleType().as_pointer())

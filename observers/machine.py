@@ -1,4 +1,4 @@
-"""How functions become machine code, where Numba is installed."""
+"""Compilation of functions by Numba, if it is installed."""
 
 import hashlib
 import logging
@@ -23,7 +23,7 @@ def available() -> bool:
 
 
 def kernel(**options: Any) -> Callable[[_F], _F]:
-    """Compile a function that Python calls, and keep its machine code on disk for later processes."""
+    """Compile a function that Python calls, and store its machine code on disk for later processes."""
 
     def compiled(function: _F) -> _F:
         import numba
@@ -38,7 +38,7 @@ def kernel(**options: Any) -> Callable[[_F], _F]:
 
 
 def pointer(function: Callable[..., Any], signature: Any, **options: Any) -> Any:
-    """Compile a function that kernels call by its ``address``; it lasts as long as the returned object."""
+    """Compile a function that kernels call by its ``address``, which is valid while the returned object exists."""
     from numba.core.ccallback import CFunc
 
     named = _named(function, options)
@@ -56,17 +56,17 @@ def _announce() -> None:
 
 @cache
 def _forgiving() -> Any:
-    """Numba's cache, except that files which cannot be read or written cost a compilation and raise nothing."""
+    """Numba's cache, but a file that cannot be read or written causes a compilation instead of an error."""
     from numba.core.caching import FunctionCache
 
     class Forgiving(FunctionCache):
-        def _index_key(self, sig: Any, codegen: Any) -> Any:  # by the name, which is that of the content
+        def _index_key(self, sig: Any, codegen: Any) -> Any:  # by name, which contains a hash
             return sig, codegen.magic_tuple(), self._py_func.__qualname__
 
         def load_overload(self, *arguments: Any) -> Any:
             try:
                 loaded = super().load_overload(*arguments)  # type: ignore[no-untyped-call]
-            except Exception:  # cut off by a power failure, say
+            except Exception:  # such as a truncated file
                 loaded = None
                 with suppress(Exception):
                     self.flush()  # type: ignore[no-untyped-call]
@@ -75,16 +75,16 @@ def _forgiving() -> Any:
             return loaded
 
         def save_overload(self, *arguments: Any) -> None:
-            with suppress(Exception):  # a full disk, say
+            with suppress(Exception):  # such as a full disk
                 super().save_overload(*arguments)  # type: ignore[no-untyped-call]
 
     return Forgiving
 
 
 def part(**options: Any) -> Callable[[_F], _F]:
-    """Make a function one that kernels may call.
+    """Register a plain function that kernels may call.
 
-    It stays a plain function. Compiled ones differ between processes, and a kernel that calls one is not found on disk.
+    A compiled function would differ between processes, and kernels that call it would not be found on disk.
     """
 
     def known(function: _F) -> _F:
@@ -97,10 +97,10 @@ def part(**options: Any) -> Callable[[_F], _F]:
 
 
 def _named(function: _F, options: dict[str, Any]) -> _F:
-    """Name a function by its content, and that of the functions that it calls.
+    """Add a hash of a function's content, and of the functions that it calls, to its name.
 
-    Machine code of several processes is linked by name, so that functions that differ must not share one. Nor do they
-    share a file, which two processes may write at once.
+    Numba links machine code of several processes by name, so different functions need different names. They then have
+    different files, too, which matters because two processes may write at once.
     """
     code = function.__code__
     used = [cell.cell_contents for cell in function.__closure__ or ()]

@@ -1,4 +1,4 @@
-"""Does the measured output still fit the estimate? A cheap test on what the observer sees anyway."""
+"""A test whether the measured outputs still fit the estimates."""
 
 from dataclasses import dataclass
 
@@ -6,34 +6,34 @@ import numpy as np
 
 from observers.checks import check_dt, is_finite, noise_levels, real_array, shown
 
-_LARGEST = 1e30  # of limits and levels; their squares are within the range of floats
+_LARGEST = 1e30  # largest limit or level, so that squares are finite
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far the residual y - h(x_hat) strays in sound operation, by noise level.
+    """Limits of the residual y - h(x_hat) in normal operation, by noise level.
 
-    Found by simulation (:func:`training.calibrate`): under white noise of a level, the process noise of the
-    environments and random inputs, a run of ``duration`` seconds exceeds one of the limits with probability
-    ``false_alarms``.
+    :func:`training.calibrate` simulates runs of ``duration`` seconds under white noise of each level, the environments'
+    process noise and random inputs. Such a run exceeds one of the limits with probability ``false_alarms``.
+    Raises ValueError if shapes or values are invalid.
 
     Parameters
     ----------
     levels : ndarray, shape (k,) or (k, ny)
-        Standard deviations of the measurement noise, of all outputs or each, rising from 0. Limits are interpolated
-        between them. Row by row, all outputs have the same part of their largest level.
+        Standard deviations of the measurement noise, one for all outputs or one for each, rising from 0. Limits are
+        interpolated between them. In each row, all outputs have the same share of their largest level.
     mean : ndarray, shape (k, ny)
         Limits of the absolute running mean of the residual.
     low, high : ndarray, shape (k, ny)
-        Limits of the running mean square of the residual. ``low`` is 0 where there is no noise to be missed.
+        Limits of the running mean square of the residual. ``low`` is 0 if there is no noise whose absence would show.
     window : float
         Time constant of the running means, in seconds.
     warm_up : float
-        Seconds after reset in which the observer is still converging and nothing is judged.
+        Seconds after reset in which the observer still converges; residuals do not count then.
     false_alarms : float
-        Probability of an alarm in a sound run, within (0, 1).
+        Probability of an alarm in a run without faults, within (0, 1).
     duration : float
-        Seconds of such a run.
+        Duration of such a run in seconds.
     """
 
     levels: np.ndarray
@@ -72,11 +72,11 @@ class Limits:
     def at(self, level: float | tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the limits at a noise level.
 
-        Where some outputs are noisier than others, relative to the last levels, their noise reaches the estimate and so
-        the residuals of all. The upper limits are then those at the noisiest output's part of the last levels.
+        If some outputs are noisier than others, relative to the largest levels, their noise reaches the estimate and so
+        every residual. All outputs then have the upper limits at the relative level of the noisiest output.
 
         Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each, interpolated as
-        variances add up. Raises ValueError if the level is not a number, negative or beyond the last one.
+        variances. Raises ValueError if a level is not a number, negative or beyond the last one.
         """
         ny = self.mean.shape[1]
         level = noise_levels("the noise level", level, ny)
@@ -87,7 +87,7 @@ class Limits:
         part = np.divide(own, last, out=np.zeros(ny), where=last > 0)
         noisiest = np.where(part == part.max(), own, part.max() * last)
 
-        def between(sigma: np.ndarray, limits: np.ndarray) -> np.ndarray:  # as variances add up
+        def between(sigma: np.ndarray, limits: np.ndarray) -> np.ndarray:  # linear in level^2
             each = zip(sigma, levels.T, limits.T, strict=True)
             return np.array([np.interp(one**2, known**2, squares) for one, known, squares in each])
 
@@ -95,17 +95,17 @@ class Limits:
 
 
 class Monitor:
-    """Running mean and mean square of the residual, against their limits.
+    """Running mean and mean square of the residual, compared with their limits.
 
-    A biased sensor moves the mean, a frozen or dead one lets the noise go missing, and whatever takes the filter's
-    state away from those that the map was trained on makes the residual large.
+    A biased sensor shifts the mean, a frozen or dead one has too little noise, and filter states far outside the
+    training make the residual large.
 
     Parameters
     ----------
     limits : Limits
-        The limits of sound operation.
+        The limits in normal operation.
     level : float or tuple of float, length ny
-        Standard deviation of the measurement noise, of all outputs or each.
+        Standard deviation of the measurement noise, one for all outputs or one for each.
     dt : float
         Sampling interval in seconds.
 
@@ -122,27 +122,27 @@ class Monitor:
         self._limits = limits.at(level)
         self._share = -np.expm1(-dt / limits.window)
         self._silent = np.round(limits.warm_up / dt)
-        self._sound = np.maximum(np.square(level), self._limits[1])  # where the running mean square begins
+        self._sound = np.maximum(np.square(level), self._limits[1])  # start of the running mean square
 
     @property
     def width(self) -> int:
-        """Number of values in a row of the state: running means (ny), running mean squares (ny), samples judged."""
+        """Number of values in a row of the state: running means (ny), running mean squares (ny), number of samples."""
         return 2 * len(self._sound) + 1
 
     def start(self, n: int) -> np.ndarray:
-        """Return n rows, (n, width), before the first sample, as :class:`observers.estimator.Estimator` has states."""
+        """Return the state (n, width) before the first sample; the caller keeps it."""
         ny = len(self._sound)
         return np.tile(np.concatenate([np.zeros(ny), self._sound, [0.0]]), (n, 1))
 
     def update(self, rows: np.ndarray, residual: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """Return rows after residuals y - h(x_hat), (n, ny), of which those ``seen``, (n, ny), count."""
+        """Return rows after residuals y - h(x_hat), (n, ny), of the outputs that are ``seen``, (n, ny)."""
         mean, square, samples = self._parts(rows)
         share = self._share * seen
         mean, square = mean + share * (residual - mean), square + share * (residual**2 - square)
         return np.concatenate([mean, square, samples + seen.any(-1, keepdims=True)], axis=-1)
 
     def score(self, rows: np.ndarray) -> np.ndarray:
-        """Return how close to an alarm rows are, (n,): above 1 a limit is exceeded; 0 while nothing is judged yet."""
+        """Return the scores (n,): above 1 a limit is exceeded, and 0 during the warm-up."""
         (mean, square, samples), (most, low, high) = self._parts(rows), self._limits
         worst = np.maximum(np.abs(mean) / most, square / high)
         worst = np.maximum(worst, low / np.maximum(square, 1e-300))

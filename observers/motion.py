@@ -1,4 +1,4 @@
-"""How a state moves over one sample: by the system's equations, or by a flow that was learned."""
+"""The motion of a state over one sample: by the system's equations, or by a learned flow."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,20 +10,20 @@ from observers.expression import Expression
 from observers.factors import Factors, check_positive_definite
 from observers.network import MLP
 
-_MAX_LEVEL = 1e30  # of a process noise or a window: its square stays finite
+_MAX_LEVEL = 1e30  # largest process noise or window, so that squares are finite
 _MAX_SUBSTEPS = 1024
 
 
 @dataclass(frozen=True)
 class Equations:
-    """x' = f(x) + g(x) u with u held, integrated over a sample; or x_next = field(x, u) in discrete time.
+    """Motion by equations: x' = f(x) + g(x) u under held u, or x_next = field(x, u) in discrete time.
 
     Parameters
     ----------
     field : Expression
-        f(x) + g(x) u, nx components; in discrete time the next state.
+        f(x) + g(x) u, or the next state in discrete time; nx components.
     substeps : int, default 1
-        Runge-Kutta steps of order four in a sample, at most 1024; 0 for a system in discrete time.
+        Fourth-order Runge-Kutta steps in a sample, 0 for a system in discrete time. Beyond 1024 raises ArtifactError.
     """
 
     field: Expression
@@ -34,7 +34,7 @@ class Equations:
             raise ArtifactError(f"substeps must be an integer from 0 to {_MAX_SUBSTEPS}, got {self.substeps!r}")
 
     def __call__(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
-        """Return the states so many samples of dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); (..., nx)."""
+        """Return the states ``samples`` times dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         f, substeps = self.field, self.steps(samples)
         if not self.substeps:
             for _ in range(substeps):
@@ -50,7 +50,7 @@ class Equations:
         return x
 
     def steps(self, samples: float) -> int:
-        """Number of Runge-Kutta steps, or of steps of the map in discrete time, in so many samples."""
+        """Number of Runge-Kutta steps, or of steps in discrete time, in so many samples."""
         return round(samples) if not self.substeps else max(1, math.ceil(self.substeps * samples - 1e-9))
 
 
@@ -61,7 +61,7 @@ class Flow:
     Parameters
     ----------
     mlp : MLP
-        A network of nx + nu inputs and nx outputs.
+        A network with nx + nu inputs and nx outputs. Raises ArtifactError if the other arrays do not fit it.
     linear : ndarray, shape (nx, 1 + nx + nu)
         The affine part.
     gain : ndarray, shape (nx,)
@@ -84,44 +84,45 @@ class Flow:
             raise ArtifactError(f"u_scale of a flow must be positive, got {self.u_scale}")
 
     def __call__(self, s: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Return the scaled states a sample later. Shapes: ``s`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        """Return the scaled states one sample later. Shapes: ``s`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         q = np.concatenate([s, np.broadcast_to(u / self.u_scale, (*s.shape[:-1], len(self.u_scale)))], -1)
         return np.asarray(s + self.linear[:, 0] + q @ self.linear[:, 1:].T + self.gain * self.mlp(q))
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What a tracker needs beside T_inv: how states move, how uncertain that is, and how it was calibrated.
+    """The model of a tracker: the motion of states, its uncertainty and its calibration.
 
-    Scaled states are s = (x - x_offset) / x_scale. All standard deviations are of scaled states, or of outputs in their
-    own units.
+    Scaled states are s = (x - x_offset) / x_scale. Standard deviations of states are in scaled units, those of outputs
+    in the outputs' units. Raises ArtifactError if the parts do not fit each other.
 
     Parameters
     ----------
     equations : Equations, optional
         The system's equations, in units of the states.
     flow : Flow, optional
-        A learned step, where there are no equations. There is one of the two.
+        A learned step. A motion has either equations or a flow.
     x_offset, x_scale : ndarray, shape (nx,)
         Scaling of the states; scales are positive.
     low, high : ndarray, shape (nx,)
-        Bounds of the states, at which estimates are cut.
+        Bounds of the states, to which estimates are limited.
     mean : ndarray, shape (nx,)
-        Mean of the states at which motions start: the estimate before the first sample.
+        Mean of the starts of motions: the estimate before the first sample.
     covariance : ndarray, shape (nx, nx)
-        Their covariance.
+        Covariance of the starts of motions.
     error : ndarray, shape (nx,)
         Standard deviation of the motion's own error over a sample.
     process_noise : ndarray, shape (nx,)
         Standard deviation that process noise of level 1 adds in a sample.
     least_process_noise : float
-        Level of process noise that is assumed at least: with Q = 0 the gain would vanish.
+        Lower bound of the assumed level of process noise: with Q = 0 the gain would vanish.
     least_measurement_noise : ndarray, shape (ny,)
-        Standard deviations of the measurement noise that are assumed at least.
+        Lower bounds of the assumed standard deviations of the measurement noise.
     window : float
-        Seconds over which innovations are averaged, and after a start within which T_inv is consulted.
+        Seconds over which innovations are averaged. T_inv's estimate may replace the tracker's for so long after a
+        start.
     factors : Factors, optional
-        Factors of the filter's covariance, with which regions of 90 % hold 90 % of the errors.
+        Calibration factors of the filter's covariance.
     """
 
     x_offset: np.ndarray
@@ -142,7 +143,7 @@ class Motion:
     def __post_init__(self) -> None:
         nx = len(self.x_offset) if self.x_offset.ndim == 1 else 0
         if (self.equations is None) == (self.flow is None):
-            raise ArtifactError("a motion is by equations or by a flow: it has one of the two")
+            raise ArtifactError("a motion needs either equations or a flow")
         field = None if self.equations is None else self.equations.field
         fits = self.flow is not None if field is None else len(field.components) == nx and field.states <= nx
         if not nx or not fits or (self.flow is not None and self.flow.mlp.outputs != nx):
@@ -171,14 +172,14 @@ class Motion:
         return len(self.x_offset)
 
     def fits_inputs(self, nu: int) -> bool:
-        """Whether the motion is one under so many inputs."""
+        """Whether the motion takes so many inputs."""
         if self.flow is not None:
             return len(self.flow.u_scale) == nu
         assert self.equations is not None
         return self.equations.field.inputs <= nu
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
-        """Return states so many samples of dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        """Return the states ``samples`` times dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         if self.equations is not None:
             return self.equations(x, u, dt, samples)
         assert self.flow is not None
@@ -188,20 +189,20 @@ class Motion:
         return self.x_offset + self.x_scale * s
 
     def check_samples(self, samples: float) -> None:
-        """Raise ValueError if the motion cannot be carried over so many samples."""
+        """Raise ValueError if the motion cannot predict over so many samples."""
         continuous = self.equations is not None and self.equations.substeps
-        # Times in seconds since 1970 are rounded to 2e-7 s, and clocks jitter.
+        # A tolerance, because clocks jitter and floats resolve seconds since 1970 only to 2e-7 s.
         if not continuous and abs(samples - max(1, round(samples))) > 1e-3:
             what = "a learned flow" if self.flow is not None else "a motion in discrete time"
             raise ValueError(
-                f"{what} is carried by whole samples, got a dt of {samples:g} of them; pass a whole multiple of the "
+                f"{what} predicts over whole samples, got a dt of {samples:g} samples; pass a whole multiple of the "
                 "sampling interval, or tracking=False"
             )
 
     def variances(
         self, measurement_noise: float | tuple[float, ...], process_noise: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the variances of Q, (nx,), in scaled states and of R, (ny,), that are assumed at levels of noise."""
+        """Return the assumed variances at noise levels: Q's, (nx,), of scaled states, and R's, (ny,)."""
         level = max(process_noise, self.least_process_noise)
         return (
             (level * self.process_noise) ** 2 + self.error**2,

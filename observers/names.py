@@ -1,4 +1,4 @@
-"""Observers by the name of a map that ships, or by file."""
+"""Load an observer by the name of a shipped map, or from a file."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -22,7 +22,7 @@ def load(
     gate: float | None = None,
     delay: int = 0,
 ) -> KKLObserver:
-    """Return the observer behind a name.
+    """Load an observer.
 
     Parameters
     ----------
@@ -34,12 +34,12 @@ def load(
     Returns
     -------
     KKLObserver
-        The observer, which awaits :meth:`KKLObserver.reset`.
+        The observer; call :meth:`KKLObserver.reset` before its first step.
 
     Raises
     ------
     ArtifactError, ImportError, ValueError
-        If there is no such name or file, or the file is damaged or foreign; and as :class:`KKLObserver`.
+        If there is no such name or file, or the file is damaged or of another kind. Also as :class:`KKLObserver`.
     """
     return KKLObserver(
         Artifact.read(resolve(name_or_path)),
@@ -59,13 +59,13 @@ def shipped() -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        What :func:`observers.load` takes, sorted.
+        The names for :func:`observers.load`, sorted.
     """
     return tuple(sorted(path.stem for path in _maps().glob("*.safetensors")))
 
 
 def resolve(name_or_path: str | os.PathLike[str]) -> Path:
-    """Return the file behind a name."""
+    """Return the file of a name."""
     text = os.fspath(name_or_path) if isinstance(name_or_path, str | os.PathLike) else None
     if not isinstance(text, str):
         raise ArtifactError(f"an observer is a shipped name or a path, got {shown(name_or_path)}")
@@ -83,12 +83,12 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
 
 
 def matching(text: str, names: Iterable[str]) -> str | None:
-    """The name that a text is, or is but for capitals and underscores, or as an environment's id; None for others."""
+    """The name that matches a text, apart from capitals, underscores and the form of an environment's id, or None."""
     return {_plain(name): name for name in names}.get(_plain(text.removeprefix("KKL").removesuffix("-v0")))
 
 
 def suggestion(text: str, names: Iterable[str]) -> str:
-    """For error messages: the name closest to a text, if one is close."""
+    """A hint for error messages: the name closest to a text, if one is close."""
     close = get_close_matches(text, list(names), n=1)
     return f", did you mean {close[0]!r}?" if close else ""
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from observers.checks import choice, real_array, shown
 
-_PIECE = 2**15  # values of a layer that a batch computes at once: they stay in the second cache
-UNROLLED = 4  # inputs that machine code takes at once
+_PIECE = 2**15  # values of a layer that a batch computes together; they fit the second-level cache
+UNROLLED = 4  # inputs that machine code processes together
 
 
 def _tanh(h: np.ndarray) -> np.ndarray:
@@ -31,16 +31,16 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"tanh": _tanh, "si
 
 @dataclass(frozen=True)
 class MLP:
-    """A multilayer perceptron in float32.
+    """A multilayer perceptron in float32. Raises ValueError if shapes do not fit, or numbers are not finite.
 
     Parameters
     ----------
     weights : sequence of ndarray, shape (outputs, inputs) each
-        For each layer, as torch stores them.
+        The weights of each layer, as torch stores them.
     biases : sequence of ndarray, shape (outputs,) each
-        For each layer.
+        The biases of each layer.
     activation : {"tanh", "silu", "relu"}
-        After every layer but the last.
+        The activation after every layer but the last.
     """
 
     weights: Sequence[np.ndarray]
@@ -54,7 +54,7 @@ class MLP:
             arrays = getattr(self, name)
             if not isinstance(arrays, Sequence) or isinstance(arrays, str | bytes):
                 raise ValueError(f"{name} must be a sequence of arrays, got {shown(arrays)}")
-            with np.errstate(over="ignore"):  # numbers that are too large become infinite, and are refused below
+            with np.errstate(over="ignore"):  # numbers that are too large become infinite, and are rejected below
                 object.__setattr__(self, name, [real_array(name, each).astype(np.float32) for each in arrays])
         if not self.weights or len(self.weights) != len(self.biases):
             raise ValueError(f"{len(self.weights)} weights and {len(self.biases)} biases do not make a network")
@@ -83,7 +83,7 @@ class MLP:
         return int(self.weights[-1].shape[0])
 
     def part(self, outputs: slice) -> "MLP":
-        """The same network with some of its outputs alone."""
+        """The same network with only some of its outputs."""
         *weights, last = self.weights
         *biases, bias = self.biases
         return MLP([*weights, last[outputs]], [*biases, bias[outputs]], self.activation)
@@ -112,10 +112,10 @@ class MLP:
         return h
 
     def packed(self, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Layers from ``first`` on as :func:`observers.kernel_functions.evaluate` takes them.
+        """Layers from ``first`` on in the form of :func:`observers.kernel_functions.evaluate`.
 
-        These are biases and weights one after another, with rows of zeros up to a multiple of UNROLLED, and the number
-        of the activation with all widths.
+        Returns one array of all biases and weights, padded with rows of zeros to a multiple of UNROLLED, and one with
+        the index of the activation and all widths.
         """
         layers, (outputs, inputs) = self.layers[first:], np.shape(self.weights[max(first - 1, 0)])
         padded = [(bias, np.pad(weight, ((0, -len(weight) % UNROLLED), (0, 0)))) for weight, bias in layers]

@@ -1,4 +1,4 @@
-"""The observer at run time: filter the output, invert the map."""
+"""The observer at run time."""
 
 import math
 import warnings
@@ -30,42 +30,42 @@ class KKLObserver(RecordEstimates):
     All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx). A step is :meth:`advance`, the
     linear filter, followed by :meth:`decode`, the network; :meth:`restart` restarts some rows of a batch.
 
-    A filter that is switched on needs some time. Where the state x_0 is known and the artifact holds the forward map T,
-    ``reset(y_0, x_0)`` begins at z_0 = T(x_0) instead. T also gives :attr:`mismatch`, the distance of z from T(x_hat).
+    After a reset the filter has a transient. If the state x_0 is known and the artifact holds the forward map T,
+    ``reset(y_0, x_0)`` starts at z_0 = T(x_0) without transient. T also gives :attr:`mismatch`, the distance of z from
+    T(x_hat).
 
-    Where the artifact holds a motion, the observer tracks: a Kalman filter predicts the estimate by the system's
+    If the artifact holds a motion, the observer tracks: a Kalman filter predicts the estimate by the system's
     equations, or by a learned flow, and corrects it by each sample (:class:`observers.tracker.Tracker`). T_inv's
-    estimate replaces it where T_inv is surer, or where the samples show divergence.
+    estimate replaces the tracker's soon after a reset if its covariance is smaller, and after a divergence.
 
     Parameters
     ----------
     artifact : Artifact
         The learned filter, maps and motion.
     measurement_noise : float or sequence of float, length ny, optional
-        Standard deviation of the noise on each sample, of all outputs or each, for maps that take it. None: the
-        usual one, :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
+        Standard deviation of the noise on each sample, one for all outputs or one for each, for maps that take it. None
+        is :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
     process_noise : float, optional
-        Level of the noise on the state's derivative, in multiples of the system's scale per second as for the
-        environments, for maps that ask for it. T_inv takes levels beyond its training for its largest; where the
-        observer tracks, its filter takes any level. None is the system's own level, which the environments and the
-        monitor's limits have too.
+        Level of the noise on the state's derivative, in multiples of the system's scale per second as in environments,
+        for maps that take it. T_inv limits the level to the largest of its training; the tracker takes any level. None
+        is the system's own level, which environments and the monitor's limits also assume.
     monitor : bool, default False
-        Whether to watch if the samples fit the estimates, see :attr:`score`.
+        Whether to test if the samples fit the estimates, see :attr:`score`.
     tracking : bool, optional
-        Whether to track; False takes T_inv alone, without any model at run time. None tracks where the artifact holds a
+        Whether to track. False uses T_inv alone, without any model at run time. None tracks if the artifact holds a
         motion.
     compiled : bool, optional
-        Whether Numba compiles the step (the extra ``fast``). None compiles where Numba is installed, True insists on
-        it, False takes NumPy. The first process on a machine compiles for some seconds, later ones read the machine
-        code from disk. Numba and NumPy agree to rounding.
+        Whether Numba compiles the step (the extra ``fast``). None compiles if Numba is installed, True requires it, and
+        False uses NumPy. The first process on a machine compiles for some seconds; later ones read the machine code
+        from disk. Numba and NumPy agree to rounding.
     gate : float, optional
-        Outputs whose innovation is larger than so many of its standard deviations are rejected: they count as missing,
-        and :attr:`rejected` counts them. The gate is open in the first window, half a second for the maps that ship;
-        and for an output that was beyond it for a whole window, or where the tracker diverged, until that output fits
-        again: a jump that stays is accepted. It needs a map that tracks.
+        Largest innovation, in its own standard deviations. Outputs beyond it are rejected: they count as missing, and
+        :attr:`rejected` counts them. The gate is open in the first window, half a second for the maps that ship. It
+        also opens for an output that was beyond it for a whole window, and after a divergence, until the output fits
+        again: so a lasting jump is accepted. A gate needs a map that tracks.
     delay : int, default 0
-        Samples by which outputs are late. ``step(y, u)`` then takes the output of so many samples ago and the input
-        held since the sample before, and the estimate is predicted by the motion to now. It needs a map that tracks.
+        Samples by which outputs arrive late. ``step(y, u)`` then takes the output of so many samples ago and the input
+        held since the last sample, and the motion predicts the estimate to now. A delay needs a map that tracks.
 
     Raises
     ------
@@ -73,7 +73,7 @@ class KKLObserver(RecordEstimates):
         If ``compiled`` is True and Numba is not installed.
     ValueError
         If an argument has the wrong type, a noise level is negative or beyond 1e12, the measurement noise is beyond
-        the map's training or differs between outputs where the map takes one level for all, or the artifact holds no
+        the map's training, it differs between outputs but the map takes one level for all, or the artifact holds no
         limits for a monitor.
     """
 
@@ -101,7 +101,7 @@ class KKLObserver(RecordEstimates):
 
     @property
     def measurement_noise(self) -> float | tuple[float, ...]:
-        """Standard deviation sigma_v of the measurement noise that the estimate assumes, of all outputs or each."""
+        """Assumed standard deviation of the measurement noise, one for all outputs or one for each."""
         return self._measurement_noise
 
     @measurement_noise.setter
@@ -111,13 +111,13 @@ class KKLObserver(RecordEstimates):
         if level != (within := inverse.within(level)):
             raise ValueError(
                 f"measurement_noise = {level} is beyond the map's range, 0 to {inverse.measurement_noise_max}; "
-                f"pass measurement_noise={within} to use it all the same"
+                f"pass measurement_noise={within} to use it nevertheless"
             )
         self._set_levels(level, self._process_noise)
 
     @property
     def process_noise(self) -> float:
-        """Level of process noise that the estimate assumes, in multiples of the system's scale per second."""
+        """Assumed level of process noise, in multiples of the system's scale per second."""
         return self._process_noise
 
     @process_noise.setter
@@ -126,7 +126,7 @@ class KKLObserver(RecordEstimates):
 
     @property
     def gate(self) -> float | None:
-        """Standard deviations of an innovation beyond which an output is rejected; None rejects none."""
+        """Largest innovation of an accepted output, in its own standard deviations; None accepts all."""
         return self._gate
 
     @gate.setter
@@ -136,7 +136,7 @@ class KKLObserver(RecordEstimates):
 
     @property
     def delay(self) -> int:
-        """Samples by which outputs are late; another delay needs a :meth:`reset`."""
+        """Samples by which outputs arrive late; after a change call :meth:`reset`."""
         return self._delay
 
     @delay.setter
@@ -150,11 +150,11 @@ class KKLObserver(RecordEstimates):
 
     @property
     def tracking(self) -> bool:
-        """Whether the observer tracks; else its estimate is T_inv's alone."""
+        """Whether the observer tracks; otherwise it uses T_inv alone."""
         return self._kkl.tracker is not None
 
     def _set_levels(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
-        """Take maps, tracker and monitor for levels of noise; the monitor starts again."""
+        """Build maps, tracker and monitor for noise levels; the monitor restarts."""
         levels: dict[str, Any] = {"measurement_noise": measurement_noise, "process_noise": process_noise}
         kkl = KKL(self.artifact, gate=self._gate, **levels, **self._options)
         if self._state is not None and kkl.monitor is not None:
@@ -162,20 +162,20 @@ class KKLObserver(RecordEstimates):
         self._kkl, self._measurement_noise, self._process_noise = kkl, measurement_noise, process_noise
 
     def replace(self, artifact: Artifact) -> None:
-        """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
+        """Use the maps of another artifact with the same filter from now on. The filter's state stays.
 
-        A map that tracks, in place of one that does not, starts its filter at the current sample.
+        If the new map tracks and the old one did not, tracking starts at the current sample.
 
         Parameters
         ----------
         artifact : Artifact
-            Of the same signals, with the same A, B and dt.
+            An artifact with the same signals, A, B and dt.
 
         Raises
         ------
         ValueError
-            If the artifact differs in more than its maps, the noise level is beyond its range, or there is a monitor,
-            which restarts, and it holds no limits. The observer is then as it was.
+            If the artifact differs in more than its maps, the noise level is beyond its range, or it holds no limits
+            for the monitor, which restarts. The observer is then unchanged.
         """
         check_replacement(self.artifact, artifact)
         how: dict[str, Any] = {**self._options, "gate": self._gate, "delay": self._delay}
@@ -187,7 +187,7 @@ class KKLObserver(RecordEstimates):
 
     @property
     def estimator(self) -> KKL:
-        """The same as an :class:`observers.estimator.Estimator`, whose state the caller keeps."""
+        """The observer as an :class:`observers.estimator.Estimator`, whose state the caller keeps."""
         return self._kkl
 
     @property
@@ -197,29 +197,29 @@ class KKLObserver(RecordEstimates):
         return state[:, self._kkl.z].reshape(*self._batch, self.artifact.filter.size).copy()
 
     def reset(self, y0: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
-        """Forget the past and take in the first sample.
+        """Start at a first sample.
 
         Parameters
         ----------
         y0 : array_like, shape (..., ny)
-            The sample; its shape is that of the batch from here on.
+            The sample; its shape sets the batch.
         x0 : array_like, shape (..., nx), optional
-            The state, where it is known. The filter then starts at z_y = T(x0) and z_u = 0, as if it had run for ever
-            beside a motion without input: there is no transient. An observer that tracks begins at x0 itself, cut at
-            the bounds of the states, with T or without. Where only some rows are known, :meth:`restart` those.
+            The state, if it is known. The filter then starts at z_y = T(x0) and z_u = 0, as if it had always followed
+            a motion without input: there is no transient. An observer that tracks starts at x0 itself, limited to the
+            bounds of the states, with or without T. If x0 is known in some rows only, :meth:`restart` these.
 
         Returns
         -------
         ndarray, shape (..., nx)
-            The first estimate: T_inv(z_0), or that of the tracker, which is x0 where it is given.
+            The first estimate: T_inv(z_0), or the tracker's, which is x0 if given.
 
         Raises
         ------
         ValueError
             If a shape is wrong, an entry is not a finite real number, or x0 is given and the artifact holds neither T
-            nor a motion; the observer is then as it was.
+            nor a motion. The observer is then unchanged.
         """
-        y0 = real_array("y", y0).copy()  # callers reuse arrays
+        y0 = real_array("y", y0).copy()  # the caller may reuse its array
         check_output(self.artifact, y0, y0.shape[:-1])
         self._state, self._batch = self._begin(y0, x0), y0.shape[:-1]
         n = len(self._state)
@@ -227,7 +227,7 @@ class KKLObserver(RecordEstimates):
         return self.decode()
 
     def _begin(self, y0: np.ndarray, x0: np.ndarray | None) -> np.ndarray:
-        """Rows at first samples (..., ny), or at known states (..., nx)."""
+        """Rows of the state at first samples (..., ny), or at known states (..., nx)."""
         z0, age = first_state(self.artifact, y0, x0)
         n = math.prod(y0.shape[:-1])
         x0 = None if x0 is None else real_array("x0", x0).reshape(n, self.artifact.nx)
@@ -235,12 +235,12 @@ class KKLObserver(RecordEstimates):
 
     @property
     def score(self) -> np.ndarray:
-        """How well the samples since reset fit the estimates, shape (...,): above 1 a fault is likely.
+        """How badly the samples since reset fit the estimates, shape (...,): above 1 a fault is likely.
 
-        The running mean and mean square of y - h(x_hat) over their limits in sound operation. It is 0 right after
-        reset; missing outputs leave it as it was. A biased, frozen or dropped-out sensor raises it, and so do states
-        outside the training. :class:`observers.Limits` gives the rate of false alarms. Raises RuntimeError before
-        :meth:`reset`, or without ``monitor=True``.
+        The score is the largest of the running means and mean squares of y - h(x_hat), each relative to its limit. It
+        is 0 right after reset, and missing outputs do not change it. A biased, frozen or dead sensor raises the score,
+        and so do states outside the training. :class:`observers.Limits` gives the rate of false alarms. Raises
+        RuntimeError before :meth:`reset`, or without ``monitor=True``.
         """
         if self._kkl.monitor is None or self._state is None:
             raise RuntimeError("score needs an observer made with monitor=True, and reset(y0)")
@@ -260,25 +260,25 @@ class KKLObserver(RecordEstimates):
     def mismatch(self) -> np.ndarray:
         """Distance of the filter's state from the image of T, shape (...,): 0 where z_y = T(x_hat).
 
-        The root mean square of (T(x_hat) - z_y) / :attr:`ForwardMap.z_scale` over the modes. It is large in the
-        transient, under sensor faults and inputs, on another plant, and beyond the training; noise adds a little. A
-        fault that keeps z on the image of T does not show. There are no limits: measure what sound runs give. Raises
-        RuntimeError before :meth:`reset`, and ValueError if the artifact holds no T.
+        It is the root mean square of (T(x_hat) - z_y) / :attr:`ForwardMap.z_scale` over the modes. It is large in the
+        transient, under sensor faults and inputs, on another plant, and outside the training; noise adds a little. It
+        does not show a fault that keeps z on the image of T. No limits are stored: compare with runs without faults.
+        Raises RuntimeError before :meth:`reset`, and ValueError if the artifact holds no T.
         """
         z, T = self.z, self.artifact.require_forward()
-        x_hat = self._kkl.decode(self._begun()).reshape(*self._batch, self.artifact.nx)  # as late as z
+        x_hat = self._kkl.decode(self._begun()).reshape(*self._batch, self.artifact.nx)  # at the time of z
         apart = (T(x_hat) - z[..., : len(T.z_scale)]) / T.z_scale
         return np.sqrt(np.mean(apart**2, axis=-1, keepdims=True))[..., 0]
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray | None = None) -> None:
-        """Forget the past in some rows of the batch and take in their first samples.
+        """Start again at first samples in some rows of the batch.
 
         Raises the errors of :meth:`reset`, and RuntimeError before it.
 
         Parameters
         ----------
         y0, x0
-            As for :meth:`reset`, a row for each True in ``rows``.
+            As for :meth:`reset`, with a row for each True in ``rows``.
         rows : array_like of bool, shape (...,)
             The rows of the batch.
         """
@@ -291,22 +291,21 @@ class KKLObserver(RecordEstimates):
         self._state[rows.ravel()] = begun
 
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None, *, dt: float | None = None) -> np.ndarray:
-        """Take in the next sample.
+        """Process the next sample.
 
-        Without a sample the observer coasts on its own prediction of the output, h(x_hat), which makes z' = A z + B
-        h(T_inv(z)) a model of the system; one that tracks coasts on its motion. Of several outputs some may be
-        missing, such as those of slower sensors: it then coasts on these alone. Where the artifact holds no h, the last
+        If outputs are missing, such as those of slower sensors, the observer uses predictions in their place: an
+        observer that tracks predicts by its motion, any other by h(T_inv(z)). If the artifact holds no h, the last
         value of a missing output is held.
 
         Parameters
         ----------
         y : array_like, shape (..., ny), or None
-            The sample; None if it is missing. NaN marks outputs, or rows of a batch, that are missing.
+            The sample; None if it is missing. NaN marks single outputs, or rows of a batch, that are missing.
         u : array_like, shape (..., nu), optional
-            The input held since the sample before, by default zero.
+            The input held since the last sample, by default zero.
         dt : float, optional
-            Seconds since the sample before, by default those of the map. The filter and the equations are integrated
-            over any, at most 1,000 samples; a learned flow is carried by whole samples.
+            Seconds since the last sample, by default the map's interval, and at most 1,000 intervals. A learned flow,
+            like a system in discrete time, needs a whole multiple of the interval.
 
         Returns
         -------
@@ -316,9 +315,9 @@ class KKLObserver(RecordEstimates):
         Raises
         ------
         ValueError
-            If a shape is wrong, an entry is not a finite real number (or NaN as described), or an input that the map
-            does not take is not zero, or ``dt`` is beyond what the motion can be carried over, or given beside a delay;
-            the observer is then as it was.
+            If a shape is wrong, an entry is not a finite real number (or NaN as described), an input is not zero that
+            the map does not take, ``dt`` does not suit the motion, or both ``dt`` and a delay are given. The observer
+            is then unchanged.
         RuntimeError
             Before :meth:`reset`.
         """
@@ -333,14 +332,14 @@ class KKLObserver(RecordEstimates):
         *,
         dt: float | None = None,
     ) -> None:
-        """Take in the next sample without an estimate: the filter's half of :meth:`step`, which raises the same.
+        """Process the next sample without computing an estimate. The errors are those of :meth:`step`.
 
         Parameters
         ----------
         y, u, dt
             As for :meth:`step`.
         rows : array_like of bool, shape (...,), optional
-            The rows of the batch that take it in, by default all.
+            The rows of the batch to advance, by default all.
         """
         state, batch = self._state, self._batch
         if state is None:
@@ -364,13 +363,13 @@ class KKLObserver(RecordEstimates):
             self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows], dt)
 
     def _warn(self, text: str) -> None:
-        """Warn once, by the first words."""
+        """Warn once of each kind of text, which its first words identify."""
         if text[:12] not in self._warned:
             self._warned = self._warned | {text[:12]}
             warnings.warn(text, stacklevel=5)
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the current estimate: T_inv(z), the network's half of :meth:`step`, or the tracker's.
+        """Return the current estimate: the tracker's, or T_inv(z).
 
         Raises ValueError if ``rows`` does not fit the batch, and RuntimeError before :meth:`reset`.
 
@@ -401,10 +400,10 @@ class KKLObserver(RecordEstimates):
     def covariance(self) -> np.ndarray:
         """Covariance of the error x - x_hat of the current estimate, shape (..., nx, nx).
 
-        It is calibrated on runs, by level of noise and age; a tracker's also follows its filter: 90 % of the
-        errors there have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of the chi-square distribution with nx
-        degrees of freedom. On another plant, under a faulty sensor or far from the training it is too small. Raises
-        RuntimeError before :meth:`reset`, and ArtifactError if the artifact holds no covariance.
+        It is calibrated on runs, by noise level and age: 90 % of their errors have (x - x_hat)^T P^-1 (x - x_hat) below
+        the 90 % quantile of the chi-square distribution with nx degrees of freedom. A tracker calibrates the covariance
+        of its Kalman filter. On another plant, under a faulty sensor or far outside the training, P is too small.
+        Raises RuntimeError before :meth:`reset`, and ArtifactError if the artifact holds no covariance.
         """
         return self.decode_covariance()
 
@@ -425,7 +424,7 @@ class KKLObserver(RecordEstimates):
         return self._state
 
     def _some(self, rows: np.ndarray | None) -> tuple[np.ndarray, tuple[int, ...]]:
-        """Some rows of the state, predicted to now where outputs are late, and the shape of the batch that they are."""
+        """Some rows of the state, predicted to now if outputs are delayed, and the shape of their batch."""
         state, batch = self._begun(), self._batch
         chosen: Any = slice(None)
         if rows is not None:

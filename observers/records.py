@@ -11,7 +11,7 @@ from observers.samples import check_output, held_input, intervals, recorded_inpu
 
 
 class RecordEstimates:
-    """The methods of :class:`observers.KKLObserver` that go along whole records, and leave its own state as it is."""
+    """The methods of :class:`observers.KKLObserver` for whole records; they do not change its state."""
 
     artifact: Artifact
     _kkl: KKL
@@ -24,18 +24,18 @@ class RecordEstimates:
     ) -> np.ndarray:
         """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
 
-        The observer's own state is left as it was. Raises the errors of :meth:`reset` and :meth:`step`.
+        The observer's own state does not change. Raises the errors of :meth:`reset` and :meth:`step`.
 
         Parameters
         ----------
         y : array_like, shape (steps, ..., ny)
-            Outputs; the first row is y_0. Later ones are NaN where they are missing.
+            Outputs; the first row is y_0. Missing outputs in later rows are NaN.
         u : array_like, shape (steps - 1, ..., nu), optional
-            The input held after each row but the last, by default zero. A last row more is ignored.
+            The input held after each row but the last, by default zero. One row more is ignored.
         x0 : array_like, shape (..., nx), optional
-            The state at y_0, where it is known, as for :meth:`reset`.
+            The state at y_0, if it is known, as for :meth:`reset`.
         t : array_like, shape (steps,), optional
-            Times of the samples in seconds, which rise; by default they are at the map's interval.
+            Increasing times of the samples in seconds; by default the samples are at the map's interval.
 
         Returns
         -------
@@ -54,7 +54,7 @@ class RecordEstimates:
     def estimate_covariance(
         self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
     ) -> np.ndarray:
-        """Covariances of the errors of what :meth:`estimate` returns: :attr:`covariance` at each sample.
+        """Error covariances of the estimates that :meth:`estimate` returns: :attr:`covariance` at each sample.
 
         Arguments and errors are those of :meth:`estimate`. Shapes: returns (steps, ..., nx, nx).
         """
@@ -64,7 +64,7 @@ class RecordEstimates:
     def _along(
         self, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, *, of: Any, t: np.ndarray | None = None
     ) -> np.ndarray:
-        """What a function of the state's rows returns at each sample."""
+        """The values of a function of the state's rows at each sample."""
         if self._delay:
             raise ValueError("a record has no delay: shift its outputs to their times, and make an observer without")
         y = real_array("y", y)

@@ -1,4 +1,4 @@
-"""What an observer takes in, checked at its boundary: arguments, other maps, samples, inputs, records and states."""
+"""Checks of all that an observer is given: arguments, other maps, samples, inputs, records and states."""
 
 import math
 from collections.abc import Callable
@@ -14,7 +14,7 @@ MAX_DELAY = 1000  # samples
 
 
 def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tracking: bool | None) -> None:
-    """Raise ValueError or ImportError unless an observer can be made of an artifact in the way that is asked for."""
+    """Raise ValueError or ImportError unless an artifact supports these arguments of an observer."""
     if not isinstance(artifact, Artifact):
         raise ValueError(f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names")
     if flag("monitor", monitor) and artifact.limits is None:
@@ -32,7 +32,7 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tr
 
 
 def check_gate(artifact: Artifact, tracking: bool | None, gate: Any) -> float | None:
-    """Return a gate as a float, of an observer that tracks."""
+    """Return a gate as a float, or raise ValueError if it is invalid or the observer does not track."""
     if gate is None:
         return None
     if not is_finite(gate) or gate <= 0:
@@ -42,7 +42,7 @@ def check_gate(artifact: Artifact, tracking: bool | None, gate: Any) -> float | 
 
 
 def check_delay(artifact: Artifact, tracking: bool | None, delay: Any) -> int:
-    """Return a delay as an int, of an observer that tracks."""
+    """Return a delay as an int, or raise ValueError if it is invalid or the observer does not track."""
     if delay := integer("delay, in samples,", delay, 0, MAX_DELAY):
         _check_tracks(artifact, tracking)
     return delay
@@ -57,7 +57,7 @@ def _check_tracks(artifact: Artifact, tracking: bool | None) -> None:
 
 
 def check_replacement(artifact: Artifact, other: Artifact) -> None:
-    """Raise ArtifactError unless an artifact can take the place of another while the filter runs."""
+    """Raise ArtifactError unless an artifact can replace another while the filter runs."""
     if not isinstance(other, Artifact):
         raise ArtifactError(f"an observer is replaced by an observers.Artifact, got {shown(other)}")
     there = _serves(other)
@@ -65,19 +65,19 @@ def check_replacement(artifact: Artifact, other: Artifact) -> None:
         if here != there[what]:
             raise ArtifactError(
                 f"the observer in use has {what} {shown(here)}, the other {shown(there[what])}: the replacement "
-                "may differ in its maps alone; make a new wrapper"
+                "may differ only in its maps; make a new wrapper"
             )
     for name in ("A", "B", "dt"):
         mine, others = (np.asarray(getattr(each.filter, name)) for each in (artifact, other))
         if mine.shape != others.shape or not np.allclose(mine, others, rtol=1e-9, atol=0.0):
             raise ArtifactError(
-                f"the filters differ in {name}, so that the state of one means nothing to the other: train with the "
+                f"the filters differ in {name}, so that one cannot use the other's state: train with the "
                 "eigenvalues and dt of the observer in use, or make a new wrapper"
             )
 
 
 def _serves(artifact: Artifact) -> dict[str, Any]:
-    """What an artifact is for, and what it estimates, by the words of messages."""
+    """The purpose and the estimates of an artifact, by the words of messages."""
     signals, environment = artifact.signals, artifact.environment
     return {
         "environment": environment,
@@ -93,7 +93,7 @@ def _serves(artifact: Artifact) -> dict[str, Any]:
 def check_output(
     artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], warn: Callable[[str], None] | None = None
 ) -> None:
-    """Check outputs (..., ny), of which none may be missing at the first sample, where there is no ``warn``."""
+    """Check outputs (..., ny); at the first sample, without ``warn``, none may be missing."""
     if y.shape != (*batch, artifact.ny):
         raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
     if all_finite(y):
@@ -101,17 +101,14 @@ def check_output(
     if warn is None:
         _check_finite("y", y, hint="; outputs may be missing later, but the first sample must be whole")
     elif not artifact.knows_output:
-        warn(
-            f"the map for {artifact.system!r} holds no output h(x) to predict a missing output by: it holds its last "
-            "value"
-        )
+        warn(f"the map for {artifact.system!r} holds no output h(x): a missing output keeps its last value")
     _check_finite("y", np.where(np.isnan(y), 0.0, y), hint="; NaN marks a missing output")
 
 
 def held_input(
     artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...], warn: Callable[[str], None]
 ) -> np.ndarray:
-    """Return inputs (..., nu) as floats, zeros for None; warns of those far beyond training."""
+    """Return inputs (..., nu) as floats, zeros for None; warns of inputs far beyond the training."""
     nu = artifact.nu
     if u is None:
         return np.zeros((*batch, nu))
@@ -123,7 +120,7 @@ def held_input(
             f"this map for {artifact.system} knows no inputs, but u = {u}; take one that does, "
             "or pass u=None to ignore the input"
         )
-    if not all_finite(u, artifact.usual_input):  # one pass for both checks, which a step would feel
+    if not all_finite(u, artifact.usual_input):  # one pass for both checks is faster
         _check_finite("u", u)
         most = np.array(artifact.u_max)
         if (far := np.abs(u) > FAR * most).any():
@@ -141,15 +138,15 @@ def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tu
     if x0.shape != shape:
         raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")
     _check_finite("x0", x0, hint="; leave x0 out where it is unknown")
-    if artifact.forward is None:  # where the tracker begins
+    if artifact.forward is None:  # only the tracker starts there
         return artifact.filter.start(y0), 0
     z0 = np.zeros((*shape[:-1], artifact.filter.size))
     z0[..., : artifact.forward.mlp.outputs] = artifact.forward(x0)
-    return z0, math.inf  # which every map takes for its age_max
+    return z0, math.inf  # every map limits this age to its age_max
 
 
 def recorded_inputs(u: np.ndarray | None, steps: int) -> np.ndarray | None:
-    """Return the inputs (steps - 1, ..., nu) of so many samples; there may be one more, after the last."""
+    """Return the inputs (steps - 1, ..., nu) between samples; one more, after the last sample, is dropped."""
     if u is None:
         return None
     u = real_array("u", u)
@@ -162,12 +159,12 @@ def intervals(t: np.ndarray, steps: int) -> np.ndarray:
     """Return the intervals (steps - 1,) between times (steps,) in seconds."""
     t = real_array("t", t)
     if t.shape != (steps,) or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
-        raise ValueError(f"t must be {steps} times in seconds, which rise, got {shown(t)}")
+        raise ValueError(f"t must be {steps} increasing times in seconds, got {shown(t)}")
     return np.diff(t)
 
 
 def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:
-    """Raise ValueError, which names the first such entry, if a value is not finite or too large."""
+    """Raise a ValueError that names the first entry that is not finite or too large."""
     if not all_finite(values):
         at = tuple(np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist())
         entry = f"{name}[{', '.join(map(str, at))}] = {values[at]}"

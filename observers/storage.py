@@ -1,7 +1,7 @@
 """Files of arrays and JSON, which are written atomically and checked when they are read.
 
-They are in the safetensors format, with a JSON object in the metadata under the key of their kind, ``KEY``. Nothing in
-them can run. Under ``KEY-sha256`` lies the SHA-256 of the file without that entry.
+Files have the safetensors format and contain no code. Their metadata holds a JSON object under ``KEY``, which names the
+kind of file, and the SHA-256 of the file without this entry under ``KEY-sha256``.
 """
 
 import hashlib
@@ -20,18 +20,18 @@ from safetensors.numpy import save as serialise
 
 from observers.network import MLP
 
-MOST_BYTES = 256 * 2**20  # of a file; maps of the paper's sizes have one or two million
-MOST_HEADER = 2**20  # bytes of its header, which holds the JSON
-DEEPEST = 32  # objects and lists within one another
-UNFINISHED = ".part-"  # what names of temporary files begin with
+MOST_BYTES = 256 * 2**20  # largest file; maps of the paper's sizes have one or two million bytes
+MOST_HEADER = 2**20  # bytes of the header, which holds the JSON
+DEEPEST = 32  # levels of nested objects and lists
+UNFINISHED = ".part-"  # prefix of temporary files
 
-# All that files hold, as safetensors calls it.
+# The types of arrays, by their safetensors names.
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype(np.float64)}
 
 
 @contextmanager
 def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Put the name of the written file into errors that name no file, such as a full disk."""
+    """Add the name of the written file to errors without one, such as that of a full disk."""
     try:
         yield
     except OSError as problem:
@@ -42,11 +42,11 @@ def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary file to write, which takes the place of ``path`` once it is whole and on disk.
+    """Yield a temporary file to write, which replaces ``path`` once it is complete and on disk.
 
-    The temporary file lies in the same folder, which is made. It keeps the ending of the name, by which some writers
-    choose a format, and has the rights that the umask gives. After an exception it is gone, and ``path`` is as it was.
-    After the end of the process it stays, see :func:`clear_unfinished`.
+    The temporary file is in the same folder, which is created if missing. It has the same suffix, from which some
+    writers choose a format, and the permissions of the umask. After an exception it is deleted, and ``path`` is
+    unchanged. If the process is killed, the temporary file stays, see :func:`clear_unfinished`.
     """
     target = Path(path)
     temporary = target.with_name(f"{UNFINISHED}{secrets.token_hex(4)}-{target.stem}{target.suffix}")
@@ -62,7 +62,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         with suppress(OSError):
             temporary.unlink()
         raise
-    with suppress(OSError):  # not every system can open a folder, or put it on disk
+    with suppress(OSError):  # not every system can open or sync a folder
         folder = os.open(target.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -73,7 +73,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 def save(
     path: str | os.PathLike[str], tensors: Mapping[str, np.ndarray], *, key: str, described: Mapping[str, Any]
 ) -> None:
-    """Write arrays and what describes them to one file, whole or not at all; makes its folder."""
+    """Write arrays and their description to one file, atomically; creates its folder."""
     arrays = {name: np.asarray(tensor, order="C") for name, tensor in tensors.items()}
     for name, array in arrays.items():
         if array.dtype not in _TYPES.values():
@@ -85,7 +85,7 @@ def save(
     if len(content) > MOST_BYTES or _header_size(content) > MOST_HEADER or _is_deeper(described, DEEPEST):
         raise ValueError(
             f"{path} would have {len(content)} bytes, {_header_size(content)} of them in its header; it may have "
-            f"{MOST_BYTES} and {MOST_HEADER}, and at most {DEEPEST} objects and lists within one another"
+            f"{MOST_BYTES} and {MOST_HEADER}, and at most {DEEPEST} levels of nested objects and lists"
         )
     with replacing(path) as temporary:
         temporary.write_bytes(content)
@@ -94,16 +94,16 @@ def save(
 def read(
     path: str | os.PathLike[str], *, key: str, error: type[Exception], what: str
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read what :func:`save` wrote."""
+    """Read a file of :func:`save`; raises ``error``, which calls the file ``what``, if it is invalid."""
     content = _content(path, error)
     try:
         views: list[tuple[str, dict[str, Any]]] = deserialize(content)  # type: ignore[no-untyped-call]
         header, data = _parts(content)
     except (SafetensorError, ValueError) as problem:
-        raise error(f"{path} is damaged or no safetensors file: {problem}") from problem
+        raise error(f"{path} is damaged or not a safetensors file: {problem}") from problem
     metadata = header.get("__metadata__") or {}
     if key not in metadata:
-        raise error(f"{path} is not {what} of kkl-gym: it carries no {key!r} metadata")
+        raise error(f"{path} is not {what} of kkl-gym: it has no {key!r} metadata")
     expected = metadata.pop(f"{key}-sha256", None)
     if expected is None:
         raise error(
@@ -117,9 +117,9 @@ def read(
     try:
         described = json.loads(metadata[key])
     except (ValueError, RecursionError) as problem:
-        raise error(f"{path} is damaged: its {key!r} metadata is no JSON: {problem}") from problem
+        raise error(f"{path} is damaged: its {key!r} metadata is not JSON: {problem}") from problem
     if not isinstance(described, dict):
-        raise error(f"{path} is damaged: its {key!r} metadata is no JSON object")
+        raise error(f"{path} is damaged: its {key!r} metadata is not a JSON object")
     if _is_deeper(described, DEEPEST):
         raise error(f"{path} is damaged: its {key!r} metadata has more than {DEEPEST} levels")
     tensors = {}
@@ -128,29 +128,29 @@ def read(
             raise error(f"{path}: its tensor {name} is of type {view['dtype']}, expected one of {', '.join(_TYPES)}")
         try:
             tensors[name] = np.frombuffer(view["data"], _TYPES[view["dtype"]]).reshape(view["shape"])
-        except (ValueError, OverflowError) as problem:  # shapes may be as long, and empty arrays as wide, as they like
+        except (ValueError, OverflowError) as problem:  # a file may state any shape
             raise error(f"{path} is damaged: its tensor {name}: {problem}") from problem
     return tensors, described
 
 
 def checksum(path: str | os.PathLike[str], error: type[Exception]) -> str:
-    """The SHA-256 of a file."""
+    """The SHA-256 of a file; raises ``error`` if it cannot be read."""
     return hashlib.sha256(_content(path, error)).hexdigest()
 
 
 def _content(path: str | os.PathLike[str], error: type[Exception]) -> bytes:
-    """The bytes of a file that may be what it should be, by its size."""
+    """The bytes of a file, after checks of its type and size."""
     try:
-        if not Path(path).is_file():  # to read a pipe may never end
+        if not Path(path).is_file():  # reading a pipe may never end
             is_other = Path(path).exists()
             raise error(f"{path} is a folder, a pipe or a device" if is_other else f"there is no file {path}")
         if (size := Path(path).stat().st_size) > MOST_BYTES:
             raise error(f"{path} has {size} bytes, more than the {MOST_BYTES} that a file of kkl-gym may have")
-        content = Path(path).read_bytes()  # as a whole: who rewrites a mapped file in place ends the process
+        content = Path(path).read_bytes()  # not memory-mapped: rewriting a mapped file would crash this process
     except OSError as problem:
         raise error(f"{path} cannot be read: {problem.strerror or problem}") from problem
     if (size := _header_size(content)) > MOST_HEADER:
-        raise error(f"{path} is damaged or no safetensors file: its header has {size} bytes, more than {MOST_HEADER}")
+        raise error(f"{path} is damaged or not a safetensors file: its header has {size} bytes, limit {MOST_HEADER}")
     return content
 
 
@@ -165,21 +165,21 @@ def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _whole(header: Mapping[str, Any], data: bytes) -> bytes:
-    """A safetensors file, as the library writes one whose metadata has a single entry; it shuffles several."""
+    """The bytes of a safetensors file. The library would write several metadata entries in random order."""
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text + data
 
 
 def _is_deeper(value: Any, levels: int) -> bool:
-    """Whether objects and lists lie within one another on more levels than so many."""
+    """Whether objects and lists are nested on more than so many levels."""
     inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else None
     return inner is not None and (levels == 0 or any(_is_deeper(one, levels - 1) for one in inner))
 
 
 @contextmanager
 def explained(path: str | os.PathLike[str], error: type[ValueError]) -> Iterator[None]:
-    """Turn whatever goes wrong while something is made of a file's contents into an error that names the file."""
+    """Convert any exception from the use of a file's contents into an error that names the file."""
     try:
         yield
     except KeyError as problem:

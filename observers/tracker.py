@@ -1,4 +1,4 @@
-"""The tracker: an unscented Kalman filter that T_inv initialises where it is surer, and again where it diverged."""
+"""The tracker: an unscented Kalman filter that T_inv initialises, and reinitialises after a divergence."""
 
 import math
 from dataclasses import dataclass
@@ -11,21 +11,21 @@ from observers.decoder import Decoders
 from observers.motion import Motion
 from observers.unscented import add, factor, shift, solved, transformed, whitened
 
-# Normal quantiles of the limits: a needless re-initialisation costs the estimate, a needless inflation of a covariance
-# little. The running means are more skewed than the chi-square distribution that the limits assume: chance exceeds the
-# second limit about twenty times as often as its quantile states.
-_DIVERGED = 6.0  # 1e-9, of the NIS
-_COLOURED = 4.265  # 1e-5, of the mean square of the innovations' running mean
-_TREND = 0.25  # windows over which innovations are averaged to see whether they agree
-_LONG = 4.0  # windows over which the square of that is averaged
-INFLATION = 10.0  # of the covariance where innovations are not white
-RELINEARISATIONS = 2  # of a step within the first window: with 0 errors without noise rise by 40 to 80 %
+# The limits are normal quantiles. A false alarm of the first loses a good estimate; one of the second only inflates a
+# covariance. Running means are more skewed than the chi-square distribution that the limits assume, so that white
+# innovations exceed the second limit about twenty times as often as its quantile implies.
+_DIVERGED = 6.0  # quantile of 1e-9, for the NIS
+_COLOURED = 4.265  # quantile of 1e-5, for the mean square of the innovations' running mean
+_TREND = 0.25  # time constant of the innovations' running mean, in windows
+_LONG = 4.0  # time constant of the mean of its square, in windows
+INFLATION = 10.0  # factor of the covariance if innovations are not white
+RELINEARISATIONS = 2  # for each step in the first window; with 0, noise-free errors are 40 to 80 % larger
 KNOWN = 1e-3  # standard deviation of a known start, in scales of the states
 
 
 @dataclass(frozen=True)
 class Supervision:
-    """Of a tracker, for all levels of noise."""
+    """Shares and limits of a tracker's running statistics of innovations, for all noise levels."""
 
     window: int
     share: float
@@ -36,10 +36,10 @@ class Supervision:
 
     @classmethod
     def of(cls, motion: Motion, dt: float) -> Self:
-        """Return that of a motion on samples every ``dt`` seconds."""
+        """Return the supervision of a motion with samples every ``dt`` seconds."""
         window, ny = max(1, round(motion.window / dt)), len(motion.least_measurement_noise)
         share, trend_share, long_share = (-math.expm1(-1 / (each * window)) for each in (1.0, _TREND, _LONG))
-        memory = (1 - trend_share) ** 2 * (1 - long_share)  # of a trend's square, a sample later
+        memory = (1 - trend_share) ** 2 * (1 - long_share)  # share of a trend's square one sample later
         return cls(
             window,
             share,
@@ -51,12 +51,12 @@ class Supervision:
 
     @property
     def trend_gain(self) -> float:
-        """What the square of a trend is multiplied with to be 1 on average where innovations are independent."""
+        """Factor with which the square of a trend is 1 on average for white innovations."""
         return (2 - self.trend_share) / self.trend_share
 
 
 def _limit(freedom: float, quantile: float) -> float:
-    """A quantile of the mean square of so many standard normal numbers, by Wilson and Hilferty's approximation."""
+    """A quantile of the mean of ``freedom`` squared normal numbers, by Wilson and Hilferty's approximation."""
     spread = 2 / (9 * freedom)
     return float((1 - spread + quantile * math.sqrt(spread)) ** 3)
 
@@ -64,25 +64,26 @@ def _limit(freedom: float, quantile: float) -> float:
 class Tracker:
     """An unscented Kalman filter on the system's equations, or on a learned flow, for a batch of rows.
 
-    It starts at the mean and covariance of the states at which motions start, corrected by the first sample. Within the
-    first window each step is taken three times, with the motion linearised about where the sample puts the start of
-    the step (Kullberg, Skog and Hendeby, 2023).
+    It starts at the mean and covariance of the starts of motions, corrected by the first sample. Within the first
+    window each step is repeated twice, with the motion linearised about the start of the step as smoothed by the sample
+    (Kullberg, Skog and Hendeby, 2023).
 
-    The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's
-    within the first window where T_inv's covariance has the smaller determinant, and where the filter diverged: the
-    mean square of its innovations over the window (NIS) exceeds its limit, or its covariance is no longer positive
-    definite. T_inv's covariance is then that of an age of one window, since what misled the filter may have misled z.
+    The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's in
+    two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The
+    filter has diverged if the mean square of its innovations over the window (NIS) exceeds its limit, or if its
+    covariance is no longer positive definite. T_inv's covariance is then that of an age of one window, because the
+    cause of the divergence may have disturbed z, too.
 
-    An error below the noise makes innovations correlated: where the mean square of their running mean exceeds its
+    Errors smaller than the noise still correlate the innovations. If the mean square of their running mean exceeds its
     limit, the covariance is multiplied by ten.
 
-    With a gate, an output whose innovation is larger than so many of its standard deviations is rejected, and counts as
-    missing. The gate is open in the first window; and for an output that has been rejected for a whole window, or of a
-    filter that diverged, until that output fits again: a jump that stays is accepted.
+    A gate rejects an output whose innovation exceeds so many of its standard deviations; the output then counts as
+    missing. The gate is open in the first window. It also opens for an output that it has rejected for a whole window,
+    and after a divergence, until the output fits again. So a lasting jump is accepted.
 
     A row of the state, which the caller keeps, holds the estimate x (nx), its covariance P (nx^2), the NIS, the mean
-    square of the innovations' running mean, the number of samples seen, that of outputs rejected, that of samples in a
-    row beyond the gate (ny), and the running mean (ny).
+    square of the innovations' running mean, the number of samples seen, the number of outputs rejected, the number of
+    successive samples beyond the gate (ny), and the running mean (ny).
     """
 
     def __init__(
@@ -109,12 +110,12 @@ class Tracker:
         self.width = self.trends + ny
 
     def covariance(self, rows: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """Calibrated covariances of the estimates' errors, (n, nx, nx), at ages (n,) in samples."""
+        """Calibrated error covariances of the estimates, (n, nx, nx), at ages (n,) in samples."""
         factors = np.exp(np.interp(age * self._dt, self.motion.factors.ages, self._log_factors))
         return self._covariances(rows) * factors[:, None, None]
 
     def begin(self, y: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
-        """Return rows at first samples (n, ny), or at known states (n, nx)."""
+        """Return rows that start at first samples (n, ny), or at known states (n, nx)."""
         motion, n = self.motion, len(y)
         if x0 is None:
             x, P = np.tile(motion.mean, (n, 1)), np.tile(motion.covariance, (n, 1, 1))
@@ -130,7 +131,7 @@ class Tracker:
         return self._packed(x, P, np.concatenate([np.ones((n, 2)), seen, np.zeros((n, 1 + 2 * y.shape[1]))], 1))
 
     def take_over(self, rows: np.ndarray) -> np.ndarray:
-        """Return the rows of a tracker with another motion, within the bounds of this one."""
+        """Return the rows of a tracker with another motion, limited to this motion's bounds."""
         rows = rows.copy()
         rows[:, self.x] = self._within(rows[:, self.x])
         return rows
@@ -140,8 +141,8 @@ class Tracker:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Predict over so many samples under inputs (n, nu), and correct by outputs (n, ny), NaN where missing.
 
-        Returns the rows, and the outputs with predicted ones where they are missing or rejected, (n, ny), which are not
-        finite where a covariance broke down.
+        Returns the rows, and the outputs (n, ny), in which predictions replace missing and rejected ones. Predictions
+        are not finite if the covariance is not positive definite.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             advanced, whole = self._advanced(rows, y, u, samples)
@@ -168,7 +169,7 @@ class Tracker:
         V, white = whitened(y - expected, S, cross, np.isnan(y))
         new = rows[:, self.nis + 2] < self.supervision.window
         for _ in range(RELINEARISATIONS if new.any() else 0):
-            # The sample also corrects the start of the step (Rauch, Tung and Striebel, 1965), by G white.
+            # The sample corrects the start of the step by G white, too (Rauch, Tung and Striebel, 1965).
             G = across @ solved(moved, V)
             spread = add(P, G, G, -1.0)
             around, curved, of_start = predict(shift(x, G, white), spread)
@@ -197,7 +198,7 @@ class Tracker:
         return np.where(rejected, np.nan, y), np.hstack([count + rejected.sum(1, keepdims=True), in_a_row])
 
     def _expected(self, x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean and covariance of the outputs to measure, and their covariance with the states."""
+        """Mean and covariance of the expected outputs, and their covariance with the states."""
         C = self._artifact.C
         if C is None:
             expected, S, across = transformed(x, P, self._output)
@@ -209,10 +210,10 @@ class Tracker:
     def _watched(
         self, watched: np.ndarray, P: np.ndarray, white: np.ndarray, seen: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Update the statistics of white innovations (n, ny), and inflate covariances where these are not white."""
+        """Update the statistics of whitened innovations (n, ny), and inflate covariances if they are correlated."""
         watch, count = self.supervision, seen.sum(-1)
         (nis, trend_square, samples), trend = watched[:, :3].T, watched[:, -seen.shape[1] :]
-        weight = count / seen.shape[1]  # of the outputs that are measured; fewer scatter more
+        weight = count / seen.shape[1]  # share of outputs measured: a mean of fewer counts less
         per_output = 1 / np.maximum(count, 1)
         nis = nis + watch.share * weight * (per_output * (white**2).sum(-1) - nis)
         trend = trend + watch.trend_share * np.where(seen, white - trend, 0.0)
@@ -225,7 +226,7 @@ class Tracker:
         return P, np.column_stack([nis, trend_square, samples + (count > 0), watched[:, 3 : -seen.shape[1]], trend])
 
     def supervise(self, rows: np.ndarray, z: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """Return rows with T_inv's estimate of z, (n, size), at ages (n,) in samples, where that replaces theirs."""
+        """Return rows, (n, width), reinitialised from z, (n, size), where needed, at ages (n,) in samples."""
         watch, nis, seen = self.supervision, rows[:, self.nis], rows[:, self.nis + 2]
         lost = ~(nis <= watch.limit)
         where = np.flatnonzero(lost | (seen < watch.window))

@@ -1,7 +1,7 @@
-"""Gaussians through functions that are not linear, by sigma points, for a batch of them.
+"""Unscented transforms: batches of Gaussians through nonlinear functions, by sigma points.
 
-The points are the mean +- sqrt(nx + kappa) times each column of the covariance's Cholesky factor, and the mean itself
-(Wan and van der Merwe, 2000, with alpha = 1, beta = 2). They are drawn again for outputs that are not linear.
+The points are the mean, and the mean +- sqrt(nx + kappa) times each column of the covariance's Cholesky factor (Wan and
+van der Merwe, 2000, with alpha = 1, beta = 2). A nonlinear output gets new points from the predicted covariance.
 """
 
 import math
@@ -13,7 +13,7 @@ _BETA = 2.0
 
 
 def weights(nx: int) -> tuple[float, float, float]:
-    """Weights of the mean in means and in covariances, and of each other point in both."""
+    """Weights: of the central point in means, of the central point in covariances, and of every other point in both."""
     middle = (_scale(nx) - nx) / _scale(nx)
     return middle, middle + _BETA, 1 / (2 * _scale(nx))
 
@@ -21,9 +21,9 @@ def weights(nx: int) -> tuple[float, float, float]:
 def transformed(
     x: np.ndarray, P: np.ndarray, function: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means (n, k), covariances (n, k, k) and those with x (n, nx, k) of a function of Gaussians, (n, nx, nx) each.
+    """Means (n, k), covariances (n, k, k) and covariances with x (n, nx, k) of a function of Gaussians x, P.
 
-    They are NaN where a covariance is not positive definite.
+    They are NaN if P is not positive definite.
     """
     nx = x.shape[-1]
     middle, middle_squares, other = weights(nx)
@@ -42,21 +42,21 @@ def transformed(
 
 
 def _scale(nx: int) -> float:
-    """Nx + kappa, with kappa = 3 - nx, or 0 where that is negative."""
+    """Return nx + kappa, where kappa is 3 - nx, or 0 if that is negative."""
     return max(float(nx), 3.0)
 
 
 def whitened(
     innovation: np.ndarray, S: np.ndarray, across: np.ndarray, missing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """V (n, nx, ny) and white innovations (n, ny), by which samples make x + V white and P - V V^T of x and P.
+    """V (n, nx, ny) and whitened innovations (n, ny); the corrected state is x + V white, with P - V V^T.
 
     Shapes: ``innovation``, ``missing`` (n, ny), ``S`` (n, ny, ny), ``across`` (n, nx, ny).
     """
     if missing.any():
         innovation = np.where(missing, 0.0, innovation)
         across = np.where(missing[:, None, :], 0.0, across)
-        S = np.where(missing[:, None, :] | missing[..., None], np.eye(S.shape[-1]), S)  # apart from those measured
+        S = np.where(missing[:, None, :] | missing[..., None], np.eye(S.shape[-1]), S)  # decouples missing outputs
     if S.shape[-1] == 1:
         root = np.sqrt(S[:, 0])
         return across / root[..., None], innovation / root
@@ -75,17 +75,17 @@ def add(P: np.ndarray, V: np.ndarray, W: np.ndarray, sign: float = 1.0) -> np.nd
 
 
 def solved(P: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Solve P X = b, (n, nx, k), for covariances P; NaN where one is not positive definite."""
+    """Solve P X = b, (n, nx, k), for covariances P; NaN if P is not positive definite."""
     root = factor(P)
     solution: np.ndarray = np.linalg.solve(root.mT, np.linalg.solve(root, b))
     return solution
 
 
 def factor(P: np.ndarray) -> np.ndarray:
-    """Cholesky factors (n, nx, nx) of covariances; NaN where one is not positive definite or not finite."""
+    """Cholesky factors (n, nx, nx) of covariances; NaN if one is not positive definite or not finite."""
     try:
         root: np.ndarray = np.linalg.cholesky(P)
-    except np.linalg.LinAlgError:  # which does not name the matrix
+    except np.linalg.LinAlgError:  # the error does not name the matrix
         root = np.full_like(P, np.nan)
         rows = np.flatnonzero(np.isfinite(P).all((1, 2)))
         if len(P) > 1:

@@ -1,7 +1,7 @@
-"""The command line, ``kkl-gym`` (or ``python -m training``): a table of commands, and messages of errors.
+"""The command line, ``kkl-gym`` (or ``python -m training``): the table of commands, and error messages.
 
-Importing this module imports nothing that takes time or may be missing. The module of a command is imported when that
-command is called.
+This module imports nothing that is slow or may be missing. The module of a command is imported when the command is
+called.
 """
 
 import _thread
@@ -35,19 +35,19 @@ COMMANDS: Commands = {
 
 DESCRIPTION = """Learned KKL observers for Gymnasium environments.
 
-A first look: kkl-gym demo. An observer for a system of yours: kkl-gym diagnose script.py, kkl-gym train script.py.
+A first look: kkl-gym demo. An observer for your own system: kkl-gym diagnose script.py, kkl-gym train script.py.
 One for any environment: kkl-gym record ENV_ID, kkl-gym train NAME --data. kkl-gym COMMAND --help has the options,
 kkl-gym --version the version."""
 
 # Hints after an interruption, by the first words of the command.
 AFTER_INTERRUPTION = dict.fromkeys(
-    [("train",), ("identify",), ("agent", "train")], "--resume goes on from the last checkpoint, if there is one"
+    [("train",), ("identify",), ("agent", "train")], "--resume continues from the last checkpoint, if there is one"
 )
-WIDE = 140  # columns of output into a file or a pipe, where tables of 80 would be cut
+WIDE = 140  # columns of output to a file or pipe; 80 would cut tables
 PROG = "kkl-gym"
 MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
-# Modules that an extra of the package brings.
+# The modules of each extra of the package.
 EXTRAS = {
     "train": {
         *["filelock", "joblib", "pandas", "pydantic", "pytorch_optimizer", "rich", "scipy", "sympy", "torch", "tyro"]
@@ -61,7 +61,7 @@ EXTRAS = {
 
 
 class _Notes(logging.Handler):
-    """Puts notes of the library, such as that it compiles, on stderr as it is then: a progress bar redirects it."""
+    """Prints the library's log messages to the present stderr, which a progress bar may have redirected."""
 
     def emit(self, record: logging.LogRecord) -> None:
         print(record.getMessage(), file=sys.stderr)
@@ -90,14 +90,14 @@ def main(
                 Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDE)
             )
         except BaseException as error:
-            if interrupted or isinstance(error, KeyboardInterrupt):  # modules turn it into errors of their own
+            if interrupted or isinstance(error, KeyboardInterrupt):  # modules may raise another error then
                 hints = [hint for words, hint in after_interruption.items() if tuple(arguments[: len(words)]) == words]
                 _end(prog, "; ".join(["interrupted", *hints]), INTERRUPTED)
             if isinstance(error, ModuleNotFoundError):
                 module = (error.name or "").partition(".")[0]
                 extras = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
                 sys.exit(": ".join([prog, str(error), *extras]))
-            if isinstance(error, BrokenPipeError):  # the reader of the pipe has enough, as head does
+            if isinstance(error, BrokenPipeError):  # the reader of the pipe, such as head, has closed it
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 sys.exit(1)
             if isinstance(error, ValueError | OSError | FloatingPointError):
@@ -107,7 +107,7 @@ def main(
 
 @contextmanager
 def _noticing_interruptions() -> Iterator[list[int]]:
-    """Yield a list that is empty until there is an interruption."""
+    """Yield a list that is empty until an interruption."""
     noticed: list[int] = []
 
     def handler(number: int, frame: object) -> None:
@@ -115,12 +115,12 @@ def _noticing_interruptions() -> Iterator[list[int]]:
         raise KeyboardInterrupt
 
     def unraisable(failed: "sys.UnraisableHookArgs") -> None:
-        if isinstance(failed.exc_value, KeyboardInterrupt):  # lost in a callback, of which imports have many: again
+        if isinstance(failed.exc_value, KeyboardInterrupt):  # it was lost in a callback, as in imports: repeat it
             threading.Timer(0.05, _thread.interrupt_main).start()
         else:
             hook(failed)
 
-    if threading.current_thread() is not threading.main_thread():  # which alone has handlers of signals
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield noticed
         return
     before, hook = signal.signal(signal.SIGINT, handler), sys.unraisablehook
@@ -133,15 +133,15 @@ def _noticing_interruptions() -> Iterator[list[int]]:
 
 
 def read(arguments: list[str], *, prog: str = PROG, commands: Commands = COMMANDS) -> Any:
-    """Read a command line, and run nothing."""
+    """Read a command line without running the command."""
     import tyro
 
     called = arguments[:1]
     if called and called[0] not in commands and not called[0].startswith("-"):
-        from observers.names import suggestion  # with numpy, which help need not wait for
+        from observers.names import suggestion  # imports numpy, for which --help need not wait
 
         _end(prog, f"unknown command {called[0]!r}{suggestion(called[0], commands)}: {', '.join(commands)}", MISUSED)
-    if called and called[0].startswith("--tyro"):  # completion of the shell needs them all
+    if called and called[0].startswith("--tyro"):  # shell completion needs all commands
         called = list(commands)
     classes = {name: (load if name in called else _described)(*behind) for name, behind in commands.items()}
     printed = io.StringIO()
@@ -166,16 +166,16 @@ def _end(prog: str, message: str, code: int) -> NoReturn:
 
 
 def _without_box(text: str) -> str:
-    """Tyro's message on options that it cannot read, in one line: without frame, colours, title, help and reasons."""
+    """Tyro's message on unreadable options, shortened to one line without frame, colours, title, help and reasons."""
     parts: list[list[str]] = [[]]
-    for line in text.splitlines()[1:]:  # the first bears the title
+    for line in text.splitlines()[1:]:  # the first line is the title
         content = re.sub(r"\x1b\[[0-9;]*m", "", line).strip(" │╰╯")
         if content and set(content) <= set("─-"):
             parts.append([])
         else:
             parts[-1].append(content)
     kept = [" ".join(" ".join(part).split()).partition(" Got errors:")[0] for part in parts]
-    similar = r"(?:Perhaps you meant|Arguments similar to \S+):.*?(--[\w-]+).*"  # and the whole help of the option
+    similar = r"(?:Perhaps you meant|Arguments similar to \S+):.*?(--[\w-]+).*"  # followed by the option's help
     kept = [re.sub(similar, r"did you mean \1?", part) for part in kept]
     return "; ".join(part for part in kept if part and not part.startswith(("Argument helptext", "For full helptext")))
 
@@ -188,8 +188,8 @@ def load(module: str, name: str) -> Callable[..., Any]:
 
 @cache
 def _described(module: str, name: str) -> Callable[..., Any]:
-    """A stand-in for a command that is not called: the summary of its class, read without importing the module."""
-    import ast  # here, as is the next, so that the handler of interruptions is set before slow imports
+    """A substitute for a command that is not called, with the summary of its class; it does not import the module."""
+    import ast  # not at the top, so that interruptions are handled before slow imports
     from importlib.util import find_spec
     from pathlib import Path
 
@@ -205,7 +205,7 @@ def _described(module: str, name: str) -> Callable[..., Any]:
 
 
 def _message(error: Exception) -> str:
-    """The message of an error; of a configuration, a line for each setting: ``name = value: requirement``."""
+    """The message of an error; for a configuration, a line for each setting: ``name = value: requirement``."""
     from pydantic import ValidationError
 
     if isinstance(error, OSError) and error.filename and error.strerror:

@@ -1,6 +1,6 @@
-"""Build the demo in the browser: ``python docs/demo/build.py OUT`` makes a folder that any file server can show.
+"""Build the demo in the browser: ``python docs/demo/build.py OUT`` writes a folder for any file server.
 
-It holds this folder's page, and a file for each system's default map that ``kkl_observer.js`` reads.
+The folder holds the page, and for each system's default map a file that ``kkl_observer.js`` reads.
 """
 
 import json
@@ -24,11 +24,11 @@ def build(out: Path) -> None:
     Parameters
     ----------
     out : Path
-        The folder, which is made.
+        The folder, which is created if missing.
     """
     out.mkdir(parents=True, exist_ok=True)
     for name in PAGE:
-        if (out / name).resolve() != (HERE / name).resolve():  # a site's builder may have copied the page already
+        if (out / name).resolve() != (HERE / name).resolve():  # mkdocs may have copied the page already
             shutil.copyfile(HERE / name, out / name)
     described = []
     for name, cls in kkl_gym.SYSTEMS.items():

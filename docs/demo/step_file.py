@@ -1,4 +1,4 @@
-"""An observer as a file that ``kkl_observer.js`` reads: ``python docs/demo/step_file.py MAP STEP.safetensors``."""
+"""Convert an observer for ``kkl_observer.js``: ``python docs/demo/step_file.py MAP STEP.safetensors``."""
 
 import os
 import sys
@@ -11,7 +11,7 @@ from observers.inverse import InverseMap
 from observers.motion import Motion
 from training.export.exported import Exported, tracker_arrays, tracker_numbers
 
-KEY = "kkl_step"  # of the metadata
+KEY = "kkl_step"  # key in the metadata
 _MAP_ARRAYS = ("z_offset", "whiten", "x_offset", "x_scale")
 _MAP_SCALARS = ("process_noise_unit", "process_noise_max", "age_unit", "age_max")
 _MOTION_ARRAYS = ("error", "process_noise", "least_measurement_noise")
@@ -19,7 +19,7 @@ _LIMIT_ARRAYS = ("levels", "mean", "low", "high")
 
 
 def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
-    """Write what a step needs to a safetensors file: matrices of the filter at its dt, maps, motion, limits."""
+    """Write the data of a step to a safetensors file: matrices of the filter at its dt, maps, motion, limits."""
     artifact, linear = exported.artifact, exported.artifact.filter
     nz = len(linear.A)
     tensors = {"transition": linear.transition[:nz, :nz]}
@@ -51,14 +51,14 @@ def _by_output(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap, ny: int) -> dict[str, Any]:
-    """Add a map's arrays; return its settings that are not arrays."""
+    """Add a map's arrays to ``tensors``; return its other settings."""
     tensors |= {f"{prefix}{name}": getattr(inverse, name) for name in _MAP_ARRAYS}
     tensors[f"{prefix}noise_gain"] = np.atleast_2d(inverse.noise_gain)
     storage.put_mlp(tensors, prefix, inverse.mlp)
     described: dict[str, Any] = {"activation": inverse.mlp.activation, "features": list(inverse.features)}
     for name in _MAP_SCALARS:
         value = getattr(inverse, name)
-        if np.isfinite(value).all():  # JSON knows no infinity
+        if np.isfinite(value).all():  # JSON has no infinity
             described[name] = value
     described["measurement_noise_unit"] = np.atleast_1d(inverse.measurement_noise_unit).tolist()
     if "measurement_noise" in inverse.features:
@@ -67,10 +67,10 @@ def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: Inverse
 
 
 def _described_motion(tensors: dict[str, np.ndarray], motion: Motion, dt: float) -> dict[str, Any]:
-    """Add a motion's arrays; return its settings that are not arrays."""
+    """Add a motion's arrays to ``tensors``; return its other settings."""
     arrays = tracker_arrays(motion) | {name: getattr(motion, name) for name in _MOTION_ARRAYS}
     arrays |= {name: getattr(motion.factors, name) for name in ("levels", "ages")}
-    arrays["factors"] = motion.factors.factors[[0, -1]].ravel()  # without process noise, and with the most
+    arrays["factors"] = motion.factors.factors[[0, -1]].ravel()  # without process noise, and at its largest level
     described = tracker_numbers(motion, dt) | {"least_process_noise": motion.least_process_noise}
     if motion.equations is not None:
         described |= {"field": motion.equations.field.components, "substeps": motion.equations.substeps}

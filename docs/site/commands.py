@@ -1,4 +1,4 @@
-"""Writes docs/reference/commands.md: every command of ``kkl-gym`` with its options, from the parsers themselves."""
+"""Writes docs/reference/commands.md: every command of ``kkl-gym`` with its options, from the commands' parsers."""
 
 import argparse
 import inspect
@@ -23,18 +23,18 @@ PAGE = Path(__file__).resolve().parents[1] / "reference" / "commands.md"
 BEGINNING = """\
 # Commands
 
-`kkl-gym COMMAND --help` prints the same. Arguments without dashes are given by their place.
+`kkl-gym COMMAND --help` prints the same text. Arguments without dashes are positional.
 
-Commands that compare observers and agents are no part of the package. In a clone, `python -m examples.research --help`
-lists them.
+The package does not include the commands that compare observers and agents. In a clone,
+`python -m examples.research --help` lists them.
 
 <!-- Written by `make docs` from the parsers of the commands. -->
 """
 SETTINGS = """\
 ## Settings
 
-`kkl-gym train` and `kkl-gym identify` take every setting by `--set NAME=VALUE`, and files of them by `--config FILE`,
-in TOML or JSON:
+`kkl-gym train` and `kkl-gym identify` take single settings by `--set NAME=VALUE`, and files of settings in TOML or
+JSON by `--config FILE`:
 
 ```toml
 width = 64
@@ -42,12 +42,12 @@ eigenvalues = [-1.0, -2.0, -4.0]
 trajectories = 2000
 ```
 
-Where `--preset`, `--pipeline` or `--data` makes a difference, a default names each: "fast 20, paper 512" is 20 for
-`--preset fast` and 512 for `--preset paper`. In parentheses follow the systems that have a value of their own.
+Some defaults depend on `--preset`, `--pipeline` or `--data`: "fast 20, paper 512" is 20 for `--preset fast` and 512 for
+`--preset paper`. Parentheses list the systems with their own value.
 """
-OF_OPTIONS = ("pipeline", "policy")  # settings that are options alone
+OF_OPTIONS = ("pipeline", "policy")  # settings that are options only
 DEFAULT = re.compile(r"\s*\((?:default: (.*)|(required|optional|sets: .*))\)\s*$", re.DOTALL)
-SHOWN = 3  # numbers of a setting that has many
+SHOWN = 3  # longest tuple whose numbers the table lists
 
 
 def page() -> str:
@@ -56,7 +56,7 @@ def page() -> str:
 
 
 def sections(prog: str, commands: Commands) -> Iterator[str]:
-    """A section for each command of a table, and for each of those below it."""
+    """A section for each command of a table, and for each of its subcommands."""
     for name, parser, description in parsers(prog, commands):
         rows = [row(action) for action in options(parser)]
         lines = table(["option and value", "meaning", "default"], rows) if rows else []
@@ -65,13 +65,13 @@ def sections(prog: str, commands: Commands) -> Iterator[str]:
 
 
 def parsers(prog: str, commands: Commands) -> Iterator[tuple[str, argparse.ArgumentParser, str]]:
-    """The words, parser and description of each command, and of those below it."""
+    """The words, parser and description of each command, and of its subcommands."""
     for name, behind in commands.items():
         command = load(*behind)
-        with warnings.catch_warnings():  # nothing else in tyro lists the options
+        with warnings.catch_warnings():  # only this function of tyro lists the options
             warnings.simplefilter("ignore", DeprecationWarning)
             parser = tyro.extras.get_parser(command, config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff))
-        # numpydoc's sections are for those who read the code
+        # without numpydoc's sections, which are for readers of the code
         yield f"{prog} {name}", parser, re.split(r"\n\n(?=\w+\n---)", inspect.getdoc(command) or "")[0]
         for action in parser._actions:
             if isinstance(action.choices, dict):
@@ -80,12 +80,12 @@ def parsers(prog: str, commands: Commands) -> Iterator[tuple[str, argparse.Argum
 
 
 def options(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    """The options and arguments of a parser, but for --help and commands below it."""
+    """The options and arguments of a parser, without --help and subcommands."""
     return [one for one in parser._actions if not isinstance(one.choices, dict) and one.dest != "help"]
 
 
 def row(action: argparse.Action) -> list[str]:
-    """Names and value, what it is, and the default."""
+    """The row of an option: names and value, meaning, default."""
     written = (action.help or "").replace("%%", "%")
     found = DEFAULT.search(written)
     default = (found[1] or (found[2] if found[2] == "required" else "") or "") if found else ""
@@ -100,7 +100,7 @@ def row(action: argparse.Action) -> list[str]:
 
 
 def text(written: str, between: str = " ") -> str:
-    """For Markdown: paragraphs in a line each, and nothing in them taken for a table or HTML."""
+    """Text for Markdown: one line for each paragraph, with characters of tables and HTML escaped."""
     paragraphs = [" ".join(part.split()) for part in written.split("\n\n")]
     joined = between.join(paragraphs).replace("|", r"\|").replace("<", "&lt;").replace("*", r"\*").strip()
     return re.sub(r"\bdocs/(\S+\.md)", r"[\1](../\1)", joined)
@@ -108,7 +108,7 @@ def text(written: str, between: str = " ") -> str:
 
 @dataclass(frozen=True)
 class Other(System):
-    """An oscillator of 1e5 rad/s and a size of 1e-5: settings that it shares with the shipped systems are general."""
+    """An oscillator of 1e5 rad/s and a size of 1e-5; settings that it shares with a shipped system are general."""
 
     name = "other"
     X = ((-1e-5, 1e-5), (-1e-5, 1e-5))
@@ -136,7 +136,7 @@ def settings() -> list[str]:
 
 def defaults() -> dict[str, str]:
     """Default of each setting as a text, for each preset and pipeline, and for records."""
-    given = {"eigenvalues": (-1.0,)}  # none are to be looked for, which takes time
+    given = {"eigenvalues": (-1.0,)}  # given, because the search for eigenvalues takes time
     configs: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
     for pipeline in get_args(Pipeline):
         for name in get_args(Preset):

@@ -1,4 +1,4 @@
-"""What the site adds to mkdocs: pages that lie elsewhere, links out of ``docs/``, pictures on dark, formulas."""
+"""Extensions of mkdocs for the site: pages from other folders, links out of ``docs/``, dark figures, formulas."""
 
 import json
 import posixpath
@@ -19,29 +19,29 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).resolve().parents[2]
 BRANCH = "main"
 NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
-EXECUTED = ROOT / "runs" / "notebooks"  # where make docs leaves them with what they print and draw
-# Files elsewhere that are pages of the site, each with its place under docs/.
+EXECUTED = ROOT / "runs" / "notebooks"  # make docs writes executed notebooks here
+# Files outside docs/ that are pages of the site, each with its place under docs/.
 SHOWN: Mapping[str, str] = {
     "CONTRIBUTING.md": "development/contributing.md",
     "CHANGELOG.md": "development/changes.md",
     **{f"examples/notebooks/{path.name}": f"notebooks/{path.stem}.md" for path in NOTEBOOKS},
 }
-WIDE = 1.5  # times as wide as high: such pictures scroll on phones
-ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>~?")  # of Sphinx, in docstrings
+WIDE = 1.5  # width over height, from which pictures scroll on phones
+ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>~?")  # Sphinx roles in docstrings
 FETCHED = re.compile(r'<(?:script|link|img)[^>]+(?:src|href)="?(https?://[^" >]+)')
-# Code of both kinds, in which nothing is a link; then the target of a link or an image.
+# Blocks and spans of code, which contain no links; then the target of a link or an image.
 LINK = re.compile(r"^```.*?^```|`[^`\n]*`|\]\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
-# The same code, then an image and where it lies.
+# The same code, then an image and its file.
 IMAGE = re.compile(r"^```.*?^```|`[^`\n]*`|(!\[[^\]]*\])\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
 
-# What pymdownx.arithmatex makes of $inline$ and $$displayed$$ formulas.
+# The HTML of pymdownx.arithmatex for $inline$ and $$displayed$$ formulas.
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 log = get_plugin_logger(__name__)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that show files from elsewhere, and the pictures of notebooks."""
+    """Add the pages of files outside docs/, and the pictures of notebooks."""
     for source, page in SHOWN.items():
         executed = EXECUTED / Path(source).name
         text = (executed if executed.exists() else ROOT / source).read_text(encoding="utf-8")
@@ -55,7 +55,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links that GitHub follows into links that hold in the site as well."""
+    """Convert links for GitHub to links that also work on the site."""
     at = page.file.src_uri
     sources = {shown: source for source, shown in SHOWN.items()}
     links = relinked(markdown, sources.get(at, f"docs/{at}"), at, repository=(config.repo_url or "").rstrip("/"))
@@ -63,21 +63,21 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Show as code what docstrings refer to by Sphinx's roles, which Markdown does not know, and formulas as MathML."""
+    """Show Sphinx's roles of docstrings as code, because Markdown has no roles, and formulas as MathML."""
     return typeset(ROLE.sub("<code>", html))
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Warn where looking at a page would ask another host for something."""
+    """Warn if a page would load something from another host."""
     for address in FETCHED.findall(output):
         log.warning(f"{page.file.src_uri} asks another host for {address}")
     return output
 
 
 def talk(notebook: Mapping[str, Any], name: str) -> tuple[str, dict[str, bytes]]:
-    """The page of a notebook, executed or not: its words and code, and what that printed and drew.
+    """The page of a notebook, executed or not: its text, its code, and the output of the code.
 
-    With the page come its pictures, PNG files named after the notebook, which lie beside it.
+    Also returns its pictures, PNG files beside the page that are named after the notebook.
     """
     parts: list[str] = []
     pictures: dict[str, bytes] = {}
@@ -100,9 +100,9 @@ def talk(notebook: Mapping[str, Any], name: str) -> tuple[str, dict[str, bytes]]
 
 
 def relinked(markdown: str, source: str, page: str, *, repository: str) -> str:
-    """A page whose links outside docs/ lead to the repository, unless the site shows their target.
+    """A page whose links out of docs/ lead to the repository, unless the site shows their target.
 
-    It lies at `source` in the repository, and at `page` under docs/ for the site.
+    The page is `source` in the repository, and `page` under docs/ on the site.
     """
 
     def rewrite(found: re.Match[str]) -> str:
@@ -123,7 +123,7 @@ def relinked(markdown: str, source: str, page: str, *, repository: str) -> str:
 
 
 def typeset(html: str) -> str:
-    """A page whose formulas are MathML, which browsers draw without a script."""
+    """A page with formulas as MathML, which browsers draw without a script."""
 
     def formula(found: re.Match[str]) -> str:
         tag, latex = found.groups()
@@ -134,9 +134,9 @@ def typeset(html: str) -> str:
 
 
 def themed(markdown: str, folder: Path) -> str:
-    """A page in which ``NAME.png`` is followed by ``NAME-dark.png``, if that lies beside it in the folder of the page.
+    """A page in which ``NAME-dark.png`` follows ``NAME.png``, if both files exist in the folder of the page.
 
-    Readers see the one that suits the ground, and the other is not loaded.
+    Browsers load and show the one that suits the background.
     """
 
     def twice(found: re.Match[str]) -> str:

@@ -1,1 +1,1 @@
-"""Comparisons and results of kkl-gym's pages: methods, agents, speed. Runs from a clone alone."""
+"""Comparisons and results of kkl-gym's pages: methods, agents, speed. It runs only in a clone."""

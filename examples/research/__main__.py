@@ -1,4 +1,4 @@
-"""``python -m examples.research``: a table of commands, read as ``kkl-gym`` reads its own."""
+"""``python -m examples.research``: the table of its commands, with the command line of ``kkl-gym``."""
 
 from training.cli import main
 

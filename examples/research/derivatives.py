@@ -9,7 +9,7 @@ import numpy as np
 from kkl_gym.equations import components
 from kkl_gym.system import Components
 
-# Functions in the derivatives that some releases of sympy do not print for NumPy, or for arrays of one shape only.
+# Functions that some releases of sympy cannot print for NumPy, or print for arrays of one shape only.
 _IN_NUMPY = {
     "largest": lambda *values: functools.reduce(np.maximum, values),
     "smallest": lambda *values: functools.reduce(np.minimum, values),
@@ -18,12 +18,12 @@ _IN_NUMPY = {
 
 
 def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
-    """Derivatives of f or h from its own equations: for each component, those that are not zero by state.
+    """Derivatives of f or h: for each component, its nonzero derivatives by the index of the state.
 
-    At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of those on both sides; at a jump it is that
-    beside it.
+    At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of both sides; at a jump it is that of the
+    neighbourhood.
     """
-    import sympy  # here, because it takes half a second that other commands need not wait for
+    import sympy  # imported here, because it takes half a second
 
     x = sympy.symbols(f"x:{nx}", real=True)
     largest, smallest = sympy.Function("largest"), sympy.Function("smallest")
@@ -32,14 +32,14 @@ def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dic
         value = _differentiable(sympy.sympify(value))
         row = {j: sympy.diff(value, symbol) for j, symbol in enumerate(x)}
         if any(derivative.has(sympy.Derivative) for derivative in row.values()):
-            raise ValueError(f"component {i} of {equations.__name__}(x) has no derivative that sympy knows: {value}")
+            raise ValueError(f"component {i} of {equations.__name__}(x) has no derivative in sympy: {value}")
         row = {j: d.replace(sympy.Max, largest).replace(sympy.Min, smallest) for j, d in row.items() if d != 0}
         rows.append({j: sympy.lambdify(x, d, [_IN_NUMPY, "numpy"], cse=True) for j, d in row.items()})
     return rows
 
 
 def _differentiable(value: Any) -> Any:
-    """An expression in which functions with kinks and jumps are written so that sympy knows their derivatives."""
+    """Rewrite functions with kinks and jumps so that sympy can differentiate them."""
     import sympy
 
     def flat(name: str) -> Any:
@@ -50,9 +50,9 @@ def _differentiable(value: Any) -> Any:
     return value.replace(sympy.sign, flat("sign")).replace(sympy.Abs, lambda u: sympy.Max(u, -u))
 
 
-@np.errstate(all="ignore")  # where(x > 0, log(x), 0) is evaluated on both sides of zero
+@np.errstate(all="ignore")  # where(x > 0, log(x), 0) evaluates log for negative x, too
 def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np.ndarray:
-    """Evaluate what :func:`jacobian` returned at states (..., nx), as (..., rows, nx)."""
+    """Evaluate the result of :func:`jacobian` at states (..., nx); returns (..., rows, nx)."""
     out = np.zeros((*x.shape[:-1], len(rows), x.shape[-1]))
     for i, row in enumerate(rows):
         for j, derivative in row.items():

@@ -1,11 +1,11 @@
-"""Draw the figures of the pages, on a light ground and on a dark one: ``make figures``.
+"""Draw the figures of the pages, on a light and on a dark background: ``make figures``.
 
-Each is drawn from the files in docs/results, or from simulations of seconds, by the functions that the commands call.
-NAME-dark.png lies beside NAME.png, and moving pictures likewise; docs/site/hooks.py shows readers the one of their
-theme. ``python -m examples.research.figures figures/portraits.gif`` draws one alone.
+The data are files in docs/results, or simulations of seconds. The functions are those of the commands. NAME-dark.png
+is written beside NAME.png, and so are animations; docs/site/hooks.py shows readers the one of their theme.
+``python -m examples.research.figures figures/portraits.gif`` draws a single figure.
 
-docs/figures/qube.png is not drawn here, and is light everywhere: it needs a training (examples/qube.py) and records
-that are not part of this project. docs/figures/kkl.svg is drawn by hand; its colours alone are changed.
+docs/figures/qube.png is not drawn here and has only a light version: it needs a training (examples/qube.py) and records
+that are not part of this project. docs/figures/kkl.svg is drawn by hand; only its colours are changed.
 """
 
 import sys
@@ -47,19 +47,19 @@ if TYPE_CHECKING:
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 RESULTS = DOCS / "results"
 Draw = Callable[[Path], object]
-COLOURS = 256  # of a picture, which a third of the bytes then holds
-SEED = 7  # of the moving pictures
-DT = 0.01  # s, of the systems that ship
+COLOURS = 256  # colours in a picture, which reduce its size to a third
+SEED = 7  # of the animations
+DT = 0.01  # s, of the shipped systems
 EKF = "EKF with the exact equations"
 RIVALS = {"ekf": "tuned EKF", "ukf": "tuned UKF", "gru": "GRU"}  # of the benchmark, in the figure of noise
-BAND = 0.9  # of the errors lie in a band
-THRESHOLDS = (0.5, 100.0)  # of the monitor's score, in the figure of faults
-LEVELS = (0.0, 0.5)  # of measurement noise, in the figure of errors over time
-SMALLEST = 0.01  # percent that is shown of errors under noise
-QUANTILES = (0.1, 0.5, 0.9)  # of the runs, in the same figure
+BAND = 0.9  # share of errors within a band
+THRESHOLDS = (0.5, 100.0)  # range of the monitor's score in the figure of faults
+LEVELS = (0.0, 0.5)  # measurement noise in the figure of errors over time
+SMALLEST = 0.01  # lower end of the error axis in %, under noise, in the same figure
+QUANTILES = (0.1, 0.5, 0.9)  # over the runs, in the figure of errors over time
 AGENTS = {"the agent sees the noisy output y": "van_der_pol-y", "the agent sees the estimate": "van_der_pol"}
-FIRST = 1.0  # s, in which bands may be wider than their panels
-# Colours of docs/figures/kkl.svg, and those on a dark ground.
+FIRST = 1.0  # s at the start, in which bands may exceed their panels
+# Colours of docs/figures/kkl.svg, and their replacements on a dark background.
 DARK = {
     "#fdfcf8": "#1e2129", "#ddd8c8": "#363b47", "#f1efe6": "#2a2f3a", "#e9f1fa": "#1f3044", "#fbecea": "#402523",
     "#333": "#c9ccd3", "#222": "#eceae4", "#555": "#b4b8c0", "#777": "#9aa0aa", "#888": "#8a909c",
@@ -74,13 +74,13 @@ def estimates(duration: float = 15.0) -> Draw:
 
 
 def portraits(name: str | None = None, duration: float = 12.0) -> Draw:
-    """Phase portraits that move: ``kkl-gym demo --gif --seed 7 --duration 12``, of one system or all."""
+    """Animated phase portraits of one system or all: ``kkl-gym demo --gif --seed 7 --duration 12``."""
     episodes = [demo.play(one, round(duration / one.system.dt), None, seed=SEED) for one in shown(name, None)]
     return lambda path: demo.animate(path, episodes)
 
 
 def agents() -> tuple[Task, Mapping[str, Episodes]]:
-    """The first episode of ``kkl-gym agent evaluate``, of an agent that sees y and of one that sees an estimate."""
+    """The first episode of ``kkl-gym agent evaluate`` for two agents: one sees y, the other an estimate."""
     played = {}
     for title, name in AGENTS.items():
         agent = Agent.read(find(name))
@@ -90,7 +90,7 @@ def agents() -> tuple[Task, Mapping[str, Episodes]]:
 
 
 def agents_moving() -> Draw:
-    """Phase portraits of both agents, which move."""
+    """Animated phase portraits of both agents."""
     task, played = agents()
     return lambda path: picture.animate(task, played, path)
 
@@ -102,7 +102,7 @@ def agents_over_time() -> Draw:
 
 
 def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
-    """Each state, its estimate and the band that holds nine errors in ten, in the run of ``kkl-gym demo``."""
+    """Each state, its estimate and the band of 90 % of the errors, in the run of ``kkl-gym demo``."""
     (environment,) = shown(name, None)
     episode = demo.play(environment, round(duration / environment.system.dt), None, seed=0)
     observer = load(name, environment.system.measurement_noise)
@@ -135,7 +135,7 @@ def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
 
 
 def noise_levels() -> Draw:
-    """Errors by level of noise, of the maps that ship and of some of the benchmark's observers."""
+    """Errors by noise level for the shipped maps and some of the benchmark's observers."""
     files = RESULTS / "accuracy.csv", RESULTS / "tracking" / "accuracy.csv"
     ours = pd.concat(map(pd.read_csv, files))
     rivals = pd.read_csv(RESULTS / "benchmark" / "results.csv")
@@ -171,7 +171,7 @@ def errors_of_runs(
 ) -> dict[str, list[np.ndarray]]:
     """Errors in % by system, (steps, n) for the default map and for an EKF, in the runs of ``kkl-gym evaluate``.
 
-    The runs start in X; the tables of the pages have their means.
+    The runs start in X. The tables of the pages contain their means.
     """
     errors = {}
     for name, kind in SYSTEMS.items():
@@ -187,7 +187,7 @@ def errors_of_runs(
 
 
 def errors_over_time(**sizes: Any) -> Draw:
-    """Medians and bands of errors at each step, of observers and Kalman filters: a column a system, a row a level."""
+    """Medians and bands of errors at each step for observers and Kalman filters, by system and noise level."""
     errors = {level: errors_of_runs(level, **sizes) for level in LEVELS}
 
     def draw(path: Path) -> None:
@@ -220,7 +220,7 @@ def _set_logarithmic(ax: "Axes", lowest: float) -> None:
 
 
 def draw_faults(path: Path, runs: pd.DataFrame) -> None:
-    """Draw how many runs exceed a threshold of the monitor's score in time, sound ones and faulty ones."""
+    """Draw the share of runs, without and with faults, whose score exceeds a threshold in time."""
     observers = list(runs.observer.unique())
     with drawing(path, max(5.0, 2.5 * len(observers)), 3.2) as figure:
         axes: Any = figure.subplots(1, len(observers), sharey=True, squeeze=False)[0]
@@ -258,12 +258,12 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
 
 
 def in_theme(name: str, theme: Theme) -> str:
-    """The name of a picture in a theme."""
+    """The file name of a figure in a theme."""
     return name if theme == "light" else str(Path(name).with_stem(f"{Path(name).stem}-dark"))
 
 
 def shrink(path: Path) -> None:
-    """Leave a picture fewer colours."""
+    """Reduce the number of colours in a picture."""
     reduced = Image.open(path).convert("RGB").quantize(COLOURS, kmeans=1, dither=Image.Dither.NONE)
     with replacing(path) as temporary:
         reduced.save(temporary, optimize=True)

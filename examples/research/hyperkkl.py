@@ -1,6 +1,6 @@
-"""``python -m examples.research hyperkkl``: HyperKKL's protocol (arXiv 2603.29744) with our default training."""
+"""``python -m examples.research hyperkkl``: HyperKKL's protocol (arXiv 2603.29744) with the default training."""
 
-# ruff: noqa: D102 - what each system defines is documented on System
+# ruff: noqa: D102 - System documents the methods that each system defines
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 Input = Literal["zero", "constant", "sinusoid", "square"]
 INPUTS: tuple[Input, ...] = ("zero", "constant", "sinusoid", "square")
-# Ranges of (amplitude, frequency in rad/s), within the distribution of the training and beyond it.
+# Ranges of (amplitude, frequency in rad/s) within HyperKKL's training distribution (False) and beyond it (True).
 RANGES: dict[str, dict[bool, tuple[tuple[float, float], tuple[float, float]]]] = {
     "constant": {False: ((-1.0, 1.0), (0.0, 0.0)), True: ((-2.0, 2.0), (0.0, 0.0))},
     "sinusoid": {False: ((0.1, 1.0), (0.5, 3.0)), True: ((1.0, 2.0), (3.0, 6.0))},
     "square": {False: ((0.1, 1.0), (0.5, 2.0)), True: ((1.0, 2.0), (2.0, 4.0))},
 }
-SETTLING = 5.0  # s, before which errors do not count
-# The best figure that the paper prints for each system, by input; SMAPE in %, within the distribution.
+SETTLING = 5.0  # s at the start, in which errors do not count
+# The paper's best SMAPE in % for each system, by input, within the distribution.
 PRINTED: dict[str, tuple[float, float, float, float]] = {
     "duffing": (5.6, 21.1, 22.7, 21.3),
     "van_der_pol": (5.0, 26.0, 15.5, 17.9),
@@ -38,7 +38,7 @@ PRINTED: dict[str, tuple[float, float, float, float]] = {
 
 
 class Driven:
-    """The first of two bases of each system: one input within [-1, 1], 0.05 s, trials of 50 s, noise 0 or ``noise``."""
+    """Base of all systems: one input within [-1, 1], samples every 0.05 s, trials of 50 s, noise 0 or ``noise``."""
 
     u_max: ClassVar[tuple[float, ...]] = (1.0,)
     dt: ClassVar[float] = 0.05
@@ -63,7 +63,7 @@ class Duffing(Driven, System):
 
 
 class VanDerPol(Driven, System):
-    """With mu = 1."""
+    """Van der Pol's oscillator with mu = 1."""
 
     name: ClassVar[str] = "van_der_pol"
     X: ClassVar[Box] = ((-3, 3), (-3, 3))
@@ -75,7 +75,7 @@ class VanDerPol(Driven, System):
 
 
 class Rossler(Driven, System):
-    """With a = b = 0.1 and c = 14; y = x2."""
+    """Rössler's system with a = b = 0.1 and c = 14; y = x2."""
 
     name: ClassVar[str] = "rossler"
     X: ClassVar[Box] = ((-10, 10), (-10, 10), (-10, 10))
@@ -88,7 +88,7 @@ class Rossler(Driven, System):
 
 
 class Lorenz(Driven, System):
-    """With sigma = 10, rho = 28 and beta = 8/3; y = x2."""
+    """Lorenz's system with sigma = 10, rho = 28 and beta = 8/3; y = x2."""
 
     name: ClassVar[str] = "lorenz"
     X: ClassVar[Box] = ((-20, 20), (-30, 30), (0, 50))
@@ -114,7 +114,7 @@ class FitzHughNagumo(Driven, System):
 
 
 class Traffic(Driven, System):
-    """Densities in five cells of a road, of which the last is measured; u is added to the inflow from a ramp."""
+    """Traffic densities in five cells of a road; the last one is measured, and u adds to the inflow from a ramp."""
 
     name: ClassVar[str] = "traffic"
     X: ClassVar[Box] = ((0.01, 0.1),) * 5
@@ -136,23 +136,23 @@ SYSTEMS = {cls.name: cls for cls in (Duffing, VanDerPol, Rossler, FitzHughNagumo
 
 @dataclass(frozen=True)
 class HyperKKL:
-    """Train a default observer for each of HyperKKL's systems, and measure it under their inputs.
+    """Train a default observer for each of HyperKKL's systems, and evaluate it under HyperKKL's inputs.
 
-    Writes OUT/results.csv, OUT/table.md and OUT/NAME.safetensors. Observers that are there are not trained again.
+    Writes OUT/results.csv, OUT/table.md and OUT/NAME.safetensors. Existing observers are not trained again.
     """
 
     systems: tuple[str, ...] = tuple(SYSTEMS)
-    """Of the six."""
+    """Some of the six systems."""
     trials: int = 100
-    """Starts, by Latin hypercube, for each input."""
+    """Number of starts for each input, by Latin hypercube sampling."""
     seed: int = 0
     """Seed of starts, inputs and noise."""
     out: Path = Path("runs/hyperkkl")
     """Folder of results."""
 
     def run(self, console: Console) -> "pd.DataFrame":
-        """Train and measure."""
-        import pandas as pd  # which, as torch, takes a second or more that help need not wait for
+        """Train and evaluate."""
+        import pandas as pd  # imported here, because --help need not wait a second
 
         from training.diagnosis import check
 
@@ -184,7 +184,7 @@ class HyperKKL:
         return Artifact.read(path)
 
     def _measured(self, system: Any, artifact: "Artifact") -> Iterator[dict[str, Any]]:
-        """Mean SMAPE after settling: of the observer, of its T_inv alone, and of a Kalman filter with the equations."""
+        """Mean SMAPE after settling for the observer, its T_inv alone, and a Kalman filter with the equations."""
         from scipy.stats.qmc import LatinHypercube
 
         from kkl_gym.simulate import simulate
@@ -213,7 +213,7 @@ class HyperKKL:
 
 
 def inputs(kind: Input, beyond: bool, n: int, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Inputs held over each sample, (steps, n, 1), with an amplitude, a frequency and a phase for each trial."""
+    """Inputs held over each sample, (steps, n, 1); each trial has its own amplitude, frequency and phase."""
     if kind == "zero":
         return np.zeros((len(t), n, 1))
     amplitude, frequency = (rng.uniform(*span, n) for span in RANGES[kind][beyond])
@@ -227,7 +227,7 @@ def inputs(kind: Input, beyond: bool, n: int, t: np.ndarray, rng: np.random.Gene
 
 
 def page(frame: "pd.DataFrame") -> str:
-    """The results as a Markdown table: a row for each system and input."""
+    """The results as a Markdown table with a row for each system and input."""
     rows = []
     for (name, kind), group in frame.groupby(["system", "input"], sort=False):
         cells = group.set_index(["beyond", "noise"])

@@ -1,4 +1,4 @@
-"""``python -m examples.research lipschitz``: a sound bound of how much an error of z changes an estimate."""
+"""``python -m examples.research lipschitz``: a rigorous bound on the change of an estimate by an error of z."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +16,12 @@ from training.evaluation.levels import Level, beyond, level_for
 from training.maps.networks import from_mlp
 from training.trajectories.motions import filter_states
 
-# Least and greatest slope of each activation, rounded outwards; those of x sigmoid(x) are where its second derivative
-# vanishes, at |x| = 2.39936.
+# Least and largest slope of each activation, rounded outwards. x sigmoid(x) has them at the zeros of its second
+# derivative, |x| = 2.39936.
 SLOPES = {"tanh": (0.0, 1.0), "silu": (-0.0998393202, 1.0998393202)}
-STEPS = 150  # of the search for the certificate
-TRIALS, EVERY = 50, 20  # motions along which Jacobians are taken, and samples between these
-CHUNK = 4096  # points whose Jacobians are taken at once
+STEPS = 150  # in the search for the certificate
+TRIALS, EVERY = 50, 20  # number of motions for Jacobians, and samples between two of these
+CHUNK = 4096  # points whose Jacobians are computed together
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Lipschitz:
     """Shipped maps, or .safetensors files."""
     system: OwnSystem = None
     measurement_noise: NoiseLevel = None
-    """Standard deviation of the noise that the map is given, or one for each output as in 0.1,0.3."""
+    """Standard deviation of the noise that the map assumes, or one for each output as in 0.1,0.3."""
 
     def run(self, console: Console) -> Table:
         """Print the bounds."""
@@ -55,7 +55,7 @@ class Lipschitz:
 
 
 def decoder(artifact: Artifact, measurement_noise: Level) -> MLP:
-    """T_inv of free motion long after reset in physical units, from the whole of z to x, in double precision."""
+    """T_inv of free motion long after reset as a network from z to x, in physical units and double precision."""
     inverse = (artifact.free_inverse or artifact.inverse).part(slice(artifact.nx))
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
     features = inverse.noise_features(measurement_noise, 0.0)
@@ -65,14 +65,14 @@ def decoder(artifact: Artifact, measurement_noise: Level) -> MLP:
     biases = [np.asarray(bias, float) for bias in inverse.mlp.biases]
     first, modes = weights[0], len(whiten)
     biases[0] = biases[0] - first[:, :modes] @ whiten @ inverse.z_offset + first[:, modes:] @ np.array(features)
-    weights[0] = np.zeros((len(first), artifact.filter.size))  # the part of z that holds inputs is 0
+    weights[0] = np.zeros((len(first), artifact.filter.size))  # z_u is 0
     weights[0][:, : whiten.shape[1]] = first[:, :modes] @ whiten
     weights[-1], biases[-1] = inverse.x_scale[:, None] * weights[-1], inverse.x_offset + inverse.x_scale * biases[-1]
     return MLP(weights, biases, inverse.mlp.activation)
 
 
 def along_motions(artifact: Artifact, system: System) -> np.ndarray:
-    """Filter states (n, nz) of unseen motions without noise, from where the transient is over."""
+    """Filter states (n, nz) of unseen motions without noise, after the transient."""
     linear, duration = artifact.filter, system.duration
     x = unseen_trajectories(system, linear.dt, n=TRIALS, duration=duration, seed=0).x
     ages = np.arange(len(x) // 5, len(x), EVERY)
@@ -81,14 +81,14 @@ def along_motions(artifact: Artifact, system: System) -> np.ndarray:
 
 
 def lipschitz_lower(mlp: MLP, z: np.ndarray) -> float:
-    """Bound a network's Lipschitz constant from below, by its Jacobians at points (n, inputs)."""
+    """Lower bound of a network's Lipschitz constant, from its Jacobians at points (n, inputs)."""
     network = from_mlp(mlp, dtype=torch.float64)
     derivative = torch.func.vmap(torch.func.jacrev(network), chunk_size=CHUNK)
     return float(torch.linalg.matrix_norm(derivative(torch.as_tensor(z, dtype=torch.float64)), 2).max())
 
 
 def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
-    """Bound a network's Lipschitz constant from above, everywhere, by a quadratic certificate for each layer.
+    """Global upper bound of a network's Lipschitz constant, by a quadratic certificate for each layer.
 
     M. Fazlyab et al., "Efficient and accurate estimation of Lipschitz constants for deep neural networks", NeurIPS
     2019, layer by layer as in Y. Xu and S. Sivaranjani, "ECLipsE", NeurIPS 2024.
@@ -97,8 +97,8 @@ def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
         return norm_product(mlp)
     low, high = SLOPES[mlp.activation]
     weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in mlp.weights]
-    # D is a shape about the diagonal of M, times the least factor with D >= M, times 1 + e^margin: always admissible.
-    # Zeros are a good start: for diagonal M they give D = 2 M, with which nothing is lost.
+    # D is a scaling of M's diagonal, times the least factor with D >= M, times 1 + e^margin, so it is admissible.
+    # Zeros are a good start: for diagonal M they give D = 2 M, which is optimal.
     shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
     margins = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in weights[:-1]]
 
@@ -125,10 +125,10 @@ def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
         optimiser.step()
         schedule.step()
     best = min(best, float(squared().detach()))
-    return min(float(np.sqrt(best)) * (1.0 + 1e-9), norm_product(mlp))  # for the rounding of the arithmetic above
+    return min(float(np.sqrt(best)) * (1.0 + 1e-9), norm_product(mlp))  # margin for rounding
 
 
 def norm_product(mlp: MLP) -> float:
-    """Product of the layers' spectral norms and the activations' largest slopes, a bound that costs no work."""
+    """Product of the layers' spectral norms and the activations' largest slopes, a simple upper bound."""
     slope = max(abs(value) for value in SLOPES[mlp.activation])
     return float(np.prod([np.linalg.norm(weight, 2) for weight in mlp.weights])) * slope ** (len(mlp.weights) - 1)

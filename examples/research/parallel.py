@@ -14,32 +14,32 @@ from typing import TypeVar
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import get_reusable_executor
 
-TRIES = 3  # of a job whose worker dies
+TRIES = 3  # attempts at a job whose worker dies
 
 Job = TypeVar("Job")
 
 
 @dataclass(frozen=True)
 class Engine:
-    """Runs jobs, as many at a time as it has workers."""
+    """Runs jobs in a number of worker processes."""
 
     workers: int
 
     def run(self, run: Callable[[Job], None], jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None]]:
-        """Yield each job when it ends, with the text of its error if it failed; jobs begin in their order."""
+        """Yield each job when it ends, with the text of its error or None; jobs start in the given order."""
         todo, lost = dict(enumerate(jobs)), Counter[int]()
         workers = min(self.workers, len(todo))
         attempt = delayed(partial(_attempt, run, Path.cwd()))
         while todo:
             suspects = {index: job for index, job in todo.items() if lost[index]}
-            # As many are handed out as there are workers: a dead worker was at one of the first. Those go one by one.
+            # Each worker has one job, so a dead worker had one of the first jobs. Each of these then runs by itself.
             handed = 1 if suspects else workers
-            # joblib would run a single job in this process, which a job must not be able to kill.
+            # With one worker, joblib would run jobs in this process, and a job could kill it.
             parallel = Parallel(max(2, workers), return_as="generator_unordered", batch_size=1, pre_dispatch=handed)
             try:
                 for index, failure in parallel([attempt(*item) for item in (suspects or todo).items()]):
                     yield todo.pop(index), failure
-            except Exception as error:  # a worker died: what a job raises comes as its failure
+            except Exception as error:  # a worker died; errors of jobs are returned as text
                 for index in [index for index in suspects or todo if index in todo][:handed]:
                     lost[index] += 1
                     if lost[index] == TRIES:
@@ -47,7 +47,7 @@ class Engine:
 
 
 def _attempt(run: Callable[[Job], None], folder: Path, index: int, job: Job) -> tuple[int, str | None]:
-    """Run a job in a folder; its error becomes text, as not every error can be sent to another process."""
+    """Run a job in a folder; returns its error as text, because not every exception can be pickled."""
     try:
         with chdir(folder):
             run(job)
@@ -60,7 +60,7 @@ def _attempt(run: Callable[[Job], None], folder: Path, index: int, job: Job) -> 
 
 @contextmanager
 def engine(workers: int) -> Iterator[Engine]:
-    """Worker processes for jobs, for as long as the context lasts."""
+    """Yield an engine whose worker processes end with the context."""
     if workers < 1:
         raise ValueError(f"jobs = {workers} at a time: give at least one worker process")
     with parallel_config("loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)):
@@ -71,7 +71,7 @@ def engine(workers: int) -> Iterator[Engine]:
 
 
 def _end_with(parent: int) -> None:
-    """End this worker soon after its parent, which may be killed: loky's go on to the end of their job."""
+    """End this worker soon after its parent is killed; loky's workers would finish their jobs."""
 
     def watch() -> None:
         while os.getppid() == parent:

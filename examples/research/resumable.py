@@ -1,4 +1,4 @@
-"""Jobs that leave their results in folders, so that a comparison goes on where it stopped."""
+"""Jobs that write their results to folders, so that an interrupted comparison can continue."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -15,30 +15,30 @@ from training.progress import LOG, ProgressBars, progress_bars
 
 @dataclass(frozen=True)
 class Workers:
-    """Where jobs run."""
+    """The worker processes."""
 
     jobs: int = 2
-    """Jobs at a time, each in a process of one thread."""
+    """Number of simultaneous jobs, each in a process with one thread."""
 
 
 class Job(ABC):
-    """One part of a comparison; derived dataclasses have its settings and the field ``folder``."""
+    """A part of a comparison; derived dataclasses hold its settings and the field ``folder``."""
 
     folder: Path
     result: ClassVar[str]
-    """File in the folder that is written last."""
+    """The file in the folder that is written last."""
     other: ClassVar[str]
-    """What a folder holds where the identity in it differs, for the error's text."""
+    """Text for errors: the content of a folder with another identity."""
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """For progress and errors."""
+        """The job's name in progress and errors."""
 
     @property
     @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """All that the result depends on."""
+        """Everything on which the result depends."""
 
     @abstractmethod
     def work(self) -> None:
@@ -46,7 +46,7 @@ class Job(ABC):
 
     @property
     def done(self) -> bool:
-        """Whether the result is there; raises ValueError if it is that of another identity."""
+        """Whether the result exists; ValueError if it has another identity."""
         if not (self.folder / self.result).exists():
             return False
         check_identity(self.folder / "job.json", self.identity, self.other)
@@ -54,8 +54,8 @@ class Job(ABC):
 
 
 def run_job(job: Job) -> None:
-    """Do a job in one thread, unless it is done."""
-    import torch  # which takes seconds that help need not wait for
+    """Run a job in one thread, unless it is done."""
+    import torch  # imported here, because --help need not wait for torch
 
     torch.set_num_threads(1)
     with claimed_job(job.folder, job.identity, job.other):
@@ -72,7 +72,7 @@ def run_and_report(
     what: str,
     report: Callable[[ProgressBars], None],
 ) -> None:
-    """Run the jobs that are not done and report on the results, also after an interruption."""
+    """Run the missing jobs, and report on the results, also after an interruption."""
     failures = list[str]()
     try:
         with progress_bars(console, out / LOG) as progress:
@@ -86,9 +86,9 @@ def run_and_report(
 def run_missing(
     run: Callable[[Job], None], jobs: Sequence[Job], *, workers: Workers, what: str, progress: ProgressBars
 ) -> list[str]:
-    """Run the jobs that are not done."""
+    """Run the missing jobs; returns the failures."""
     todo, failures = [job for job in jobs if not job.done], list[str]()
-    names = [job.name for job in todo]  # the engine begins jobs in this order: the first ones run
+    names = [job.name for job in todo]  # the engine starts jobs in this order, so the first ones are running
     bar = progress.add_task(what, total=len(jobs), completed=len(jobs) - len(todo))
 
     def described() -> str:
@@ -109,6 +109,6 @@ def run_missing(
 
 
 def check_failures(failures: Sequence[str], jobs: Sequence[Job], what: str) -> None:
-    """Raise ValueError with the first failure, if there are some."""
+    """Raise ValueError with the first failure, if there are any."""
     if failures:
         raise ValueError(f"{len(failures)} of {len(jobs)} {what} failed; the first: {failures[0]}")

@@ -1,1 +1,1 @@
-"""Wrappers: a learned observer in an environment, a memory around any, agents that act more slowly than it samples."""
+"""Wrappers: a learned observer in an environment, a memory around any environment, and actions held over steps."""

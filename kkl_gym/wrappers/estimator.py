@@ -1,4 +1,4 @@
-"""What single and vector wrappers share: an observer fitted to a plant, and what it shows."""
+"""The observer inside single and vector wrappers, and the observations and ``info`` that it gives."""
 
 import math
 import os
@@ -17,31 +17,31 @@ from observers.names import resolve
 
 
 class Estimates:
-    """Any estimator of states, as :class:`VectorEstimate` drives and shows it; it takes no known states at a start."""
+    """Any state estimator, as :class:`VectorEstimate` calls it; it makes no use of known starts."""
 
     def __init__(self, estimator: Estimator[Any], space: gym.spaces.Box) -> None:
         self._running, self.space = Running(estimator), space
         self.advance = self._running.advance
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past and take in the first samples. Shapes: ``y0`` (n, ny), ``x0`` (n, nx)."""
+        """Begin an episode with its first samples. Shapes: ``y0`` (n, ny), ``x0`` (n, nx)."""
         self._running.reset(y0)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
+        """Begin episodes in rows (n,) with their first samples (number of True in rows, ny)."""
         self._running.restart(y0, rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains. Shapes: ``rows`` (n,); returns (number of rows, ...)."""
+        """The entries to add to ``info``. Shapes: ``rows`` (n,); returns (number of rows, ...)."""
         return {"x_hat": self._running.decode(rows)}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What of a report is the observation. Shapes: returns (number of rows, width)."""
+        """The observation from a report. Shapes: returns (number of rows, width)."""
         return report["x_hat"]
 
 
 class KKLEstimator:
-    """A learned observer, one sample or a batch at a time, and the space of what it shows."""
+    """A learned observer for one environment or a batch, and the space of its observations."""
 
     def __init__(
         self,
@@ -81,13 +81,14 @@ class KKLEstimator:
         uncertainty: bool = False,
         **how: Any,
     ) -> "KKLEstimator":
-        """An observer that was learned for a plant, at the plant's levels of noise."""
+        """An observer that was learned for a plant, at the plant's noise levels; ValueError if it does not fit."""
         choice("estimate", estimate, ("x", "z"))
         uncertainty, system = flag("uncertainty", uncertainty), plant.system
         if observer is None and system.name not in shipped():
             raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer or system.name))
-        artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
+        # A wrong system must be reported before wrong noise levels.
+        artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)
         if flag("known_start", known_start) and artifact.nx > system.nx:
             raise ValueError("leave known_start out: this observer estimates a bias too, of which no start is known")
         space: gym.spaces.Box = gym.spaces.Box(-np.inf, np.inf, (artifact.filter.size,))
@@ -110,14 +111,14 @@ class KKLEstimator:
         )
 
     def replace(self, observer: str | os.PathLike[str] | Artifact) -> None:
-        """Take other maps for the same filter, which goes on."""
+        """Use the maps of another observer with the same filter; the filter's state stays."""
         self.observer.replace(self.asked(observer))
 
     def asked(self, observer: str | os.PathLike[str] | Artifact) -> Artifact:
-        """What :meth:`replace` would take."""
+        """The artifact that :meth:`replace` would use; ValueError if an option asks for more than it holds."""
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
         if self._known_start:
-            artifact.require_known_start()  # an error now, not at the first reset
+            artifact.require_known_start()  # raises now instead of at the first reset
         if self._uncertainty and self.estimate != "x":
             raise ValueError(f"uncertainty=True is about x_hat: it needs estimate='x', got {self.estimate!r}")
         if self._uncertainty:
@@ -125,7 +126,7 @@ class KKLEstimator:
         return artifact
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
-        """The input as far as the map knows it. Shapes: ``u`` (..., nu); returns (..., nu), or None."""
+        """The input, or None if the map has no inputs. Shapes: ``u`` (..., nu)."""
         if not self._blind:
             return u
         if not self._ignore_input and u.any():
@@ -136,19 +137,19 @@ class KKLEstimator:
         return None
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past and take in the first samples. Shapes: ``y0`` (..., ny), ``x0`` (..., nx)."""
+        """Begin an episode with its first samples. Shapes: ``y0`` (..., ny), ``x0`` (..., nx)."""
         self.observer.reset(y0, x0 if self._known_start else None)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in rows (n,) and take in their first samples (number of True in rows, ny)."""
+        """Begin episodes in rows (n,) with their first samples (number of True in rows, ny)."""
         self.observer.restart(y0, rows, x0 if self._known_start else None)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in samples (..., ny), NaN where missing, and the inputs (..., nu) that led to them."""
+        """Process samples (..., ny), NaN where missing, and the inputs (..., nu) that led to them."""
         self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains. Shapes: ``rows`` (...,)."""
+        """The entries to add to ``info``. Shapes: ``rows`` (...,)."""
         found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
         if self.estimate == "x":
             found["x_hat"] = self.observer.decode(rows)
@@ -163,13 +164,13 @@ class KKLEstimator:
         return found
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What of a report is the observation. Shapes: returns (..., width)."""
+        """The observation from a report. Shapes: returns (..., width)."""
         if self._uncertainty:
             return np.concatenate([report["x_hat"], standard_deviations(report["x_cov"])], axis=-1)
         return report["x_hat" if self.estimate == "x" else "z"]
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
-        """As :meth:`shown`, of a single sample: of so few numbers every call of NumPy would be felt."""
+        """As :meth:`shown`, for a single sample; lists are faster than NumPy for so few numbers."""
         values: list[float] = report["x_hat" if self.estimate == "x" else "z"].tolist()
         if self._uncertainty:
             variances = report["x_cov"].ravel().tolist()[:: len(values) + 1]
@@ -178,15 +179,15 @@ class KKLEstimator:
 
 
 def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
-    """Values (..., width) as observations: float32, within the bounds of their space."""
-    with np.errstate(over="ignore"):  # what float32 cannot hold is infinite
+    """Values (..., width) as observations: float32, clipped to their space."""
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite
         out = values.astype(np.float32)
     np.maximum(out, space.low, out=out)
     return np.minimum(out, space.high, out=out)
 
 
 def check_untouched(obs: Any, emitted: bytes, env: Any, inside: Any) -> None:
-    """Raise ValueError unless observations are still those that were emitted inside the wrappers of ``env``."""
+    """Raise ValueError if a wrapper between ``env`` and ``inside`` has changed the observations."""
     if isinstance(obs, np.ndarray) and obs.tobytes() == emitted:
         return
     between = []
@@ -194,20 +195,20 @@ def check_untouched(obs: Any, emitted: bytes, env: Any, inside: Any) -> None:
         between.append(type(env).__name__)
         env = env.env
     raise ValueError(
-        f"of the wrappers between the environment and the observer ({', '.join(between) or shown(env)}) one changes "
-        "observations, but the observer reads info['y'], which it does not change: put it outside the observer, or "
-        "give the environment a sensor that does the same, as in gym.make(ID, sensor=kkl_gym.Sensor(bias=0.1))"
+        f"a wrapper between the environment and the observer ({', '.join(between) or shown(env)}) changes "
+        "observations, but the observer reads info['y'], which stays the same: put that wrapper outside, or "
+        "give the environment a sensor with the same effect, as in gym.make(ID, sensor=kkl_gym.Sensor(bias=0.1))"
     )
 
 
 def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds (2 nx,) of states and of their standard deviations, which are no larger than the bounds are wide."""
-    with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
+    """Bounds (2 nx,) of states and of their standard deviations, which are at most the width of the bounds."""
+    with np.errstate(over="ignore"):  # widths beyond float32 become infinite
         return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
 
 
 def _estimate_space(plant: Plant, nx: int) -> gym.spaces.Box:
-    """Bounds of the estimates: those of the states, and none of what an observer estimates behind them."""
+    """Bounds of the estimates: those of the states, and infinite ones for further estimates, such as a bias."""
     space, others = plant.state_space, np.full(max(0, nx - plant.system.nx), np.inf, dtype=np.float32)
     low, high = np.concatenate([space.low, -others]), np.concatenate([space.high, others])
     return gym.spaces.Box(low, high, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""A memory around any environment: filtered outputs and actions beside the measured entries, without training."""
+"""A memory around any environment: filtered outputs and actions, beside the measured entries, without training."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ Weights = Sequence[Sequence[float]] | np.ndarray
 
 
 class _Remembering:
-    """A memory between the spaces of an environment, for one of them or a batch; arguments are the wrappers'."""
+    """The memory within both wrappers, for one environment or a batch; its arguments are those of the wrappers."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class _Remembering:
         sizes = (len(low), len(self.inputs.low), self.outputs.pairs)
         how: dict[str, Any] = {"time_constants": time_constants, "input_time_constants": input_time_constants}
         self.memory = Memory(*sizes, **how) if weights is None else PredictiveMemory(*sizes, weights, **how)
-        # As the specification can write it down, once it is known to be what it should.
+        # Checked arguments, in types that the environment's specification can store
         self.arguments: dict[str, Any] = {
             "measured": self.outputs.measured,
             "angles": self.outputs.angles,
@@ -58,77 +58,76 @@ class _Remembering:
             "input_time_constants": self.memory.input_time_constants,
         }
         unbounded, keys = np.full(self.memory.size - len(low), np.inf), self.outputs.keys
-        if weights is not None:  # expected outputs may leave all other bounds
+        if weights is not None:  # expected outputs may exceed the bounds of outputs
             high = np.where(np.isin(range(len(low)), self.outputs.pairs), 1.0, np.inf)
             low = -high
         low, high = np.append(low, -unbounded), np.append(high, unbounded)
         self._beside = [] if keys is None else [*self.outputs.unseen, *range(len(self.outputs.low), self.memory.size)]
         if keys is not None:
             if weights is not None or "memory" in keys:
-                raise ValueError(f"{source}: weights, and a key that is named memory, need entries, measured=[0, 1]")
+                raise ValueError(f"{source}: weights, and a key named memory, need measured=[0, 1], indices of entries")
             low, high = low[self._beside], high[self._beside]
-        with np.errstate(over="ignore"):  # what floats cannot hold is unbounded
+        with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
             flat = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
         self.space: gym.Space[Any] = flat if keys is None else spaces.Dict(keys | {"memory": flat})
 
     def read(self, obs: Any, batch: tuple[int, ...] = (), before: np.ndarray | None = None) -> np.ndarray:
-        """Read the measured entries; the last value replaces a NaN that is held. Shapes: returns (*batch, entries)."""
+        """Read the measured entries; with "hold", ``before`` replaces NaN. Shapes: returns (*batch, entries)."""
         flat = self.outputs.flat(obs, batch)
         return np.where(np.isnan(flat), before, flat) if self._hold and before is not None else flat
 
     def show(self, obs: Any, flat: np.ndarray, shown: np.ndarray) -> Any:
-        """The observation: what the memory shows, beside the keys of a Dict."""
+        """The observation: the memory's row, or the keys of a Dict with the memory beside them."""
         return self.outputs.kept(obs, flat) | {"memory": shown[..., self._beside]} if self._beside else shown
 
 
 class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Shows the measured entries and a memory of them and of the actions, around any environment.
+    """Wraps any environment: an agent then sees the measured entries, and a memory of them and of its actions.
 
-    With it an agent without memory of its own, such as an MLP, can act where part of the state is hidden. The memory is
+    With it an agent without its own memory, such as an MLP, can act where part of the state is hidden. The memory is
     linear, stable and fixed: filters of the outputs and inputs, the linear half of a KKL observer.
 
-    The observation is [y, memory of y, memory of u], float32. y are the entries that are measured. For each of
-    them and each time constant follows what a first-order filter keeps of its changes, 0 where y rests; for each input
-    and time constant a running mean. An angle's cosine and sine have one memory, of how far it has turned. The
-    coordinates are about as large as y once the memory has filled, see :class:`kkl_gym.memory.Memory`. At reset the
-    memory is that of an output at rest and of no action. From the first step on, outputs are taken to have changed
-    before it as they have since, for 64 steps. ``info`` is left alone.
+    The observation is [y, memory of y, memory of u], float32, where y are the measured entries. The memory of y has one
+    number for each entry and time constant: a first-order filter of the entry's changes, 0 where y rests. The memory of
+    u has a running mean for each input and time constant. The cosine and sine of an angle share one memory, of the
+    angle that it has turned. Once the memory has filled, its numbers are about as large as y, see
+    :class:`kkl_gym.memory.Memory`. At reset it assumes that y has rested and that no input has acted. From the first
+    step on, it assumes that y changed in the 64 steps before the reset as it has since. ``info`` is unchanged.
 
-    A Dict stays a Dict: its keys are as before, and ``"memory"`` holds the memory, and cosine and sine of angles.
-    Images are not remembered.
+    A Dict stays a Dict with the same keys; the new key ``"memory"`` holds the memory, and the cosine and sine of
+    angles. Images are not remembered.
 
     Parameters
     ----------
     env : gymnasium.Env
-        Any environment whose observations and actions are boxes, discrete, or Dict and Tuple spaces of these; images
-        only as keys of a Dict.
+        Any environment whose observations and actions are Box or Discrete, or Dict and Tuple spaces of these. Images
+        may only be keys of a Dict.
     measured : sequence of int or of str, optional
-        What the agent may see: keys of a Dict, or indices in the flattened observation, which is then shown flat. None
-        is all.
+        Entries that the agent sees: keys of a Dict, or indices in the flattened observation. With indices the
+        observation is flat. None is all entries.
     angles : sequence of int or of str, or of pairs of these
-        Which of these are angles; each is replaced by its cosine and sine. A pair such as (0, 1) names the cosine and
-        the sine of an angle that is measured by them. An angle is taken to turn by less than half a turn in a step.
+        The measured entries that are angles; each is replaced by its cosine and sine. A pair such as (0, 1) names two
+        entries that are the cosine and the sine of one angle. An angle must turn by less than half a turn in a step.
     period : float, optional
-        A turn of all angles but pairs. None: 360 where the bounds are one or two turns in degrees, 2 pi where they are
-        at most two turns in rad or infinite. It must be given for other bounds, and for those 1, 2 or 4 apart.
+        Length of a turn, for all angles that are not pairs. None: 360 if the bounds are 360 or 720 apart, 2 pi if they
+        are infinite or at most 4 pi apart. It is required for other bounds, and for bounds 1, 2 or 4 apart.
     missing : {"error", "hold"}
-        How to treat NaN among the measured entries: an error, or the value before. The first sample must be whole.
+        Treatment of NaN among the measured entries: an error, or the last value. The first sample must be complete.
     weights : array_like, optional
-        Under noise: what :meth:`learn_weights` returns. The observation is then [y as expected in the next step,
-        what else predicts y], see :class:`kkl_gym.prediction.PredictiveMemory`.
+        Return value of :meth:`learn_weights`, for noisy outputs. The observation is then [y as expected in the next
+        step, predictions of later y], see :class:`kkl_gym.prediction.PredictiveMemory`.
     time_constants : sequence of float
-        Of the outputs' filters, in steps, from 0.5 to 10,000, each at least 1.5 times the one before. Longer ones
-        remember longer.
+        Time constants of the outputs' filters in steps, from 0.5 to 10,000, each at least 1.5 times the one before.
     input_time_constants : sequence of float
-        Of the filters of actions, in steps, likewise; none leave actions out. Boxes with bounds are scaled to [-1, 1],
-        discrete actions are one-hot.
+        The same for the filters of actions; an empty sequence leaves actions out. Boxes with bounds are scaled to
+        [-1, 1], discrete actions are one-hot.
 
     Raises
     ------
     ValueError
-        If the environment is not a gymnasium.Env, has other spaces or is under ``Autoreset``; if an argument is not as
-        described, or the period of an angle is unknown. At reset and at a step, if something measured is infinite,
-        beyond 1e15, or NaN that is not held, which the memory would keep; at a step, if the action is.
+        If the environment is not a gymnasium.Env, has other spaces or is under ``Autoreset``, if an argument is not as
+        described, or if the period of an angle is unknown. At a reset or step, if a measured entry is infinite, beyond
+        1e15, or NaN without "hold", because the memory would keep it. At a step, if the action is such a value.
 
     Examples
     --------
@@ -166,13 +165,13 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._flat = np.empty(0)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and the memory: the measured entries, with the memory of an output at rest."""
+        """Reset the environment and the memory. Returns the measured entries, with the memory of an output at rest."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._flat = self._of.read(obs)
         return self._of.show(obs, self._flat, self._of.memory.reset(self._of.outputs.of_flat(self._flat))), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment, and remember the action and the entries measured then."""
+        """Step the environment, and update the memory with the action and the new measured entries."""
         u = self._of.inputs(action)
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._flat = self._of.read(obs, before=self._flat)
@@ -180,18 +179,28 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._of.show(obs, self._flat, shown), reward, terminated, truncated, info
 
     def learn_weights(self, steps: int = 4_000, *, seed: int = 0) -> list[list[float]]:
-        """Learn what of the memory predicts the next outputs, from random actions: pass it to wrappers as ``weights``.
+        """Learn from random actions how the memory predicts later outputs.
 
-        All environments of an agent need the same. The environment is reset, with ``seed``.
+        All environments of an agent need the same weights. This method resets the environment.
 
         Parameters
         ----------
         steps : int
-            Steps with random actions; noise or short episodes ask for more.
+            Steps with random actions; more are needed under strong noise or with short episodes.
         seed : int
-            Of the environment and of the actions.
+            Seed of the environment and of the actions.
+
+        Returns
+        -------
+        list of list of float
+            The argument ``weights`` of the wrappers.
+
+        Raises
+        ------
+        ValueError
+            If the episodes have too few samples for the fit.
         """
-        env = KKLMemory(self.env, **self._of.arguments | {"weights": ()})  # of which the features are recorded
+        env = KKLMemory(self.env, **self._of.arguments | {"weights": ()})  # records the features
         memory, actions = cast(PredictiveMemory, env._of.memory), copy.deepcopy(self.action_space)
         actions.seed(seed)
         env.reset(seed=seed)
@@ -209,35 +218,35 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 class KKLVectorMemory(VectorWrapper):
     """:class:`KKLMemory` for vector environments: one batched memory, reset row by row in every autoreset mode.
 
-    Works on Gymnasium's Sync and Async vectors and on environments that are vectors by themselves.
-    ``info["final_obs"]`` holds the last observations with their memory; else ``info`` is left alone. In the mode
-    SAME_STEP, vectors hand out the last observation after the reset: around environments that write into the same array
-    again, put :class:`KKLMemory` into each.
+    It works around Gymnasium's Sync and Async vectors, and around environments that are natively vectors.
+    ``info["final_obs"]`` holds the last observations with their memory; the rest of ``info`` is unchanged. In the mode
+    SAME_STEP, vectors return an episode's last observation after the next reset. If the environments reuse the array of
+    their observations, wrap each in :class:`KKLMemory` instead.
 
     Parameters
     ----------
     env : gymnasium.vector.VectorEnv
         Any vector environment with the spaces that :class:`KKLMemory` takes.
     measured : sequence of int or of str, optional
-        As for :class:`KKLMemory`, of one environment's observation.
+        As for :class:`KKLMemory`; indices count within one environment's observation.
     **arguments
         All other arguments of :class:`KKLMemory`.
 
     Attributes
     ----------
     autoreset_mode : gymnasium.vector.AutoresetMode
-        The environment's.
+        The mode of the environment.
 
     Raises
     ------
     ValueError
-        As :class:`KKLMemory`, and if the environment does not say its autoreset mode.
+        As for :class:`KKLMemory`, and if the environment's metadata has no autoreset mode.
 
     Examples
     --------
     >>> import gymnasium as gym
     >>> from kkl_gym import KKLVectorMemory
-    >>> envs = KKLVectorMemory(gym.make_vec("CartPole-v1", num_envs=64), measured=[0, 2])  # positions alone
+    >>> envs = KKLVectorMemory(gym.make_vec("CartPole-v1", num_envs=64), measured=[0, 2])  # positions only
     >>> obs, info = envs.reset(seed=0)
     >>> obs.shape
     (64, 14)
@@ -275,17 +284,17 @@ class KKLVectorMemory(VectorWrapper):
         return self._of.show(obs, self._flat, memory.shown()), info
 
     def step(self, actions: Any) -> Step:
-        """Step the environments, and remember the actions and the entries measured then."""
+        """Step the environments, and update the memories with the actions and the new measured entries."""
         batch, of, memory, before = (self.num_envs,), self._of, self._of.memory, self._ended
         u = of.inputs(actions, batch)
         obs, reward, terminated, truncated, info = self.env.step(actions)
         ended, same = terminated | truncated, self.autoreset_mode is AutoresetMode.SAME_STEP
-        resting = self.autoreset_mode is AutoresetMode.DISABLED  # rows that have ended wait for their reset
+        resting = self.autoreset_mode is AutoresetMode.DISABLED  # ended rows wait for a reset
         fresh = ended if same else before & (not resting)
         last, flat = self._flat, of.read(obs, batch, np.where(fresh[:, None], np.nan, self._flat))
         self._flat, self._ended = flat, ended & (not same)
         y = of.outputs.of_flat(flat)
-        if same and ended.any():  # the last outputs of these episodes come first, then the first ones of the next
+        if same and ended.any():  # first the last outputs of these episodes, then the first outputs of the next
             rows, final, ends = np.flatnonzero(ended), np.full(self.num_envs, None, dtype=object), flat.copy()
             for row in rows:
                 ends[row] = of.read(info["final_obs"][row], before=last[row])

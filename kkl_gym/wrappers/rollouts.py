@@ -1,4 +1,4 @@
-"""Observers that were learned from rollouts, inside the environment that these are of."""
+"""Observers that were learned from rollouts, inside the environment of these rollouts."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from observers.checks import choice, flag
 
 
 class NamedEstimator(KKLEstimator):
-    """An observer from rollouts, which shows the measured outputs beside its estimates."""
+    """An observer from rollouts; its observations hold the measured outputs beside its estimates."""
 
     def __init__(
         self,
@@ -42,18 +42,18 @@ class NamedEstimator(KKLEstimator):
         if uncertainty:
             low, high = with_deviations(low, high)
         low, high = np.concatenate([measured.low, low]), np.concatenate([measured.high, high])
-        with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
+        with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
             space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
         super().__init__(artifact, space, estimate=estimate, uncertainty=uncertainty, **how)
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past and take in the first samples; see :class:`KKLEstimator`."""
+        """Begin an episode with its first samples; see :class:`KKLEstimator`."""
         self._check_start(x0)
         super().reset(y0, x0)
         self._y, self._held = y0.copy(), y0.copy()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Forget the past in some rows; see :class:`KKLEstimator`."""
+        """Begin episodes in some rows; see :class:`KKLEstimator`."""
         self._check_start(x0)
         super().restart(y0, rows, x0)
         self._y[rows] = self._held[rows] = y0
@@ -65,29 +65,29 @@ class NamedEstimator(KKLEstimator):
             raise ValueError(f"known_start: the environment does not show {hidden} at its reset; leave known_start out")
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in samples and the inputs that led to them; see :class:`KKLEstimator`."""
+        """Process samples and the inputs that led to them; see :class:`KKLEstimator`."""
         super().advance(y, u, rows)
         self._y = y.copy() if rows is None else np.where(rows[..., None], y, self._y)
         self._held = np.where(np.isnan(self._y), self._held, self._y)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains: as :class:`KKLEstimator`, and ``y``, the measured outputs, NaN where missing."""
+        """The entries to add to ``info``: those of :class:`KKLEstimator`, and the measured ``y``, NaN where missing."""
         return super().report(rows) | {"y": self._y.copy() if rows is None else self._y[rows]}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What of a report is the observation: y, its last value where it is missing, then x_hat or z."""
+        """The observation from a report: y, with its last value where it is missing, then x_hat or z."""
         y = report["y"]
-        if np.isnan(y).any():  # not in rows that have been restarted, whose first sample is whole
+        if np.isnan(y).any():  # never in restarted rows, whose first sample is complete
             y = np.where(np.isnan(y), self._held, y)
         return np.concatenate([y, super().shown(report)], axis=-1)
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
-        """The same of a single sample."""
+        """The same for a single sample."""
         return [*self._held.tolist(), *super().listed(report)]
 
 
 class Samples:
-    """What an observer from rollouts sees of an environment."""
+    """The signals that an observer from rollouts reads from an environment."""
 
     def __init__(
         self, artifact: Artifact, observation_space: gym.Space[Any], action_space: gym.Space[Any], *, source: str
@@ -101,15 +101,15 @@ class Samples:
         self.count = 0
 
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs after a reset, and the hidden signals, NaN if not shown; ``info`` gains the keys of our own."""
+        """Outputs and hidden signals after a reset, NaN if not shown; adds the keys of a KKLEnv to ``info``."""
         self.count = 0
         y, x = self.outputs(observation, info), self.states(observation, info)
-        info.pop("x", None)  # whatever else the environment calls so
+        info.pop("x", None)  # the environment's own key may mean something else
         info |= x | {"sample": np.array(0)}
         return y, x.get("x", self._nothing)
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs after a step, and the inputs that led to them; ``info`` gains the keys of our own."""
+        """Outputs after a step and the inputs that led to them; adds the keys of a KKLEnv to ``info``."""
         y, u = self.outputs(observation, info), self.inputs(action)
         x = self.states(observation, info)
         info.pop("x", None)
@@ -117,17 +117,17 @@ class Samples:
         return y, u
 
     def states(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> dict[str, np.ndarray]:
-        """True hidden signals."""
+        """The true hidden signals as ``{"x": ...}``; empty if the environment does not show them."""
         if self.hidden is None:
             return {}
         try:
             return {"x": self.hidden(observation, info, batch)}
-        except ValueError:  # a wrapper inside has blanked them, or info does not hold them at this step
+        except ValueError:  # a wrapper inside blanks them, or info lacks them at this step
             return {}
 
 
 def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) -> Reader | None:
-    """What reads the hidden signals, which observations need not show."""
+    """The reader of the hidden signals, or None if the environment does not show them."""
     try:
         return Reader(space, resolved(names, space, role="hidden", source=source), source=source)
     except ValueError:
@@ -135,7 +135,7 @@ def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) 
 
 
 def _check_actions(env: Any, space: gym.Space[Any]) -> None:
-    """Raise ValueError if a wrapper inside makes other inputs of actions, as ClipAction's are not bounded."""
+    """Raise ValueError if a wrapper inside changes the scale of actions, as ClipAction does, whose box is unbounded."""
     base, source = env.unwrapped, source_of(env)
     own = base.single_action_space if isinstance(base, gym.vector.VectorEnv) else base.action_space
     here, there = (Inputs(one, source=source) for one in (space, own))
@@ -147,7 +147,7 @@ def _check_actions(env: Any, space: gym.Space[Any]) -> None:
 
 
 def _bounds(artifact: Artifact, space: gym.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the hidden signals, as the observation has them; infinite where it does not show them."""
+    """Bounds of the hidden signals from the observation space; infinite if they are not in it."""
     low, high = np.full(artifact.nx, -np.inf), np.full(artifact.nx, np.inf)
     there = observed(space)
     for i, name in enumerate((artifact.signals or {})["hidden"]):

@@ -1,4 +1,4 @@
-"""Wrappers: a learned observer inside the environment, and an agent that acts more slowly than it samples."""
+"""Wrappers: a learned observer inside an environment, and actions that are held over several steps."""
 
 import os
 from collections import deque
@@ -18,15 +18,15 @@ from observers import Artifact
 from observers.checks import choice, flag, integer, shown
 from observers.names import resolve
 
-_FEW = 8  # numbers that are compared one by one more quickly than NumPy clips them
+_FEW = 8  # up to so many numbers, a comparison one by one is faster than np.clip
 _FLOAT32 = np.dtype(np.float32)
 
 
 class _SystemSamples:
-    """Samples of environments of systems, which their ``info`` holds and numbers."""
+    """Reads the samples of a :class:`KKLEnv` from its ``info``."""
 
     def __init__(self, env: Any) -> None:
-        self.count = 0  # of the sample that the observer has seen last
+        self.count = 0  # number of the last sample that the observer has seen
         self._env = self._inside = env
         while not isinstance(self._inside, KKLEnv | KKLObservation):
             self._inside = self._inside.env
@@ -42,7 +42,7 @@ class _SystemSamples:
         sample = int(info["sample"])
         if sample != self.count + 1:
             raise ValueError(
-                f"the observer was to see sample {self.count + 1} and was shown sample {sample}: put "
+                f"the observer expected sample {self.count + 1} and received sample {sample}: put "
                 "wrappers that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation, and "
                 "reset after an error"
             )
@@ -51,70 +51,69 @@ class _SystemSamples:
 
 
 class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
-    """Shows a learned observer's estimate in place of the state.
+    """Wraps an environment: an agent then sees a learned observer's estimate in place of the state.
 
-    Around an environment of ours the observer sees only ``info["y"]``, which the environment's ``sensor`` makes, and
-    the input ``info["u"]`` that the environment applied. ``info`` gains ``z``, the filter's state, and with
-    ``estimate="x"`` ``x_hat``, shape (nx,), both float64 and not clipped. With ``monitor`` it gains ``score`` too, an
-    array of shape (), above 1 where the samples do not fit the estimates (a faulty sensor, states that the map was not
-    made for).
+    Around a :class:`KKLEnv` the observer sees only the sensor's output ``info["y"]`` and the input ``info["u"]`` that
+    the environment applied. ``info`` gains ``z``, the filter's state, and with ``estimate="x"`` also ``x_hat``, shape
+    (nx,). Both are float64 and not clipped. With ``monitor`` it gains ``score``, an array of shape (). The score is
+    above 1 where the samples do not fit the estimates, as with a faulty sensor or far outside the map's training.
 
-    With ``estimate="z"`` the network is not evaluated, and nothing tracks, unless there is a monitor or the start is
-    known. There is then no ``x_hat``, and :meth:`render` shows no estimate.
+    With ``estimate="z"`` neither the network nor the tracking runs, unless there is a monitor or the start is known.
+    There is then no ``x_hat``, and :meth:`render` shows no estimate.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
-    ``training.learn``). That one sees the signals of the observation that its file names, and the actions. The
-    observation is then [y, x_hat] or [y, z]: the measured outputs, and the estimates beside them. ``info`` gains ``y``
-    as well, ``u``, the inputs that led to it, and the number of the ``sample`` since the reset. It also gains ``x``,
-    shape (nx,), the true hidden signals, where the environment inside shows them. That is privileged: it is for
-    evaluation and for ``training.KKLTrainingCallback``.
+    ``training.learn``). Such an observer sees the actions, and the signals of the observation that its file names. The
+    observation is then [y, x_hat] or [y, z]: the measured outputs, then the estimates. ``info`` also gains ``y``, the
+    inputs ``u`` that led to it, and the number of the ``sample`` since the reset. It gains ``x``, shape (nx,), the true
+    hidden signals, where the environment inside shows them. ``x`` is privileged: it serves evaluation and
+    ``training.KKLTrainingCallback``.
 
     Parameters
     ----------
     env : gymnasium.Env
-        A :class:`KKLEnv`, bare or under wrappers that leave observations and ``info`` alone; or the environment that
-        the observer's file names, under wrappers that leave its measured signals, its actions and its steps alone.
+        A :class:`KKLEnv`, bare or under wrappers that do not change observations and ``info``; or the environment that
+        the observer's file names, under wrappers that do not change its measured signals, its actions and its steps.
     observer : str or path, optional
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the environment's
         system.
     estimate : {"x", "z"}
-        "x" shows the state estimate, clipped to the system's declared bounds. "z" shows the filter's state
+        The observation: "x" is the state estimate, clipped to the system's declared bounds, "z" the filter's state
         [z_y, z_u].
     measurement_noise : float or sequence of float, length ny, optional
-        The noise level that the observer assumes, of all outputs or each; None takes the environment's, or none where
-        it is not ours. (Process noise is always taken from the environment, by maps that ask for it.)
+        The noise level that the observer assumes, one for all outputs or one for each. None takes the level of a
+        :class:`KKLEnv`, and no level around other environments. Maps that need a level of process noise always take the
+        environment's.
     ignore_input : bool
-        Whether to use a map that knows no inputs (the paper's) although the agent acts.
+        Whether to use a map without inputs, such as the paper's, although the agent acts.
     monitor : bool
-        Whether to keep the score, see :attr:`observers.KKLObserver.score`.
+        Whether to compute the score, see :attr:`observers.KKLObserver.score`.
     known_start : bool
-        Whether the observer takes the true state ``info["x"]`` at reset, and only there. It then has no transient.
-        Maps that track can use it, as the default ones, and those with a forward map T, ``observer="SYSTEM-spinn"``.
+        Whether the observer is given the true state ``info["x"]`` at reset, and only there. It then has no transient.
+        This needs a map that tracks, such as the default ones, or a forward map T, as in ``observer="SYSTEM-spinn"``.
     uncertainty : bool
-        Whether the observation is [x_hat, std], with the standard deviation of each state's error behind the estimate.
-        ``info`` gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). It needs a map with a covariance,
-        as ``kkl-gym train`` makes them.
+        Whether the observation is [x_hat, std], where std are the standard deviations of the estimation error.
+        ``info`` then gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). This needs a map with a covariance,
+        such as ``kkl-gym train`` makes.
     compiled : bool, optional
-        Whether Numba compiles the observer's step, as :class:`observers.KKLObserver` has it; None: where installed.
+        Whether Numba compiles the observer's step, as in :class:`observers.KKLObserver`. None: if Numba is installed.
 
     Attributes
     ----------
     observer : KKLObserver
         The observer.
     estimate : str
-        As given.
+        The argument ``estimate``.
 
     Raises
     ------
     ValueError
-        If the environment is not one of ours and the observer not from its rollouts, ``estimate`` is unknown, a flag is
-        no bool, no map ships for the system, or the noise level is beyond the map's range. At a step, if the agent acts
-        on a map that knows no inputs and ``ignore_input`` is false, or a wrapper inside hides samples from the
-        observer. At a reset and at a step, if a wrapper inside changes observations, which would not reach the
-        observer.
+        If the environment is not a :class:`KKLEnv` and the observer is not from its rollouts, ``estimate`` is unknown,
+        a flag is not a bool, no map ships for the system, or the noise level is beyond the map's range. At a step, if
+        the agent acts on a map without inputs and ``ignore_input`` is false, or if a wrapper inside skips samples. At a
+        reset or step, if a wrapper inside changes observations: the observer would not see the change.
     observers.ArtifactError
-        If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
-        forward map or motion and ``known_start`` is asked for, or no covariance and ``uncertainty``: a ValueError.
+        If the file is missing or damaged, or was made for another system, other parameters or another dt. If it lacks
+        the forward map or motion for ``known_start``, or the covariance for ``uncertainty``. It is a ValueError.
 
     Examples
     --------
@@ -148,7 +147,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 f"KKLObservation needs a gymnasium.Env (for vectors: KKLVectorObservation), got {shown(env)}"
             )
         base, artifact = env.unwrapped, None if observer is None else Artifact.read(resolve(observer))
-        # As the specification can write it down, once it is known to be what it should.
+        # Checked arguments, in types that the environment's specification can store
         how: dict[str, Any] = {
             "estimate": choice("estimate", estimate, ("x", "z")),
             "measurement_noise": measurement_noise,
@@ -179,9 +178,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self._estimator, self._samples = estimator, samples
         self.observer = self._estimator.observer
         self.estimate = estimate
-        self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # of estimates
-        self._rendering = env.render_mode is not None  # which every wrapper inside would be asked for at each step
-        self._draws = 0  # which of the observers around one environment it is; the outermost draws the window
+        self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # estimates
+        self._rendering = env.render_mode is not None  # stored, because reading it passes through every wrapper
+        self._draws = 0  # number of this observer among those around the environment; the outermost draws
         if isinstance(base, KKLEnv):
             base.drawn_by += 1
             self._draws = base.drawn_by
@@ -191,24 +190,24 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Reset the environment, and the observer to its first sample; the first estimate."""
+        """Reset the environment, and start the observer at its first sample. Returns the first estimate."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._trail.clear()
         self._estimator.reset(*self._samples.first(obs, info))
         return self._show(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Step the environment, and the observer with the new sample and the input that led to it."""
+        """Step the environment, and update the observer with the new sample and the input that led to it."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._estimator.advance(*self._samples.next(obs, info, action))
         self._samples.count += 1
         return self._show(info), float(reward), terminated, truncated, info
 
     def replace_observer(self, observer: str | os.PathLike[str] | Artifact) -> None:
-        """Take the maps of another observer with the same filter, at once: the filter's state stays.
+        """Use the maps of another observer with the same filter from now on. The filter's state stays.
 
-        The specification ``env.spec`` still names the observer that the wrapper was made with. Vectors of
-        stable-baselines3 take it by ``env_method("replace_observer", artifact)``.
+        The specification ``env.spec`` still names the observer with which the wrapper was made. In vectors of
+        stable-baselines3, call ``env_method("replace_observer", artifact)``.
 
         Parameters
         ----------
@@ -218,14 +217,14 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Raises
         ------
         ValueError
-            If the noise level is beyond its range, or it holds no limits and there is a monitor.
+            If the noise level is beyond the new maps' range, or they have no limits for the monitor in use.
         observers.ArtifactError
-            If it differs in more than its maps (A, B, dt, signals), or the file is missing or damaged.
+            If A, B, dt or the signals differ, or the file is missing or damaged.
         """
         self._estimator.replace(observer)
 
     def render(self) -> np.ndarray | None:
-        """Draw the phase portrait with states and estimates so far; other environments draw what they draw."""
+        """Draw the phase portrait with states and estimates so far; other environments render as without observer."""
         base = self.unwrapped
         return base.draw(self._trail) if isinstance(base, KKLEnv) else self.env.render()  # type: ignore[return-value]
 
@@ -236,7 +235,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             self._trail.append(report["x_hat"].tolist())
         if self._rendering and self.render_mode == "human":
             base = self.unwrapped
-            if isinstance(base, KKLEnv) and base.drawn_by == self._draws:  # and no observer further out
+            if isinstance(base, KKLEnv) and base.drawn_by == self._draws:  # the outermost observer
                 base.animate(self._trail)
         if len(self._low) <= _FEW:
             values = self._estimator.listed(report)
@@ -248,26 +247,26 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         return self._emit(observation(self._estimator.shown(report), self._estimator.space))
 
     def _emit(self, obs: np.ndarray) -> np.ndarray:
-        self.emitted = obs.tobytes()  # as another observer around this one compares what reaches it
+        self.emitted = obs.tobytes()  # an observer outside compares it with the one that it receives
         return obs
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
     """Holds each action for ``repeat`` steps and sums their rewards; put it outside :class:`KKLObservation`.
 
-    The observer then sees every sample while the agent acts more slowly. Stops early where the episode ends.
+    The observer then sees every sample, while the agent acts more slowly. The repeat stops early if the episode ends.
 
     Parameters
     ----------
     env : gymnasium.Env
         The environment.
     repeat : int
-        How many steps an action is held.
+        Number of steps for which an action is held.
 
     Raises
     ------
     ValueError
-        Unless ``env`` is an environment and ``repeat`` a positive integer.
+        If ``env`` is not a gymnasium.Env, or ``repeat`` not a positive integer.
 
     Examples
     --------
@@ -287,11 +286,11 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
         RecordConstructorArgs.__init__(self, repeat=repeat)
         gym.Wrapper.__init__(self, env)
         self.repeat = repeat
-        frames = env.metadata.get("render_fps", 30)  # a second, as Gymnasium assumes
+        frames = env.metadata.get("render_fps", 30)  # frames a second; 30 is Gymnasium's default
         self.metadata = {**env.metadata, "render_fps": max(1, round(frames / repeat))}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold an action for ``repeat`` steps; all but the sum of rewards is of the last of them."""
+        """Hold an action for ``repeat`` steps. Returns the sum of their rewards, and all else from the last step."""
         total = 0.0
         for _ in range(self.repeat):
             obs, reward, terminated, truncated, info = self.env.step(action)

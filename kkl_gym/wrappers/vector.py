@@ -1,4 +1,4 @@
-"""Wrappers for vector environments: a batched learned observer, and agents that act more slowly than they sample."""
+"""Wrappers for vector environments: a batched learned observer, and actions that are held over several steps."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -22,16 +22,16 @@ from observers.names import resolve
 VectorEnv = gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
 if TYPE_CHECKING:
     VectorWrapper = gym.vector.VectorWrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-else:  # no generic class before gymnasium 1.4
+else:  # before gymnasium 1.4 the class is not generic
     VectorWrapper = gym.vector.VectorWrapper
 Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]
 
 
 class VectorEstimate(VectorWrapper):
-    """Shows what a batch of observers makes of ``info["y"]`` and ``info["u"]``, in every autoreset mode.
+    """Observations are the estimates of a batch of observers from ``info["y"]`` and ``info["u"]``.
 
-    ``info`` gains what the observers report, a row for each environment; so does ``info["final_info"]``, and
-    ``info["final_obs"]`` holds the last estimates.
+    In every autoreset mode, ``info`` and ``info["final_info"]`` gain the observers' reports, with a row for each
+    environment, and ``info["final_obs"]`` holds the last estimates.
     """
 
     def __init__(self, env: VectorEnv, estimator: Estimates | KKLEstimator) -> None:
@@ -42,13 +42,13 @@ class VectorEstimate(VectorWrapper):
         self.observation_space: gym.spaces.Box = batch_space(estimator.space, env.num_envs)  # type: ignore[assignment]
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._sample = np.zeros(env.num_envs, dtype=np.int64)
-        self.emitted = b""  # the last observations, as of environments
-        # What emits the observations; None if that are environments in a Sync or Async vector.
+        self.emitted = b""  # the last observations, as in KKLVectorEnv
+        # The environment or observer that emits the observations; None for a Sync or Async vector.
         self._inside: Any = None if isinstance(env, _Telling) else env
         while self._inside is not None and not isinstance(self._inside, KKLVectorEnv | VectorEstimate):
             self._inside = getattr(self._inside, "env", None)
         rendering = isinstance(env.unwrapped, KKLVectorEnv) and env.render_mode is not None
-        self._trails = Trails(env.num_envs) if rendering else None  # of estimates
+        self._trails = Trails(env.num_envs) if rendering else None  # estimates
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -73,7 +73,7 @@ class VectorEstimate(VectorWrapper):
         return obs, info
 
     def step(self, actions: np.ndarray) -> Step:
-        """Step the environments, and the observers with the new samples and the inputs that led to them."""
+        """Step the environments, and update the observers with the new samples and the inputs that led to them."""
         inner, reward, terminated, truncated, info = self.env.step(actions)
         self._check_untouched(inner)
         before, ended = self._ended, terminated | truncated
@@ -85,7 +85,7 @@ class VectorEstimate(VectorWrapper):
         disabled = self.autoreset_mode is AutoresetMode.DISABLED
         expected = self._sample + 1
         over = bool(before.any())
-        if over:  # rows that this step has reset, or that stay at their end
+        if over:  # rows that were reset in this step, or stay at their end
             expected[before] = self._sample[before] if disabled else 0
         self._check(expected, info["sample"], before)
         if over and disabled:
@@ -100,7 +100,7 @@ class VectorEstimate(VectorWrapper):
         return obs, reward, terminated, truncated, info
 
     def _show_and_restart(self, info: Infos, ended: np.ndarray) -> np.ndarray:
-        """SAME_STEP: the last samples of the episodes that ended come first, then the first ones of the next."""
+        """In SAME_STEP, process the last samples of the episodes that ended, and then the first ones of the next."""
         final = info["final_info"]
         expected = self._sample + 1
         self._check(expected, np.where(ended, final["sample"], info["sample"]), np.zeros_like(ended))
@@ -124,8 +124,8 @@ class VectorEstimate(VectorWrapper):
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw the phase portrait of each row with states and estimates so far.
 
-        Estimates are drawn on :class:`kkl_gym.KKLVectorEnv`, where the observers report ``x_hat``. For Sync and Async
-        vectors put :class:`kkl_gym.KKLObservation` into each environment.
+        Estimates are drawn around a :class:`kkl_gym.KKLVectorEnv`, if the observers report ``x_hat``. For Sync and
+        Async vectors put :class:`kkl_gym.KKLObservation` into each environment.
         """
         env: Any = self.env
         return env.render() if self._trails is None else env.unwrapped.draw(self._trails)
@@ -140,13 +140,13 @@ class VectorEstimate(VectorWrapper):
             if ended[row]:
                 raise ValueError(f"the episode of environment {row} has ended: reset it before the next step")
             raise ValueError(
-                f"the observer was to see sample {expected[row]} of environment {row} and was shown {seen[row]}: put "
+                f"the observer expected sample {expected[row]} of environment {row} and received {seen[row]}: put "
                 "wrappers that skip steps, such as VectorActionRepeat, outside KKLVectorObservation, and reset after "
                 "an error"
             )
 
     def _check_untouched(self, obs: Any, *, at_reset: bool = False) -> None:
-        """Raise ValueError if a wrapper inside changes observations; Sync and Async vectors say at resets only."""
+        """Raise ValueError if a wrapper inside changes observations; Sync and Async vectors show it only at resets."""
         if self._inside is not None:
             check_untouched(obs, self._inside.emitted, self.env, self._inside)
         elif at_reset and not isinstance(self.env, _Telling):
@@ -154,7 +154,7 @@ class VectorEstimate(VectorWrapper):
             check_untouched(obs, b"".join(base.get_attr("emitted")), self.env, base)
 
     def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
-        """Add the observers' report to ``info``, for ``rows``; returns the observations of all."""
+        """Add the observers' report to ``info`` for ``rows``. Returns the observations of all rows."""
         report = self._estimator.report()
         for key, values in report.items():
             info |= {key: values, f"_{key}": rows.copy()}
@@ -164,14 +164,14 @@ class VectorEstimate(VectorWrapper):
 
 
 class _Telling(VectorWrapper):
-    """Lets any vector environment say of its signals what ours say in ``info``: y, u, and the number of the sample."""
+    """Adds the keys of a KKLVectorEnv to the ``info`` of any vector environment: y, u, sample and, if shown, x."""
 
     def __init__(self, env: VectorEnv, samples: Samples) -> None:
         super().__init__(env)
         self._mode, self._read, n = autoreset_mode_in(env), samples, env.num_envs
         if samples.outputs.keys:
             raise ValueError(
-                f"the observer measures info[{samples.outputs.keys[0]}], which vectors do not say at each step: put "
+                f"the observer measures info[{samples.outputs.keys[0]}], which vectors do not report at each step: put "
                 "KKLObservation into each environment"
             )
         self._asked = () if samples.hidden is None else samples.hidden.keys
@@ -183,7 +183,7 @@ class _Telling(VectorWrapper):
         options, mask = with_mask(options, self.num_envs)
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         if not isinstance(info, dict):
-            return obs, info  # which the observers reject with a reason
+            return obs, info  # the observers raise an error that names the cause
         self._ended, self._count = self._ended & ~mask, np.where(mask, 0, self._count)
         signals = {"y": self._read.outputs(obs, info, (self.num_envs,)), "sample": self._count.copy()}
         signals |= self._states(obs, info)
@@ -217,59 +217,59 @@ class _Telling(VectorWrapper):
         return obs, reward, terminated, truncated, info | signals
 
     def _states(self, obs: Any, info: Infos) -> dict[str, np.ndarray]:
-        """True hidden signals and of which rows they are, where they are shown."""
+        """The true hidden signals, and a mask of the rows that show them; empty if none does."""
         found = self._read.states(obs, info, (self.num_envs,))
         if found:
             known = np.ones(self.num_envs, dtype=bool)
             for key in self._asked:
                 known &= info.get(f"_{key}", True)
             found = {"x": np.where(known[:, None], found["x"], np.nan), "_x": known}
-        for key in ("x", "_x"):  # whatever else the environment calls so
+        for key in ("x", "_x"):  # the environment's own keys may mean something else
             info.pop(key, None)
         return found
 
 
 def _states(info: Infos, rows: np.ndarray) -> np.ndarray:
-    """True states in some rows, as far as ``info`` holds them."""
+    """True states in some rows; without columns if ``info`` does not hold them."""
     return info["x"][rows] if "x" in info else np.full((int(rows.sum()), 0), np.nan)
 
 
 class KKLVectorObservation(VectorEstimate):
     """:class:`kkl_gym.KKLObservation` for vector environments: one batched observer, reset row by row.
 
-    Works on the package's vector environments and on Gymnasium's Sync and Async ones over the package's environments,
-    in every autoreset mode. Around vectors of another environment it needs an observer from rollouts of that, and shows
-    the measured outputs beside the estimates, as :class:`kkl_gym.KKLObservation` does.
+    It works around :class:`kkl_gym.KKLVectorEnv`, and around Gymnasium's Sync and Async vectors of
+    :class:`kkl_gym.KKLEnv`, in every autoreset mode. Vectors of another environment need an observer from its rollouts.
+    Observations then hold the measured outputs beside the estimates, as in :class:`kkl_gym.KKLObservation`.
 
-    ``info`` gains ``z``, with ``estimate="x"`` ``x_hat``, and with ``monitor`` ``score``, a row for each environment;
-    so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates. Around another environment it
-    gains ``y``, ``u``, ``sample`` and ``x`` as well, as there.
+    ``info`` and ``info["final_info"]`` gain ``z``, with ``estimate="x"`` also ``x_hat``, and with ``monitor`` also
+    ``score``, each with a row for each environment. ``info["final_obs"]`` holds the last estimates. Around vectors of
+    another environment ``info`` also gains ``y``, ``u``, ``sample`` and ``x``.
 
     Parameters
     ----------
     env : gymnasium.vector.VectorEnv
-        A vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave observations and ``info``
-        alone, or over the environment that the observer's file names.
+        A vector of :class:`kkl_gym.KKLEnv`, bare or under wrappers that do not change observations and ``info``, or a
+        vector of the environment that the observer's file names.
     observer : str or path, optional
         As for :class:`kkl_gym.KKLObservation`.
     **options
-        All other arguments of :class:`kkl_gym.KKLObservation`; starts that are known are those of each row's episodes.
-        ``info["x_cov"]`` has the shape (num_envs, nx, nx).
+        All other arguments of :class:`kkl_gym.KKLObservation`. With ``known_start`` the observer is given the start of
+        every episode in each row. ``info["x_cov"]`` has the shape (num_envs, nx, nx).
 
     Attributes
     ----------
     observer : KKLObserver
         The observer of all rows.
     estimate : str
-        As given.
+        The argument ``estimate``.
     autoreset_mode : gymnasium.vector.AutoresetMode
-        The environment's.
+        The mode of the environment.
 
     Raises
     ------
     ValueError
-        As :class:`kkl_gym.KKLObservation`, and if the environments of a Sync or Async vector differ in what the
-        observer must know (process noise only if the map asks for it).
+        As for :class:`kkl_gym.KKLObservation`, and if the environments of a Sync or Async vector differ in a setting
+        that the observer needs; the level of process noise counts only if the map takes it.
 
     Examples
     --------
@@ -299,15 +299,15 @@ class KKLVectorObservation(VectorEstimate):
         self.estimate = estimator.estimate
 
     def replace_observer(self, observer: str | os.PathLike[str] | Artifact) -> None:
-        """As :meth:`kkl_gym.KKLObservation.replace_observer`, in all rows at once: the filters' states stay."""
+        """Like :meth:`kkl_gym.KKLObservation.replace_observer`, in all rows at once. The filters' states stay."""
         asked = self._estimator.asked(observer)
-        if self.observer.artifact.environment is None:  # the vector is of environments of ours
+        if self.observer.artifact.environment is None:  # a vector of KKLEnv
             _check_process_noise(self.env, asked)
         self.observer.replace(asked)
 
 
 def _check_process_noise(env: gym.vector.VectorEnv, artifact: Artifact) -> None:
-    """ValueError if the rows differ in a level of noise that the observer assumes for all of them."""
+    """Raise ValueError if the rows differ in the level of process noise that the observer assumes for all."""
     if artifact.process_noise_max is not None or artifact.motion is not None:
         plant_of(env, "process_noise")
 
@@ -315,23 +315,23 @@ def _check_process_noise(env: gym.vector.VectorEnv, artifact: Artifact) -> None:
 class VectorActionRepeat(VectorWrapper):
     """:class:`kkl_gym.ActionRepeat` for :class:`kkl_gym.KKLVectorEnv`, bare or under :class:`KKLVectorObservation`.
 
-    Holds each action for ``repeat`` steps and sums the rewards. A row whose episode ends on the way stays at its end
-    for the rest of the repeat, so that its next episode begins with an action of its own. The environment inside must
-    therefore leave resets to this wrapper (``autoreset_mode="Disabled"``), which then offers every mode.
+    It holds each action for ``repeat`` steps and sums the rewards. If a row's episode ends on the way, the row stays at
+    its end for the rest of the repeat, so that its next episode begins with its own action. Therefore the environment
+    inside must leave resets to this wrapper (``autoreset_mode="Disabled"``). The wrapper itself offers every mode.
 
     Parameters
     ----------
     env : gymnasium.vector.VectorEnv
         The vector environment, with ``autoreset_mode`` DISABLED.
     repeat : int
-        How many steps an action is held.
+        Number of steps for which an action is held.
     autoreset_mode : str or gymnasium.vector.AutoresetMode
         The mode that this wrapper offers.
 
     Raises
     ------
     ValueError
-        If ``repeat`` is not a positive integer, the mode is unknown, or the environment is another or resets by itself.
+        If ``repeat`` is not a positive integer, the mode is unknown, or the environment is not as described.
 
     Examples
     --------
@@ -373,8 +373,8 @@ class VectorActionRepeat(VectorWrapper):
         return obs, info
 
     def step(self, actions: np.ndarray) -> Step:
-        """Hold actions for ``repeat`` steps; rewards are sums over each row's steps, the rest is of its last one."""
-        waiting = self._ended  # since an earlier step; they stay as they are in this one
+        """Hold actions for ``repeat`` steps. Returns each row's sum of rewards, and all else from its last step."""
+        waiting = self._ended  # rows that ended in an earlier step and stay unchanged in this one
         total, info = np.zeros(self.num_envs), Infos()
         for _ in range(self.repeat):
             obs, reward, terminated, truncated, new = self.env.step(actions)
@@ -396,7 +396,7 @@ class VectorActionRepeat(VectorWrapper):
 
 
 def _merged(old: Infos, new: Infos) -> Infos:
-    """What ``new`` reports, and ``old`` where ``new`` reports nothing."""
+    """The entries of ``new``, and those of ``old`` in rows where ``new`` has none."""
     out = dict(old)
     for key, mask in new.items():
         if key.startswith("_") and key[1:] in new:
@@ -409,23 +409,23 @@ def _merged(old: Infos, new: Infos) -> Infos:
 
 
 def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Shape a mask over rows to go with values. Shapes: ``mask`` (n,), ``values`` (n, ...); returns (n, 1, ...)."""
+    """Reshape a mask to broadcast against values. Shapes: ``mask`` (n,), ``values`` (n, ...); returns (n, 1, ...)."""
     return mask.reshape(-1, *(1,) * (values.ndim - 1))
 
 
 def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
-    """The autoreset mode in the metadata of a vector environment, or ValueError if that has no mode."""
+    """The autoreset mode in the metadata of a vector environment, or ValueError without one."""
     mode = env.metadata.get("autoreset_mode")
     if not isinstance(mode, AutoresetMode):
         raise ValueError(
-            f"{env} does not say its autoreset mode: metadata['autoreset_mode'] is {mode!r}; "
+            f"{env} does not declare its autoreset mode: metadata['autoreset_mode'] is {mode!r}; "
             "set it to one of gymnasium.vector.AutoresetMode"
         )
     return mode
 
 
 def plant_of(env: VectorEnv, *also: str) -> Plant:
-    """What the rows of a vector environment have in common."""
+    """The plant that all rows of a vector environment share; ValueError if they differ in it or in ``also``."""
     base: Any = env.unwrapped if isinstance(env, gym.vector.VectorEnv) else env
     if isinstance(base, KKLVectorEnv):
         return base.plant

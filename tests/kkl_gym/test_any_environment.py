@@ -203,7 +203,7 @@ def test_vectors_that_are_refused(saved):
     with pytest.raises(ValueError, match="KKLVectorMemory"):
         KKLVectorObservation(gym.make_vec("CartPole-v1", num_envs=2))
     told = observer_of("Pendulum-v1", ["info[angle]"], ["obs[2]"], [], dt=0.05)
-    with pytest.raises(ValueError, match=r"measures info\[angle\], which vectors do not say"):
+    with pytest.raises(ValueError, match=r"measures info\[angle\], which vectors do not report"):
         KKLVectorObservation(SyncVectorEnv([partial(gym.make, "Pendulum-v1")] * 2), saved(told))
 
 

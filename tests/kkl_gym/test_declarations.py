@@ -41,10 +41,10 @@ def test_a_parameter_that_is_not_declared_anew_is_refused():
 
 
 def test_what_would_be_lost_is_refused_of_parents_too():
-    with pytest.raises(TypeError, match="Tank defines __init__, and would be copied without what that sets"):
+    with pytest.raises(TypeError, match="Tank defines __init__, and a copy would lack what __init__ sets"):
         declared(__init__=lambda self: None)
     hardware = type("Hardware", (), {"__init__": lambda self: None})
-    with pytest.raises(TypeError, match="Boat defines __init__, and would be copied without"):
+    with pytest.raises(TypeError, match="Boat defines __init__, and a copy would lack"):
         type("Boat", (hardware, VanDerPol), {"name": "boat"})
     with pytest.raises(TypeError, match=r"Mixed: mu = 2\.0 does not change the parameter mu"):
         type("Mixed", (type("Softer", (), {"mu": 2.0}), VanDerPol), {"name": "mixed"})
@@ -96,5 +96,5 @@ def test_a_class_variable_that_is_annotated_as_a_parameter_is_named(name, value)
 
 
 def test_another_system_needs_a_name():
-    with pytest.raises(TypeError, match="Wide is another system than 'van_der_pol' and needs a name of its own"):
+    with pytest.raises(TypeError, match="Wide differs from the system 'van_der_pol' and needs a name of its own"):
         type("Wide", (VanDerPol,), {"X": ((-9, 9), (-9, 9))})

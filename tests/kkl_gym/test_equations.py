@@ -88,7 +88,7 @@ def test_an_equation_that_raises(tank, f, texts):
     ({"f": "x[1], 1e400 * x[0]"}, "must return finite numbers within X"),
     ({"f": "x[1], np.sum(x)"}, "sum, max and norm mix states"),
     ({"h": "x[0]"}, r"^h\(x\) of 'tank' .* must return its components in a sequence"),
-    ({"f": "x[1], np.float32(-2.0) * x[0]"}, "would make a whole motion that coarse: write constants as Python's"),
+    ({"f": "x[1], np.float32(-2.0) * x[0]"}, "whose precision a whole motion would inherit: write constants as"),
     ({"more": "def f(self, x):\n return x[1], -friction(x[1])"}, r"\(`return math.tanh\(v\)`\).*elementary.tanh"),
     ({"more": "def f(x):\n return x"}, r"must be defined as f\(self, x\)"),
     ({"more": "def g(self, x):\n return (0.0,),"}, "must return 2 rows, one for each state, of 1 components"),

@@ -161,7 +161,7 @@ def test_wrong_environments_say_what_to_do():
     with pytest.raises(ValueError, match=r"KKLMemory\)"):
         KKLVectorMemory(gym.make("CartPole-v1"))
     envs.unwrapped.metadata = {}
-    with pytest.raises(ValueError, match="does not say its autoreset mode"):
+    with pytest.raises(ValueError, match="does not declare its autoreset mode"):
         KKLVectorMemory(envs)
 
 
@@ -244,7 +244,7 @@ def test_a_dict_stays_a_dict():
     assert np.allclose(second["memory"][:2], [np.cos(second["way"][0]), np.sin(second["way"][0])])
     flat = KKLMemory(gym.wrappers.FilterObservation(Walk(), ["place"]), measured=[0, 1])
     assert np.array_equal(flat.reset(seed=0)[0][:2], place)  # entries are shown flat
-    with pytest.raises(ValueError, match="a key that is named memory"):
+    with pytest.raises(ValueError, match="a key named memory"):
         KKLMemory(env)
 
 

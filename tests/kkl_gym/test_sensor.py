@@ -193,12 +193,12 @@ class DroppingInPlace(gym.Wrapper):
 @pytest.mark.parametrize("change", CHANGING)
 def test_a_wrapper_inside_that_changes_observations_raises(change, saved):
     inner = change(gym.make("KKLVanDerPol-v0"))
-    with pytest.raises(ValueError, match=f"{type(inner).__name__}, .*one changes observations.*sensor=kkl_gym.Sensor"):
+    with pytest.raises(ValueError, match=f"{type(inner).__name__}.*changes observations.*sensor=kkl_gym.Sensor"):
         KKLObservation(RecordEpisodeStatistics(inner), saved()).reset(seed=0)
     outer = change(KKLObservation(gym.make("KKLVanDerPol-v0"), saved()))
     outer.reset(seed=0)
     sync = SyncVectorEnv([lambda: change(gym.make("KKLVanDerPol-v0"))] * 2)
-    with pytest.raises(ValueError, match="one changes observations"):
+    with pytest.raises(ValueError, match="changes observations"):
         KKLVectorObservation(sync, saved()).reset(seed=0)
 
 
@@ -207,7 +207,7 @@ def test_a_change_on_the_way_is_noticed_and_other_wrappers_are_not(saved):
     env.reset(seed=0)
     for _ in range(2):
         env.step([0.0])
-    with pytest.raises(ValueError, match=r"DroppingInPlace, .*one changes observations"):
+    with pytest.raises(ValueError, match=r"DroppingInPlace.*changes observations"):
         env.step([0.0])
     quiet = gym.wrappers.TransformReward(RecordEpisodeStatistics(gym.make("KKLVanDerPol-v0")), lambda r: 2.0 * r)
     for inner in (quiet, KKLObservation(quiet, saved(), estimate="z")):  # an observer around another one

@@ -284,5 +284,5 @@ def test_a_compiled_step_may_take_the_steps():
 
 def test_huge_steps_of_a_batch_are_refused():
     x, none = np.ones((2, 1)), np.zeros((2, 1))
-    with pytest.raises(SubstepsError, match=r"dt = 1e\+06 s of two_inputs, .* at x = \[.*take a smaller dt"):
+    with pytest.raises(SubstepsError, match=r"dt = 1e\+06 s of two_inputs; .* at x = \[.*take a smaller dt"):
         advance_batch(TwoInputs(), x, none, none, 1e6)

@@ -88,7 +88,7 @@ def test_a_known_start_is_used_at_every_reset_and_no_other_state(estimate, saved
 
 def test_known_starts_need_a_map_with_a_motion_or_T(saved):
     for kind, env in ((KKLObservation, KKLEnv("lorenz")), (KKLVectorObservation, KKLVectorEnv("lorenz", 2))):
-        with pytest.raises(ArtifactError, match="'lorenz' can begin at no known state"):
+        with pytest.raises(ArtifactError, match="'lorenz' cannot start at a known state"):
             kind(env, saved(system="lorenz"), known_start=True)
 
 

@@ -212,8 +212,8 @@ def test_maps_must_fit_the_one_of_driven_motion(make_artifact):
     artifact, plain = make_artifact(process=True, free_inverse=True), make_artifact(free_inverse=True)
     free, lorenz = artifact.free_inverse, make_artifact("lorenz", free_inverse=True).free_inverse
     for whole, other, words in (
-        (artifact, artifact.inverse, "must be of z_y, 5 values"),
-        (artifact, lorenz, "must be of z_y"),
+        (artifact, artifact.inverse, "must take z_y, 5 values"),
+        (artifact, lorenz, "must take z_y"),
         (artifact, dataclasses.replace(free, measurement_noise_max=2.0), "differ in measurement noise"),
         (artifact, plain.free_inverse, "differ in process noise"),
         (artifact, with_error_bars(artifact).free_inverse, "differ in having a covariance"),

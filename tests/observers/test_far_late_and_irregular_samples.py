@@ -138,7 +138,7 @@ def test_motions_that_know_whole_samples_alone(by):
     artifact = tracking(by)
     observer, dt = KKLObserver(artifact, 0.1), artifact.filter.dt
     observer.reset(np.zeros(1))
-    with pytest.raises(ValueError, match=r"is carried by whole samples, got a dt of 1\.5 of them"):
+    with pytest.raises(ValueError, match=r"predicts over whole samples, got a dt of 1\.5 samples"):
         observer.step([0.1], dt=1.5 * dt)
     u, twice = np.array([0.2]), copy.copy(observer)
     expected = artifact.motion.step(artifact.motion.step(observer.decode(), u, dt), u, dt)
@@ -211,7 +211,7 @@ def test_wrappers_have_the_gate_and_the_delay_of_their_observers():
 def test_the_first_gap_that_no_map_fills_warns_once():
     observer = KKLObserver(random_artifact())
     observer.reset(np.zeros(1))
-    with pytest.warns(UserWarning, match="it holds its last value") as warned:
+    with pytest.warns(UserWarning, match="a missing output keeps its last value") as warned:
         observer.estimate([[0.0], [0.1]]), observer.step(None), observer.step(None)
     assert len(warned) == 1
     with warnings.catch_warnings():

@@ -60,8 +60,8 @@ def test_variances_have_floors():
 
 
 @pytest.mark.parametrize(("changes", "words"), [
-    ({"flow": exact_flow()}, "it has one of the two"),
-    ({"equations": None}, "it has one of the two"),
+    ({"flow": exact_flow()}, "either equations or a flow"),
+    ({"equations": None}, "either equations or a flow"),
     ({"equations": None, "flow": tracking("flow", system="lorenz").motion.flow}, "a motion of 2 states does not fit"),
     ({"equations": Equations(Expression([["x", 0], ["x", 2]]))}, "a motion of 2 states does not fit"),
     *(({name: np.zeros(3)}, name) for name in ("x_scale", "low", "high", "mean", "error", "process_noise")),

@@ -84,7 +84,7 @@ def nested(levels):
     + [
         ({}, {"a": object()}, TypeError, "JSON"),
         ({}, {"a": np.nan}, ValueError, "JSON"),
-        ({}, nested(33), ValueError, "at most 32 objects and lists within one another"),
+        ({}, nested(33), ValueError, "at most 32 levels of nested objects and lists"),
         ({}, {"text": "a" * storage.MOST_HEADER}, ValueError, "file.safetensors would have"),
         ({"a": np.zeros(200)}, {}, ValueError, "file.safetensors would have"),
     ],
@@ -171,10 +171,10 @@ def test_damage_is_noticed_wherever_it_is(path):
     whole = path.read_bytes()
     for length in range(len(whole)):
         path.write_bytes(whole[:length])
-        with named(path, "damaged or no safetensors file"):
+        with named(path, "damaged or not a safetensors file"):
             read(path)
     path.write_bytes(whole + b"more")
-    with named(path, "damaged or no safetensors file"):
+    with named(path, "damaged or not a safetensors file"):
         read(path)
     for place in range(0, 8 * len(whole), 7):
         flipped = bytearray(whole)
@@ -194,16 +194,16 @@ def ours(text, tensors={}):  # noqa: B006
 @pytest.mark.parametrize(
     ("whole", "words"),
     [
-        (b"this is no file of tensors\n" * 100, "damaged or no safetensors file"),
-        (content({}), "is not a test of kkl-gym: it carries no 'ours' metadata"),
-        (content({}, {"format": "pt"}), "is not a test of kkl-gym: it carries no 'ours' metadata"),
+        (b"this is no file of tensors\n" * 100, "damaged or not a safetensors file"),
+        (content({}), "is not a test of kkl-gym: it has no 'ours' metadata"),
+        (content({}, {"format": "pt"}), "is not a test of kkl-gym: it has no 'ours' metadata"),
         (sealed(content({}, {"ours": "{}", "more": ""}), "ours"), "unknown metadata: more"),
-        *((ours(text), "its 'ours' metadata is no JSON: ") for text in ("", "nonsense", "[" * 100_000, "9" * 5000)),
-        *((ours(text), "its 'ours' metadata is no JSON object") for text in ("[]", "3", "null", '"text"')),
+        *((ours(text), "its 'ours' metadata is not JSON: ") for text in ("", "nonsense", "[" * 100_000, "9" * 5000)),
+        *((ours(text), "its 'ours' metadata is not a JSON object") for text in ("[]", "3", "null", '"text"')),
         (ours(json.dumps(nested(33))), "has more than 32 levels"),
         *((ours("{}", {"weights": (dtype, [2], bytes(2 * size))}), f"its tensor weights is of type {dtype}, expected")
           for dtype, size in (("BOOL", 1), ("I64", 8), ("F16", 2))),
-        *((ours("{}", {"a": ("F32", shape, bytes(4 * (0 not in shape)))}), "its tensor a|no safetensors file")
+        *((ours("{}", {"a": ("F32", shape, bytes(4 * (0 not in shape)))}), "its tensor a|not a safetensors file")
           for shape in ([1] * 100, [0, 2**40, 2**40], [0, 2**63])),
     ],
     ids=lambda value: str(value)[:40],
@@ -217,7 +217,7 @@ def test_foreign_and_impossible_files(path, whole, words):
 def test_files_that_are_too_large_are_not_looked_into(path, monkeypatch):
     path.write_bytes(content({"a": ("F32", [1], bytes(4))}, {"ours": "{}" + " " * storage.MOST_HEADER}))
     monkeypatch.setattr(storage, "deserialize", lambda content: pytest.fail("looked into"))
-    with named(path, f"its header has [0-9]+ bytes, more than {storage.MOST_HEADER}"):
+    with named(path, f"its header has [0-9]+ bytes, limit {storage.MOST_HEADER}"):
         read(path)
     monkeypatch.setattr(Path, "read_bytes", lambda self: pytest.fail("read"))
     for size in (2 * 2**30, storage.MOST_BYTES + 1):

@@ -249,7 +249,7 @@ def test_artifacts_with_a_motion_that_does_not_fit(make_artifact):
     for lacking in ({"inverse": replace(plain.inverse, error_covariance=None)}, {"C": None}):
         with pytest.raises(ArtifactError, match="needs T_inv's covariance and the output"):
             replace(plain, motion=motion, **lacking)
-    with pytest.raises(ArtifactError, match="of one plant, not of a range of k"):
+    with pytest.raises(ArtifactError, match="has fixed parameters, not ranges of k"):
         replace(plain, motion=motion, parameters={"k": 1.0}, parameter_ranges={"k": (0.9, 1.1)})
     with pytest.raises(ArtifactError, match="does not track; kkl-gym train"):
         plain.require_motion()

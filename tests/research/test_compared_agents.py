@@ -64,7 +64,7 @@ def test_impossible_comparisons(tmp_path):
         ("lorenz CartPole-v1", "on systems or in environments"),
         ("CartPole-v1 --information ekf", "are not compared by ekf"),
         ("lorenz --observers rossler", "the observer rossler is for rossler"),
-        ("lorenz --observers lorenz-spinn", "takes in no inputs"),
+        ("lorenz --observers lorenz-spinn", "has no inputs"),
     ):
         with pytest.raises(SystemExit, match=message):
             research("agents", *wrong.split(), "--out", str(tmp_path))

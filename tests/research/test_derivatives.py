@@ -45,5 +45,5 @@ def test_what_sympy_cannot_differentiate_is_named():
     def rounded(x):
         return x[0], sympy.ceiling(x[0])
 
-    with pytest.raises(ValueError, match=r"component 1 of rounded\(x\) has no derivative .* knows: ceiling\(x0\)"):
+    with pytest.raises(ValueError, match=r"component 1 of rounded\(x\) has no derivative in sympy: ceiling\(x0\)"):
         jacobian(rounded, 1)

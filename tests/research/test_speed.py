@@ -43,5 +43,5 @@ def test_the_table_of_torch_has_a_row_for_each_observer_and_the_memory(capsys):
     ]
     assert min(float(each) for line in lines for each in line[2:] if each != "–") > 0
     assert capsys.readouterr().out.count("| lorenz | 128 |") == 1
-    with pytest.raises(ValueError, match="rows positive, got 3 and"):
+    with pytest.raises(ValueError, match="turns and rows must be positive, got 3 and"):
         TorchSpeed(rows=(0,)).run(Console())

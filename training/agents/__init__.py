@@ -6,7 +6,7 @@ __all__ = ["OnTask", "SB3VecEnv"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import on first use: stable-baselines3 takes seconds to import, and playing an agent does without."""
+    """Import on first use: stable-baselines3 takes seconds to import, and playing an agent does not need it."""
     if name == "SB3VecEnv":
         from training.agents.bridge import SB3VecEnv
 

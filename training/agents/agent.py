@@ -22,12 +22,12 @@ from training.trajectories.equations import describe
 
 FORMAT = 2
 KEY = "kkl-gym-agent"
-MAX_SCALED = 10.0  # of a normalised observation, as stable-baselines3 clips it
+MAX_SCALED = 10.0  # limit of normalised observations, as in stable-baselines3
 Head = Literal["tanh", "clip", "argmax"]
 
 
 class AgentError(ValueError):
-    """Raised for invalid or corrupt files of agents, and for agents that do not fit what they are played with."""
+    """Raised for invalid or corrupt files of agents, and for agents that do not fit their environment or observer."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 class Agent:
     """A deterministic policy, its task, and its information set.
 
-    Shapes: ``mean`` and ``scale``, of normalised observations, (inputs,).
+    Shapes: ``mean`` and ``scale`` of the normalisation of observations, (inputs,).
     """
 
     network: MLP
@@ -103,7 +103,7 @@ class Agent:
         for name in ("rules", "training"):
             if not isinstance(getattr(self, name), Mapping):
                 raise AgentError(f"{name} must be a mapping, got {getattr(self, name)!r}")
-        if type(self.seed) is not int:  # it becomes part of the names of files
+        if type(self.seed) is not int:  # it is part of file names
             raise AgentError(f"the seed must be a whole number, got {self.seed!r}")
 
     @property
@@ -117,7 +117,7 @@ class Agent:
         return self.network.inputs if self.lstm is None else self.lstm.inputs
 
     def policy(self, action_space: gym.Space[Any]) -> Callable[[np.ndarray], Any]:
-        """Return the policy at the beginning of episodes, (n, inputs) to n actions; it remembers if it is recurrent."""
+        """Return a policy for new episodes, from (n, inputs) to n actions; a recurrent one keeps its own state."""
         space: Any = action_space
         memory: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -142,10 +142,10 @@ class Agent:
         return act
 
     def make(self, num_envs: int = 1, *, trusted: str | None = None, observer: str | None = None) -> VectorEnv:
-        """Make the environment that the agent was trained in; ``observer`` is where its observer lies now.
+        """Make the environment of the agent's training; ``observer`` is the present path of its observer.
 
-        An agent may come from a stranger's file, and to make an environment may import the module or script that it
-        names. So one that is neither Gymnasium's nor a shipped system's is made only if the caller names it too.
+        A file of an agent may be untrusted, and making its environment may import a module or script that the file
+        names. So an environment that is neither Gymnasium's nor a shipped system's needs ``trusted``, its name.
         """
         named = self.task.system or self.task.env_id
         spec = gym.registry.get(named)
@@ -174,7 +174,7 @@ class Agent:
         return env
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write weights and description to one safetensors file, whole or not at all."""
+        """Write weights and description to one safetensors file, atomically."""
         tensors: dict[str, np.ndarray] = {}
         storage.put_mlp(tensors, "", self.network)
         if self.mean is not None and self.scale is not None:
@@ -214,7 +214,7 @@ class Agent:
 
 
 def rules(task: Task) -> dict[str, Any]:
-    """Return the properties of a system, beside task and observer, that its observations depend on."""
+    """Return the properties of a system, besides task and observer, on which the agent's observations depend."""
     if task.system is None:
         return {}
     system = get_system(task.system)
@@ -236,7 +236,7 @@ def fingerprint(observer: str) -> str:
 
 
 def find(name: str) -> Path:
-    """Return the file of an agent that ships, by its name, or of a path that ends in .safetensors."""
+    """Return the file of a shipped agent by its name, or the path itself if it ends in .safetensors."""
     if name.endswith(".safetensors"):
         return Path(name)
     folder = files("training.agents").joinpath("shipped")

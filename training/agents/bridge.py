@@ -1,4 +1,4 @@
-"""Gymnasium's vector environments for stable-baselines3, which has vector environments of its own kind."""
+"""Gymnasium's vector environments as vector environments of stable-baselines3."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -12,24 +12,24 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 
 class SB3VecEnv(VecEnv):
-    """A stable-baselines3 ``VecEnv`` over any Gymnasium ``VectorEnv`` that resets in the same step.
+    """A stable-baselines3 ``VecEnv`` around any Gymnasium ``VectorEnv`` that resets in the same step.
 
-    ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` go on top. Where an episode ends, the row's info holds
-    ``terminal_observation`` (the one before the reset), ``TimeLimit.truncated`` and all that the environment
-    reported of the last step. Other steps report ``info_keys`` only, because a dictionary for each row
-    and step costs more than a batched simulation.
+    ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` may wrap it. When an episode ends, the row's info holds
+    ``terminal_observation`` (the one before the reset), ``TimeLimit.truncated`` and everything that the environment
+    reported for the last step. Other steps report only ``info_keys``, because a dictionary for each row and step costs
+    more than a batched simulation.
 
     Parameters
     ----------
     env : gymnasium.vector.VectorEnv
-        With ``autoreset_mode`` SAME_STEP.
+        A vector environment with ``autoreset_mode`` SAME_STEP.
     info_keys : sequence of str
-        Keys of ``info`` to pass on in every step.
+        Keys of ``info`` to report at every step.
 
     Raises
     ------
     ValueError
-        If the environment resets otherwise or takes no inputs, or stable-baselines3 sets different options for
+        If the environment has another autoreset mode or no inputs, or stable-baselines3 sets different options for
         different rows.
     """
 
@@ -41,13 +41,13 @@ class SB3VecEnv(VecEnv):
                 'autoreset_mode="SameStep" (vector_kwargs={"autoreset_mode": "SameStep"} for Sync and Async vectors)'
             )
         if 0 in (env.single_action_space.shape or ()):
-            raise ValueError("the action space is empty: a system without inputs leaves an agent nothing to decide")
+            raise ValueError("the action space is empty: an agent needs a system with inputs")
         self.env = env
         self._info_keys = tuple(info_keys)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Reset all rows, with the seeds and options that were set for the next reset; returns their observations."""
+        """Reset all rows with the seeds and options that were set for the next reset. Returns their observations."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         options = self._options
         self._reset_seeds()
@@ -59,16 +59,16 @@ class SB3VecEnv(VecEnv):
         return deepcopy(obs)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions for :meth:`step_wait`."""
+        """Store the actions for :meth:`step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all rows; where an episode ended, the observation is the next one's first."""
+        """Step all rows; after the end of an episode, the observation is the first of the next one."""
         obs, reward, terminated, truncated, info = self.env.step(self._actions)
         done = terminated | truncated
         infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
         for row in np.flatnonzero(done).tolist():
-            self.reset_infos[row] = infos[row]  # the environment reports the new episode
+            self.reset_infos[row] = infos[row]  # info describes the new episode
             infos[row] = _row(info, row, _keys(info)) | _row(info["final_info"], row, _keys(info["final_info"]))
             infos[row]["terminal_observation"] = info["final_obs"][row]
             infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
@@ -79,12 +79,12 @@ class SB3VecEnv(VecEnv):
         self.env.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Return frames of all rows, None where the environment renders nothing."""
+        """Return frames of all rows, None if the environment renders nothing."""
         frames: Any = self.env.render() if self.render_mode == "rgb_array" else None
         return [None] * self.num_envs if frames is None else list(frames)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of each row: of the vector environment's wrappers, else of its own environments."""
+        """Return an attribute of each row, from the vector environment's wrappers or else from its environments."""
         rows = list(self._get_indices(indices))
         owner = self._owner(attr_name)
         if owner is not None:
@@ -93,7 +93,7 @@ class SB3VecEnv(VecEnv):
         return [values[row] for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of all rows, where :meth:`get_attr` finds it."""
+        """Set an attribute of all rows, in the object where :meth:`get_attr` finds it."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("attributes of a vector environment are set for all rows at once")
         owner = self._owner(attr_name)
@@ -103,13 +103,13 @@ class SB3VecEnv(VecEnv):
             self._rows_of("set_attr", attr_name)(attr_name, [value] * self.num_envs)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **options: Any) -> list[Any]:
-        """Call a method of all rows' environments, which Sync and Async vectors have, and return the results."""
+        """Call a method of every row's environment, in Sync and Async vectors only, and return the results."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("methods of a vector environment's rows are called in all rows at once")
         return list(self._rows_of("call", method_name)(method_name, *args, **options))
 
     def _owner(self, name: str) -> Any:
-        """The wrapper that has set an attribute, else the vector environment; None if its rows are to be asked."""
+        """The wrapper that has an attribute, else the vector environment; None if its rows have their own."""
         env: Any = self.env
         while hasattr(env, "env"):
             if name in vars(env):
@@ -119,11 +119,11 @@ class SB3VecEnv(VecEnv):
 
     def _rows_of(self, how: str, name: str) -> Any:
         if not hasattr(self.env.unwrapped, how):
-            raise AttributeError(f"{self.env} has no {name!r}, and its rows are no environments of their own")
+            raise AttributeError(f"{self.env} has no {name!r}, and its rows are not separate environments")
         return getattr(self.env.unwrapped, how)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Return for each row whether a wrapper of this class is around the vector environment."""
+        """Return for each row whether a wrapper of this class surrounds the vector environment."""
         env: Any = self.env
         while not (wrapped := isinstance(env, wrapper_class)) and hasattr(env, "env"):
             env = env.env
@@ -131,7 +131,7 @@ class SB3VecEnv(VecEnv):
 
 
 def _row(info: dict[str, Any], row: int, keys: Sequence[str]) -> dict[str, Any]:
-    """The part of ``info`` that belongs to a row; environments need not say for which rows they report a key."""
+    """The part of ``info`` that belongs to a row; a key without a mask belongs to all rows."""
     out = {}
     for key in keys:
         if key in info and (f"_{key}" not in info or info[f"_{key}"][row]):

@@ -1,4 +1,4 @@
-"""Where an agent's training stands, without stable-baselines3's own files, which are pickled."""
+"""Checkpoints of an agent's training; they replace the files of stable-baselines3, which are pickled."""
 
 import csv
 import time
@@ -18,12 +18,12 @@ from training import run
 from training.records import Record
 
 CURVE = "curve.csv"
-_STORED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")  # in replay buffers
-_ARRAYS = ("t", "y", "u", "x")  # of a record
+_STORED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")  # arrays of replay buffers
+_ARRAYS = ("t", "y", "u", "x")  # arrays of a record
 
 
 class Checkpoint(BaseCallback):
-    """Writes a checkpoint and the learning curve now and then, between two rollouts, and at the end.
+    """Writes a checkpoint and the learning curve from time to time, between two rollouts, and at the end.
 
     A checkpoint holds networks, optimisers, counters, the scaling of observations, the replay buffer, the learning
     curve, the weights of z and the steps from which an observer is learned. It holds neither the environments nor
@@ -35,9 +35,9 @@ class Checkpoint(BaseCallback):
         super().__init__()
         self.path, self._fingerprint, self._curve_path = path, fingerprint, path.with_name(CURVE)
         self.resumed = self.restarts = 0
-        self.spent = 0  # steps before those of the algorithm
-        self.privileged = False  # whether the agent sees hidden signals in place of estimates
-        self.records: Callable[[], Sequence[Record]] = list  # those to keep
+        self.spent = 0  # random steps before the algorithm's first
+        self.privileged = False  # whether the agent sees true hidden signals instead of estimates
+        self.records: Callable[[], Sequence[Record]] = list  # the records to save
         self._curve, self._began = list[tuple[float, ...]](), time.process_time()
         if not resume:
             path.unlink(missing_ok=True)
@@ -62,10 +62,10 @@ class Checkpoint(BaseCallback):
             self.resumed, self.restarts = (int(saved[name]) + goes_on for name in ("resumed", "restarts"))
             self._curve = [tuple(row) for row in saved["curve"].tolist()]
             self._began -= self._curve[-1][1] if self._curve else 0.0
-        self.saved = None  # which may be large
+        self.saved = None  # frees memory
 
     def saved_records(self, like: Record) -> list[Record]:
-        """Return the records that were saved, which are ``like`` another one but for their samples."""
+        """Return the saved records, whose fields other than samples are those of ``like``."""
         if self.saved is None:
             return []
         with run.restoring(self.path):
@@ -81,7 +81,7 @@ class Checkpoint(BaseCallback):
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
-            if "episode" in info:  # of VecMonitor
+            if "episode" in info:  # from VecMonitor
                 seconds = round(time.process_time() - self._began, 2)
                 self._curve.append((self.num_timesteps + self.spent, seconds, round(float(info["episode"]["r"]), 4)))
         return True
@@ -91,7 +91,7 @@ class Checkpoint(BaseCallback):
 
     def _save(self) -> None:
         model = self.model
-        counters = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls")  # the last one is DQN's
+        counters = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls")  # the last one belongs to DQN
         kept = [{key: torch.from_numpy(getattr(one, key)) for key in _ARRAYS} for one in self.records()]
         state: dict[str, Any] = {
             "parameters": model.get_parameters(),
@@ -114,7 +114,7 @@ class Checkpoint(BaseCallback):
 
 
 def _moments(scaling: VecNormalize | None) -> dict[str, Any]:
-    """The running moments of observations and returns."""
+    """The running moments for the normalisation of observations and returns."""
     if scaling is None:
         return {}
     pairs: dict[str, Any] = {name: getattr(scaling, name) for name in ("obs_rms", "ret_rms")}
@@ -125,7 +125,7 @@ def _moments(scaling: VecNormalize | None) -> dict[str, Any]:
 
 
 def _buffer(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    """The replay buffer, as far as it is filled, and SAC's weight of the entropy."""
+    """The filled part of the replay buffer, and SAC's entropy coefficient."""
     buffer, weight = model.replay_buffer, getattr(model, "log_ent_coef", None)
     assert buffer is not None
     rows = buffer.size()

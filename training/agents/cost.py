@@ -1,4 +1,4 @@
-"""The reward of agents of systems in training."""
+"""The reward in the training of agents for systems."""
 
 from typing import Any
 
@@ -7,11 +7,11 @@ import numpy as np
 from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 from training.agents.tasks import Task
 
-MAX_COST = 10.0  # three scales off in every state; beyond it, networks would learn little else
+MAX_COST = 10.0  # about three scales from the target in every state; larger costs would dominate the training
 
 
 def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
-    """Minus the cost c, at most ``MAX_COST``, from the reward 1/(1 + 4c) averaged over an action's samples."""
+    """Minus the cost c, limited to ``MAX_COST``, from the reward 1/(1 + 4c) averaged over an action's samples."""
     samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
     remaining = np.where(terminated, task.steps - np.ceil(age / task.repeat), 0.0)
     cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, MAX_COST)
@@ -19,10 +19,10 @@ def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
 
 
 class Cost(VectorWrapper):
-    """Pays minus the cost, see :func:`paid`, where a system does not state a reward of its own.
+    """Rewards with minus the cost, see :func:`paid`, if a system does not define its own reward.
 
-    The environment's reward is flat far from the target, where c still tells an agent which way to go. Escaping never
-    pays.
+    Far from the target the environment's reward is flat, while c still has a slope for an agent to follow. To escape
+    is never worth it.
     """
 
     def __init__(self, env: VectorEnv, task: Task) -> None:
@@ -30,7 +30,7 @@ class Cost(VectorWrapper):
         self._task = task
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step, and replace the rewards. Shapes: ``actions`` (n, nu)."""
+        """Step the environments, and replace the rewards. Shapes: ``actions`` (n, nu)."""
         obs, total, terminated, truncated, info = self.env.step(actions)
         age = info["final_info"]["sample"] if terminated.any() else info["sample"]
         return obs, paid(self._task, total, age, terminated), terminated, truncated, info

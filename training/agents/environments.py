@@ -1,4 +1,4 @@
-"""The vector environments of tasks: systems as one batch, other environments side by side."""
+"""The vector environments of tasks: systems as one batch, other environments in a Sync vector."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -16,7 +16,7 @@ from observers.checks import shown
 from training.agents.tasks import Task
 from training.rollouts.playing import make
 
-CLEAN, CLEAN_Y = "clean", "clean_y"  # keys of info: the observation before noise was added, and its measured entries
+CLEAN, CLEAN_Y = "clean", "clean_y"  # keys of info: the observation without added noise, and its measured entries
 
 
 def vector(
@@ -26,7 +26,7 @@ def vector(
     *,
     each: Callable[[], gym.Env[Any, Any]] | None = None,
 ) -> VectorEnv:
-    """Make environments that reset in the same step; ``wrap`` sees every sample, ``each`` makes one of another's."""
+    """Make environments that reset in the same step; ``wrap`` goes inside the action repeat, ``each`` makes a row."""
     if task.system is None:
         side_by_side = SyncVectorEnv([each or partial(single, task)] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
         return wrap(side_by_side)
@@ -37,7 +37,7 @@ def vector(
 
 
 def single(task: Task, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
-    """Make one environment other than a system's, with flat observations and noise on the measured entries."""
+    """Make one environment that is not a system's, with flat observations and noise on the measured entries."""
     env = make(task.env_id, task.env_kwargs)
     if not (isinstance(env.observation_space, spaces.Box) and len(env.observation_space.shape) == 1):
         env = gym.wrappers.FlattenObservation(env)
@@ -58,8 +58,8 @@ def single(task: Task, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
 class MeasurementNoise(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
     """Adds independent Gaussian noise to some entries of an observation.
 
-    It has a random generator of its own, so that the same seed starts the same episodes with and without noise.
-    ``info`` has the observation before the noise, ``clean``, and its noisy entries, ``clean_y``.
+    It has its own random generator, so that a seed starts the same episodes with and without noise. ``info`` gains the
+    noise-free observation, ``clean``, and the noise-free values of the noisy entries, ``clean_y``.
     """
 
     def __init__(self, env: gym.Env[np.ndarray, Any], entries: Sequence[int], standard_deviation: float) -> None:
@@ -74,7 +74,7 @@ class MeasurementNoise(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCons
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Reset the environment, and with a seed the noise."""
+        """Reset the environment; a seed also seeds the noise."""
         if seed is not None:
             self._rng = np.random.default_rng([seed, 1])
         observation, info = self.env.reset(seed=seed, options=options)

@@ -1,4 +1,4 @@
-"""Observations and actions of the past, as a bank of linear filters keeps them."""
+"""Past observations and actions, in banks of linear filters."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,9 +13,9 @@ from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 
 
 class History(VectorWrapper):
-    """Shows the state of the filters s' = ``keep`` s + ``take`` [y, u], with the observation y and the action u before.
+    """Shows the state s of filters s' = ``keep`` s + ``take`` [y, u], where the action u led to the observation y.
 
-    At reset s rests at the first observation and no action. Needs an environment that resets in the same step.
+    At reset s rests at the first observation and no action. The environment must reset in the same step.
 
     Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.
     """
@@ -63,7 +63,7 @@ class History(VectorWrapper):
 
 
 def stacked(env: VectorEnv, frames: int, *, actions: bool = True) -> History:
-    """Show the last observations, the latest last, each with the action before it."""
+    """Show the last observations in order of time, each with the action before it."""
     return History(env, np.eye(frames, k=1), np.eye(frames)[-1], actions=actions)
 
 

@@ -25,8 +25,8 @@ from training.trajectories.equations import linearised
 Information = Literal["state", "y", "stacked", "traces", "z", "x_hat", "x_hat_std", "recurrent"]
 INFORMATION: tuple[Information, ...] = get_args(Information)
 ESTIMATED: tuple[Information, ...] = ("x_hat", "x_hat_std")
-OBSERVED: tuple[Information, ...] = (*ESTIMATED, "z")  # what a learned observer may show
-MIN_DEVIATION = 1e-6  # standard deviation over a state's scale, below which agents see no difference
+OBSERVED: tuple[Information, ...] = (*ESTIMATED, "z")  # the information that a learned observer gives
+MIN_DEVIATION = 1e-6  # least standard deviation that agents see, over a state's scale
 
 Values = Mapping[str, np.ndarray]
 Feature = Callable[[Values], np.ndarray]
@@ -112,7 +112,7 @@ def _memory(task: Task) -> dict[str, Any]:
 
 
 def estimates(task: Task, information: Information, num_envs: int, observer: str) -> VectorEnv:
-    """Show an observer's x_hat (after y where y is exact), its standard deviations, or z; it sees every sample."""
+    """Show an observer's x_hat (after y, if exact), its standard deviations, or z. The observer sees every sample."""
     artifact = Artifact.read(resolve(observer))
     options: dict[str, Any] = {
         "observer": observer,
@@ -124,7 +124,7 @@ def estimates(task: Task, information: Information, num_envs: int, observer: str
     system = None if task.system is None else get_system(task.system)
     if information == "z":
         return _modes(env, artifact, system)
-    first = len(task.measured) if task.measurement_noise else 0  # an observer estimates noisy outputs too
+    first = len(task.measured) if task.measurement_noise else 0  # an observer also estimates noisy outputs
     last = len(task.measured) + artifact.nx
     if system is not None and artifact.nx > system.nx:
         raise ValueError(f"the observer {observer} estimates a bias too, which agents do not know; take one without")
@@ -152,15 +152,15 @@ def observer_of(system: System) -> str:
 
 
 def output_deviation(system: System) -> Feature:
-    """Make the feature (y - h(target)) over the size that the states' scales give to y, to first order."""
+    """Make the feature (y - h(target)) / size, where size is the first-order effect of the states' scales on y."""
     _, _, C = linearised(system, system.target)
     y, size = np.array(system.h(system.target)), np.abs(C) @ np.array(system.scale)
-    size = np.where(size > 0, size, 1.0)  # an output that is flat at the target
+    size = np.where(size > 0, size, 1.0)  # outputs without a slope at the target
     return lambda at: (at["y"] - y) / size
 
 
 def _modes(env: VectorEnv, artifact: Artifact, system: System | None) -> VectorEnv:
-    """Show z as the observer's network reads it, and its age: of a system from z at the target, else beside y."""
+    """Show z as the observer's network reads it, and the age: in systems relative to the target, else beside y."""
     inverse, linear, inside = artifact.inverse, artifact.filter, env
     while not isinstance(inside, KKLVectorObservation):
         inside = inside.env  # type: ignore[attr-defined]

@@ -38,17 +38,17 @@ from training.progress import ProgressBars, progress_bars
 from training.run import CHECKPOINT
 
 RECURRENT = "ppo_lstm"
-# Share of the steps of a training, the first ones, in which there are no estimates yet.
-PRIVILEGED = 0.9  # without noise: estimates are so near to the truth that the same policy is right
-WANDERED = 0.1  # under noise
-REHEARSAL = 0.05  # of the steps, the last ones, in which the agent acts without exploration and learns no more
+# Share of a training's steps, at its start, in which there are no estimates yet.
+PRIVILEGED = 0.9  # without noise: estimates are so accurate that the same policy suits them
+WANDERED = 0.1  # under noise: random actions
+REHEARSAL = 0.05  # share of the last steps, in which the agent neither explores nor learns
 FILE = "agent.safetensors"
-_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # not of the algorithm
-_OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # what rl-zoo3 makes a system's task of
+_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings of the run
+_OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # from these rl-zoo3 makes a system's task
 
 
 def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:
-    """Choose the algorithm: recurrent PPO for recurrent agents, SAC where it is tuned, else PPO."""
+    """Choose the algorithm: recurrent PPO for recurrent agents, SAC if it is tuned for the task, else PPO."""
     if information == "recurrent":
         return RECURRENT
     if task.system is not None:
@@ -94,16 +94,16 @@ def learn(
     show: Callable[..., VectorEnv] = make,
     progress: ProgressBars | None = None,
 ) -> Agent:
-    """Train one agent, with checkpoints; writes agent.safetensors, curve.csv and maybe observer.safetensors.
+    """Train one agent, with checkpoints. Writes agent.safetensors, curve.csv and, if learned, observer.safetensors.
 
-    Where an observer has to be learned, the agent's first steps are for both. Without noise, the agent sees the hidden
-    signals in place of estimates; the observer is learned from these steps, and the agent goes on with estimates. Under
-    noise estimates are far from the truth; these steps are then fewer, and random actions, from which the observer
-    alone is learned. They count too. The weights of z under noise are learned in this way too if ``observer_steps`` are
-    given.
+    If an observer must be learned, it is learned from the agent's first steps. Without noise, the agent learns in these
+    steps, too: it sees the true hidden signals, and continues with estimates. With noise, estimates are less accurate,
+    and a policy for true signals does not suit them. There are then fewer first steps, with random actions, from which
+    only the observer learns. They count as steps of the training. If ``observer_steps`` are given for z under noise,
+    the memory's weights are learned from them.
 
-    A training that goes on from a checkpoint begins new episodes, so that it makes another agent than one that never
-    stopped; ``Agent.training`` then has the number of times it was resumed.
+    A resumed training starts new episodes, so that its agent differs from that of an uninterrupted training.
+    ``Agent.training`` then holds the number of resumptions.
     """
     with closing(vector(task.without_noise, 1)) as env:
         actions, size = env.single_action_space, gym.spaces.flatdim(env.single_observation_space)
@@ -118,7 +118,7 @@ def learn(
     if task.system is not None and information in OBSERVED and observer is None and show is make:
         observer = observer_of(get_system(task.system))
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
-    # Whether an observer is learned on the way.
+    # Whether an observer is learned during the training.
     fits = task.system is None and information in ESTIMATED and observer is None
     if fits and information != "x_hat":
         raise ValueError(f"{information}: train an observer with error bars first, and name it (--observer FILE)")
@@ -135,7 +135,7 @@ def learn(
     checkpoint = Checkpoint(folder / f"agent{CHECKPOINT}", hashlib.sha256(identity.encode()).hexdigest(), resume=resume)
     resumes = checkpoint.saved is not None
     if resumes and (folder / FILE).exists():
-        return Agent.read(folder / FILE)  # nothing is left to do
+        return Agent.read(folder / FILE)  # the training is complete
     if weighs:
         checkpoint.spent = first
         task = replace(task, weights=checkpoint.weights) if resumes else weighted(task, first, seed=seed)
@@ -143,7 +143,7 @@ def learn(
     with progress_bars(progress) as bars:
         fit = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
         privileged = None
-        if fits and task.measurement_noise:  # a policy that is right with the truth is not with estimates
+        if fits and task.measurement_noise:  # a policy for true signals does not suit noisy estimates
             checkpoint.spent = first
             if not resumes:
                 fit(wander(task, first, seed=seed, progress=bars))
@@ -178,7 +178,7 @@ def learn(
                 learner.move(make_envs(), checkpoint.restarts)
             callbacks: list[BaseCallback] = [checkpoint]
             if aggregate:
-                before = [] if privileged is None else privileged.records()  # no random actions
+                before = [] if privileged is None else privileged.records()  # without the random steps
                 checkpoint.records = lambda: before
                 every = max(1, (left - (first - checkpoint.spent)) // (aggregate + 1))
                 callbacks.append(refits(task, every, rehearsal, folder / OBSERVER, before))
@@ -188,7 +188,7 @@ def learn(
                 learner.learn(left, [_Bar(report), *callbacks])
     model = learner.model
     if aggregate:
-        observer = str(folder / OBSERVER)  # which is what the agent has seen last
+        observer = str(folder / OBSERVER)  # the last observer that the agent used
     resumed = {"resumed": checkpoint.resumed} if checkpoint.resumed else {}
     training = {**how, "timesteps": model.num_timesteps + checkpoint.spent, **resumed}
     agent = agent_of(model, task, information, observer=observer, training=training)
@@ -197,13 +197,13 @@ def learn(
 
 
 def _first_steps(task: Task, steps: int, rehearsal: int, given: int | None) -> int:
-    """Number of steps from which an observer is learned."""
+    """Number of first steps, from which an observer is learned."""
     first = round((WANDERED if task.measurement_noise else PRIVILEGED) * steps) if given is None else given
     if 0 < first < steps - rehearsal:
         return first
     if given is None:
         raise ValueError(f"{steps} steps are too few for an observer and an agent; give it more (--timesteps)")
-    raise ValueError(f"observer_steps must be some, and fewer than all {steps - rehearsal} of learning; got {given}")
+    raise ValueError(f"observer_steps must be from 1 to below the {steps - rehearsal} steps of learning; got {given}")
 
 
 def _like(task: Task) -> Any:
@@ -230,7 +230,7 @@ def _check_actions(algorithm: str, space: gym.Space[Any], env_id: str) -> None:
 
 
 class Learner:
-    """An algorithm and its environments, with settings that mean what they mean in rl-zoo3."""
+    """An algorithm and its environments; settings have the same meaning as in rl-zoo3."""
 
     def __init__(
         self,
@@ -263,29 +263,29 @@ class Learner:
 
     @property
     def steps(self) -> int:
-        """Steps that it has learned from."""
+        """Number of steps so far."""
         return self.model.num_timesteps
 
     def begin(self, checkpoint: Checkpoint, steps: int) -> None:
-        """Seed the episodes, and go on from a checkpoint if there is one."""
+        """Seed the episodes, and resume from a checkpoint if there is one."""
         checkpoint.restore(self.model, steps)
         vec_env: Any = self.model.get_env()
         first = agent_training_seed(self._seed, checkpoint.restarts, vec_env.num_envs)
         if checkpoint.restarts:
             self.model.set_random_seed(first)
-        vec_env.seed(first)  # the model has seeded it with its own
+        vec_env.seed(first)  # replaces the model's own seed
 
     def learn(self, steps: int, callbacks: list[BaseCallback], *, until: int | None = None) -> None:
-        """Learn until there were so many steps.
+        """Learn until ``steps`` are reached.
 
-        ``until`` stops before, where an algorithm begins to collect, and at the latest where it would collect for the
-        last time.
+        With ``until``, learning stops earlier, after so many steps: before a rollout, and at the latest before the last
+        rollout.
         """
         stop = [] if until is None else [_Until(until, steps)]
         self.model.learn(steps - self.steps, callback=[*callbacks, *stop], reset_num_timesteps=False)
 
     def move(self, env: VectorEnv, restarts: int) -> None:
-        """Go on in other environments, which show what the ones before showed; these are closed."""
+        """Continue in other environments with the same observations; close the previous ones."""
         vec_env, before = self._monitored(env), self.model.get_env()
         if isinstance(before, VecNormalize):
             moments = before.obs_rms, before.ret_rms
@@ -306,7 +306,7 @@ class Learner:
 
 
 class _Until(BaseCallback):
-    """Stops a training after so many steps, between two rollouts, and before the last one."""
+    """Stops a training between two rollouts after so many steps, and at the latest before the last rollout."""
 
     def __init__(self, steps: int, last: int) -> None:
         super().__init__()
@@ -338,7 +338,7 @@ class _Bar(BaseCallback):
 
 
 def _keywords(call: str) -> dict[str, Any]:
-    """The arguments of ``dict(...)``, as rl-zoo3 needs it for a class of torch.nn."""
+    """The arguments in a text ``dict(...)``, which rl-zoo3 needs for classes of torch.nn."""
     tree: Any = ast.parse(call, mode="eval")
     return {
         k.arg: getattr(nn, k.value.attr) if isinstance(k.value, ast.Attribute) else ast.literal_eval(k.value)
@@ -354,7 +354,7 @@ def agent_of(
     observer: str | None = None,
     training: Mapping[str, Any] | None = None,
 ) -> Agent:
-    """Take the deterministic policy out of a trained agent."""
+    """Return a trained model's deterministic policy as an :class:`Agent`."""
     scaling = model.get_vec_normalize_env()
     moments: Any = None if scaling is None else scaling.obs_rms
     name = next(name for name, algorithm in ALGORITHMS.items() if type(model) is algorithm)

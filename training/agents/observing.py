@@ -1,4 +1,4 @@
-"""An observer for an agent: from the first steps that it makes in an environment, and from later ones."""
+"""An observer for an agent, learned from the agent's first steps in an environment, and again from later ones."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,9 +19,9 @@ from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
 from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset
 
 OBSERVER = "observer.safetensors"
-HEADROOM = 1.5  # of the noise that a map is trained for over the noise that there is
-HELD_OUT = 0.2  # of the episodes
-KEPT = 100_000  # steps that an observer is learned from, the latest
+HEADROOM = 1.5  # largest noise in a map's training, over the noise of the task
+HELD_OUT = 0.2  # share of the episodes
+KEPT = 100_000  # an observer is learned from so many of the latest steps
 SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
 
 
@@ -31,22 +31,22 @@ def hidden_entries(task: Task, size: int) -> tuple[int, ...]:
 
 
 def estimated_entries(task: Task, size: int) -> tuple[int, ...]:
-    """Entries of an observation of some size that an observer estimates; under noise the measured ones too."""
+    """Entries of an observation of some size that an observer estimates; under noise also the measured ones."""
     hidden = hidden_entries(task, size)
     return tuple(sorted({*hidden, *task.measured})) if task.measurement_noise else hidden
 
 
 def signals(task: Task, env: gym.Env[Any, Any]) -> dict[str, Any]:
-    """The signals to record in an environment of a task, as :class:`Recorder` takes them."""
+    """The signals to record in a task's environment, as arguments of :class:`Recorder`."""
     source = f"info[{CLEAN}]" if task.measurement_noise else "obs"
     hidden = [f"{source}[{i}]" for i in estimated_entries(task, gym.spaces.flatdim(env.observation_space))]
     return {"measured": [str(i) for i in task.measured], "hidden": hidden}
 
 
 class Privileged:
-    """Environments that show what an observer is to estimate in place of the estimates, and record the latest steps.
+    """Environments that show the true hidden signals in place of estimates, and record the latest steps.
 
-    ``earlier`` are records of an interrupted training, the oldest first.
+    ``earlier`` are records of an interrupted training, in order of time.
     """
 
     def __init__(self, task: Task, rows: int, earlier: Sequence[Record] = ()) -> None:
@@ -65,13 +65,13 @@ class Privileged:
         return self._recorders[-1]
 
     def records(self) -> list[Record]:
-        """Return the recorded episodes, those that ended first at the beginning."""
+        """Return the recorded episodes, in the order of their ends."""
         rows = [recorder.rollouts(going_on=True).records() for recorder in self._recorders]
         return latest([*self._earlier, *oldest_first(rows)])
 
 
 def latest(records: Sequence[Record]) -> list[Record]:
-    """Return the latest records, of at least as many steps as an observer is learned from."""
+    """Return the latest records, with at least ``KEPT`` steps if there are so many."""
     kept, steps = list[Record](), 0
     for record in reversed(records):
         if steps >= KEPT:
@@ -82,10 +82,10 @@ def latest(records: Sequence[Record]) -> list[Record]:
 
 
 def oldest_first(rows: Sequence[Sequence[Record]]) -> list[Record]:
-    """Put together the records of environments that were stepped together."""
+    """Merge the records of environments that were stepped together, in the order of their ends."""
     dated = list[tuple[int, Record]]()
     for records in rows:
-        after = 0  # steps that were made since
+        after = 0  # steps since the end of a record
         for record in reversed(records):
             dated.append((after, record))
             after += len(record.t) - 1
@@ -93,7 +93,7 @@ def oldest_first(rows: Sequence[Sequence[Record]]) -> list[Record]:
 
 
 def wander(task: Task, steps: int, *, seed: int, progress: ProgressBars) -> list[Record]:
-    """Act at random, each action held for a while."""
+    """Record random actions, each held for a while."""
     with single(task, noisy=False) as env, progress.phase(f"playing {task.env_id}", steps) as report:
         policy = policy_of(WANDERING, env)
         rollouts = roll_out(env, policy, **signals(task, env), steps=steps, seed=seed, report=report)
@@ -109,7 +109,7 @@ def learn_observer(
     progress: ProgressBars,
     tracking: bool | None = None,
 ) -> Path:
-    """Learn an observer from recorded steps; unless ``tracking`` is given, it tracks under noise alone."""
+    """Learn an observer from recorded steps; by default it tracks only under noise."""
     changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, **SETTINGS}
     changes["tracking"] = bool(task.measurement_noise) if tracking is None else tracking
     if task.measurement_noise:
@@ -125,7 +125,7 @@ def learn_observer(
 
 
 def refits(task: Task, every: int, rehearsal: int, path: Path, records: Sequence[Record]) -> KKLTrainingCallback:
-    """A callback that fits an observer again to an agent's own steps and to earlier ``records``."""
+    """A callback that refits an observer to an agent's own steps and to earlier ``records``."""
     outputs = CLEAN_Y if task.measurement_noise else "y"
     return KKLTrainingCallback(
         every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS

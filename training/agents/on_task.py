@@ -1,4 +1,4 @@
-"""The control task of a shipped system as a wrapper of one environment, for what trains on single environments."""
+"""The control task of a shipped system as a wrapper, for training on single environments, as in rl-zoo3."""
 
 from typing import Any
 
@@ -14,15 +14,14 @@ from training.agents.tasks import deviation, task_of
 
 
 class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
-    """Shows an agent what ``kkl-gym agent train SYSTEM`` shows it, and pays it the same.
+    """Gives an agent the observations and rewards of ``kkl-gym agent train SYSTEM``.
 
     The agent sees (x_hat - target) / scale and acts once in a period of the task, while the observer sees every sample.
-    It is paid minus the cost, or by the system's own ``reward``. Row i of the task's vector environment behaves as this
-    one does with that row's seed.
+    The reward is minus the cost, or the system's own ``reward``. With the seed of row i of the task's vector
+    environment, this environment behaves like that row.
 
-    Noise, starts and length of the episodes are the environment's: make it with the
-    ``env_kwargs`` of ``training.agents.tasks.get_task(SYSTEM)``. The files in training/agents/hyperparameters do so for
-    rl-zoo3.
+    The environment itself sets the noise, the starts and the length of episodes: make it with the ``env_kwargs`` of
+    ``training.agents.tasks.get_task(SYSTEM)``. The files in training/agents/hyperparameters do so for rl-zoo3.
     """
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], observer: str | None = None) -> None:
@@ -32,7 +31,7 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
         RecordConstructorArgs.__init__(self, observer=observer)
         self._system, self._task = base.system, task_of(base.system)
         if base.dt != (dt := self._task.env_kwargs["dt"]):
-            raise ValueError(f"the environment has dt = {base.dt} s, the task {dt} s: make it with that")
+            raise ValueError(f"the environment has dt = {base.dt} s, the task {dt} s: make it with the task's")
         seen = KKLObservation(env, observer or observer_of(base.system))
         gym.Wrapper.__init__(self, ActionRepeat(seen, self._task.repeat))
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (base.system.nx,), np.float32)

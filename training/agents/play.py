@@ -9,15 +9,15 @@ import numpy as np
 from kkl_gym.wrappers.vector import VectorEnv
 
 Policy = Callable[[np.ndarray], Any]
-SIGNALS = ("x", "x_hat", "y")  # of info, kept at each instant at which the agent acts
+SIGNALS = ("x", "x_hat", "y")  # keys of info that are recorded whenever the agent acts
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes side by side; where one has ended, its last values stay.
+    """A batch of n episodes; after the end of an episode its last values are repeated.
 
-    Shapes: ``returns``, ``lengths`` and ``escaped`` (n,), ``x``, ``x_hat`` and ``y`` (steps + 1, n, signals), None
-    where the environment does not show them; ``u`` (steps, n, nu).
+    Shapes: ``returns``, ``lengths`` and ``escaped`` (n,); ``x``, ``x_hat`` and ``y`` (steps + 1, n, signals), None
+    if the environment does not show them; ``u`` (steps, n, nu).
     """
 
     returns: np.ndarray
@@ -38,7 +38,7 @@ class Episodes:
 def play(
     env: VectorEnv, policy: Policy, *, seed: int, report: Callable[[float], object] = lambda ended: None
 ) -> Episodes:
-    """Play one episode in each row of an environment that resets in the same step, row i with the seed ``seed`` + i."""
+    """Play one episode in each row, with seed ``seed`` + i in row i; the environment must reset in the same step."""
     obs, info = env.reset(seed=seed)
     kept = {key: [info[key]] for key in SIGNALS if key in info}
     inputs = list[np.ndarray]()

@@ -1,4 +1,4 @@
-"""Policies of stable-baselines3 as perceptrons, and where their layers are."""
+"""Policies of stable-baselines3, and their layers as perceptrons."""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,19 +22,19 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "tqc": TQC,
     "ppo_lstm": RecurrentPPO,
 }
-CONTINUOUS = ("sac", "td3", "tqc")  # whose actions are bounded numbers
+CONTINUOUS = ("sac", "td3", "tqc")  # these need bounded actions
 ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.SiLU: "silu"}
 
 
 def head_of(algorithm: str, *, discrete: bool) -> Head:
-    """How the output of an algorithm's network becomes an action."""
+    """The function from the output of an algorithm's network to an action."""
     if discrete:
         return "argmax"
     return "tanh" if algorithm in CONTINUOUS else "clip"
 
 
 def actor(model: BaseAlgorithm) -> list[nn.Module]:
-    """The modules of an agent's deterministic policy behind the LSTM, linear ones and activations, in their order."""
+    """The linear modules and activations of an agent's deterministic policy after the LSTM, in order."""
     policy: Any = model.policy
     if isinstance(model, SAC | TQC):
         return [*policy.actor.latent_pi, policy.actor.mu]
@@ -46,7 +46,7 @@ def actor(model: BaseAlgorithm) -> list[nn.Module]:
 
 
 def perceptron(model: BaseAlgorithm) -> MLP:
-    """Take the layers of the deterministic policy out of a trained agent."""
+    """Return the layers of a trained agent's deterministic policy."""
     body = actor(model)
     layers = [layer for layer in body if isinstance(layer, nn.Linear)]
     activation = next((ACTIVATIONS[type(layer)] for layer in body if type(layer) in ACTIVATIONS), "tanh")
@@ -54,7 +54,7 @@ def perceptron(model: BaseAlgorithm) -> MLP:
 
 
 def lstm_in(weights: dict[str, torch.Tensor]) -> LSTM | None:
-    """The LSTM in the tensors of a policy, if there is one."""
+    """The LSTM in the tensors of a policy, or None."""
     parts = [weights.get(f"lstm_actor.{name}_l0") for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
     if any(part is None for part in parts):
         return None
@@ -63,8 +63,8 @@ def lstm_in(weights: dict[str, torch.Tensor]) -> LSTM | None:
 
 
 def linear(start: float) -> Callable[[float], float]:
-    """Make a schedule that ends at zero."""
-    return lambda remaining: start * max(remaining, 0.0)  # the last rollout ends past the last step
+    """Return a linear schedule that ends at zero."""
+    return lambda remaining: start * max(remaining, 0.0)  # the last rollout exceeds the number of steps
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

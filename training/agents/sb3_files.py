@@ -1,4 +1,4 @@
-"""Agents as stable-baselines3's own files, AGENT.zip, and back, without unpickling any."""
+"""Conversion of agents to and from stable-baselines3's own files, AGENT.zip, without unpickling."""
 
 import io
 import json
@@ -23,20 +23,20 @@ from training.agents.information import OBSERVED, Information, make, observer_of
 from training.agents.policy import ACTIVATIONS, ALGORITHMS, CONTINUOUS, actor, head_of, lstm_in
 from training.agents.tasks import Task
 
-_LAYERS = {  # of the deterministic policy in a file of each algorithm; SAC's are TQC's, and PPO's A2C's
+_LAYERS = {  # layers of the deterministic policy by algorithm; TQC has SAC's, and A2C has PPO's
     "sac": re.compile(r"actor\.latent_pi\.\d+|actor\.mu"),
     "td3": re.compile(r"actor\.mu\.\d+"),
     "dqn": re.compile(r"q_net\.q_net\.\d+"),
     "ppo": re.compile(r"mlp_extractor\.policy_net\.\d+|action_net"),
 }
-_MAX_BYTES = 1 << 28  # of a policy, unpacked
+_MAX_BYTES = 1 << 28  # size of an unpacked policy
 
 
 def to_sb3(agent: Agent, *, trusted: str | None = None) -> BaseAlgorithm:
-    """Make an agent of stable-baselines3 that acts as this one; its ``save`` writes the zip.
+    """Make an agent of stable-baselines3 that acts like this one; its ``save`` writes the zip.
 
-    Its value functions are not trained: it is for playing. Where observations are normalised, its first layer does so,
-    without clipping them to ±10.
+    Its value functions are untrained, so that it can play but not continue to learn. Its first layer includes the
+    normalisation of observations, without the clip at ±10.
     """
     network = agent.network
     hidden = [len(bias) for bias in network.biases[:-1]]
@@ -78,7 +78,7 @@ def from_sb3(
 ) -> Agent:
     """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task, without VecNormalize.
 
-    Of the file, its tensors and its text are read; nothing is unpickled.
+    Only the tensors and the text of the file are read; nothing is unpickled.
     """
     if task.system is not None and information in OBSERVED and observer is None:
         observer = observer_of(get_system(task.system))
@@ -115,7 +115,7 @@ def from_sb3(
 
 
 def _content(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """The tensors of a policy and the text beside them."""
+    """The tensors of a policy, and the settings as text."""
     try:
         with zipfile.ZipFile(path) as files:
             if max(files.getinfo(name).file_size for name in ("policy.pth", "data")) > _MAX_BYTES:
@@ -123,13 +123,13 @@ def _content(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
             weights = torch.load(io.BytesIO(files.read("policy.pth")), map_location="cpu", weights_only=True)
             return weights, json.loads(files.read("data"))
     except (KeyError, zipfile.BadZipFile, RuntimeError, UnpicklingError) as error:
-        raise AgentError(f"it is no agent of stable-baselines3: {error}") from error
+        raise AgentError(f"it is not an agent of stable-baselines3: {error}") from error
     except OSError as error:
         raise AgentError(f"it cannot be read: {error.strerror}") from error
 
 
 def _activation(described: dict[str, Any], default: str) -> str:
-    """The activation between the layers, as the text beside the pickled settings names it."""
+    """The activation between the layers, from the text beside the pickled settings."""
     named = str(described.get("policy_kwargs", {}).get("activation_fn", default))
     for module, name in ACTIVATIONS.items():
         if named.rpartition(".")[2].removesuffix("'>") == module.__name__:

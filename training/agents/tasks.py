@@ -1,4 +1,4 @@
-"""Control tasks: an environment, its measured entries and the hold of an action; scores of systems' tasks."""
+"""Control tasks: an environment, its measured entries and the time between actions; scores of systems' tasks."""
 
 import json
 import re
@@ -17,16 +17,16 @@ from observers.checks import LARGEST, flag, integer, is_finite, real_array, show
 from observers.names import matching
 from training.evaluation.levels import Level
 
-MAX_SAMPLES = 100_000  # of an episode: all of them are kept while it is played
-MAX_FRAMES = 1_000  # which may come from a stranger's file
-TOLERANCE = 0.2  # distance from the target over the scale, within which an agent holds it
+MAX_SAMPLES = 100_000  # longest episode, because play stores all its samples
+MAX_FRAMES = 1_000  # bounded, because an untrusted file may set it
+TOLERANCE = 0.2  # an agent holds the target within this distance, over the scale
 
 
 @dataclass(frozen=True)
 class Task:
-    """An environment and what agents may see of it.
+    """An environment and the entries of its observations that agents may see.
 
-    Of a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` stay empty. ``env_id`` and
+    In a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` stay empty. ``env_id`` and
     ``env_kwargs`` are those of ``gym.make``; ``repeat`` is in samples, ``time_constants`` and ``frames`` in actions.
     ``weights`` are those of z, as :meth:`kkl_gym.KKLMemory.learn_weights` returns them.
     """
@@ -46,7 +46,7 @@ class Task:
     def __post_init__(self) -> None:
         if not isinstance(self.env_id, str):
             raise ValueError(f"env_id must be a string, got {shown(self.env_id)}")
-        try:  # as a file holds them
+        try:  # in the form that a file holds
             object.__setattr__(self, "env_kwargs", json.loads(json.dumps(dict(self.env_kwargs))))
         except (TypeError, ValueError) as error:
             raise ValueError(f"env_kwargs must be JSON, got {shown(self.env_kwargs)}: {error}") from None
@@ -110,7 +110,7 @@ def control_task(
     start_box: Box | None = None,
     dt: float = 0.01,
 ) -> Task:
-    """Return the task to bring a system to its target and hold it there; times are in seconds."""
+    """Return the task to bring a system to its target and hold it there. Times are in seconds."""
     for name, time, unit in (("period", period, dt), ("duration", duration, period)):
         if not (is_finite(time) and is_finite(unit)) or not 0 < unit <= time:
             raise ValueError(f"a task needs 0 < dt <= period <= duration, got {dt}, {period} and {duration}")
@@ -124,17 +124,17 @@ def control_task(
 
 
 TASKS: dict[str, Task] = {
-    # Marginally stable: an agent that does not know the state cannot take energy out.
+    # Marginally stable: an agent that does not know the state cannot remove energy.
     "reverse_duffing": control_task("reverse_duffing", period=0.1),
-    # The target is unstable. Starts keep to |x1| < 3: beyond it a slow manifold holds the motion under any input.
+    # The target is unstable. Starts have |x1| < 3: beyond, a slow manifold holds the motion under any input.
     "van_der_pol": control_task("van_der_pol", start_box=((-3, 3), (-6, 6))),
     "rossler": control_task("rossler", period=0.1, duration=30.0),
     "lorenz": control_task("lorenz", duration=5.0),  # the input is weak
 }
-PREFERRED = {"reverse_duffing": "sac"}  # algorithm; ppo for all others
+PREFERRED = {"reverse_duffing": "sac"}  # the algorithm; all others have ppo
 
-# Positions are measured and velocities are not, as in rl-zoo3's tasks. ``hidden`` where an observer estimates less than
-# all the rest: of the double pendulum not the forces of its constraints.
+# Positions are measured and velocities are hidden, as in rl-zoo3's tasks. ``hidden`` names the estimated entries, if
+# these are not all others: the double pendulum's constraint forces are left out.
 HIDDEN_VELOCITIES: dict[str, Task] = {
     task.env_id: task
     for task in (
@@ -177,7 +177,7 @@ def get_task(name: str, measurement_noise: Level | None = None, **changes: Any) 
 
 
 def task_of(system: System, name: str | None = None) -> Task:
-    """Return the task of a system, whose ``name`` imports it if it does not ship."""
+    """Return the task of a system; ``name`` imports a system that does not ship."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs for an agent to act on")
     dt = system.dt
@@ -199,6 +199,6 @@ def scores(system: System, x: np.ndarray) -> np.ndarray:
 
 
 def successes(system: System, x: np.ndarray) -> np.ndarray:
-    """Whether ``x`` (steps, n, nx) stay within the tolerance of the target for their last fifth."""
+    """Whether ``x`` (steps, n, nx) stays within the tolerance of the target in its last fifth; returns (n,)."""
     late = x[-max(1, round(0.2 * len(x))) :]
     return np.asarray((np.linalg.norm(deviation(system, late), axis=-1) <= TOLERANCE).all(0))

@@ -31,31 +31,31 @@ from training.evaluation.levels import show_level
 from training.files import locked
 from training.progress import LOG, ProgressBars, progress_bars
 
-TRANSIENT = 20  # steps of an episode whose estimates are not judged
+TRANSIENT = 20  # first steps of an episode, whose errors do not count
 Name = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
         metavar="SYSTEM|ENV_ID",
-        help="A shipped system, a class of yours as script.py:Class or module:Class, or an environment as gym.make "
+        help="A shipped system, your own class as script.py:Class or module:Class, or an environment as gym.make "
         "takes it, such as Pendulum-v1.",
     ),
 ]
 AgentFile = Annotated[
     tyro.conf.Positional[str],
-    tyro.conf.arg(metavar="AGENT", help="An agent that ships, by its system's name, or an agent.safetensors file."),
+    tyro.conf.arg(metavar="AGENT", help="A shipped agent, by its system's name, or an agent.safetensors file."),
 ]
 Trust = Annotated[
     str | None,
     hint(
         metavar="NAME",
-        help="The agent's system or environment if it is one of your own: script.py:Class, module:Class or module:ID, "
+        help="The agent's system or environment, if it is your own: script.py:Class, module:Class or module:ID, "
         "as the agent's file names it.",
     ),
 ]
 
 
 def numbers(kind: type, form: str, count: int | None = None) -> Callable[[str], tuple[Any, ...]]:
-    """A reader of numbers with commas between them."""
+    """Return a reader of comma-separated numbers."""
 
     def read(text: str) -> tuple[Any, ...]:
         try:
@@ -72,29 +72,28 @@ def numbers(kind: type, form: str, count: int | None = None) -> Callable[[str], 
 _INDICES = words(numbers(int, "indices in the flattened observation, as in 0,1"), "INDICES", 1)
 _PAIR = words(numbers(int, "the cosine's entry and the sine's, once for each angle, as in 0,1", 2), "PAIR", 1)
 _STEPS = words(numbers(float, "numbers of steps, as in 1,2"), "STEPS", 1)
-Measured = Annotated[tuple[int, ...], _INDICES, hint("the positions, of environments known here")]
+Measured = Annotated[tuple[int, ...], _INDICES, hint("the positions, in known environments")]
 
 
 @dataclass(frozen=True)
 class TaskOptions:
-    """Options of a task; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
+    """Options of a task; annotate fields of this type with ``tyro.conf.OmitArgPrefixes``."""
 
     measured: Measured = ()
-    """Entries of the flattened observation that agents may see, with commas between them, as in 0,1. Of systems y is
-    measured."""
+    """Entries of the flattened observation that agents may see, as in 0,1. In systems, y is measured."""
     hidden: Annotated[tuple[int, ...], _INDICES, hint("all others")] = ()
-    """Entries that an observer estimates."""
+    """Entries of the flattened observation that an observer estimates."""
     env_kwargs: EnvironmentArguments = ()
     time_constants: Annotated[tuple[float, ...], _STEPS, hint("1,2,4,8")] = ()
-    """Time constants of z's memory and of traces, in actions. Where there is no noise, 1 or 1,2 may be easier to learn
-    with."""
+    """Time constants of z's memory and of traces, in actions. Without noise, agents may learn more easily with 1 or
+    1,2."""
     frames: Annotated[int | None, hint("8")] = None
     """Number of stacked observations, each with the action before it."""
     no_past_actions: tyro.conf.FlagCreatePairsOff[bool] = False
     """Leave past actions out of z, traces and stacked."""
     angles: Annotated[tuple[Annotated[tuple[int, ...], _PAIR], ...], tyro.conf.UseAppendAction, hint("none")] = ()
-    """Measured entries that are the cosine and the sine of an angle, once for each angle, as in 0,1. Then z holds how
-    far it has turned."""
+    """Measured entries that are the cosine and the sine of an angle, once for each angle, as in 0,1. z then holds the
+    turned angle."""
 
     def task(self, name: str, measurement_noise: Any = None) -> Task:
         """The task of a system or an environment with these options."""
@@ -108,42 +107,42 @@ class TaskOptions:
 
 @dataclass(frozen=True)
 class Train:
-    """Train an agent with stable-baselines3: to hold a system's target, or in any environment of which it sees a part.
+    """Train an agent with stable-baselines3: to hold a system's target, or in any partly observed environment.
 
     Writes agent.safetensors (the policy, with its task and observer) and curve.csv (steps, CPU seconds and return of
-    each episode) into the run's folder. Hyperparameters are those of training/agents/hyperparameters. A resumed agent
-    is another than without a stop.
+    each episode) into the run's folder. Hyperparameters are those of training/agents/hyperparameters. A resumed
+    training does not reproduce an uninterrupted one.
     """
 
     name: Name
     information: Information = "x_hat"
-    """The agent's observation: docs/guides/agents.md explains each."""
+    """The agent's observation; docs/guides/agents.md explains the choices."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each measured sample."""
     timesteps: Annotated[int | None, hint("the hyperparameters'")] = None
-    """Actions to learn from, in all environments together."""
-    observer: Annotated[str | None, hint("the system's; of environments one is learned", metavar="MAP")] = None
+    """Number of actions in the training, over all environments."""
+    observer: Annotated[str | None, hint("the system's; for environments one is learned", metavar="MAP")] = None
     """A shipped map's name or a .safetensors file, for an agent that sees x_hat, x_hat_std or z."""
     algorithm: Annotated[
         Literal["ppo", "sac", "td3", "tqc", "dqn", "a2c", "ppo_lstm"] | None,
-        hint("sac for reverse_duffing and where it is tuned, else ppo"),
+        hint("sac for reverse_duffing and wherever it is tuned, else ppo"),
     ] = None
-    """The algorithm of stable-baselines3; recurrent agents learn by ppo_lstm."""
-    observer_steps: Annotated[int | None, hint("nine tenths of all, under noise one tenth")] = None
-    """First steps of an agent in an environment, from the latest 100,000 of which its observer is learned, where none
-    is named. Without noise the agent learns from them too: it sees hidden signals where estimates will be. Under noise
-    actions are random; if named, an agent on z learns from them which parts of its memory predict y."""
+    """The algorithm of stable-baselines3. Recurrent agents need ppo_lstm."""
+    observer_steps: Annotated[int | None, hint("nine tenths of all, with noise one tenth")] = None
+    """Number of first steps in an environment from which the observer is learned, if none is named; the latest 100,000
+    count. Without noise the agent learns during these steps, too, on true hidden signals in place of estimates. With
+    noise these steps are random actions; if given for z, they decide which parts of the memory predict y."""
     aggregate: int = 0
-    """How often an observer is fitted again, to the agent's own steps, while the agent learns on estimates. The last
-    twentieth of all steps is then without exploration, and followed by one more fit."""
+    """How often the observer is refitted to the agent's own steps while the agent learns on estimates. In the last
+    twentieth of all steps the agent then does not explore, and one more fit follows."""
     options: tyro.conf.OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
     def run(self, console: Console) -> None:
-        """Train, and play a hundred episodes."""
-        from training.agents.learning import learn  # which takes seconds to import
+        """Train an agent, and evaluate it on a hundred episodes."""
+        from training.agents.learning import learn  # the import takes seconds
         from training.run import CHECKPOINT
 
         task = self.options.task(self.name, self.measurement_noise)
@@ -151,10 +150,10 @@ class Train:
         set_threads(self.folder.threads)
         with locked(folder), progress_bars(console, folder / LOG) as progress:
             if (folder / "agent.safetensors").exists() and not self.folder.resume:
-                raise FileExistsError(f"{folder} holds an agent already; choose another folder with --out")
+                raise FileExistsError(f"{folder} already holds an agent; choose another folder with --out")
             if (folder / f"agent{CHECKPOINT}").exists() and not self.folder.resume:
                 raise FileExistsError(
-                    f"{folder} holds the checkpoint of a training: go on with it (--resume), remove it, or choose "
+                    f"{folder} holds the checkpoint of a training: continue it (--resume), remove it, or choose "
                     "another folder with --out"
                 )
             progress.say(f"training an agent for {task.name} that sees {self.information}, in {folder}")
@@ -183,7 +182,7 @@ class Evaluate:
     episodes: int = 500
     """Number of episodes."""
     seed: int = 0
-    """Seed of the episodes; no seed gives any that training draws."""
+    """Seed of the episodes. They differ from those of every training."""
     trust: Trust = None
 
     def run(self, console: Console) -> None:
@@ -194,9 +193,9 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Export:
-    """Write an agent as stable-baselines3's zip, which PPO.load, SAC.load and so on read.
+    """Write an agent as a zip of stable-baselines3, for PPO.load, SAC.load and so on.
 
-    Its value functions are not trained: it is for playing.
+    Its value functions are untrained, so that it can play but not continue to learn.
     """
 
     agent: AgentFile
@@ -216,9 +215,9 @@ class Export:
 
 @dataclass(frozen=True)
 class Import:
-    """Read an agent that stable-baselines3 or rl-zoo3 has trained, of systems on training.agents.OnTask.
+    """Convert an agent that stable-baselines3 or rl-zoo3 has trained; for systems, on training.agents.OnTask.
 
-    Writes agent.safetensors, which kkl-gym agent evaluate plays. Nothing is unpickled.
+    Writes agent.safetensors for kkl-gym agent evaluate. Nothing is unpickled.
     """
 
     path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="AGENT.zip")]
@@ -229,7 +228,7 @@ class Import:
     out: Path = Path("agent.safetensors")
     """The agent's file."""
     observer: Annotated[str | None, hint("the system's", metavar="MAP")] = None
-    """The shipped map or .safetensors file that it was trained on."""
+    """The shipped map or .safetensors file with which the agent was trained."""
     measured: Measured = ()
     """Entries of the flattened observation that the agent may see, as in 0,1."""
 
@@ -243,7 +242,7 @@ class Import:
 
 @dataclass(frozen=True)
 class AgentCommand:
-    """Train, evaluate and convert agents that see a part of the state, a memory of it, or an observer's estimate."""
+    """Train, evaluate and convert agents that see a part of the state, a memory, or an observer's estimate."""
 
     command: Annotated[
         Annotated[Train, tyro.conf.subcommand("train")]
@@ -254,12 +253,12 @@ class AgentCommand:
     ]
 
     def run(self, console: Console) -> None:
-        """Run the chosen one."""
+        """Run the chosen command."""
         self.command.run(console)
 
 
 def evaluate(progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, trusted: str | None = None) -> Episodes:
-    """Play episodes and print their return; of systems also score and success, of environments errors of x_hat."""
+    """Play episodes and print their return, for systems also score and success, for environments errors of x_hat."""
     first, task = agent_evaluation_seed(seed, n), agent.task
     env = agent.make(n, trusted=trusted)
     try:

@@ -1,4 +1,4 @@
-"""``kkl-gym demo``: environments with their observers, in one table, one figure and one moving picture."""
+"""``kkl-gym demo``: environments with their observers, in a table, a figure and an animation."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -24,22 +24,22 @@ from training.files import require_writable
 from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports
-SECONDS = 12.0  # of moving pictures at the pace of the systems that ship, where they play as fast as the motion
-FRAMES = 144  # at most
-TRAIL = 0.35  # of the samples drawn: older points would hide the new ones
+SECONDS = 12.0  # length of animations for systems with a pace of 1 s, which are shown in real time
+FRAMES = 144  # largest number in an animation
+TRAIL = 0.35  # share of the samples drawn: older points would hide the new ones
 
 
 @dataclass(frozen=True)
 class Demo:
     """Run the environments with their observers: a table of errors, a figure of true and estimated states.
 
-    The observer runs inside the environment. SPINN, the paper's, is given the same outputs afterwards, where it ships.
+    The observer runs inside the environment. The paper's observer SPINN, if one ships, then runs on the same outputs.
     """
 
     system: OneSystem = None
     observer: OneObserver = None
     out: Path = Path("runs/demo")
-    """Folder for the figure: estimates.png, of one system alone estimates-NAME.png."""
+    """Folder for the figure: estimates.png, or estimates-NAME.png for a single system."""
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y."""
     duration: Seconds = None
@@ -48,7 +48,7 @@ class Demo:
     """Seed of the starts and the noise."""
     policy: OwnPolicy = None
     gif: bool = False
-    """Draw phase portraits of the first 12 s that move, at the pace of the shipped systems: estimates.gif."""
+    """Also animate the phase portraits: estimates.gif, of 12 s, or 1,200 samples for systems of another pace."""
 
     def run(self, console: Console) -> Path:
         """Run."""
@@ -85,7 +85,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of an environment with an observer; ``spinn`` is the paper's observer's estimate, where it ships."""
+    """One episode of an environment with an observer; ``spinn`` holds the estimates of SPINN, if one ships."""
 
     environment: Shown
     artifact: Artifact
@@ -112,7 +112,7 @@ def play(
     policy: str | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> Episode:
-    """Play one episode with an observer, undriven unless it was trained under a policy."""
+    """Play one episode with an observer, without input unless it was trained under a policy."""
     options: dict[str, Any] = {"measurement_noise": measurement_noise, "max_episode_steps": steps}
     env = kkl_gym.KKLObservation(gym.make(environment.env_id, **environment.options, **options), environment.observer)
     base: Any = env.unwrapped
@@ -133,7 +133,7 @@ def play(
         if k % EVERY == 0:
             report(k)
     x, x_hat, y = (np.array([info[key] for info in infos]) for key in ("x", "x_hat", "y"))
-    # SPINN's maps know no inputs.
+    # SPINN's maps have no inputs.
     ships = acting is None and type(system) in kkl_gym.SYSTEMS.values()
     return Episode(
         environment,
@@ -141,15 +141,15 @@ def play(
         dt=base.dt,
         noise=show_level(level),
         x=x,
-        x_hat=x_hat[:, : system.nx],  # without a bias behind the states
+        x_hat=x_hat[:, : system.nx],  # without an estimated bias
         spinn=load(f"{system.name}-spinn", level).estimate(y) if ships else None,
         y=y,
-        seconds=float(np.median(seconds)),  # the first one compiles, or loads machine code
+        seconds=float(np.median(seconds)),  # median, because the first step compiles or loads machine code
     )
 
 
 def table(episodes: Sequence[Episode]) -> Table:
-    """Errors of the observers, and the time of a step."""
+    """A table of the observers' errors and of the time of a step."""
     noise = ", ".join(dict.fromkeys(episode.noise for episode in episodes))
     with_spinn = any(episode.spinn is not None for episode in episodes)
     laid_out = Table(
@@ -205,16 +205,16 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=len(handles))
         noise = ", ".join(dict.fromkeys(episode.noise for episode in episodes))
         what = "one noisy output" if all(episode.y.shape[1] == 1 for episode in episodes) else "noisy outputs"
-        end = "\n" if len(episodes) == 1 else " "  # so that a narrow figure has room
+        end = "\n" if len(episodes) == 1 else " "  # a narrow figure needs two lines
         figure.suptitle(f"Hidden states estimated from {what}{end}(standard deviation {noise} on every sample)")
 
 
 def animate(path: Path, motions: Sequence[Episode]) -> None:
-    """Draw states and estimates as they move, a column for each motion."""
+    """Animate states and estimates, with a column for each motion."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    side = 2.4 if len(motions) > 1 else 4.8  # one alone must have room for the legend
+    side = 2.4 if len(motions) > 1 else 4.8  # a single one needs room for the legend
     frames: list[Image.Image] = []
     with style():
         figure = Figure(figsize=(side * len(motions), side + 0.7), dpi=120)
@@ -233,7 +233,7 @@ def animate(path: Path, motions: Sequence[Episode]) -> None:
 
 
 class Column:
-    """A phase portrait of the beginning of a motion, and the measured outputs below it."""
+    """An animated phase portrait of the beginning of a motion, and the measured outputs below it."""
 
     def __init__(self, motion: Episode, portrait: Any, strip: Any) -> None:
         system, shown = motion.system, list(motion.system.portrait)
@@ -260,7 +260,7 @@ class Column:
         self.outputs = [strip.plot([], [], color=MEASURED, lw=0.6, animated=True)[0] for _ in self.y.T]
 
     def name_lines(self, figure: Any) -> None:
-        """Put the legend of all columns above them."""
+        """Draw the legend above all columns."""
         lines = [*(trail for trail, _ in self.trails), self.outputs[0]]
         figure.legend(lines, ["state", "estimate", "what the observer sees"], loc="outside upper center", ncols=3)
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from training.diagnosis import Finding
 
 COLOURS = {"ok": "green", "note": "yellow", "problem": "bold red"}
-# Options that are not for every subject. --measured and --hidden are for data, and make of a name an environment.
+# Options that do not apply to every subject. With --measured and --hidden, a name is that of an environment.
 ONLY = {
     "a system": ("dt", "duration", "parameters"),
     "an environment": ("episodes", "steps", "env_kwargs"),
@@ -46,12 +46,12 @@ ONLY = {
 class Diagnose:
     """Report before any training whether a system can be observed and learned, with problems and their remedies.
 
-    Three kinds of subject: a system (NAME alone); an environment, which is played for it (NAME with --measured and
-    --hidden); recorded data (--data, and no NAME). Takes some ten seconds.
+    The subject is a system (only NAME), an environment, of which episodes are then played (NAME with --measured and
+    --hidden), or recorded data (--data without NAME). The command takes about ten seconds.
 
-    Of a system: its equations on all kinds of numbers, its motions, sampling, outputs and noise, and the least error of
-    each state. Of data and environments: which hidden signals y and u determine, over which window and under how much
-    noise. The exit status is 1 if there is a problem. docs/guides/diagnose.md explains the lines.
+    For a system it checks the equations on all types of numbers, motions, sampling, outputs and noise, and the least
+    error of each state. For data and environments it reports which hidden signals y and u determine, over which window
+    and under how much noise. The exit status is 1 if there is a problem. docs/guides/diagnose.md explains the lines.
     """
 
     name: Annotated[
@@ -61,26 +61,24 @@ class Diagnose:
             help=f"{SYSTEM} With --measured and --hidden: an environment as gym.make takes it, such as Pendulum-v1.",
         ),
     ] = None
-    measurement_noise: Annotated[NoiseLevels, hint("of a system, its own; else 1 % and 10 % of each output's size")] = (
-        None
-    )
-    """Standard deviations of noise on each sample of y, beside 0; one for all outputs or, as in 0.1,0.3, for each."""
+    measurement_noise: Annotated[NoiseLevels, hint("the system's own; else 1 % and 10 % of each output's size")] = None
+    """Standard deviations of noise on each sample of y, besides 0; one for all outputs, or one for each: 0.1,0.3."""
     dt: Annotated[float | None, hint("the system's")] = None
     """Sampling interval of a system in seconds."""
     duration: Annotated[float | None, hint("the system's")] = None
-    """Length in seconds of a system's motions that are followed."""
+    """Duration of a system's simulated motions in seconds."""
     policy: Annotated[str | None, hint("random")] = None
-    """Chooses the inputs: of a system as for `kkl-gym train` ("controller", or a function of yours as
-    script.py:function), in an environment as for `kkl-gym record`."""
+    """Policy that chooses the inputs. For a system, as in `kkl-gym train`: "controller", or your function as
+    script.py:function. For an environment, as in `kkl-gym record`."""
     parameters: Parameters = ()
     seed: int = 0
     """Seed of the environment's episodes and of the comparison."""
     json: Annotated[Path | None, NO_FILE] = None
-    """File to which the findings are written as well."""
+    """File for the findings in JSON."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
-    """For an environment."""
+    """Options for environments."""
     records: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
-    """For recorded data; --measured and --hidden are for an environment too, named as for `kkl-gym record`."""
+    """Options for recorded data. --measured and --hidden also serve environments, with names as in `kkl-gym record`."""
 
     def run(self, console: Console) -> "list[Finding]":
         """Diagnose and print."""
@@ -103,14 +101,14 @@ class Diagnose:
         return findings
 
     def _of_system(self, progress: ProgressBars) -> "Iterator[Finding]":
-        from training.diagnosis import check  # here, because it imports torch, which help need not wait for
+        from training.diagnosis import check  # imported here, because --help need not wait for torch
         from training.presets import named_policy
 
         assert self.name is not None
         parameters = merged("--parameters", self.parameters)
         try:
             system = get_system(self.name, parameters)
-        except EquationError:  # the findings describe it
+        except EquationError:  # the findings describe the error
             system = load_class(self.name, System)().replace(parameters)
         except ValueError as error:
             if not str(error).startswith("unknown system"):
@@ -134,10 +132,10 @@ class Diagnose:
         yield from observability(self.name or "", policy=policy, console=progress, **how).findings()
 
     def _refuse(self, subject: str) -> None:
-        """Raise ValueError if the subject is not named as it must be, or an option is for another."""
+        """Raise ValueError if the subject is not given properly, or an option belongs to another kind of subject."""
         if (self.name is None) != (subject == "recorded data"):
             raise ValueError(
-                f"NAME is the system or the environment, and has no place beside --data; got {self.name}"
+                f"NAME is the system or the environment, and cannot be given with --data; got {self.name}"
                 if self.name
                 else "name a system, an environment (with --measured and --hidden), or recorded data (--data)"
             )
@@ -145,7 +143,7 @@ class Diagnose:
         for of, options in ONLY.items():
             given = [f"--{option.replace('_', '-')}" for option in options if values[option] not in (None, "", ())]
             if given and subject not in of:
-                raise ValueError(f"{', '.join(given)}: of no use for {subject}, but for {of} alone")
+                raise ValueError(f"{', '.join(given)}: of no use for {subject}, only for {of}")
 
 
 def _row(finding: "Finding") -> Table:

@@ -49,31 +49,31 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
-SKIPPED = 5.0  # seconds of driven runs at the pace of the shipped systems, half of the run at most
-FIRST, SETTLED = 2.0, 5.0  # seconds at that pace: error bars are judged before the first and after the second
-SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # levels of noise for error bars, in multiples of the map's largest
+SKIPPED = 5.0  # seconds of driven runs that do not count, in units of the pace; at most half of the run
+FIRST, SETTLED = 2.0, 5.0  # also in units of the pace: error bars are evaluated before FIRST and after SETTLED
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, in multiples of the map's largest
 FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %")
 
 
 @dataclass(frozen=True)
 class Motions:
-    """The motions, and the plant that moves. The observer keeps its model."""
+    """The trajectories and their plant, which may differ from the observer's model."""
 
-    trajectories: Annotated[int | None, hint("100, with --faults 500")] = None
-    """Number of trajectories from each domain."""
+    trajectories: Annotated[int | None, hint("100, or 500 with --faults")] = None
+    """Number of trajectories from each region of starts."""
     duration: Seconds = None
     """Length of each trajectory in seconds; 50 for the systems that ship."""
     seed: int = 0
-    """Seed of the trajectories and the noise; no seed gives any that training draws."""
+    """Seed of the trajectories and the noise. They differ from those of every training."""
     process_noise: float = 0.0
-    """Level of the process noise, in multiples of the system's scale per second; the environments' default is 0.05."""
+    """Level of the process noise, in multiples of the system's scale per second. Environments have 0.05 by default."""
     plant: Plant = ()
-    """Parameters of the plant that moves, such as mu=3.3."""
+    """Parameters of the simulated plant, such as mu=3.3. The observer keeps its model."""
     plant_error: Annotated[float | None, hint("none", metavar="SHARE")] = None
-    """In place of --plant: share by which every parameter of the plant is larger than the observer's; 0.1 is 10 %."""
+    """Instead of --plant: makes every parameter of the plant larger by this share; 0.1 is 10 %."""
 
     def plant_of(self, system: System) -> System | None:
-        """Return the plant; None where it is the system."""
+        """Return the plant, or None if it is the system itself."""
         changes = merged("--plant", self.plant)
         if self.plant_error is None:
             return system.replace(changes) if changes else None
@@ -88,9 +88,9 @@ class Motions:
 
 @dataclass(frozen=True)
 class Subject:
-    """An observer, its system and its model, which may have a bias as a state, and motions of which plant and policy.
+    """An observer, its system, its model, which may have a bias as a state, and the plant and policy of the motions.
 
-    ``plant`` is None where the system moves.
+    ``plant`` is None if it is the system itself.
     """
 
     name: str
@@ -103,34 +103,34 @@ class Subject:
 
     @property
     def on(self) -> str:
-        """The plant, for titles."""
+        """Text on the plant for titles."""
         return f", plant {show_parameters(self.plant)}" if self.plant else ""
 
     def runs(self, **motions: Any) -> dict[str, Any]:
-        """Arguments of :func:`training.unseen_trajectories` beside some of them."""
+        """All arguments of :func:`training.unseen_trajectories`; ``motions`` are some of them."""
         plant = self.plant and model_of(self.artifact, self.plant)
         return {"duration": self.duration, "policy": self.policy, "plant": plant, **motions}
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure observers on unseen trajectories: errors, coverage of error bars, or how soon faults are noticed.
+    """Evaluate observers on unseen trajectories: errors, coverage of error bars, or detection of faults.
 
-    Errors are measured from starts in X and in 2X without X, with and without noise. SMAPE, in percent, is of the norm
-    of all states, over all steps (the paper's measure) and after the transient. NRMSE is the root mean square error of
-    each state after the transient, in percent of its standard deviation. The transient is the first fifth of a run, or
-    5 s where random steps and sines drive it (of systems of another pace, 500 samples).
+    Trajectories start in X and in 2X without X, with and without noise. SMAPE, in percent, uses the norm of all states,
+    over all steps (the paper's measure) and after the transient. NRMSE is the root mean square error of each state
+    after the transient, in percent of its standard deviation. The transient is the first fifth of a run, or 5 s if
+    random steps and sines drive it (500 samples for systems of another pace).
 
-    2X is cut at the system's declared bounds. Trajectories that leave these are counted, and left out. A level of noise
-    beyond a map's range is left out. Under a policy, driven runs are those in which it errs about the state and
-    explores; in the others its inputs give the state away to an observer that has learned the policy.
+    2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out, and so are
+    noise levels beyond a map's range. For an observer trained under a policy, the policy acts in all runs. In driven
+    runs it acts on a state with errors, and explores. In the others its inputs reveal the state to the observer.
 
-    --calibration: how many errors lie in the regions of 50, 90 and 99 % of the covariances, of all states and of each,
-    and their mean normalised square (NEES), at six levels of noise.
+    --calibration: the shares of errors within the regions of 50, 90 and 99 % of the covariances, for all states and for
+    each, and the mean normalised square of errors (NEES), at six noise levels.
 
-    --faults: from the middle of each run the sensor is biased by a fifth of the output's range, or dead (y = 0), or
-    frozen at its last value. Half of the runs are driven, if the observer takes inputs. A fault should be noticed
-    within a time that is chosen for each shipped system, and is a fifth of the duration for others.
+    --faults: from the middle of each run the sensor is biased by a fifth of the output's range, dead (y = 0), or frozen
+    at its last value. Half of the runs are driven, if the observer takes inputs. The time in which a fault should be
+    detected is chosen for each shipped system; for others it is a fifth of the duration.
     """
 
     observers: Observers
@@ -138,26 +138,26 @@ class Evaluate:
     system: OwnSystem = None
     policy: OwnPolicy = None
     measurement_noise: NoiseLevels = None
-    """Standard deviations of the noise on each sample of y, a table row for each. 0.1,0.3 is one for each output."""
+    """Standard deviations of the noise on each sample of y; each gives a row. 0.1,0.3 is one value for each output."""
     ekf: bool = False
-    """Beside each observer, an extended Kalman filter that knows the equations, the inputs and the levels of noise.
-    On another plant it knows those of the observer's model."""
+    """Also evaluate an extended Kalman filter that knows the inputs, the noise levels and the equations of the
+    observer's model."""
     limit: bool = False
-    """Beside each observer, for starts in X: the errors that noise leaves to any unbiased causal estimator (posterior
-    Cramér-Rao bound), by the plant's exact equations."""
+    """Also report, for starts in X, the least errors of any unbiased causal estimator under the noise (posterior
+    Cramér-Rao bound of the plant's exact equations)."""
     no_tracking: bool = False
-    """T_inv alone of observers that track."""
+    """Evaluate T_inv alone, also for observers that track."""
     calibration: bool = False
-    """In place of errors: coverage of the error bars."""
+    """Instead of errors, report the coverage of the error bars."""
     faults: bool = False
-    """In place of errors: how soon the monitor notices faults of the sensor."""
+    """Instead of errors, report how soon the monitor detects sensor faults."""
     csv: Annotated[Path | None, NO_FILE] = None
-    """File to which the results of each trajectory are written as well."""
+    """File for the results of each trajectory."""
     motions: tyro.conf.OmitArgPrefixes[Motions] = field(default_factory=Motions)
 
     def run(self, console: Console) -> "pd.DataFrame":
         """Evaluate."""
-        import pandas as pd  # which takes half a second that help need not wait for
+        import pandas as pd  # imported here, because --help need not wait half a second
 
         self._check()
         frames: list[pd.DataFrame] = []
@@ -170,7 +170,7 @@ class Evaluate:
                 for reason in left_out:
                     progress.say(f"{subject.name}, left out: {reason}")
         if not frames:
-            raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: see the lines above")
+            raise ValueError(f"there is nothing to evaluate for {', '.join(self.observers)}: see the lines above")
         results = pd.concat(frames, ignore_index=True)
         if self.faults:
             console.print(table("", [Column("observer", overflow="fold"), *FAULTS_HEADER], fault_rows(results)))
@@ -180,7 +180,7 @@ class Evaluate:
         return results
 
     def _check(self) -> None:
-        """Raise an error for invalid options, before any work."""
+        """Raise ValueError for invalid options, before any work."""
         levels = self.measurement_noise
         if levels is not None and not levels:
             raise ValueError("give at least one level of measurement noise, such as 0")
@@ -206,7 +206,7 @@ class Evaluate:
         return Subject(name, artifact, system, model, plant, duration, read_policy(artifact, system, self.policy))
 
     def _errors(self, of: Subject, progress: ProgressBars, left_out: list[str]) -> list["pd.DataFrame"]:
-        """Print tables of errors; rows of the CSV file."""
+        """Print tables of errors, and return the rows of the CSV file."""
         import pandas as pd
 
         process_noise, several, levels = self.motions.process_noise, self.ekf or self.limit, self._levels(of, left_out)
@@ -222,7 +222,7 @@ class Evaluate:
         for starts, driven, trajectories, level in self._cases(f"evaluating {of.name}", of, levels, progress, left_out):
             skip = min(SKIPPED * of.system.pace, of.duration / 2) if driven else None
             for estimator, measure in estimators.items():
-                if estimator == "limit" and starts != "X":  # the variance of other starts is not known
+                if estimator == "limit" and starts != "X":  # the bound needs the covariance of the starts
                     continue
                 one = measure(trajectories, measurement_noise=level, seed=self.motions.seed, skip=skip)
                 case = [estimator] * several + [starts] + [("no", "yes")[driven]] * inputs
@@ -253,7 +253,7 @@ class Evaluate:
         return frames
 
     def _parameters(self, of: Subject, levels: Sequence[Level]) -> Table:
-        """A table of errors of estimated parameters, from starts in X: of the plant, or of many from their ranges."""
+        """A table with the errors of estimated parameters, for starts in X."""
         inputs, rows, names = bool(of.artifact.nu), list[list[str]](), of.artifact.estimated_parameters
         ranges = {name: of.artifact.parameter_ranges[name] for name in names}
         system = of.system if of.plant else with_parameters(of.system, ranges)
@@ -270,7 +270,7 @@ class Evaluate:
         return table(title, [], rows, [*["driven"] * inputs, "noise\non y", *names])
 
     def _coverage(self, of: Subject, progress: ProgressBars, left_out: list[str]) -> list["pd.DataFrame"]:
-        """Print the coverage of error bars; rows of the CSV file."""
+        """Print the coverage of error bars, and return the rows of the CSV file."""
         import pandas as pd
 
         of.artifact.require_covariance()
@@ -305,7 +305,7 @@ class Evaluate:
         return [frame]
 
     def _faults(self, of: Subject, progress: ProgressBars, left_out: list[str]) -> list["pd.DataFrame"]:
-        """Simulate faults of the sensor; rows of the CSV file."""
+        """Simulate sensor faults, and return the rows of the CSV file."""
         from training.evaluation.faults import FAULTS, simulate_faults
 
         level = level_for(of.artifact, of.model, self.measurement_noise[0] if self.measurement_noise else None)
@@ -322,9 +322,9 @@ class Evaluate:
     def _cases(
         self, description: str, of: Subject, levels: Sequence[Level], progress: ProgressBars, left_out: list[str]
     ) -> Iterator[tuple[str, bool, UnseenTrajectories, Level]]:
-        """Yield the starts, whether inputs drive the trajectories, these, and each level of noise.
+        """Yield, for each noise level, the name of the starts, whether inputs drive, the trajectories and the level.
 
-        Starts without trajectories are described in ``left_out``.
+        A line in ``left_out`` describes starts without trajectories.
         """
         cases = CASES[: 3 if of.artifact.nu else 2] if levels else ()
         bar = progress.add_task(description, total=len(cases) * len(levels))
@@ -344,7 +344,7 @@ class Evaluate:
                 progress.advance(bar)
 
     def _levels(self, of: Subject, left_out: list[str]) -> list[Level]:
-        """Levels of measurement noise within a map's range; the others are described in ``left_out``."""
+        """Levels of measurement noise within a map's range; lines in ``left_out`` describe the others."""
         if self.measurement_noise is None:
             return list(dict.fromkeys([0.0, level_for(of.artifact, of.model)]))
         levels = [level_for(of.artifact, of.model, level) for level in self.measurement_noise]
@@ -367,7 +367,7 @@ def table(
     right: Sequence[str] = (),
     caption: str | None = None,
 ) -> Table:
-    """A table whose columns are aligned left, and then right."""
+    """A table whose first columns are aligned left, and the others right."""
     columns = [Column(name, justify="right") for name in right]
     laid_out = Table(*left, *columns, title=title or None, caption=caption)
     for row in rows:
@@ -376,7 +376,7 @@ def table(
 
 
 def fault_rows(runs: "pd.DataFrame") -> list[list[str]]:
-    """A row for each observer and fault, of results with ``--faults``."""
+    """The rows of the table of ``--faults``, one for each observer and fault."""
     rows = []
     for observer, group in runs.groupby("observer", sort=False):
         false = f"{100 * (group[group.fault == 'none'].score > 1).mean():.1f} %"
@@ -388,7 +388,7 @@ def fault_rows(runs: "pd.DataFrame") -> list[list[str]]:
 
 
 def show_parameters(system: System) -> str:
-    """For titles and tables: ``mu=3.3``, with spaces between several."""
+    """Parameters as text, such as ``mu=3.3 a=1``."""
     return " ".join(f"{name}={value:g}" for name, value in system.parameters.items())
 
 
@@ -399,5 +399,5 @@ def spread(values: np.ndarray) -> str:
 
 
 def percent(value: float) -> str:
-    """An NRMSE as text; NaN is that of a state that does not move."""
+    """An NRMSE as text; it is NaN for a constant state."""
     return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.2f}"

@@ -12,9 +12,9 @@ from training.commands.options import NoiseLevel, hint, words
 
 
 def read_format(text: str) -> str:
-    """Read the kind of files, in small letters or capitals."""
+    """Read the format, in lower or upper case."""
     if text.lower() not in ("onnx", "c"):
-        raise ValueError(f"{text!r} is no format: write onnx or c")
+        raise ValueError(f"{text!r} is not a format: write onnx or c")
     return text.lower()
 
 
@@ -22,27 +22,27 @@ def read_format(text: str) -> str:
 class ExportCommand:
     """Export an observer for programs without Python: as an ONNX graph or as C99.
 
-    Both take in a sample and the input before it, and return the estimate, as observers.KKLObserver does. All maps can
-    be exported: those that ship, of your own systems, from records and from rollouts.
+    Like observers.KKLObserver, both take a sample and the input before it, and return the estimate. All maps can be
+    exported: shipped ones, those of your own systems, and those from records and rollouts.
 
-    --format onnx: NAME.onnx, which takes a batch of any size, and levels of noise as inputs. It needs the extra onnx.
-    --format c: NAME.h and NAME.c, which allocate nothing and need the C library alone, and NAME_main.c, a program that
-    reads samples and prints estimates. docs/guides/export.md goes from end to end.
+    --format onnx: NAME.onnx takes a batch of any size, and noise levels as inputs. It needs the extra onnx.
+    --format c: NAME.h and NAME.c allocate no memory and need only the C library. NAME_main.c is a program that reads
+    samples and prints estimates. docs/guides/export.md shows a complete example.
     """
 
     observer: Annotated[
         tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP", help="A shipped map, or a .safetensors file.")
     ]
     format: Annotated[str, words(read_format, "{onnx,c}", 1)]
-    """The kind of files."""
+    """The format of the files."""
     precision: Literal["float", "double"] = "float"
-    """Type of the network, of samples and of estimates. The filter and the covariance of maps that track are doubles in
-    both: floats are too coarse for them."""
+    """Type of the network, of samples and of estimates. The filter, and the covariance of maps that track, always need
+    doubles."""
     measurement_noise: Annotated[NoiseLevel, hint("the map's own")] = None
-    """For --format c: standard deviation of the noise on each sample that the estimate assumes, or one for each output
-    as in 0.1,0.3."""
+    """For --format c: assumed standard deviation of the noise on each sample, one for all outputs or one for each as in
+    0.1,0.3."""
     process_noise: Annotated[float | None, hint("the system's")] = None
-    """For --format c: level of process noise that the estimate assumes."""
+    """For --format c: assumed level of process noise."""
     out: Path = Path("runs/export")
     """Folder for the files."""
 
@@ -52,7 +52,7 @@ class ExportCommand:
 
         if self.format == "onnx" and (self.measurement_noise, self.process_noise) != (None, None):
             raise ValueError(
-                "levels of noise are inputs of an ONNX graph: leave out --measurement-noise and --process-noise"
+                "noise levels are inputs of an ONNX graph: leave out --measurement-noise and --process-noise"
             )
         exported = Exported.read(
             self.observer,
@@ -72,5 +72,5 @@ class ExportCommand:
             with replacing(path) as temporary:
                 temporary.write_bytes(content)
         written = ", ".join(f"{path} ({len(content) / 1e3:.0f} kB)" for path, content in files.items())
-        console.print(f"wrote {written}", markup=False, highlight=False, soft_wrap=True)  # whole paths, to be copied
+        console.print(f"wrote {written}", markup=False, highlight=False, soft_wrap=True)  # unbroken paths, to copy
         return list(files)

@@ -27,38 +27,39 @@ from training.commands.options import (
 )
 from training.progress import LOG, progress_bars
 
-FARTHEST = 10.0  # factor by which a parameter without limits may move from its starting value
+FARTHEST = 10.0  # largest factor between a parameter without limits and its first guess
 
 
 @dataclass(frozen=True)
 class Identify:
-    """Learn a plant's unknown parameters, and an observer for it, from records of its outputs alone.
+    """Learn a plant's unknown parameters, and an observer for it, from records of its outputs only.
 
-    No state is needed. Multiple shooting fits the parameters and the states at which windows of the records start,
-    from random starts in the training box, and gives standard errors. The observer is trained on simulated motions of
-    the identified plant; with --observer, as that one was, for a plant that differs from its model.
+    No recorded state is needed. Multiple shooting fits the parameters, and the states at which windows of the records
+    start, from random states in the training box. It gives standard errors. The observer is then trained on simulated
+    motions of the identified plant. --observer adapts an observer to a plant that differs from its model, with the
+    settings of its training.
 
     The folder, runs/NAME-identified or with --observer runs/NAME-adapted, receives parameters.json, identification.png
-    (residuals, and predictions of records left out), NAME.safetensors, checkpoints and log.txt. Parameters that the
-    outputs do not identify are named, and are null in parameters.json.
+    (residuals, and predictions of held-out records), NAME.safetensors, checkpoints and log.txt. Parameters that the
+    outputs do not identify are listed, and are null in parameters.json.
     """
 
     system: SystemName
     unknown: Unknowns = ()
-    """Parameters that are not known: a first guess of each, and limits if you know them, as in mu=1.5 or mu=1.5:0.5:6.
-    Without limits a parameter stays between a tenth of the guess and ten times that. With --observer all by default,
-    from the observer's values on."""
+    """Unknown parameters: a first guess of each, and limits if you know them, as in mu=1.5 or mu=1.5:0.5:6. Without
+    limits a parameter stays between a tenth of the guess and ten times the guess. With --observer the default is all
+    parameters, with the observer's values as first guesses."""
     parameters: Parameters = ()
     observer: Annotated[str | None, hint("none", metavar="MAP")] = None
     """An observer of the plant's model to adapt: a shipped map or a .safetensors file."""
     data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
     """Records of the plant."""
     settings: tyro.conf.OmitArgPrefixes[SettingsOptions] = field(default_factory=SettingsOptions)
-    """Of the observer's training; dt is that of the records or of --observer."""
+    """Settings of the observer's training; dt is that of the records or of --observer."""
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
     def run(self, console: Console) -> Path:
-        """Identify, and write the observer's report."""
+        """Identify the plant, train the observer, and write both reports."""
         began = time.monotonic()
         set_threads(self.folder.threads)
         from training.evaluation.report import write_report
@@ -69,12 +70,12 @@ class Identify:
         if artifact is None:
             model = get_system(self.system, parameters)
         elif parameters:
-            raise ValueError("--parameters: of no use with --observer, which has parameters of its own")
+            raise ValueError("--parameters: of no use with --observer, which has its own parameters")
         else:
             model = system_of(artifact, self.system)
             unknown = unknown or {name: (value,) for name, value in model.parameters.items()}
             if not unknown:
-                raise ValueError(f"{model.name} has no parameters that could be adapted")
+                raise ValueError(f"{model.name} has no parameters to adapt")
         model = model.replace({name: guess for name, (guess, *_) in unknown.items()})
         folder = self.folder.out or Path("runs") / f"{model.name}-{'adapted' if artifact else 'identified'}"
         with progress_bars(console, folder / LOG) as progress:
@@ -95,11 +96,11 @@ class Identify:
 
 
 def limits(unknown: Mapping[str, tuple[float, ...]]) -> dict[str, tuple[float, float]]:
-    """Limits of unknown parameters: those given, or ten times as large and small as the first guess."""
+    """Limits of unknown parameters: the given ones, or a tenth of the first guess and ten times the guess."""
     by_name: dict[str, tuple[float, float]] = {}
     for name, (guess, *ends) in unknown.items():
         if not ends and not guess:
-            raise ValueError(f"{name} = 0 is no first guess without limits: write {name}=0:LOW:HIGH")
+            raise ValueError(f"{name} = 0 as a first guess needs limits: write {name}=0:LOW:HIGH")
         low, high = ends or sorted((guess / FARTHEST, guess * FARTHEST))
         by_name[name] = (low, high)
     return by_name

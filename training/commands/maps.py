@@ -9,7 +9,7 @@ from rich.table import Table
 from observers import Artifact, shipped
 from observers.names import resolve
 
-WIDTH = 80  # of the table; a narrower terminal breaks its lines, which cuts nothing
+WIDTH = 80  # columns of the table; narrower terminals wrap its lines
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Maps:
     """List the maps that ship with the package."""
 
     def run(self, console: Console) -> None:
-        """Print a row for each."""
+        """Print a row for each map."""
         table = Table(box=SIMPLE_HEAD, show_edge=False, padding=0, width=WIDTH)
         for column in ("map", "pipeline", "tracks by"):
             table.add_column(column, no_wrap=True)
@@ -41,7 +41,7 @@ class Maps:
 
 
 def tracks_by(artifact: Artifact) -> str:
-    """The motion by which an observer predicts: "equations", "flow", or nothing where it does not track."""
+    """The motion by which an observer tracks: "equations", "flow", or "" if it does not track."""
     if artifact.motion is None:
         return ""
     return "flow" if artifact.motion.equations is None else "equations"

@@ -1,4 +1,4 @@
-"""Options that several commands share: observers, systems, levels of noise, parameters, records, settings, folders."""
+"""Options that several commands share: observers, systems, noise levels, parameters, records, settings, folders."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,12 +22,12 @@ from training.records import Record, Signals, read_records
 from training.trajectories.motions import Controller
 from training.trajectories.parameters import EVERY, blind, with_bias
 
-Pairs = tuple[tuple[str, Any], ...]  # of the words NAME=VALUE behind an option
-Repeated = tuple[Pairs, ...]  # of an option that may be given several times; merged makes one mapping of them
+Pairs = tuple[tuple[str, Any], ...]  # the words NAME=VALUE after an option
+Repeated = tuple[Pairs, ...]  # an option that may be given several times; merged() combines the pairs
 
 
 def words(read: Callable[[str], Any], metavar: str, nargs: Any = "*") -> PrimitiveConstructorSpec[Any]:
-    """An option that takes several words, or with ``nargs`` 1 one, each read by a function."""
+    """An option that takes several words, or one if ``nargs`` is 1; ``read`` converts each."""
     return PrimitiveConstructorSpec(
         nargs=nargs,
         metavar=metavar,
@@ -38,7 +38,7 @@ def words(read: Callable[[str], Any], metavar: str, nargs: Any = "*") -> Primiti
 
 
 def pair(read: Callable[[str], Any], kind: str, form: str, alone: str = "") -> Callable[[str], tuple[str, Any]]:
-    """A reader of NAME=VALUE, where a value without a name is that of ``alone``, if it is given."""
+    """Return a reader of NAME=VALUE; with ``alone``, a value without a name gets that name."""
 
     def read_pair(text: str) -> tuple[str, Any]:
         name, equals, value = text.partition("=")
@@ -55,7 +55,7 @@ def pair(read: Callable[[str], Any], kind: str, form: str, alone: str = "") -> C
 
 
 def read_unknown(text: str) -> tuple[float, ...]:
-    """Read a first guess, or a first guess with limits."""
+    """Read a first guess, possibly with limits."""
     numbers = tuple(map(float, text.split(":")))
     if len(numbers) not in (1, 3):
         raise ValueError(text)
@@ -63,7 +63,7 @@ def read_unknown(text: str) -> tuple[float, ...]:
 
 
 def read_json(text: str) -> Any:
-    """Read JSON, or else text."""
+    """Read JSON; anything else is text."""
     try:
         return json.loads(text)
     except ValueError:
@@ -82,12 +82,12 @@ def read_setting(text: str) -> tuple[str, Any]:
 
 
 def hint(default: str = "", **named: Any) -> Any:
-    """The default of an option in words, if any, and other arguments of :func:`tyro.conf.arg`."""
+    """Describe the default of an option in words; other arguments are those of :func:`tyro.conf.arg`."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {default})" if default else "", **named)
 
 
 def merged(option: str, repeated: Iterable[Pairs]) -> dict[str, Any]:
-    """The values of an option by name; ValueError if one has two."""
+    """The values of an option by name; ValueError if a name has two."""
     names = [name for pairs in repeated for name, _ in pairs]
     if len({*names}) < len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -96,7 +96,7 @@ def merged(option: str, repeated: Iterable[Pairs]) -> dict[str, Any]:
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """The names between commas."""
+    """Comma-separated names."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
@@ -105,20 +105,20 @@ _UNKNOWN = pair(read_unknown, "unknown parameter", "NAME=VALUE, or NAME=VALUE:LO
 _HALF_WIDTH = pair(float, "uncertainty of a parameter", "NAME=SHARE, as in mu=0.1, or a number for all", EVERY)
 read_argument = pair(read_json, "argument of an environment", "NAME=VALUE, as in g=9.5")
 NO_FILE = hint("no file", metavar="FILE")
-SYSTEM = "A shipped system (lorenz, Lorenz or KKLLorenz-v0), or yours: script.py, script.py:Class or module:Class."
+SYSTEM = "A shipped system (lorenz, Lorenz or KKLLorenz-v0), or your own: script.py, script.py:Class or module:Class."
 SystemName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SYSTEM", help=SYSTEM)]
 OneSystem = Annotated[tyro.conf.Positional[str | None], hint("all four that ship", metavar="[SYSTEM]", help=SYSTEM)]
 OwnSystem = Annotated[
     str | None,
     hint(
         metavar="CLASS",
-        help="The system of observers that were made for one of your own, as script.py:Class or module:Class.",
+        help="The system of the observers, if it is your own, as script.py:Class or module:Class.",
     ),
 ]
 OneObserver = Annotated[
     str | None,
     hint(
-        "the newest that ships for it",
+        "the one that ships for it",
         metavar="MAP",
         help="An observer for that system: a shipped map or a .safetensors file.",
     ),
@@ -139,9 +139,9 @@ HalfWidths = Annotated[
 EnvironmentArguments = Annotated[
     tuple[Annotated[Pairs, words(read_argument, "NAME=VALUE")], ...],
     tyro.conf.UseAppendAction,
-    hint("none", help="Arguments of the environment; values are JSON, or text."),
+    hint("none", help="Arguments of the environment. Values are JSON or text."),
 ]
-# A level is written as a number for all outputs, or as one for each with commas between them. Defaults are in words.
+# A level is one number for all outputs, or comma-separated numbers, one for each. Defaults are described in words.
 NoiseLevel = Annotated[Level | None, words(read_level, "LEVEL", 1), hint("the system's own")]
 NoiseLevels = Annotated[
     tuple[Level, ...] | None, words(read_level, "LEVEL [LEVEL ...]"), hint("0 and the system's own")
@@ -151,8 +151,8 @@ OwnPolicy = Annotated[
     str | None,
     hint(
         metavar="FUNCTION",
-        help="The policy of observers that were trained under one of your own, as script.py:function or "
-        "module:function. Those that were trained under the system's own controller need no option.",
+        help="The policy under which the observers were trained, if it is your own, as script.py:function or "
+        "module:function. The system's own controller needs no option.",
     ),
 ]
 
@@ -161,17 +161,17 @@ OwnPolicy = Annotated[
 class RunOptions:
     """The folder of a training, and how it runs."""
 
-    out: Annotated[Path | None, hint("runs/NAME, of agents runs/agents/NAME-INFORMATION-SEED", metavar="FOLDER")] = None
-    """Where all files are written."""
+    out: Annotated[Path | None, hint("runs/NAME; agents: runs/agents/NAME-INFORMATION-SEED", metavar="FOLDER")] = None
+    """Folder for all files."""
     resume: bool = False
-    """Go on from the checkpoints in the folder, if there are any."""
+    """Resume from the checkpoints in the folder, if there are any."""
     threads: int = 1
-    """CPU threads. More than one hardly help networks of the fast preset's size."""
+    """CPU threads. More threads hardly help with the fast preset's small networks."""
 
 
 def set_threads(threads: int) -> None:
-    """Set torch's threads."""
-    import torch  # which takes longer to import than all the rest
+    """Set the number of torch's threads."""
+    import torch  # torch takes longest to import
 
     if threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
@@ -180,19 +180,19 @@ def set_threads(threads: int) -> None:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """The recorded data of a command; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
+    """The recorded data of a command; annotate fields of this type with ``tyro.conf.OmitArgPrefixes``."""
 
     data: Annotated[tuple[Path, ...], hint(metavar="FILE [FILE ...]")] = ()
-    """Records: .npz files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named columns;
-    rollouts in a Minari data set, minari:ID or its folder, whose signals are named as in `kkl-gym record`."""
+    """Records: .npz files with arrays t, y and, if recorded, u and x; .csv or .parquet files with named columns; or
+    rollouts in a Minari data set, as minari:ID or its folder, with signals named as in `kkl-gym record`."""
     time: Annotated[str, hint("t or time", metavar="COLUMN")] = ""
     """Column of the time in seconds."""
     measured: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
-    """Measured outputs, with commas between them; y, or y1, y2, ... if they are not named."""
+    """Measured outputs, separated by commas. By default y, or y1, y2, ..."""
     inputs: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
-    """Known inputs, each held until the next sample; u, or u1, u2, ... if they are not named."""
+    """Known inputs, each held until the next sample. By default u, or u1, u2, ..."""
     hidden: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
-    """Recorded states; x, or x1, x2, ... if they are not named. Of an angle, cos(COLUMN) and sin(COLUMN)."""
+    """Recorded states. By default x, or x1, x2, ... For an angle, name cos(COLUMN) and sin(COLUMN)."""
 
     def read(self, progress: ProgressBars, system: System | None = None) -> list[Record]:
         """Read the files; ValueError if a column is named twice."""
@@ -205,19 +205,19 @@ class DataOptions:
 
 @dataclass(frozen=True)
 class SettingsOptions:
-    """Changes of the preset's settings; docs/reference/commands.md lists these and their defaults."""
+    """Changes of the preset's settings; docs/reference/commands.md lists all settings and their defaults."""
 
     config: Annotated[Path | None, NO_FILE] = None
     """TOML or JSON file of settings."""
     set: Annotated[
         tuple[Annotated[Pairs, words(read_setting, "NAME=VALUE")], ...], tyro.conf.UseAppendAction, hint("none")
     ] = ()
-    """Single settings, which come before those of the file, as in --set width=64 eigenvalues=-1,-2,-3."""
+    """Single settings, which override those of the file, as in --set width=64 eigenvalues=-1,-2,-3."""
     seed: Annotated[int | None, hint("0")] = None
-    """Seed of everything random."""
+    """Seed of all random numbers."""
 
     def read(self) -> dict[str, Any]:
-        """The settings by name, checked."""
+        """The changed settings by name, after checks."""
         settings = read_changes(self.config) if self.config else {}
         settings |= checked_changes(merged("--set", self.set), "--set")
         return settings if self.seed is None else settings | {"seed": self.seed}
@@ -225,12 +225,12 @@ class SettingsOptions:
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """How an environment is made and for how long it is played."""
+    """The arguments of an environment, and the number of episodes or steps to play."""
 
     episodes: Annotated[int | None, hint("no limit")] = None
     """Episodes to play."""
     steps: Annotated[int | None, hint("100,000 if no episodes are given")] = None
-    """Steps to play, at most; to diagnose, 10,000 by default."""
+    """Largest number of steps to play. diagnose plays 10,000 by default."""
     env_kwargs: EnvironmentArguments = ()
 
     @property
@@ -240,7 +240,7 @@ class PlayOptions:
 
 
 def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[str, Artifact, System]]:
-    """Read observers and find their systems."""
+    """Read observers, and find their systems."""
     if not names:
         raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
     artifacts = [(name, Artifact.read(resolve(name))) for name in names]
@@ -249,7 +249,7 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
 
 @dataclass(frozen=True)
 class Shown:
-    """An environment that a command shows, and its observer; None for the one that ships for the system."""
+    """An environment for a demo, and its observer; None is the one that ships for the system."""
 
     label: str
     env_id: str
@@ -259,15 +259,15 @@ class Shown:
 
     @property
     def observed(self) -> bool:
-        """Whether there is an observer, named or shipped."""
+        """Whether an observer is given or ships."""
         return self.observer is not None or self.system.name in shipped()
 
 
 def shown(system: str | None, observer: str | None) -> list[Shown]:
-    """Find the environments to show: those that ship, or one that is named."""
+    """The environments to show: all that ship, or the named one."""
     if system is None:
         if observer is not None:
-            raise ValueError(f"name the system that the observer {observer} is for")
+            raise ValueError(f"name the system of the observer {observer} as well")
         return [Shown(env_id, env_id, {}, get_system(name), None) for name, env_id in ENV_IDS.items()]
     options: dict[str, Any] = {}
     if observer is None:
@@ -280,27 +280,27 @@ def shown(system: str | None, observer: str | None) -> list[Shown]:
 
 
 def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> Controller | None:
-    """Find the policy under which an observer is to be judged: one like that of its training."""
+    """The policy for the evaluation of an observer: that of its training."""
     trained = artifact.training.get("policy")
     if own_policy is None and trained is not None and trained != "controller":
         raise ValueError(
-            f"this observer was trained under the policy {trained!r}, which acts in its tests too: name it yourself, "
+            f"this observer was trained under the policy {trained!r}, which must act in its tests, too: name it by "
             "--policy script.py:function"
         )
     name = own_policy or trained
     if name is None:
         return None
     if not artifact.nu:
-        raise ValueError(f"the policy {name!r} needs an observer that takes in inputs; this one takes none")
+        raise ValueError(f"the policy {name!r} needs an observer with inputs; this one has no inputs")
     policy = named_policy(system, name)
     return blind(policy, system.nx) if np.any(artifact.training.get("bias", 0.0)) else policy
 
 
 def system_of(artifact: Artifact, given: str | None) -> System:
-    """The system that an artifact was made for, checked against it."""
+    """The system of an artifact, after a check that both match."""
     artifact.require_system()
     if given is None and artifact.system not in SYSTEMS:
-        raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")
+        raise ValueError(f"{artifact.system!r} is not a shipped system: name its class with --system script.py:Class")
     base = get_system(given or artifact.system)
     if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
         base = base.replace(artifact.parameters)
@@ -309,6 +309,6 @@ def system_of(artifact: Artifact, given: str | None) -> System:
 
 
 def model_of(artifact: Artifact, system: System) -> System:
-    """A system with the biases that an artifact estimates as further states."""
+    """A system with the biases that an artifact estimates as additional states."""
     bias = artifact.training.get("bias", 0.0)
     return with_bias(system, bias) if np.any(bias) else system

@@ -27,27 +27,27 @@ class RecordCommand:
         tyro.conf.arg(metavar="ENV_ID", help="An environment as gym.make takes it, such as Pendulum-v1."),
     ]
     measured: Annotated[str, _NAMES] = ""
-    """Signals that an observer will see, with commas between them: indices in the flattened observation, keys of a
-    Dict, info[KEY], or cos(...) and sin(...) of one."""
+    """Signals that an observer will see, separated by commas: indices in the flattened observation, keys of a Dict,
+    info[KEY], or cos(...) and sin(...) of a signal."""
     hidden: Annotated[str, _NAMES] = ""
-    """Signals that it will estimate, likewise."""
+    """Signals that the observer will estimate, in the same form."""
     policy: str = "random"
-    """Chooses the actions: random; wandering (random actions, each held for a while); a function from observation to
-    action as script.py:function or module:function; an agent.safetensors of `kkl-gym agent train ENV_ID --information
-    state`; or an agent of stable-baselines3 as ppo:FILE.zip, whose code loading may run."""
+    """Policy that chooses the actions: random; wandering (random actions, each held for a while); a function from
+    observation to action as script.py:function or module:function; an agent.safetensors of `kkl-gym agent train ENV_ID
+    --information state`; or an agent of stable-baselines3 as ppo:FILE.zip. Loading such a zip may run its code."""
     seed: int = 0
-    """Of the environment and of random actions."""
+    """Seed of the environment and of random actions."""
     dataset: Annotated[str, hint("from environment and policy", metavar="ID")] = ""
     """Name of the data set, as in pendulum/random-v0."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
 
     def run(self, console: Console) -> str:
-        """Record."""
+        """Play, record and write."""
         from training.records.episodes import dataset_folder, write_dataset
         from training.rollouts import play, policy_of
 
         name = self.dataset or f"{_word(self.env_id)}/{_word(self.policy)}-v0"
-        dataset_folder(name)  # an error now, not at the end
+        dataset_folder(name)  # raises now instead of at the end
         policy_in = partial(_player if self.policy.endswith(".safetensors") else policy_of, self.policy)
         with progress_bars(console) as progress:
             rollouts = play(
@@ -77,14 +77,14 @@ class RecordCommand:
 
 
 def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
-    """The policy of an agent of this package that observes the whole state."""
+    """The policy of one of this package's agents, which must observe the whole state."""
     from training.agents.agent import Agent
 
     agent, here = Agent.read(path), env.spec.id if env.spec else ""
     if agent.information != "state" or agent.task.env_id != here:
         raise ValueError(
-            f"{path} is an agent for {agent.task.env_id} that sees {agent.information}; to be recorded in {here} it "
-            "must see the state of that"
+            f"{path} is an agent for {agent.task.env_id} that sees {agent.information}; to act in {here} it "
+            "must see its state"
         )
     policy = agent.policy(env.action_space)
     flatten: Any = gym.spaces.flatten
@@ -92,5 +92,5 @@ def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
 
 
 def _word(text: str) -> str:
-    """A text as a part of a data set's name."""
+    """A text in the form of a part of a data set's name."""
     return re.sub(r"\W+", "-", text.rpartition("/")[2].lower().removesuffix(".safetensors")).strip("-") or "data"

@@ -38,10 +38,10 @@ if TYPE_CHECKING:
     from training.sources.recorded import RecordedSource
     from training.sources.simulated import SimulatedSource
 
-RECORDED = "recorded"  # name of an observer from records, where the user gives none
-NAME = r"[\w][\w.-]*"  # of an observer, and so of a file
-OF_SYSTEMS = ("pipeline", "preset", "size", "uncertain", "policy", "parameters")  # options
-SIMULATED = (  # settings that say how motions are simulated
+RECORDED = "recorded"  # default name of an observer from records
+NAME = r"[\w][\w.-]*"  # pattern of observers' names, which are also files' names
+OF_SYSTEMS = ("pipeline", "preset", "size", "uncertain", "policy", "parameters")  # options that need equations
+SIMULATED = (  # settings of simulated motions
     *("trajectories", "duration", "process_noise_share", "free_inverse", "lead_in_input", "runs"),
     *("estimate_parameters", "false_alarms", "bias"),
 )
@@ -53,9 +53,9 @@ OF_RECORDS = ("windows", "arbitrary_zero", "held_out")
 class Train:
     """Learn an observer from equations or from records, and write it to one file.
 
-    kkl-gym train lorenz: a shipped system. kkl-gym train script.py: the one that the script defines. kkl-gym train
-    NAME --data run*.csv: from recorded states. The folder runs/NAME receives NAME.safetensors (T_inv, the motion that
-    it tracks by, covariances, a monitor's limits), report.png, checkpoints, and log.txt with all lines printed.
+    kkl-gym train lorenz: a shipped system. kkl-gym train script.py: the system that the script defines. kkl-gym train
+    NAME --data run*.csv: from recorded states. The folder runs/NAME receives NAME.safetensors (T_inv, the motion for
+    tracking, covariances, a monitor's limits), report.png, checkpoints, and log.txt with all printed lines.
     """
 
     system: Annotated[
@@ -63,24 +63,24 @@ class Train:
         hint(metavar="SYSTEM", help=f"{SYSTEM} With --data, a name of your choice for the recorded plant."),
     ] = ""
     pipeline: Pipeline = "input-aware"
-    """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs, which
-    does not track. Writes NAME-spinn."""
+    """input-aware: T_inv is fitted along noisy trajectories, with and without inputs. spinn: the paper's pipeline,
+    without inputs and tracking; writes NAME-spinn."""
     preset: Preset = "fast"
     """fast: about half a minute; it made the shipped maps. paper: the paper's sizes."""
     size: Size = "default"
-    """large: a T_inv that is accurate without tracking, for use without a model; about ten minutes (input-aware).
-    Writes NAME-large."""
+    """large: a T_inv that is accurate without tracking, for use without a model; takes about ten minutes, needs
+    input-aware and writes NAME-large."""
     parameters: Parameters = ()
     uncertain: HalfWidths = ()
-    """How far a parameter may be from its value, as a part of that: mu=0.1, or 0.1 for all. Some motions in training
-    then have their own (input-aware), and the observer serves every such plant. It does not track."""
+    """Relative uncertainty of parameters: mu=0.1, or 0.1 for all. Some trajectories then have their own parameters, and
+    the observer serves every plant within the ranges. It does not track. Needs input-aware."""
     policy: Annotated[str | None, hint("random inputs", metavar="FUNCTION")] = None
     """Policy of the simulated motions: "controller" for the system's own, or script.py:function, from states
-    (n, nx) to actions (n, nu) in [-1, 1]. For plants that no random input would hold within their bounds."""
+    (n, nx) to actions (n, nu) in [-1, 1]. For plants that leave their bounds under random inputs."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where networks are trained; auto takes a GPU if there is one."""
+    """Device for the training of networks; auto takes a GPU if there is one."""
     data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
-    """Recorded motions, where the equations are unknown."""
+    """Recorded motions, if the equations are unknown."""
     settings: tyro.conf.OmitArgPrefixes[SettingsOptions] = field(default_factory=SettingsOptions)
     """Changes of the preset. docs/reference/commands.md lists the settings and their defaults."""
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
@@ -113,7 +113,7 @@ class Train:
             )
             device = None if self.device == "auto" else torch.device(self.device)
             result = train(source, folder=folder, resume=self.folder.resume, device=device, console=progress)
-            result.artifact.save(path)  # before anything else may fail
+            result.artifact.save(path)  # first, because the report may fail
             with progress.phase("drawing the report"):
                 write_report(folder / "report.png", result, source)
             for line in summary(result):
@@ -128,7 +128,7 @@ class Train:
         return path
 
     def _has_records(self, changes: Mapping[str, Any]) -> bool:
-        """Whether motions are recorded; ValueError if options are for the other kind."""
+        """Whether motions are recorded; ValueError if an option belongs to the other kind."""
         if not self.data.data:
             given = [f"--{option}" for option in ("time", "measured", "inputs", "hidden") if getattr(self.data, option)]
             if given := [*given, *(name for name in changes if name in OF_RECORDS)]:
@@ -143,16 +143,16 @@ class Train:
         return True
 
     def _name(self, system: System | None, changes: Mapping[str, Any]) -> str:
-        """The observer's name, and its file's."""
+        """The name of the observer and of its file."""
         if system is None:
             name = self.system or RECORDED
             if not re.fullmatch(NAME, name):
                 raise ValueError(
-                    f"with --data, SYSTEM is a name of your choice, of letters, digits, _, - and .; got {name!r}"
+                    f"with --data, SYSTEM is a name of your choice with letters, digits, _, - and .; got {name!r}"
                 )
             return name
         if self.size != "default" and self.pipeline == "spinn":
-            raise ValueError(f"--size {self.size} is of the pipeline 'input-aware', not 'spinn'")
+            raise ValueError(f"--size {self.size} needs the pipeline 'input-aware', not 'spinn'")
         name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
         return name if self.size == "default" else f"{name}-{self.size}"
 
@@ -190,7 +190,7 @@ class Train:
 
 
 def summary(result: "Result") -> list[str]:
-    """Lines on a training: its CPU time, and how the observer estimates."""
+    """Lines of text on a training: its CPU time, and the observer's method of estimation."""
     artifact = result.artifact
     by, covariance = tracks_by(artifact), artifact.inverse.error_covariance
     lines = [

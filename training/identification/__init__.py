@@ -1,8 +1,8 @@
 """Parameters of a plant from records of its outputs, by multiple shooting, and an observer for it.
 
 :mod:`motions` simulates windows of the records, :mod:`shooting` fits parameters on windows of one length, and
-:mod:`windows` makes them longer. :mod:`identifiability` finds what outputs cannot tell apart. :mod:`identify` puts them
-together, and :mod:`learning` trains the observer.
+:mod:`windows` lengthens the windows. :mod:`identifiability` finds parameters and signs that the outputs do not
+determine. :mod:`identify` combines these steps, and :mod:`learning` trains the observer.
 """
 
 from training.identification.identify import Identified, Product, estimate_parameters

@@ -1,4 +1,4 @@
-"""Which parameters, products of their powers, and signs are identifiable from outputs."""
+"""Tests of identifiability from outputs: of parameters, of products of their powers, and of signs."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,22 +10,22 @@ from kkl_gym.equations import input_matrix
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
-RANK = 1e-7  # of the largest eigenvalue of the information: smaller ones are zero
-HARDLY = 1.0  # standard error over the parameter itself that makes a direction unidentifiable
-PART = 0.05  # component of a direction below which a parameter is not in it
-LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # of exponents that are rounded to fractions
-MOST_SIGNS = 12  # states and parameters of which all combinations of signs are tried
-POINTS = 64
+RANK = 1e-7  # eigenvalues of the information below this share of the largest count as zero
+HARDLY = 1.0  # relative standard error from which a direction counts as unidentifiable
+PART = 0.05  # a parameter with a smaller component of a direction does not belong to it
+LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # exponents are rounded to fractions within this relative error
+MOST_SIGNS = 12  # states and parameters; with more, there are too many combinations of signs to test
+POINTS = 64  # states at which a symmetry is tested
 
 
 def unidentifiable_directions(information: np.ndarray) -> np.ndarray:
-    """Directions (p, k) of the parameters that change the outputs not at all, or hardly."""
+    """Directions (p, k) of the parameters that change the outputs little or not at all."""
     values, vectors = np.linalg.eigh(information)
     return vectors[:, (values <= RANK * values[-1]) | (values <= HARDLY**-2)]
 
 
 def identifiable_directions(information: np.ndarray) -> np.ndarray:
-    """Directions (p, k) of the parameters that change the outputs, however little."""
+    """Directions (p, k) of the parameters that change the outputs, even if little."""
     values, vectors = np.linalg.eigh(information)
     return vectors[:, values > RANK * max(values[-1], 0.0)]
 
@@ -38,7 +38,7 @@ def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fra
     seen = np.linalg.svd(hidden)[0][:, k:].T if k else np.eye(p)
     rows: list[np.ndarray] = []
     pivots: list[int] = []
-    for _ in range(p - k):  # Gauss-Jordan, the largest remaining entry first
+    for _ in range(p - k):  # Gauss-Jordan elimination with full pivoting
         left = np.abs(seen)
         left[: len(rows)] = 0.0
         row, column = np.unravel_index(left.argmax(), left.shape)
@@ -64,7 +64,7 @@ def written(powers: dict[str, Fraction | float]) -> str:
 
 
 def sign_symmetries(system: System, parameters: Sequence[str], *, driven: bool = False) -> list[tuple[str, ...]]:
-    """States and parameters that may change sign together without any change of the outputs."""
+    """Sets of states and parameters that may change sign together without any change of the outputs."""
     values = system.parameters
     ranges = {name: _around(values[name]) for name in parameters}
     both = with_parameters(system, ranges)

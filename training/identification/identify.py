@@ -1,4 +1,4 @@
-"""From records of outputs to parameters with standard errors: :func:`estimate_parameters`."""
+"""Estimates parameters and their standard errors from records of outputs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from training.identification.windows import LEAST_USED, MORE_COST, Prediction, f
 from training.progress import ProgressBars
 from training.records import Record, check_signals, pieces
 
-HELD_OUT = 10  # one record of so many is held out of the fit
-KEPT_RATIOS = 100.0  # cost of a change of ratios of unidentifiable parameters, over that of a common factor
-BACK = (1.0, 0.5, 0.25)  # parts of the way to the nearest parameters; farther on states may leave their bounds
-UNSCALED = 0.05  # relative change of a state with unidentifiable parameters, over theirs
-SIMULATED = 1e-7  # relative error of simulation: lower bound of standard errors
-HIDDEN = 0.05  # part of a parameter in an unidentifiable direction that makes it unidentifiable
+HELD_OUT = 10  # every tenth record is held out of the fit
+KEPT_RATIOS = 100.0  # cost of a change in the ratios of unidentifiable parameters, over the cost of a common factor
+BACK = (1.0, 0.5, 0.25)  # shares of the way to the nearest parameters; smaller ones if states leave their bounds
+UNSCALED = 0.05  # relative change of a state's scale, over that of the unidentifiable parameters
+SIMULATED = 1e-7  # relative error of simulation, the lower bound of relative standard errors
+HIDDEN = 0.05  # a parameter with a larger component of an unidentifiable direction is unidentifiable
 
 Limits = Mapping[str, tuple[float, float]]
 
@@ -41,7 +41,7 @@ class Product:
 
 @dataclass(frozen=True)
 class Identified:
-    """Parameters of a system by records of its outputs; ``standard_errors`` are None where one is not identifiable."""
+    """Parameters identified from records of outputs; the ``standard_errors`` of unidentifiable ones are None."""
 
     system: System
     standard_errors: dict[str, float | None]
@@ -55,28 +55,28 @@ class Identified:
     predictions: list[Prediction]
 
     def to_json(self) -> dict[str, dict[str, float | None]]:
-        """Value and standard error of each parameter; both None where it is not identifiable."""
+        """Value and standard error of each parameter; both are None if it is not identifiable."""
         return {
             name: {"value": None if error is None else self.system.parameters[name], "standard_error": error}
             for name, error in self.standard_errors.items()
         }
 
     def summary(self) -> list[str]:
-        """Lines for people: parameters and products with their standard errors, and the unidentifiable ones."""
+        """Lines of text: parameters and products with their standard errors, and the unidentifiable parameters."""
         values = self.system.parameters
         lines = [f"{name} = {values[name]:.6g} +- {e:.2g}" for name, e in self.standard_errors.items() if e is not None]
         lines += [f"{name} is at its limit: give it a wider range" for name in self.at_limits]
         if self.fit.coloured:
-            lines.append("the residuals are not white: the standard errors are those of the windows' scatter")
+            lines.append("the residuals are not white: the standard errors follow from the scatter of the windows")
         elif self.fit.used.sum() < CLUSTERS:
-            lines.append(f"fewer than {CLUSTERS} windows: the standard errors are right for white noise alone")
+            lines.append(f"fewer than {CLUSTERS} windows: the standard errors are right only for white noise")
         hidden = [name for name, error in self.standard_errors.items() if error is None]
         if hidden:
             known = [one for one in self.products if len(one.powers) > 1 or set(one.powers) & set(hidden)]
             only = ", ".join(f"{one.text} = {one.value:.6g} +- {one.standard_error:.2g}" for one in known)
             lines.append(f"not identifiable from the outputs: {', '.join(hidden)}" + (f"; only {only}" if only else ""))
             used = ", ".join(f"{name} = {values[name]:.6g}" for name in hidden)
-            lines.append(f"the observer has {used}: of all that explain the outputs, nearest to the first guesses")
+            lines.append(f"the observer has {used}, the values nearest to the first guesses that explain the outputs")
             if self.unscaled_states:
                 lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: it follows")
         lines += [
@@ -97,15 +97,15 @@ def estimate_parameters(
 ) -> Identified:
     """Estimate unknown parameters of a system from records of its outputs.
 
-    Multiple shooting fits parameters and starts on windows of growing length (:func:`fit_windows`). Unidentifiable
-    directions of the parameters go back to the first guesses.
+    Multiple shooting fits parameters and starts on windows of growing length (:func:`fit_windows`). Parameters then
+    return to the first guesses along unidentifiable directions.
     """
     _check_unknown(system, unknown)
     check_signals(records, system)
     least = SAMPLES_PER_STATE * system.nx
     whole = [record for record in pieces(records) if len(record.t) > least]
     if not whole:
-        raise ValueError(f"no record has more than {least} samples without a gap, of which a start could be found")
+        raise ValueError(f"no record has more than {least} samples without a gap, as a fit of its start needs")
     held_out = whole[HELD_OUT // 2 :: HELD_OUT] if len(whole) >= HELD_OUT // 2 else []
     fitted = [record for record in whole if not any(record is other for other in held_out)]
     rng, dt = np.random.default_rng(seed), float(records[0].t[1] - records[0].t[0])
@@ -120,9 +120,9 @@ def estimate_parameters(
 
 
 def _check_unknown(system: System, unknown: Limits) -> None:
-    """Raise ValueError unless the unknown parameters are the system's, and start between finite limits."""
+    """Raise ValueError unless unknown parameters are the system's, with first guesses between finite limits."""
     if not unknown:
-        raise ValueError("name a parameter that is unknown, as in --unknown mu=1.5")
+        raise ValueError("name an unknown parameter, as in --unknown mu=1.5")
     for name, (low, high) in unknown.items():
         if name not in system.parameters:
             raise ValueError(
@@ -134,10 +134,10 @@ def _check_unknown(system: System, unknown: Limits) -> None:
 
 
 def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Of all parameters that explain the outputs as well, those nearest to the given ones.
+    """Among all parameters that explain the outputs equally well, return those nearest to the given ones.
 
-    A parameter without any influence on the outputs stays as given. For the others near means nearly equal ratios: a
-    plant that is faster by a factor has them all larger.
+    A parameter without any influence on the outputs keeps its given value. For the others, the distance measures mainly
+    changes of their ratios: a plant that is faster by a factor has all of them larger.
 
     Shapes: ``values`` (p,), ``given`` (p,), ``hidden`` (p, k); returns (p,).
     """
@@ -158,7 +158,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
 
 
 def _brought_back(fit: Fit, given: np.ndarray) -> Fit:
-    """A fit that explains the records as well, with parameters nearest to the given ones."""
+    """A fit that explains the records equally well, with parameters nearer to the given ones."""
     shooting, values, hidden = fit.shooting, fit.theta, unidentifiable_directions(fit.relative_information)
     if not hidden.size:
         return fit
@@ -181,14 +181,14 @@ def _judged(
     predictions: list[Prediction],
     expected_noise: np.ndarray,
 ) -> Identified:
-    """Standard errors, products and symmetries of a fit."""
+    """The result of a fit: standard errors, products, symmetries and predictions."""
     names, hidden = tuple(unknown), unidentifiable_directions(fit.relative_information)
     values = fit.theta
     identifiable = np.abs(hidden).max(1, initial=0.0) < HIDDEN
     seen = np.linalg.svd(hidden)[0][:, hidden.shape[1] :] if hidden.size else np.eye(len(names))
 
     def relative_error(exponents: np.ndarray) -> float:
-        """Of a product of powers."""
+        """Relative standard error of a product of powers."""
         found = fit.errors((exponents / fit.size)[:, None], seen * fit.size[:, None])
         return max(float(found[0]), SIMULATED)
 
@@ -221,7 +221,7 @@ def _judged(
 
 
 def _unscaled(fit: Fit, system: System, hidden: np.ndarray) -> tuple[str, ...]:
-    """States that change with unidentifiable directions (p, k) of the parameters, in their units."""
+    """States whose scale changes along unidentifiable directions (p, k) of the parameters, in units of these."""
     if not hidden.size:
         return ()
     half = np.array([(high - low) / 2 for low, high in system.X])

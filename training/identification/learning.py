@@ -1,4 +1,4 @@
-"""Identification and training in one: :func:`identify` and :func:`adapt`."""
+"""Identification of a plant and training of its observer: :func:`identify` and :func:`adapt`."""
 
 import dataclasses
 import json
@@ -24,8 +24,8 @@ from training.records import Record, check_signals, resampled, sampling_interval
 from training.records import check_dt as check_steps
 from training.trajectories.equations import describe
 
-NOISE_RANGE = 2.0  # largest measurement noise that the observer is trained for, over that of the records
-LEAST_NOISE = 0.002  # the least of it, over the output's range
+NOISE_RANGE = 2.0  # largest measurement noise in the observer's training, over that of the records
+LEAST_NOISE = 0.002  # lower bound of that noise, over the output's range
 OBSERVER_FOLDER = "observer"
 
 
@@ -51,34 +51,34 @@ def identify(
 ) -> Learned:
     """Identify parameters of a plant from records of its outputs, and train an observer for it.
 
-    No state is needed. :func:`training.identification.identify.estimate_parameters` fits the parameters. The observer
-    is trained on simulated motions of the identified plant, for noise up to twice that of the records.
+    No recorded state is needed. :func:`training.identification.identify.estimate_parameters` fits the parameters. The
+    observer is trained on simulated motions of the identified plant, for noise up to twice that of the records.
 
     Parameters
     ----------
     system : System
         The model, with first guesses of its parameters.
     unknown : mapping of str to (float, float)
-        Lowest and highest value of each parameter that is unknown.
+        (low, high) limits of each unknown parameter.
     records : sequence of Record
-        Outputs, and inputs where they acted, of one plant.
+        Outputs of one plant, and its inputs if they acted.
     folder : Path
-        Receives parameters.json, identification.png, SYSTEM.safetensors, checkpoints and log.txt.
+        Folder for parameters.json, identification.png, SYSTEM.safetensors, checkpoints and log.txt.
     dt : float, optional
         Sampling interval of the observer in seconds; by default that of the records.
     settings : mapping of str to object, optional
         Settings of :class:`training.Config` for the observer.
     seed : int
-        Of the random starts, and of the observer's training.
+        Seed of the random starts and of the observer's training.
     resume : bool
-        Whether to go on from checkpoints in the folder.
+        Whether to resume from checkpoints in the folder.
     console : Console or ProgressBars, optional
-        Where progress is shown; by default nowhere but in log.txt.
+        Shows the progress; by default only log.txt has it.
 
     Returns
     -------
     Learned
-        Parameters and observer, which are in the folder as well.
+        Parameters and observer, which are also in the folder.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def identify(
     check_signals(records, system)
     interval = sampling_interval(*records) if dt is None else check_dt(dt)
     given = {"dt": interval, "seed": seed, **(settings or {})}
-    preset(system, "input-aware", "fast", changes={"eigenvalues": (-1.0,), **given})  # bad settings are refused early
+    preset(system, "input-aware", "fast", changes={"eigenvalues": (-1.0,), **given})  # rejects bad settings early
     inputs = bool(system.nu) and records[0].u is not None
 
     def configured(found: Identified) -> Config:
@@ -123,9 +123,9 @@ def adapt(
     resume: bool = False,
     console: Console | ProgressBars | None = None,
 ) -> Learned:
-    """Identify a plant that differs from an observer's model, and train the observer again for it.
+    """Identify a plant that differs from an observer's model, and train the observer again for this plant.
 
-    The observer is trained by its own settings, noise levels among them.
+    The training uses the observer's own settings, including its noise levels.
 
     Parameters
     ----------
@@ -134,17 +134,17 @@ def adapt(
     system : System
         The observer's model; its parameters are the first guesses.
     records : sequence of Record
-        Outputs, and inputs where they acted, of one plant.
+        Outputs of one plant, and its inputs if they acted.
     folder : Path
         As for :func:`identify`.
     unknown : mapping of str to (float, float)
-        Lowest and highest value of each parameter that may differ.
+        (low, high) limits of each parameter that may differ.
     settings : mapping of str to object, optional
-        Settings of :class:`training.Config` that are to differ from those of the observer.
+        Settings of :class:`training.Config` to change from those of the observer.
     resume : bool
-        Whether to go on from checkpoints in the folder.
+        Whether to resume from checkpoints in the folder.
     console : Console or ProgressBars, optional
-        Where progress is shown; by default nowhere but in log.txt.
+        Shows the progress; by default only log.txt has it.
 
     Returns
     -------
@@ -154,12 +154,12 @@ def adapt(
     Raises
     ------
     ValueError
-        As for :func:`identify`, and if the observer's settings are not those of a training, or it estimates a bias.
+        As for :func:`identify`, and if the observer holds no settings of a training, or estimates a bias.
     """
     config = settings_of(observer.training, **(settings or {}))
     if np.any(config.bias):
         raise ValueError(
-            f"this observer estimates a bias of up to {config.bias}, which identification does not: pass bias = 0, or "
+            f"this observer estimates a bias of up to {config.bias}, but identification does not: pass bias = 0, or "
             "identify the parameters from records without a bias and train again"
         )
     dt, seed = observer.filter.dt, config.seed
@@ -201,5 +201,5 @@ def _learned(
 
 
 def _level(noise: np.ndarray) -> float | tuple[float, ...]:
-    """A noise level as artifacts and settings have it: one number for one output."""
+    """A noise level in the form of artifacts and settings: a number for one output, else a tuple."""
     return float(noise[0]) if len(noise) == 1 else tuple(noise.tolist())

@@ -1,4 +1,4 @@
-"""Motions that fit windows of measured outputs for given parameters, and their derivatives."""
+"""Motions that fit windows of measured outputs under given parameters, and their derivatives."""
 
 import functools
 from collections.abc import Mapping
@@ -11,19 +11,19 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
-STEP = 1e-8  # of a state's half-width, or of a parameter's unit, in numerical derivatives
-SETTLING = 12  # Levenberg-Marquardt steps of starts
-CONVERGED = 1e-3  # relative fall of a window's mean square below which its start has converged
+STEP = 1e-8  # step of numerical derivatives, in half-widths of states or units of parameters
+SETTLING = 12  # Levenberg-Marquardt steps that fit starts
+CONVERGED = 1e-3  # a start has converged if its window's mean square falls by a smaller share
 FIRST_DAMPING = 1e-3
-BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # parts of windows to which starts are fitted first
-DRAWS, KEPT = 64, 4  # random starts of each window, and the best of them, which are fitted
-SAMPLES_PER_STATE = 8  # of the shortest beginning, so that noise does not decide on the start
-MOST_ROWS = 60_000  # motions simulated at once
+BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # shares of windows to which starts are fitted first
+DRAWS, KEPT = 64, 4  # random starts for each window, and the number of best ones that are fitted
+SAMPLES_PER_STATE = 8  # in the shortest beginning, so that noise does not determine the start
+MOST_ROWS = 60_000  # most motions in one simulation
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Equally long stretches of records, ``y`` (steps + 1, n, ny), each with a start of its own."""
+    """Equally long windows of records, ``y`` (steps + 1, n, ny), each with its own start."""
 
     y: np.ndarray
     u: np.ndarray
@@ -31,10 +31,10 @@ class Windows:
 
 
 class Shooting:
-    """Outputs of a system by its start and its unknown parameters, and their derivatives.
+    """Outputs of a system as a function of its start and its unknown parameters, and their derivatives.
 
-    Substeps follow the rate of ``system``, whose parameters must be near the others. Shapes: ``unit`` (p,), the
-    parameters' units.
+    The rate of ``system`` sets the substeps, so its parameters must be near the unknown ones. Shapes: ``unit`` (p,),
+    the parameters' units.
     """
 
     def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
@@ -47,7 +47,7 @@ class Shooting:
         self._step = batch_step(self._both)
 
     def around(self, theta: np.ndarray) -> "Shooting":
-        """The same about other parameters."""
+        """The same for a system with other parameters."""
         system = self.system.replace(dict(zip(self.names, theta.tolist(), strict=True)))
         return Shooting(system, self.dt, self.limits, self.unit)
 
@@ -64,7 +64,7 @@ class Shooting:
     def derivatives(
         self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
     ) -> np.ndarray:
-        """Derivatives (steps + 1, n, ny, nx + p) by starts, over X's half-widths, and parameters, over their units."""
+        """Derivatives (steps + 1, n, ny, nx + p) by starts, in X's half-widths, and by parameters, in their units."""
         n, nx = x0.shape
         size = np.concatenate([self.half, self.unit]) * STEP
         moved = len(size) if parameters else nx
@@ -74,14 +74,14 @@ class Shooting:
         return np.moveaxis((beside.reshape(len(y), moved, n, -1) - y[:, None]) / STEP, 1, -1)
 
 
-@functools.lru_cache(maxsize=8)  # a class of its own each time would be compiled each time
+@functools.lru_cache(maxsize=8)  # a new class would be compiled again
 def _with_parameters(system: System, ranges: tuple[tuple[str, tuple[float, float]], ...]) -> System:
     return with_parameters(system, dict(ranges))
 
 
 @dataclass
 class Motions:
-    """Starts (n, nx) of windows with what follows: ``y`` and residuals ``r`` (steps + 1, n, ny)."""
+    """Motions from starts (n, nx) of windows: outputs ``y`` and residuals ``r`` (steps + 1, n, ny)."""
 
     x0: np.ndarray
     y: np.ndarray
@@ -95,7 +95,7 @@ class Motions:
 
 
 class Problem:
-    """The weighted squares of one set of windows."""
+    """The weighted least squares of one set of windows."""
 
     def __init__(self, shooting: Shooting, windows: Windows, noise: np.ndarray | None = None) -> None:
         self.shooting, self.windows = shooting, windows
@@ -108,7 +108,7 @@ class Problem:
         self.rows = np.arange(len(windows.x0))
 
     def follow(self, theta: np.ndarray, x0: np.ndarray, rows: np.ndarray) -> Motions:
-        """Motions of some windows from starts, which are clipped to the bounds."""
+        """Motions of some windows from starts, after these are clipped to the bounds."""
         x0, there = np.clip(x0, self.low, self.high), self.there[:, rows]
         y = self.shooting.outputs(np.tile(theta, (len(x0), 1)), x0, self.windows.u[:, rows])
         r = np.where(there & np.isfinite(y), self.windows.y[:, rows] - y, 0.0)
@@ -118,21 +118,21 @@ class Problem:
     def normal(
         self, theta: np.ndarray, at: Motions, rows: np.ndarray, *, parameters: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """J'J (m, d, d) and J'r (m, d) of some windows, by starts and, if wanted, parameters."""
+        """J'J (m, d, d) and J'r (m, d) of some windows, for starts and, if ``parameters``, for parameters."""
         J = self.derivatives(theta, at, rows, parameters=parameters)
         Jw = J * self.weight[:, None]
         H = np.einsum("knya,knyb->nab", Jw, J, optimize=True)
         return H, np.einsum("knya,kny->na", Jw, at.r[:, rows], optimize=True)
 
     def derivatives(self, theta: np.ndarray, at: Motions, rows: np.ndarray, *, parameters: bool = True) -> np.ndarray:
-        """J (steps + 1, m, ny, d) of some windows, zero where nothing was measured."""
+        """J (steps + 1, m, ny, d) of some windows, zero where the output is missing."""
         u = self.windows.u[:, rows]
         J = self.shooting.derivatives(theta, at.x0[rows], u, y=at.y[:, rows], parameters=parameters)
         there = self.there[:, rows][..., None] & np.isfinite(J).all(-1, keepdims=True)
         return np.where(there, J, 0.0)
 
     def settle(self, theta: np.ndarray, at: Motions, rows: np.ndarray, rounds: int) -> None:
-        """Move starts of some windows to where they fit best, each by itself (Levenberg-Marquardt)."""
+        """Fit the starts of some windows, each separately, by Levenberg-Marquardt steps."""
         nx, damping = at.x0.shape[1], np.full(len(at.x0), FIRST_DAMPING)
         H, g = np.zeros((len(at.x0), nx, nx)), np.zeros((len(at.x0), nx))
         moved = rows = rows[np.isfinite(at.each[rows])]
@@ -153,20 +153,20 @@ class Problem:
             moved, rows = rows[going], rows[going | ~better]
 
     def part(self, rows: np.ndarray, x0: np.ndarray, length: int | None = None) -> "Problem":
-        """The same for some of the windows, or for their beginnings, from other starts."""
+        """The same problem for some windows, or for their beginnings, with other starts."""
         u = self.windows.u[:length, rows]
         return Problem(self.shooting, Windows(self.windows.y[: len(u) + 1, rows], u, x0), self.weight**-0.5)
 
     def beginnings(self) -> list[int]:
-        """Lengths of the windows' beginnings and of the windows."""
+        """Rising lengths of the windows' beginnings, up to the whole windows."""
         steps, nx = len(self.windows.u), self.shooting.system.nx
         return sorted({min(max(round(part * steps), SAMPLES_PER_STATE * nx), steps) for part in (*BEGINNINGS, 1.0)})
 
     def searched(self, theta: np.ndarray, rng: np.random.Generator) -> Motions:
         """Motions that fit the windows, from random starts in X.
 
-        The squares of a long chaotic window have many minima, those of its beginning few: starts are fitted to the
-        beginning first, and from there to more and more of the window.
+        The least squares of a long chaotic window have many minima, those of its beginning few. So starts are fitted
+        first to the beginning, and then to more and more of the window.
         """
         x0, (length, *longer) = self.windows.x0.copy(), self.beginnings()
         draws = self.shooting.system.draw_starts(rng, DRAWS)
@@ -190,7 +190,7 @@ class Problem:
 
 
 def damped(H: np.ndarray, damping: "float | np.ndarray") -> np.ndarray:
-    """Matrices (n, d, d) with a part of their diagonals added (Levenberg-Marquardt)."""
+    """Matrices (n, d, d) with a share of their diagonals added (Levenberg-Marquardt)."""
     diagonal = np.einsum("naa->na", H)
     more = np.reshape(damping, (-1, 1)) * diagonal + 1e-12 * diagonal.max(1, keepdims=True, initial=0.0) + 1e-30
     return H + more[:, :, None] * np.eye(H.shape[-1])

@@ -1,4 +1,4 @@
-"""A picture of an identified system."""
+"""The figure of an identified system."""
 
 from pathlib import Path
 from typing import Any
@@ -9,18 +9,18 @@ from training.figures import ESTIMATE, MEASURED, TRUTH, drawing
 from training.identification.identify import Identified
 
 LAGS = 40  # samples
-SHOWN = 3  # records that took no part
+SHOWN = 3  # held-out records
 
 
 def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
-    """Correlation (lags,) of residuals (steps + 1, n) with those of so many samples before."""
+    """Autocorrelation (lags,) of residuals (steps + 1, n) from lag 1 on."""
     r = residuals - np.nanmean(residuals)
     products = [np.nanmean(r[lag:] * r[:-lag]) for lag in range(1, min(lags, len(r) - 1) + 1)]
     return np.array(products) / max(np.nanmean(r**2), 1e-300)
 
 
 def write_report(path: Path, found: Identified) -> None:
-    """Draw the residuals, and predictions of held-out records."""
+    """Draw the autocorrelation of residuals, and predictions of held-out records."""
     shown = found.predictions[:SHOWN]
     with drawing(path, 12, 3.2 + 2.2 * len(shown)) as figure:
         first, *others = figure.subplots(1 + len(shown), squeeze=False)[:, 0]
@@ -32,12 +32,12 @@ def write_report(path: Path, found: Identified) -> None:
                 ax.plot(t, record.y[: len(t), j], ".", ms=2, color=MEASURED, label=f"{name}, measured")
                 ax.plot(t, prediction.y[:, j], color=ESTIMATE, label="predicted")
             ax.axvline(t[prediction.fitted], color=TRUTH, lw=0.8, ls=":")
-            ax.set(xlabel="t in s", title=f"{record.name}, left out; its start from the samples before the line")
+            ax.set(xlabel="t in s", title=f"{record.name}, held out; start fitted to the samples before the line")
             ax.legend(loc="upper right")
 
 
 def _draw_residuals(ax: Any, found: Identified) -> None:
-    """Autocorrelation of the residuals of each output; white ones stay in the band."""
+    """Draw the autocorrelation of each output's residuals; that of white residuals stays in the band."""
     fit = found.fit
     for j, noise in enumerate(fit.noise):
         values = autocorrelation(fit.residuals[:, fit.used, j], LAGS)

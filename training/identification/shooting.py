@@ -1,4 +1,4 @@
-"""Parameters of a system, and starts, that explain measured outputs: multiple shooting by Gauss-Newton."""
+"""Multiple shooting: fits parameters and starts of a system to measured outputs by Gauss-Newton steps."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,21 +8,21 @@ import numpy as np
 from training.identification.identifiability import PART, identifiable_directions
 from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped
 
-RESETTLING = 3  # steps of starts after each step of the parameters, where they fit worse than before
-NONLINEAR = 0.3  # rms error over the noise of linearised outputs, one standard error of the parameters away
-ROUNDS = 40  # Gauss-Newton steps at one length of windows, at most
-SLOW, PATIENCE = 0.1, 3  # fall of the squares, over the noise's, that is too slow, and steps in a row that may be
-SMALL_STEP = 0.05  # standard errors: a Gauss-Newton step below that ends the fit
-EXACT = 1e-16  # mean square of residuals, over the outputs' variances, that ends the fit
-ROUNDING = 1e-14  # of an output's standard deviation: lower bound of the noise
+RESETTLING = 3  # steps of starts after a step of the parameters, in windows that then fit worse
+NONLINEAR = 0.3  # largest rms error of linearised outputs, over the noise, for a change by one standard error
+ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
+SLOW, PATIENCE = 0.1, 3  # a smaller fall of the squares, over the noise's, is slow; three slow steps end the fit
+SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit
+EXACT = 1e-16  # a smaller mean square of residuals, over the outputs' variances, ends the fit
+ROUNDING = 1e-14  # lower bound of the noise, in an output's standard deviations
 MOST_DAMPING = 1e9
-CLUSTERS = 20  # windows, from which on their scatter gives standard errors
-COLOURED = 1.5  # standard errors by the windows' scatter over those of white noise: more than chance in 20 windows
-OUTLIER = 9.0  # median absolute deviations above the median: mean square of a window that is left out
+CLUSTERS = 20  # least number of windows whose scatter gives standard errors
+COLOURED = 1.5  # ratio of standard errors, scatter over white noise, that chance does not reach in 20 windows
+OUTLIER = 9.0  # a window is left out if its mean square is so many median absolute deviations above the median
 
 
 class UnexplainedError(ValueError):
-    """No window of the records can be explained from the first guesses."""
+    """The model explains no window of the records from the first guesses."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Fit:
     starts_by_parameters: np.ndarray
 
     def errors(self, directions: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Standard errors along some directions, for white noise or as windows scatter, whichever are larger.
+        """Standard errors along some directions: the larger of those for white noise and those by scatter of windows.
 
-        Correlated residuals, such as those of process noise, make parameters less certain than white ones of the same
-        size do. The scatter of the windows' gradients shows by how much (the sandwich estimator for clustered data);
-        it needs CLUSTERS windows.
+        Correlated residuals, such as those of process noise, make parameters less certain than white residuals of equal
+        size. The scatter of the windows' gradients measures this (the sandwich estimator for clustered data). It needs
+        CLUSTERS windows.
 
         Shapes: ``directions`` (p, k), ``known`` (p, m); returns (k,).
         """
@@ -72,7 +72,7 @@ class Fit:
 
     @property
     def unit(self) -> np.ndarray:
-        """Units (p,) of the parameters in all that follows."""
+        """Units (p,) of the parameters."""
         return self.shooting.unit
 
     @property
@@ -93,7 +93,7 @@ class Fit:
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Of the parameters, (p,); infinite where one is not identifiable."""
+        """Standard errors of the parameters, (p,); infinite if one is not identifiable."""
         known = identifiable_directions(self.relative_information)
         unidentifiable = 1.0 - (known**2).sum(1) > PART**2
         errors = self.errors(np.eye(len(self.unit)), known * self.size[:, None])
@@ -101,15 +101,16 @@ class Fit:
 
     @property
     def coloured(self) -> bool:
-        """Whether windows scatter more than they would with white residuals."""
+        """Whether windows scatter more than white residuals explain."""
         known = identifiable_directions(self.information)
         return bool((self.errors(known, known) > COLOURED * self._errors(known, known, self.white)).any())
 
 
 def predictable(fit: Fit, windows: Windows) -> np.ndarray:
-    """Which windows (n,) respond linearly to changes of the parameters by a standard error.
+    """A mask (n,) of the windows that respond linearly to changes of the parameters by a standard error.
 
-    Longer windows of a chaotic motion do not: their squares have many minima, whose curvature gives no standard errors.
+    Long windows of a chaotic motion do not: their least squares have many minima, and the curvature gives no standard
+    errors.
     """
     shooting, theta, problem = fit.shooting, fit.theta, Problem(fit.shooting, windows)
     at = problem.settled(theta)
@@ -126,7 +127,7 @@ def predictable(fit: Fit, windows: Windows) -> np.ndarray:
 
 
 def explained(each: np.ndarray) -> np.ndarray:
-    """Which windows are no outliers by the mean squares (n,) of their residuals."""
+    """A mask of the windows that are not outliers by the mean squares (n,) of their residuals."""
     median = np.median(each)
     deviation = np.median(np.abs(each[np.isfinite(each)] - median)) if np.isfinite(median) else 0.0
     return np.isfinite(each) & (each <= median + OUTLIER * deviation)
@@ -142,10 +143,10 @@ def shoot(
     noise: Sequence[float] | None = None,
     report: Callable[[float], object] = lambda part: None,
 ) -> Fit:
-    """Least squares over parameters and starts of windows of one length; ``report`` takes the part that is done.
+    """Least squares over parameters and starts of windows of one length; ``report`` is called with the share done.
 
-    Windows that the model explains much worse than most are left out. Where a model is good for some motions and rough
-    for others, as of friction, give the ``noise``: all windows then have the weight 1 / (1 + mean square of their
+    Windows that the model explains much worse than most are left out. If a model, such as one of friction, is good for
+    some motions and rough for others, give the ``noise``. Each window then has the weight 1 / (1 + mean square of its
     residuals over the noise's).
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
@@ -153,7 +154,7 @@ def shoot(
         raise ValueError(f"noise must be {windows.y.shape[-1]} positive numbers, one for each output, got {noise}")
     problem = Problem(shooting, windows, deviations)
     nx, damping, slow = shooting.system.nx, FIRST_DAMPING, 0
-    # log(1 + mean square) is the loss whose weight is 1 / (1 + mean square).
+    # The loss log(1 + mean square) has the weight 1 / (1 + mean square).
     loss = np.log1p if noise is not None else np.asarray
     fits = explained if noise is None else np.isfinite
     at = problem.settled(theta)
@@ -183,7 +184,7 @@ def shoot(
             x0 = at.x0 + (along[..., -1] - along[..., :-1] @ change) * shooting.half
             tried = problem.follow(new, x0, problem.rows)
             problem.settle(new, tried, np.flatnonzero(tried.each > at.each), RESETTLING)
-            # A chaotic window may diverge by a step that is good for all others: its loss is bounded.
+            # A step that is good for all others may make a chaotic window diverge, so its loss is bounded.
             worst = np.minimum(tried.each[used], 2 * at.each[used].max())
             fall = loss(at.each[used]).sum() - loss(worst).sum()
             better = fall > 0
@@ -201,9 +202,9 @@ def shoot(
 def _reduced(
     H: np.ndarray, g: np.ndarray, *, used: np.ndarray, nx: int, damping: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normal equations S (p, p), s (p,) of the parameters alone, from which starts are eliminated (Schur complement).
+    """Normal equations S (p, p), s (p,) of the parameters, after elimination of the starts (Schur complement).
 
-    The third, (n, nx, p + 1), gives the starts: they move by its last column less the others times the change.
+    The third array, (n, nx, p + 1), gives the steps of starts: its last column minus the others times the parameters'.
     """
     D, cross = damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
     along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))
@@ -212,7 +213,7 @@ def _reduced(
 
 
 def _left(S: np.ndarray, s: np.ndarray, cost: float) -> float:
-    """Length of the Gauss-Newton step of normal equations in standard errors, for a mean square of the residuals."""
+    """Length of a Gauss-Newton step in standard errors, if ``cost`` is the mean square of the residuals."""
     step = np.linalg.lstsq(S, s, rcond=1e-12)[0]
     return float(np.sqrt(max(step @ s, 0.0) / max(cost, 1e-300)))
 
@@ -222,12 +223,12 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
     J = problem.derivatives(theta, at, np.flatnonzero(used))
     there = problem.there[:, used] & (J != 0).any(-1)
     count = there.sum((0, 1))
-    free = 1.0 - min(nx * used.sum() / max(count.sum(), 1), 0.9)  # degrees of freedom that starts leave
+    free = 1.0 - min(nx * used.sum() / max(count.sum(), 1), 0.9)  # share of degrees of freedom that starts leave
     squares = np.where(there, at.r[:, used] ** 2, 0.0).sum((0, 1)) / np.maximum(count, 1) / free
     noise = np.sqrt(np.maximum(squares, ROUNDING**2 / problem.weight))
     curvature, beyond, by_parameters = _beyond_starts(J, problem.weight, nx)
     gradients = np.einsum("knyp,kny->np", beyond, at.r[:, used] * problem.weight)
-    few = len(gradients) / max(len(gradients) - len(theta), 1)  # as the windows' gradients add up to zero
+    few = len(gradients) / max(len(gradients) - len(theta), 1)  # because the gradients add up to zero
     return Fit(
         shooting=shooting,
         theta=theta,
@@ -245,7 +246,7 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
 
 
 def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Curvature (n, p, p), outputs by parameters with starts refitted, and starts by parameters (n, nx, p)."""
+    """Curvature (n, p, p), derivatives of outputs with refitted starts, and of starts (n, nx, p), by parameters."""
     H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
     by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
     beyond = J[..., nx:] + np.einsum("knyx,nxp->knyp", J[..., :nx], by_parameters)

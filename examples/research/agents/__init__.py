@@ -1,1 +1,1 @@
-"""Agents on our systems that know different things, compared."""
+"""Comparisons of agents that see different information."""

@@ -26,37 +26,37 @@ from training.progress import ProgressBars
 
 @dataclass(frozen=True)
 class Compare:
-    """Train agents that see different things, several seeds each, and compare them on the same unseen episodes.
+    """Train agents that see different information, with several seeds, and compare them on the same unseen episodes.
 
     Writes OUT/results.csv (a row for each agent), OUT/table.md, OUT/scores.png, and the learning curves as
-    OUT/curves.csv and OUT/curves.png. Each agent is a job with a folder of its own. An interrupted run goes on where it
-    stopped, and reports on the agents that are done.
+    OUT/curves.csv and OUT/curves.png. Each agent is a job with its own folder. An interrupted run reports on the agents
+    that are done; the same command continues it.
     """
 
     names: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[SYSTEM ... | ENV_ID ...]", help_behavior_hint="")
     ] = tuple(TASKS)
-    """Systems (shipped, or classes of yours with inputs as script.py:Class or module:Class; by default all that ship),
-    or any environments of Gymnasium, of which agents see a part (docs/results/partly_observed.md)."""
+    """Systems with inputs (shipped, or your own as script.py:Class or module:Class; by default all that ship), or any
+    Gymnasium environments, which agents then observe partly (docs/results/partly_observed.md)."""
     information: Annotated[
         tuple[Kind, ...] | None, tyro.conf.arg(help_behavior_hint="(default: those of the published tables)")
     ] = None
-    """What agents see (docs/guides/agents.md); ekf is for systems alone."""
+    """Information that agents see (docs/guides/agents.md); ekf serves only systems."""
     seeds: int = comparison.SEEDS
-    """Agents of each kind. On systems at most 3 of the recurrent ones, which take longest, and 1 at the further noise
-    levels."""
+    """Number of agents of each kind. On systems there are at most 3 recurrent agents, which take longest, and 1 at the
+    second noise level."""
     episodes: int = 100
-    """Number of episodes that each agent is played on."""
+    """Number of evaluation episodes of each agent."""
     timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None
-    """Actions to learn from, in all environments together."""
+    """Number of actions in a training, over all environments."""
     measurement_noise: Annotated[
         NoiseLevels, tyro.conf.arg(help_behavior_hint="(default: the task's own, on Van der Pol also 0.2, on Lorenz 2)")
     ] = None
-    """Standard deviations of the measurement noise; each level is a task of its own."""
+    """Standard deviations of the measurement noise; each level is a separate task."""
     observers: tuple[str, ...] = ()
-    """Observers for agents on systems: a .safetensors file for each system of yours, or shipped maps."""
+    """Observers for agents on systems: a .safetensors file for each of your own systems, or shipped maps."""
     aggregate: int = 0
-    """How often an observer is fitted again to the agent's own steps in environments (kkl-gym agent train --help)."""
+    """How often an observer is refitted to the agent's own steps in environments (kkl-gym agent train --help)."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     out: Annotated[
         Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/comparison, or runs/agents/environments)")
@@ -70,11 +70,11 @@ class Compare:
             raise ValueError(f"seeds and episodes must be positive, got {self.seeds} and {self.episodes}")
         for what, given in (("names", self.names), ("information", self.information or ("state",))):
             if len(set(given)) < len(given) or not given:
-                raise ValueError(f"give some {what}, each once; got {', '.join(given) or 'none'}")
+                raise ValueError(f"give at least one of the {what}, each once; got {', '.join(given) or 'none'}")
         tasks = [task for name in self.names for task in self._tasks(name)]
         systems = {task.system is not None for task in tasks}
         if len(systems) > 1:
-            raise ValueError("compare agents on systems or in environments, each in a folder of its own")
+            raise ValueError("compare agents either on systems or in environments, in separate folders")
         (on_systems,) = systems
         if not on_systems and {"ekf", "x_hat_std"} & set(self.information or ()):
             raise ValueError("agents in environments are not compared by ekf, x_hat_std")
@@ -89,7 +89,7 @@ class Compare:
         agents = comparison.planned(tasks, out, kinds=kinds, seeds=self.seeds, **how)
 
         def report(progress: ProgressBars) -> None:
-            """Report all agents of these tasks in the folder, whichever run trained them."""
+            """Report all agents of these tasks in the folder, including those of earlier runs."""
             everyone = comparison.planned(tasks, out, kinds=comparison.KINDS, seeds=comparison.seeds_in(out), **how)
             there = [agent for agent in everyone if (agent.folder / agent.result).exists() and agent.done]
             results = comparison.collect(there)
@@ -108,7 +108,7 @@ class Compare:
         run_and_report(agents, out, console, workers=self.workers, what="agents", report=report)
 
     def _tasks(self, name: str) -> list[Task]:
-        """A task at each level of noise."""
+        """The task at each noise level."""
         own = self.options.task(name)
         levels: list[Level] = list(self.measurement_noise or (own.measurement_noise,))
         if self.measurement_noise is None and own.name in comparison.SECOND_NOISE:
@@ -116,17 +116,17 @@ class Compare:
         return [self.options.task(name, level) for level in levels]
 
     def _observers(self, tasks: list[Task]) -> dict[str, str]:
-        """Observers by the name of their system; raises ValueError if one that is needed is missing."""
+        """Observers by the name of their system; ValueError if one is missing."""
         observers: dict[str, str] = {}
         systems = {task.name: task.system for task in tasks if task.system is not None}
         for observer in self.observers:
             artifact = Artifact.read(resolve(observer))
             system = artifact.system
             if not artifact.nu:
-                raise ValueError(f"the observer {observer} takes in no inputs, by which agents act")
+                raise ValueError(f"the observer {observer} has no inputs, but agents act by inputs")
             if system not in systems or system in observers:
                 raise ValueError(
-                    f"the observer {observer} is for {system}: name one for each of {', '.join(systems)} at most"
+                    f"the observer {observer} is for {system}: name at most one for each of {', '.join(systems)}"
                 )
             observers[system] = observer
         kinds = set(comparison.ON_SYSTEMS if self.information is None else self.information)

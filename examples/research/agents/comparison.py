@@ -1,4 +1,4 @@
-"""Agents that see different things of one task: which there are, and the training and value of each."""
+"""The compared agents of a task: their kinds, and the training and evaluation of each."""
 
 import json
 import time
@@ -26,7 +26,7 @@ from training.files import write
 if TYPE_CHECKING:
     import pandas as pd
 
-# An information set, or one with another source of estimates or another learner.
+# An information set, possibly with another source of estimates or another algorithm.
 Kind = Literal[
     "state",
     "ekf",
@@ -42,21 +42,21 @@ Kind = Literal[
 KINDS: tuple[Kind, ...] = get_args(Kind)
 ON_SYSTEMS: tuple[Kind, ...] = ("state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state")
 IN_ENVIRONMENTS: tuple[Kind, ...] = ("state", "x_hat", "z", "stacked", "recurrent", "y")
-IDLE: Literal["random"] = "random"  # no action on systems, random ones elsewhere: the normalised score 0
+IDLE: Literal["random"] = "random"  # no action on systems, random actions elsewhere; its normalised score is 0
 SEEN: dict[str, Information] = {
     "ekf": "x_hat",
     "recurrent-state": "state",
-}  # where a kind is not an information set
-CONCERNED = {  # by settings of a task that matter to some agents alone
+}  # the information set of kinds with another name
+CONCERNED = {  # the kinds for which a setting of a task matters
     "time_constants": ("z", "traces"),
     "frames": ("stacked",),
     "past_actions": ("z", "traces", "stacked"),
     "angles": ("z",),
     "weights": ("z",),
 }
-SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # further levels at which agents are trained
+SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # second noise level of these tasks
 SEEDS = 5
-RECURRENT_SEEDS, SECOND_NOISE_RECURRENT_SEEDS = 3, 1  # on systems, at most; their trainings take longest
+RECURRENT_SEEDS, SECOND_NOISE_RECURRENT_SEEDS = 3, 1  # at most, on systems, because their trainings take longest
 COLUMNS = {
     "results.csv": ["environment", "noise", "shown", "seed", "return", "success", "seconds"],
     "curves.csv": ["environment", "noise", "shown", "steps", "seconds", "return"],
@@ -86,7 +86,7 @@ class ComparedAgent(Job):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Task, hyperparameters, the observer's content and the package's version, as far as they concern the agent."""
+        """All that the agent depends on: task, hyperparameters, content of the observer, version of the package."""
         task = asdict(self.task)
         for setting, kinds in CONCERNED.items():
             if self.kind not in kinds:
@@ -112,7 +112,7 @@ class ComparedAgent(Job):
 
     @property
     def _observer(self) -> str | None:
-        """The observer that the agent begins with, if it does."""
+        """The observer with which the agent begins, or None."""
         if self.task.system is None or self.kind not in OBSERVED:
             return None
         return self.observer or observer_of(get_system(self.task.system))
@@ -131,7 +131,7 @@ class ComparedAgent(Job):
             return algorithm_for(self.task, self._information, env.single_action_space)
 
     def work(self) -> None:
-        """Train the agent, play it and write the value of each episode."""
+        """Train the agent, play it, and write the return of each episode."""
         began, task = time.process_time(), self.task
         if self.kind == IDLE:
             env = make(task, "state", self.episodes)
@@ -142,7 +142,7 @@ class ComparedAgent(Job):
             from training.agents.observing import OBSERVER
 
             show = show_filtered if self.kind == "ekf" else make
-            fitted = task.system is None and self.kind == "x_hat"  # an observer, from hidden signals
+            fitted = task.system is None and self.kind == "x_hat"  # an observer is learned from hidden signals
             agent = learn(
                 task,
                 self._information,
@@ -186,7 +186,7 @@ def planned(
     observers: dict[str, str] | None = None,
     **how: Any,
 ) -> list[ComparedAgent]:
-    """All agents of a comparison, the first seed of each first; environments' levels of noise share some agents."""
+    """All agents of a comparison, ordered by seed; in environments, noise levels share the agents without noise."""
     agents: dict[Path, ComparedAgent] = {}
     for seed in range(seeds):
         for task in tasks:
@@ -204,12 +204,12 @@ def planned(
 
 
 def seeds_in(out: Path) -> int:
-    """One more than the largest seed of the agents' folders, OUT/jobs/TASK/KIND/SEED."""
+    """Number of seeds in the agents' folders, OUT/jobs/TASK/KIND/SEED."""
     return 1 + max((int(path.name) for path in out.glob("jobs/*/*/*") if path.name.isdigit()), default=-1)
 
 
 def collect(agents: Sequence[ComparedAgent]) -> "pd.DataFrame":
-    """Results of agents that are done, a row each."""
+    """Results of agents that are done, a row for each."""
     import pandas as pd
 
     rows = []
@@ -231,7 +231,7 @@ def read_results(folder: Path) -> "pd.DataFrame":
 
 
 def unusual_settings(tasks: Sequence[Task]) -> str:
-    """Settings of agents on memories and stacks that are not the defaults, as a sentence; empty if all are."""
+    """A sentence with the changed settings of memories and stacks; empty if all are the defaults."""
     changed = []
     for field in fields(Task):
         values = {getattr(task, field.name) for task in tasks} if field.name in CONCERNED else set()

@@ -10,11 +10,11 @@ from training.agents.information import FeatureObservation, Information
 from training.agents.tasks import Task, deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 
-PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of a second of its pace
+PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of the pace
 
 
 def kalman_filters(env: VectorEnv) -> Estimates:
-    """Extended Kalman filters that know model, noise level and input, as VectorEstimate drives them."""
+    """Extended Kalman filters that know the model, noise level and input, in the form for VectorEstimate."""
     plant = plant_of(env)
     system = plant.system
     Q = np.diag((PROCESS_NOISE * np.array(system.scale)) ** 2 / system.pace)

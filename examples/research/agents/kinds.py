@@ -31,17 +31,17 @@ if TYPE_CHECKING:
     from kkl_gym.wrappers.vector import VectorEnv
 
 Shown = Literal["state", "y", "stacked", "traces", "z", "x_hat", "lru"]
-ALGORITHMS = {"CartPole-v1": "ppo"}  # sac for all others
-FRAMES = 32  # that the linear recurrent unit runs over
+ALGORITHMS = {"CartPole-v1": "ppo"}  # all others: sac
+FRAMES = 32  # length of the linear recurrent unit's history
 EVALUATIONS, EPISODES, LAST_EPISODES = 15, 20, 100
-OBSERVER_STEPS = 40_000  # random ones, from which an observer, or the weights of z under noise, are learned
-FAULTY = ("noise", "delay", "drop-out")  # kinds in which an observer tracks, and the agent sees its estimates alone
+OBSERVER_STEPS = 40_000  # random steps from which an observer, or the weights of z under noise, are learned
+FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and the agent sees only estimates
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return", "observer_seconds")
 
 
 @dataclass(frozen=True)
 class TimedAgent(Job):
-    """One agent, trained for so many CPU seconds and evaluated on the way."""
+    """One agent, trained for ``seconds`` of CPU time, and evaluated during the training."""
 
     env_id: str
     kind: str
@@ -60,7 +60,7 @@ class TimedAgent(Job):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What the curve depends on."""
+        """The settings on which the curve depends."""
         own = {"kind": KINDS[self.kind], "shown": self.shown, "seconds": self.seconds}
         return {"env_id": self.env_id, **own, "version": kkl_gym.__version__}
 
@@ -82,11 +82,11 @@ class TimedAgent(Job):
         return float(KINDS[self.kind].get("noise", 0.0))
 
     def _states(self, size: int, known: Sequence[int] = ()) -> tuple[int, ...]:
-        """Places of the state in an observation of some size, without those entries of it that are known."""
+        """Indices of the state in an observation of some size, without the entries that are known."""
         return tuple(place for place in range(self._ny, size) if place - self._ny not in known)
 
     def make(self, rows: int, observer: Path | None = None) -> "VectorEnv":
-        """Make environments that show the agent what it is to see."""
+        """Make environments with the agent's information."""
         task = self.task
         if self.shown == "state":
             with closing(single(task)) as one:
@@ -106,7 +106,7 @@ class TimedAgent(Job):
         return FeatureObservation(env, lambda at: at["obs"][:, first:], flatdim(env.single_observation_space) - first)
 
     def learn_observer(self) -> Path:
-        """Learn an observer from random steps in a simulator; returns its file."""
+        """Learn an observer from random steps in a simulator. Returns its file."""
         from training.agents.observing import learn_observer
         from training.rollouts.playing import WANDERING, policy_of, roll_out
 
@@ -122,7 +122,7 @@ class TimedAgent(Job):
         return learn_observer(task, rollouts.records(), self.folder, seed=self.seed, progress=quiet, tracking=tracking)
 
     def work(self) -> None:
-        """Train for the CPU time; an evaluation's own does not count."""
+        """Train for the CPU time; the time of evaluations does not count."""
         from examples.research.agents.recurrent import LinearRecurrence
         from training.agents.learning import Learner, hyperparameters
 
@@ -132,7 +132,7 @@ class TimedAgent(Job):
         algorithm = ALGORITHMS.get(self.env_id, "sac")
         settings = hyperparameters(algorithm, Task(self.env_id, tuple(MEASURED[self.env_id])))
         if algorithm == "sac":
-            settings["buffer_size"] = 100_000  # more than the steps that there will be
+            settings["buffer_size"] = 100_000  # more than the number of steps
         budget = _budget(self.seconds, lambda seconds: evaluate(seconds))
         for name, value in settings.items():
             if str(value).startswith("lin_"):
@@ -161,12 +161,12 @@ class TimedAgent(Job):
 
 
 def _falling(start: float, budget: Any) -> Callable[[float], float]:
-    """A schedule that ends at zero with the CPU time, in place of steps."""
+    """A schedule that falls to zero over the CPU time instead of steps."""
     return lambda progress: start * float(budget.remaining())
 
 
 def policy_of(model: Any) -> Callable[[np.ndarray], Any]:
-    """The deterministic policy of a model while it learns."""
+    """The deterministic policy of a model, for use during its training."""
     scaling = model.get_vec_normalize_env()
 
     def act(obs: np.ndarray) -> Any:
@@ -176,7 +176,7 @@ def policy_of(model: Any) -> Callable[[np.ndarray], Any]:
 
 
 def _budget(seconds: float, evaluate: Callable[[float], None]) -> Any:
-    """A callback that evaluates at equal CPU times and stops at the last; an evaluation's own time does not count."""
+    """A callback that evaluates at equal intervals of CPU time, and stops at the last; evaluations do not count."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Budget(BaseCallback):
@@ -205,18 +205,18 @@ def _budget(seconds: float, evaluate: Callable[[float], None]) -> Any:
 class Kinds:
     """Compare agents in five kinds of partial observability, each trained for the same CPU time on one core.
 
-    Writes OUT/kinds.csv (returns along CPU seconds and steps) and OUT/table.md. An interrupted run goes on where it
-    stopped; the first seed of everything comes first.
+    Writes OUT/kinds.csv (returns along CPU seconds and steps) and OUT/table.md. The jobs are ordered by seed. After an
+    interruption, the same command continues.
     """
 
     environments: tuple[str, ...] = ("Pendulum-v1", "CartPole-v1")
     """Environments whose velocities are hidden."""
     kinds: tuple[str, ...] = tuple(KINDS)
-    """masked (velocities alone), noise (0.1), delay (5 steps), drop-out (30 %), parameters (new ones each episode)."""
+    """masked (hidden velocities), noise (0.1), delay (5 steps), drop-out (30 %), parameters (new in each episode)."""
     information: tuple[Shown, ...] = get_args(Shown)
-    """What agents see; lru is a linear recurrent unit over 32 frames."""
+    """Information that agents see; lru is a linear recurrent unit over 32 frames."""
     seeds: int = 5
-    """Agents of each kind."""
+    """Number of agents of each kind."""
     seconds: float = 150.0
     """CPU seconds of a training."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
@@ -236,7 +236,7 @@ class Kinds:
             for kind in self.kinds
             for env_id in self.environments
             for shown in self.information
-            # The full state is the same whatever the sensor does.
+            # Agents on the full state do not depend on the sensor.
             if shown != "state" or kind in ("masked", "parameters")
         ]
         agents = [
@@ -258,7 +258,7 @@ class Kinds:
 
 
 def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
-    """Interquartile means of the last returns, with bootstrap intervals where there are three seeds or more."""
+    """Interquartile means of the last returns, with bootstrap intervals for three or more seeds."""
     last = rows.groupby(["environment", "kind", "shown", "seed"], sort=False).last().reset_index()
     shown = [name for name in get_args(Shown) if name in set(last.shown)]
     lines, steps = list[list[str]](), list[list[str]]()

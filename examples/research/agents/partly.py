@@ -1,4 +1,4 @@
-"""Five kinds of partial observability around any environment: what the sensor shows, and the state beside it."""
+"""An environment with one of five kinds of partial observability; it shows the sensor's outputs and the state."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 ENV_ID = "KKLPartly-v0"
-# Velocities are hidden in all of them.
+# Velocities are hidden in every kind.
 KINDS: dict[str, dict[str, Any]] = {
     "masked": {},
     "noise": {"noise": 0.1},
@@ -18,7 +18,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 MEASURED = {"Pendulum-v1": [0, 1], "CartPole-v1": [0, 2], "InvertedDoublePendulum-v5": [0, 1, 2, 3, 4]}
 ANGLES = {"Pendulum-v1": ((0, 1),), "InvertedDoublePendulum-v5": ((3, 1), (4, 2))}  # cosine and sine, in y
-# Each episode multiplies a parameter by a number between 1/factor and factor, log-uniformly distributed.
+# Each episode multiplies a parameter by a log-uniform number between 1/factor and factor.
 FACTORS: dict[str, dict[str, float]] = {
     "Pendulum-v1": {"m": 1.3, "l": 1.3},
     "CartPole-v1": {"masspole": 2.0, "length": 2.0, "force_mag": 2.0},
@@ -26,9 +26,9 @@ FACTORS: dict[str, dict[str, float]] = {
 
 
 class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
-    """Shows [y, state]: the entries that a faulty sensor delivers, then the whole observation and varied parameters.
+    """Shows [y, state]: the outputs of a faulty sensor, then the whole observation and the varied parameters.
 
-    ``hold`` repeats the last sample in place of a lost one, which is NaN otherwise.
+    With ``hold``, the last sample replaces a lost one, which is NaN otherwise.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     ) -> None:
         super().__init__(gym.make(env_id))
         if vary and env_id not in FACTORS:
-            raise ValueError(f"no parameters of {env_id} are varied; those of {', '.join(FACTORS)} are")
+            raise ValueError(f"{env_id} has no parameters to vary; {', '.join(FACTORS)} have some")
         self._noise, self._drop_out, self._hold = noise, drop_out, hold
         self._measured, self._late = list(MEASURED[env_id]), deque[np.ndarray](maxlen=delay + 1)
         self._factors: Mapping[str, float] = FACTORS[env_id] if vary else {}
@@ -53,7 +53,7 @@ class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
     def exact(self) -> None:
-        """Make the sensor perfect, as in the simulator in which an observer is learned."""
+        """Remove the sensor's faults, for the simulator in which an observer is learned."""
         self._noise, self._drop_out, self._late = 0.0, 0.0, deque(maxlen=1)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -86,7 +86,7 @@ class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         self._parameters = np.array([factor ** self._rng.uniform(-1, 1) for factor in self._factors.values()])
         for name, factor in zip(self._factors, self._parameters, strict=True):
             setattr(base, name, self._nominal[name] * factor)
-        if hasattr(base, "polemass_length"):  # which the cart derives from its parameters
+        if hasattr(base, "polemass_length"):  # CartPole derives these from its parameters
             base.total_mass, base.polemass_length = base.masspole + base.masscart, base.masspole * base.length
 
 

@@ -1,4 +1,4 @@
-"""Pictures of closed-loop episodes of systems."""
+"""Figures and animations of closed-loop episodes of systems."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,9 +14,9 @@ from training.agents.tasks import Task
 from training.evaluation.levels import show_level
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, drawing, save_moving, style
 
-FRAMES = 150  # of an animation, at most
-SECONDS = 10.0  # that it lasts
-WIDTH = 4.6  # inches of a column
+FRAMES = 150  # largest number in an animation
+SECONDS = 10.0  # length of an animation
+WIDTH = 4.6  # inches, of a column
 
 
 def draw(task: Task, played: Mapping[str, Episodes], path: Path) -> None:
@@ -55,12 +55,12 @@ def _system(task: Task) -> System:
 
 
 def _numbered(symbol: str, number: int) -> list[str]:
-    """Names of signals: y where there is one, and y1, y2 and so on."""
+    """Names of signals: y for a single one, else y1, y2 and so on."""
     return [symbol] if number == 1 else [f"{symbol}{i + 1}" for i in range(number)]
 
 
 def animate(task: Task, played: Mapping[str, Episodes], path: Path) -> None:
-    """Draw the moving phase portraits of the first episode of several agents side by side."""
+    """Animate the phase portraits of several agents' first episodes, side by side."""
     system = _system(task)
     points = [p[:, 0] for one in played.values() for p in (one.signals("x"), one.x_hat) if p is not None]
     reached = np.concatenate([*points, [system.target]])
@@ -76,6 +76,6 @@ def animate(task: Task, played: Mapping[str, Episodes], path: Path) -> None:
 
 
 def _frame(canvas: Canvas, episodes: Episodes, k: int) -> np.ndarray:
-    """The frame of the samples before the instant k."""
+    """The frame with the samples before index k."""
     estimates = () if episodes.x_hat is None else episodes.x_hat[:k, 0]
     return canvas.draw(episodes.signals("x")[:k, 0], estimates, episodes.signals("u")[k - 1, 0])

@@ -9,10 +9,10 @@ from torch import nn
 
 
 class LinearRecurrence(BaseFeaturesExtractor):
-    """The latest frame of a stack, and the state of a linear recurrent unit that has run over all of its frames.
+    """The latest frame of a stack, and the state of a linear recurrent unit after all frames of the stack.
 
-    h' = lambda h + B x with complex lambda inside the unit circle, all learned (Orvieto et al., arXiv:2303.06349). As
-    it is linear, its weights on all frames make one matrix.
+    h' = lambda h + B x with complex lambda inside the unit circle, all learned (Orvieto et al., arXiv:2303.06349).
+    Because the unit is linear, its weights on all frames are one matrix.
     """
 
     ages: torch.Tensor

@@ -8,7 +8,7 @@ import scipy
 
 
 def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
-    """Scores on a scale on which doing nothing of use has 0 and the best agents have 1."""
+    """Scores on a scale with 0 for idle agents and 1 for the best agents."""
     span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
     return np.asarray((scores - idle) / span)
 
@@ -21,7 +21,7 @@ def middle(values: np.ndarray, axis: int = -1) -> Any:
 def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, float, float]:
     """Interquartile mean of the normalised scores of agents, with a bootstrap 95 % interval.
 
-    With five agents the interval covers about nine times in ten, which is usual for so few.
+    With only five agents the interval covers the true value in about nine of ten cases.
 
     Shapes: ``values`` (n,), ``best`` (m,).
     """
@@ -33,7 +33,7 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
     if min(len(values), len(best)) < 3 or np.isnan(score):
         return score, np.nan, np.nan
     samples = (values,) if values is best else (values, best)
-    with warnings.catch_warnings():  # where some resamples of the best are no better than zero, there are no ends
+    with warnings.catch_warnings():  # intervals are NaN if a resample of the best is not better than idle
         warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
         resampled = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0)
     ends = resampled.confidence_interval

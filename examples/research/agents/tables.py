@@ -1,4 +1,4 @@
-"""Tables and figures of compared agents, from their results.csv alone."""
+"""Tables and figures of compared agents, from results.csv only."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -38,15 +38,15 @@ LABELS_IN_ENVIRONMENTS = LABELS | {
 }
 PANELS_IN_A_ROW = 3
 NARROWEST = 7.0  # inches, of a figure with its title
-POINTS = 60  # of a learning curve
-WINDOW = 0.05  # share of a training's steps over which a learning curve is averaged
+POINTS = 60  # in a learning curve
+WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 
 
 @dataclass(frozen=True)
 class Cell:
     """Agents of one kind in one task.
 
-    Shapes: ``values``, ``scores`` (n,); ``scores`` and ``interval`` are normalised, NaN if the task has no scale.
+    Shapes: ``values``, ``scores`` (n,). ``scores`` and ``interval`` are normalised, NaN if the task has no scale.
     """
 
     values: np.ndarray
@@ -57,18 +57,18 @@ class Cell:
 
 
 def on_systems(results: "pd.DataFrame") -> bool:
-    """Whether results are of systems, in which agents may succeed."""
+    """Whether results are those of systems, which have success rates."""
     return bool(results.success.notna().any())
 
 
 def tasks_in(results: "pd.DataFrame") -> list[tuple[str, Any]]:
-    """Environments and levels of noise, in their order, without those of the full state alone."""
+    """Environments and noise levels in order, without those that have only agents on the full state."""
     partly = results[~results.shown.isin(["state", IDLE])]
     return list(partly[["environment", "noise"]].drop_duplicates().itertuples(index=False, name=None))
 
 
 def _kinds_in(results: "pd.DataFrame") -> list[str]:
-    """Kinds of agents in the order of their table, the usual ones of systems even without results."""
+    """Kinds of agents in the table's order; the default kinds for systems are listed even without results."""
     systems = on_systems(results)
     there = {*results.shown} | ({*ON_SYSTEMS} if systems else set())
     order = KINDS if systems else dict.fromkeys((*IN_ENVIRONMENTS, *KINDS))
@@ -81,7 +81,7 @@ def _labels(results: "pd.DataFrame") -> dict[str, str]:
 
 
 def _task_name(environment: str, noise: float | str) -> str:
-    """A task's title; a column of levels has numbers, and texts of a level for each output."""
+    """A task's title; ``noise`` is a number, or a text with a level for each output."""
     try:
         level = f"{float(noise):g}"
     except ValueError:
@@ -90,7 +90,7 @@ def _task_name(environment: str, noise: float | str) -> str:
 
 
 def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
-    """Rows with their task and its idle value; agents on the full state without noise serve all levels of noise."""
+    """Rows with their task and its idle return; agents on the full state without noise count for all noise levels."""
     import pandas as pd
 
     tasks = []
@@ -106,7 +106,7 @@ def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def cells(rows: "pd.DataFrame") -> dict[tuple[str, str], Cell]:
-    """Cells by task and kind, of the rows that :func:`in_tasks` gives."""
+    """Cells by task and kind, from the rows of :func:`in_tasks`."""
     by_kind = {}
     for (task, kind), group in rows.groupby(["task", "shown"], sort=False):
         values, idle = group["return"].to_numpy(), float(group.idle.iloc[0])
@@ -197,7 +197,7 @@ def _table_of_environments(
 
 
 def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
-    """Draw the normalised scores of all tasks, a panel each, with a row for each kind of agents."""
+    """Draw the normalised scores: a panel for each task, with a row for each kind of agents."""
     rows, kinds = in_tasks(results), _labels(results)
     by_kind, tasks = cells(rows), list(dict.fromkeys(rows.task))
     columns = min(PANELS_IN_A_ROW, max(1, len(tasks)))
@@ -214,7 +214,7 @@ def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
 
 
 def _draw_panel(ax: "Axes", row: Sequence[Cell | None]) -> None:
-    """Draw agents as dots and their means with intervals, from below."""
+    """Draw agents as dots, and their means with intervals; the first kind is at the bottom."""
     for place, cell in enumerate(row):
         if cell is not None and np.isfinite(cell.interval[0]):
             score, low, high = cell.interval
@@ -226,7 +226,7 @@ def _draw_panel(ax: "Axes", row: Sequence[Cell | None]) -> None:
 
 
 def curves(agents: Sequence[ComparedAgent]) -> "pd.DataFrame":
-    """Learning curves: returns of training episodes, averaged over a twentieth of the training, over its steps."""
+    """Learning curves: returns of training episodes by steps, averaged over a twentieth of the training."""
     import pandas as pd
 
     groups: dict[tuple[str, Any, str], list[pd.DataFrame]] = {}
@@ -251,7 +251,7 @@ def curves(agents: Sequence[ComparedAgent]) -> "pd.DataFrame":
 
 
 def draw_curves(path: Path, learned: "pd.DataFrame", partial: str = "") -> None:
-    """Draw learning curves against steps and against CPU seconds."""
+    """Draw learning curves by steps and by CPU seconds."""
     tasks = tasks_in(learned)
     rows = max(1, math.ceil(len(tasks) / 2))
     with drawing(path, 12.0, 2.3 * rows + 0.8) as figure:

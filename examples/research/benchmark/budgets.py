@@ -1,6 +1,6 @@
 """The budgets of trainings and the test protocols behind ``--budget`` and ``--quick``.
 
-Times are at the pace of the shipped systems; other systems are given as many samples of their own.
+Times are those of systems with a pace of 1 s; other systems have equally many samples.
 """
 
 import math
@@ -12,7 +12,7 @@ from kkl_gym.system import System
 
 BUDGETS = {
     "cpu": Budget("cpu", trajectories=2000, duration=50.0, samples=200, cpu_seconds=300.0),
-    # As many batches on any machine, so that the same results come out again.
+    # The number of batches does not depend on the machine, so that results are reproducible.
     "quick": Budget(
         "quick", trajectories=200, duration=20.0, samples=50, cpu_seconds=math.inf, width=64, depth=2, steps=300
     ),
@@ -22,15 +22,15 @@ BUDGETS = {
 PROTOCOL = Protocol()
 QUICK_PROTOCOL = Protocol(trajectories=5, duration=10.0)
 VALIDATION = Protocol(trajectories=20, duration=20.0)
-SEARCH = 0.2  # of the budget's CPU seconds, for each configuration that is compared
+SEARCH = 0.2  # share of the budget's CPU seconds for the training of each compared configuration
 
 
 def paced_budget(budget: Budget, system: System) -> Budget:
-    """The same at a system's own pace."""
-    dt = float(f"{budget.dt * system.pace:.12g}")  # the system's own, where rounding would not have it so
+    """The budget in units of a system's pace."""
+    dt = float(f"{budget.dt * system.pace:.12g}")  # removes the rounding of the product
     return replace(budget, duration=budget.duration * system.pace, dt=dt)
 
 
 def paced_protocol(protocol: Protocol, system: System) -> Protocol:
-    """The same at a system's own pace."""
+    """The protocol in units of a system's pace."""
     return replace(protocol, duration=protocol.duration * system.pace)

@@ -22,39 +22,39 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Compare observers: train every method on every system, measure all on the same unseen trajectories.
+    """Compare observers: train every method on every system, and evaluate all on the same unseen trajectories.
 
-    Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
-    OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
-    trained observer. A run that was interrupted goes on where it stopped.
+    Writes OUT/results.csv (a row for each trajectory), OUT/methods.csv (the cost of each method), OUT/table.md and
+    OUT/heatmap.png. Each method on each system is a job whose folder under OUT/jobs holds the trained observer. After
+    an interruption, the same command continues.
     """
 
     budget: Literal["short", "cpu"] = "cpu"
-    """cpu: 400,000 points and 300 CPU seconds for each training. short: a half of that, 40 s."""
+    """cpu: 400,000 points and 300 CPU seconds for each training. short: half of the points, 40 s."""
     quick: bool = False
-    """In place of the budget: trainings of 300 batches, no search, few and short test trajectories; a matter of
-    minutes, with the same results each time."""
+    """Instead of the budget: trainings of 300 batches, no search, few and short test trajectories. Takes minutes, with
+    the same results each time."""
     systems: tuple[str, ...] = tuple(SYSTEMS)
-    """Names, or classes of yours as script.py:Class or module:Class."""
+    """Shipped systems, or your own as script.py:Class or module:Class."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
-    """default, spinn, node, node-noise, gru, lru, transformer, ekf, ukf; or, with the maps that ship, shipped,
-    shipped-spinn, shipped-large; or classes of yours as script.py:Class or module:Class."""
+    """default, spinn, node, node-noise, gru, lru, transformer, ekf, ukf; for the maps that ship, shipped,
+    shipped-spinn, shipped-large; or your own classes as script.py:Class or module:Class."""
     measurement_noise: NoiseLevels = None
     """Standard deviations of the noise on each sample of y. 0.1,0.3 is one for each output."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
     """Folder of results."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     seed: int = 0
-    """Seed of the test trajectories; training's is always 0."""
+    """Seed of the test trajectories. Trainings always have seed 0."""
     beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
-    """Folder with results.csv and methods.csv of the same benchmark, such as docs/results/benchmark: the rows of its
-    other observers are taken over, so that new ones stand beside them without training those again."""
+    """Folder with results.csv and methods.csv of the same benchmark, such as docs/results/benchmark. The tables then
+    include its other observers, without training them again."""
     report: bool = False
-    """Only write table and figure again from OUT/results.csv and OUT/methods.csv."""
+    """Only write the table and the figure again, from OUT/results.csv and OUT/methods.csv."""
 
     def run(self, console: Console) -> Path:
         """Run the missing jobs, then report."""
-        from examples.research.benchmark.results import check_results, collect, report  # pandas takes a second
+        from examples.research.benchmark.results import check_results, collect, report  # imports pandas, slowly
 
         name = "quick" if self.quick else self.budget
         out = self.out or Path("runs") / "benchmark" / name
@@ -70,7 +70,7 @@ class Benchmark:
                 for job in progress.track(trained, description="timing steps"):
                     try:
                         job.time_steps()
-                    except Exception as error:  # of one method; the others go on
+                    except Exception as error:  # one method failed; the others continue
                         failures.append(f"{job.name}, timing: {error}")
                 if trained:
                     collect(out, self.beside)
@@ -82,15 +82,15 @@ class Benchmark:
         return out
 
     def jobs(self, name: str, out: Path) -> "list[Training]":
-        """Make the jobs of a budget; raises ValueError if an option is invalid."""
-        from examples.research.benchmark import budgets  # torch takes seconds that help need not wait for
+        """Make the jobs of a budget; ValueError if an option is invalid."""
+        from examples.research.benchmark import budgets  # imported here, because --help need not wait for torch
         from examples.research.benchmark.jobs import Training
         from examples.research.methods import METHODS, get_method
 
         methods, levels = tuple(METHODS) if self.methods is None else self.methods, self.measurement_noise
         if not self.systems or not methods or levels == ():
             raise ValueError("give at least one system, method and noise level")
-        generator(Stream.EVALUATION, self.seed)  # raises for an invalid seed before anything is trained
+        generator(Stream.EVALUATION, self.seed)  # raises for an invalid seed before any training
         named = [[get_system(name).name for name in self.systems], [get_method(name).name for name in methods]]
         for names in (*named, [show_level(level) for level in levels or ()]):
             if len(set(names)) < len(names):

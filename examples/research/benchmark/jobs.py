@@ -1,4 +1,4 @@
-"""One method on one system: its configuration is chosen, it is trained, and its errors are measured."""
+"""One method on one system: the choice of its configuration, its training and its evaluation."""
 
 import hashlib
 import inspect
@@ -21,14 +21,14 @@ from training import run
 from training.files import write
 from training.trajectories.equations import describe
 
-FAILED = 200.0  # the largest SMAPE, for a configuration whose training diverges
-REVISION = 9  # rises with every change of the shipped methods: results from before are not reused
+FAILED = 200.0  # largest SMAPE, given to a configuration whose training diverges
+REVISION = 9  # increased with every change of the shipped methods, so that older results are not reused
 
 
 def seconds_spent(folder: Path) -> float:
-    """CPU seconds of all stages whose checkpoints are in a folder, interruptions included."""
+    """CPU seconds of all stages with checkpoints in a folder, including those before interruptions."""
     spent = 0.0
-    for path in sorted(folder.glob(f"[!.]*{run.CHECKPOINT}")):  # not those that are being written
+    for path in sorted(folder.glob(f"[!.]*{run.CHECKPOINT}")):  # complete ones only
         checkpoint = run.load_checkpoint(path)
         with run.restoring(path):
             spent += float(checkpoint["seconds"])
@@ -75,7 +75,7 @@ class Training(Job):
         return described
 
     def work(self) -> None:
-        """Choose a configuration, train, measure; steps that were done before are not done again."""
+        """Choose a configuration, train and evaluate; completed steps are not repeated."""
         try:
             self._work()
         except Exception:
@@ -100,7 +100,7 @@ class Training(Job):
         write(self.folder / self.result, errors.to_csv(index=False, float_format="%.4g"))
 
     def _chosen(self) -> tuple[Configuration, list[float]]:
-        """The configuration with the least validation error after a short training each, and all their errors."""
+        """The configuration with the least validation error after a short training, and the errors of all."""
         method, system = get_method(self.method), get_system(self.system)
         configurations = method.configurations(system)
         if not 1 <= len(configurations) <= 3:
@@ -125,7 +125,7 @@ class Training(Job):
         return configurations[best], scores
 
     def _trained(self, configuration: Configuration, budget: Budget, name: str) -> tuple[Any, float]:
-        """Train, or read the file of an earlier training; also returns the CPU seconds of the optimisation."""
+        """Train, or read the file of an earlier training. Also returns the CPU seconds of the optimisation."""
         method, system = get_method(self.method), get_system(self.system)
         path, timing = self.folder / f"{name}.safetensors", self.folder / f"{name}.seconds"
         if not (path.exists() and timing.exists()):
@@ -135,7 +135,7 @@ class Training(Job):
             try:
                 trained = method.train(task, configuration)
             except FloatingPointError:
-                shutil.rmtree(folder)  # its checkpoint would fail again
+                shutil.rmtree(folder)  # continuing from its checkpoint would fail again
                 raise
             write(timing, f"{seconds_spent(folder):.1f}\n")
             method.save(trained, path)
@@ -145,7 +145,7 @@ class Training(Job):
         return method.load(path), seconds
 
     def time_steps(self) -> None:
-        """Time the steps of the observer, unless that is done; call it while no training runs."""
+        """Time the steps of the observer, unless they are timed; call it while no training runs."""
         path = self.folder / "speed.json"
         if path.exists():
             return

@@ -1,4 +1,4 @@
-"""What every observer of the benchmark is measured on."""
+"""The evaluation of the benchmark's observers."""
 
 import time
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from training.evaluation.levels import Level, as_cell, multiple
 from training.evaluation.metrics import by_state, nrmse, smape
 from training.seeds import Stream, generator
 
-UNTIMED, TIMED = 100, 400  # samples of each round, in the first of which observers find their way
-LOST = 50.0  # % of SMAPE after the transient, above which a trajectory counts as lost
-SETTLED = 0.1  # of a trajectory's root mean square size
+UNTIMED, TIMED = 100, 400  # samples of each round; observers converge in the first ones
+LOST = 50.0  # a trajectory with a larger SMAPE in % after the transient counts as lost
+SETTLED = 0.1  # largest settled error, over a trajectory's root mean square
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Trajectories to test on."""
+    """The test trajectories."""
 
     domains: tuple[Domain, ...] = ("X", "1.5X", "2X")
     measurement_noise: tuple[Level, ...] = (0.0, 0.5)
@@ -35,7 +35,7 @@ class Protocol:
 def with_shared_noise(
     system: System, runs: UnseenTrajectories, *, measurement_noise: Level, n: int, seed: tuple[Stream, *tuple[int, ...]]
 ) -> np.ndarray:
-    """Outputs with noise on every sample, the same for every method.
+    """Outputs with noise on every sample; every method gets the same noise.
 
     Shapes: ``measurement_noise`` of length ny; returns (steps + 1, trajectories inside bounds, ny).
     """
@@ -46,18 +46,18 @@ def with_shared_noise(
 
 
 def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Mean of each component's SMAPE, as the notebooks released with the paper print after 20 % of the steps: (n,)."""
+    """Mean of each component's SMAPE, (n,), as the paper's notebooks print it after 20 % of the steps."""
     return np.mean([smape(x[..., [i]], x_hat[..., [i]], skip) for i in range(x.shape[-1])], axis=0)
 
 
 def rmse(x: np.ndarray, x_hat: np.ndarray) -> np.ndarray:
-    """Root of the mean over the steps of |x - x_hat|^2, (n,)."""
+    """Root of the mean of |x - x_hat|^2 over the steps, (n,)."""
     error = np.where(np.isfinite(x_hat), x - x_hat, np.inf)
     return np.asarray(np.sqrt((error**2).sum(-1).mean(0)))
 
 
 def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
-    """Time, (n,), from which |x - x_hat| stays below a tenth of the root mean square of |x|."""
+    """Times (n,) in seconds after which |x - x_hat| stays below a tenth of the root mean square of |x|."""
     limit = SETTLED * np.sqrt((x**2).sum(-1).mean(0))
     outside = ~(np.linalg.norm(x - x_hat, axis=-1) <= limit)
     last = len(x) - 1 - outside[::-1].argmax(0)
@@ -65,7 +65,7 @@ def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
 
 
 def measure(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> pd.DataFrame:
-    """Measure an observer on test trajectories."""
+    """Evaluate an observer on test trajectories. Returns a row for each trajectory and case."""
     n, frames = protocol.trajectories, []
     for i, domain in enumerate(protocol.domains):
         seed = (Stream.EVALUATION, protocol.seed, 1, i)
@@ -95,12 +95,12 @@ def measure(method: Method[Any], trained: Any, system: System, *, dt: float, pro
 
 
 def tuned_for(method: Method[Any], system: System) -> tuple[Level, ...] | None:
-    """Levels of noise at which a method's configurations are compared; None for those of the test."""
+    """Noise levels for the comparison of a method's configurations; None for those of the test."""
     return None if method.tuned_for is None else tuple(multiple(system, factor) for factor in method.tuned_for)
 
 
 def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
-    """Score a configuration on validation trajectories from X: smaller is better."""
+    """The error of a configuration on validation trajectories from X."""
     n = protocol.trajectories
     runs = unseen_trajectories(
         system,
@@ -125,7 +125,7 @@ def validate(method: Method[Any], trained: Any, system: System, *, dt: float, pr
 def step_time(
     method: Method[Any], trained: Any, *, system: System, dt: float, batch: int, seconds: float = 0.3
 ) -> float:
-    """Time one step of a whole batch along motions from X, once an observer has followed them for a while."""
+    """CPU seconds of a step of a whole batch, along motions from X, after the observer's transient."""
     observer = Running(method.observer(trained, system, dt, system.measurement_noise))
     x = simulate(system, starts(system, "X", batch, np.random.default_rng(0)), UNTIMED + TIMED, dt)
     y = np.nan_to_num(system.output(x))

@@ -1,4 +1,4 @@
-"""The results of a benchmark's jobs, put together: as CSV files, as a table and as a figure."""
+"""The combined results of a benchmark's jobs: CSV files, a table and a figure."""
 
 import json
 from io import StringIO
@@ -14,11 +14,11 @@ from observers.storage import explained
 from training.evaluation.levels import read_level, show_level
 from training.files import write
 
-FILES = ("results.csv", "methods.csv")  # a row for each trajectory, and for each method on each system
+FILES = ("results.csv", "methods.csv")  # a row for each trajectory; a row for each method and system
 
 
 def collect(out: Path, beside: Path | None = None) -> None:
-    """Write one CSV file of all errors and one of all costs, of every job in the folder."""
+    """Write a CSV file with the errors, and one with the costs, of all jobs in the folder."""
     errors, costs = [], []
     for folder in sorted(path.parent for path in (out / "jobs").glob("*/*/errors.csv")):
         with explained(folder, ValueError):
@@ -51,12 +51,12 @@ def collect(out: Path, beside: Path | None = None) -> None:
 
 
 def _as_written(source: Path | StringIO) -> pd.DataFrame:
-    """A CSV file, every digit as it is there."""
+    """Read a CSV file as text, so that every digit is kept."""
     return pd.read_csv(source, dtype=str, keep_default_na=False)
 
 
 def _joined(rows: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
-    """Rows of jobs, in the columns that the earlier ones have, and those of other observers as they are."""
+    """Rows of jobs in the columns of the earlier rows, and the unchanged earlier rows of other observers."""
     here, there = (_conditions(frame, set(rows.system) & set(earlier.system)) for frame in (rows, earlier))
     if here != there:
         raise ValueError(
@@ -68,7 +68,7 @@ def _joined(rows: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
 
 
 def _conditions(frame: pd.DataFrame, systems: set[str]) -> set[str]:
-    """What rows of one benchmark have in common."""
+    """The conditions in which all rows of a benchmark agree."""
     if "budget" in frame:
         return {f"budget {budget}, seed {seed}" for budget, seed in zip(frame.budget, frame.seed)}
     cases = frame[frame.system.isin(systems)][["system", "starts", "noise"]].drop_duplicates()
@@ -76,7 +76,7 @@ def _conditions(frame: pd.DataFrame, systems: set[str]) -> set[str]:
 
 
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
-    """First what ships, in its order, then the user's systems and methods; rows of an observer stay as they are."""
+    """Rows sorted: shipped systems and methods first, then the user's; the rows of an observer keep their order."""
     places = [
         {name: place for place, name in enumerate(dict.fromkeys([*shipped, *sorted(set(column))]))}
         for shipped, column in ((SYSTEMS, rows.system), (ABLATION | METHODS, rows.method))
@@ -86,7 +86,7 @@ def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def check_results(folder: Path) -> None:
-    """Raise a ValueError unless a folder has the two CSV files."""
+    """Raise ValueError unless a folder has both CSV files."""
     for name in FILES:
         if not (folder / name).exists():
             raise ValueError(f"{folder / name} does not exist; run the benchmark first")
@@ -100,13 +100,13 @@ def report(out: Path) -> None:
 
 
 def draw_results(out: Path, path: Path) -> None:
-    """Draw the heatmap alone from the CSV files."""
+    """Draw only the heatmap from the CSV files."""
     results, methods, note = _read(out)
     draw(path, results, methods, note=note)
 
 
 def _read(out: Path) -> tuple[pd.DataFrame, pd.DataFrame, str]:
-    """Results and methods, and the conditions."""
+    """Results, methods, and a note on the conditions."""
     check_results(out)
     results, methods = (pd.read_csv(out / name) for name in FILES)
     note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."

@@ -1,4 +1,4 @@
-"""Tables and the figure, from the benchmark's two CSV files and nothing else."""
+"""Tables and the figure, only from the benchmark's two CSV files."""
 
 import json
 import re
@@ -15,14 +15,14 @@ from training.figures import drawing
 from training.files import table, write
 
 PAPERS_MEASURE = "The paper's measure: median ± half the interquartile range [bootstrap 95 % interval of the median]."
-# Column of results.csv, and title.
+# Columns of results.csv, and their titles.
 MEASURES = (("smape", "SMAPE in %, all steps"), ("smape_late", "SMAPE in % after the first 20 %"))
 NRMSE = re.compile(r"nrmse\d+")  # columns of results.csv
-NEVER = 1e12  # stands for an infinite time or error, of which no quantile can be taken
+NEVER = 1e12  # replaces infinite times and errors, so that quantiles exist
 NARROWEST = 7.0  # inches, of a figure with its title
 DOMAINS = {"X": "starts in X", "1.5X": "starts in 1.5X \\ X", "2X": "starts in 2X \\ X"}
 
-# SMAPE in % that the released notebooks print, by system and method.
+# SMAPE in % in the paper's released notebooks, by system and method.
 PRINTED = {
     "reverse_duffing": {"spinn": 1.96, "ae": 55.4, "dmf": 46.2, "node": 159.8},
     "van_der_pol": {"spinn": 0.35, "ae": 200.0, "dmf": 98.2, "node": 11.9},
@@ -32,8 +32,8 @@ PRINTED = {
 
 
 def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Median, half the interquartile range and a bootstrap 95 % interval of the median, for each cell."""
-    from scipy.stats import bootstrap  # here, because it takes half a second that other commands need not wait for
+    """Median, half the interquartile range and the median's bootstrap 95 % interval for each cell."""
+    from scipy.stats import bootstrap  # imported here, because it takes half a second
 
     rows = []
     for key, group in results[results.escaped == 0].groupby(["system", "method", "starts", "noise"], sort=False):
@@ -51,7 +51,7 @@ def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
 
 
 def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> None:
-    """Write all measures as Markdown, a table for each measure and case with a row for each method."""
+    """Write all measures as Markdown: a table for each measure and case, with a row for each method."""
     results = _by_text_of_noise(results)
     cases = sorted(
         results[["starts", "noise"]].drop_duplicates().itertuples(index=False, name=None),
@@ -63,7 +63,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         for case in cases:
             lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", PAPERS_MEASURE, ""]
             lines += _by_method(methods, partial(_spread, summary, case))
-    states = [column for column in results if NRMSE.fullmatch(column)]  # none in the published results.csv
+    states = [column for column in results if NRMSE.fullmatch(column)]  # the published results.csv has none
     if states:
         medians = results[results.escaped == 0].groupby(["starts", "noise", "system", "method"])[states].median()
         for case in cases:
@@ -109,18 +109,18 @@ def _by_method(methods: pd.DataFrame, cell: Callable[[tuple[str, str]], str]) ->
 
 
 def _by_text_of_noise(results: pd.DataFrame) -> pd.DataFrame:
-    """The same with levels of noise as text, whether they are numbers or one for each output."""
+    """The same frame with noise levels as text, for one level or one for each output."""
     texts = {noise: show_level(read_level(str(noise))) for noise in results.noise.unique()}
     return results.assign(noise=results.noise.map(texts))
 
 
 def _size(noise: str) -> list[float]:
-    """By which levels of noise are put in order."""
+    """Sort key of noise levels."""
     return np.atleast_1d(read_level(noise)).tolist()
 
 
 def _each_state(medians: pd.DataFrame, case: tuple[str, str], job: tuple[str, str]) -> str:
-    """The figures of the states that the system has; a state that does not move has none."""
+    """The figures of the system's states; a constant state has none."""
     if (*case, *job) not in medians.index:
         return "–"
     row = medians.loc[(*case, *job)].to_numpy()
@@ -129,14 +129,14 @@ def _each_state(medians: pd.DataFrame, case: tuple[str, str], job: tuple[str, st
 
 
 def _spread(summary: pd.DataFrame, case: tuple[str, str], job: tuple[str, str]) -> str:
-    if (*case, *job) not in summary.index:  # every trajectory escaped
+    if (*case, *job) not in summary.index:  # every trajectory left the bounds
         return "–"
     row = summary.loc[(*case, *job)].map(_number)
     return f"{row['median']} ± {row.half_iqr} [{row.low}, {row.high}]"
 
 
 def _number(value: float) -> str:
-    """To three digits, as far as they mean something."""
+    """A number with three significant digits."""
     if value >= NEVER / 4:
         return "∞"
     return f"{value:.3g}" if value >= 0.001 or value == 0 else "<0.001"
@@ -204,7 +204,7 @@ def _write_cell(ax: Any, at: tuple[int, int], median: float, half_iqr: float) ->
 
 
 def _labels(methods: pd.DataFrame) -> dict[str, str]:
-    """By method; a number of trajectories that is not everyone's is part of the label."""
+    """Labels by method; a label includes the number of trajectories if it differs from the others."""
     most = methods.trajectories.max()
     return {
         row.method: row.label if row.trajectories == most else f"{row.label} ({row.trajectories} runs)"

@@ -22,13 +22,13 @@ default = Default()
 METHODS = _by_name(default, SPINN(), NODE(), NODENoise(), GRU(), LRU(), Transformer(), EKF(), UKF())
 # Steps from the paper's pipeline to the package's, in the order of ``make ablation``.
 ABLATION = _by_name(*SPINN_METHODS, *INVERSE_METHODS, default)
-# Those that need a map that ships for the system; they run only if they are named.
+# These need a map that ships for the system; they run only if they are named.
 AS_SHIPPED = _by_name(Shipped(), ShippedSPINN(), ShippedLarge())
 SHIPPED = METHODS | ABLATION | AS_SHIPPED
 
 
 def get_method(name: str) -> Method[Any]:
-    """A method of the benchmark, or of the user's as module:Class or script.py:Class."""
+    """A method of the benchmark, or the user's own as module:Class or script.py:Class."""
     if name in SHIPPED:
         return SHIPPED[name]
     if ":" not in name:
@@ -39,9 +39,9 @@ def get_method(name: str) -> Method[Any]:
     if isabstract(cls):
         raise ValueError(f"the method {name!r} must define {', '.join(sorted(cls.__abstractmethods__))}")
     if not isinstance(vars(cls).get("name"), str) or not isinstance(getattr(cls, "label", None), str):
-        raise ValueError(f"the method {name!r} must set the class variables name and label, its own")
+        raise ValueError(f"the method {name!r} must set its own class variables name and label")
     if cls.name in SHIPPED and cls is not type(SHIPPED[cls.name]):
-        raise ValueError(f"the method {name!r} takes the name {cls.name!r} of another; give it one of its own")
+        raise ValueError(f"the method {name!r} has the name {cls.name!r} of another method; give it its own")
     return SHIPPED.get(cls.name) or cls()
 
 

@@ -1,4 +1,4 @@
-"""What each idea earns: pipelines that differ from the next one in a few settings, trained for equal times.
+"""The gain of each idea: pipelines that differ from the next one in a few settings, trained for equal times.
 
 One series of steps leads from the paper's SPINN to the package's, the other from inverses without T to the default.
 """
@@ -17,8 +17,8 @@ from training.spectrum import papers_spectrum
 
 Settings = Mapping[str, Any]
 
-NO_NOISE = 0.02  # of the system's own measurement noise: the largest in training of inverses for none
-# One inverse for free and driven motion, with samples drawn alike for all systems.
+NO_NOISE = 0.02  # largest noise in the training of noise-free inverses, over the system's own
+# A single inverse for free and driven motion, with the same sampling for all systems.
 TOGETHER: Settings = {
     "free_inverse": False,
     "process_noise_share": 0.0,
@@ -26,7 +26,7 @@ TOGETHER: Settings = {
     "high_noise_emphasis": 2.0,
 }
 ADAM: Settings = {"optimiser": "adam", "batch": 4096, "learning_rate": 8e-3}
-# The paper's SPINN (its sec. 8.1), beside its spectrum: points uniform in X, and a small budget.
+# The paper's SPINN (its sec. 8.1) without its spectrum: points uniform in X, and a small budget.
 PAPERS: Settings = {
     "optimiser": "adam",
     "learning_rate": 1e-3,
@@ -37,7 +37,7 @@ PAPERS: Settings = {
     "transients": False,
     "solved_output_layer": False,
 }
-# Name, label and the settings of the paper that are the preset's from this step on.
+# Name, label, and the paper's settings that this step replaces by the preset's.
 SPINN_STEPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("ablation-spinn", "SPINN", ()),
     ("ablation-spinn-soap", "SPINN by SOAP", ("optimiser", "learning_rate", "batch")),
@@ -53,7 +53,7 @@ class Ablation(KKLMethod):
     """A pipeline of the package with some settings changed."""
 
     def __init__(self, name: str, label: str, changes: Callable[[Task], Settings], pipeline: Pipeline) -> None:
-        self.name, self.label = name, label  # type: ignore[misc]  # which other methods have of their class
+        self.name, self.label = name, label  # type: ignore[misc]  # class variables in other methods
         self.changes, self.pipeline = changes, pipeline
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
@@ -70,7 +70,7 @@ def papers_modes(task: Task) -> Settings:
 
 
 def _without(given_back: tuple[str, ...]) -> Callable[[Task], Settings]:
-    """The paper's settings, without some that are the preset's."""
+    """The paper's settings, without those that are replaced by the preset's."""
     return lambda task: {key: value for key, value in {**papers_modes(task), **PAPERS}.items() if key not in given_back}
 
 

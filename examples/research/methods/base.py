@@ -1,4 +1,4 @@
-"""The interface of the benchmark's methods: trained from a system and a budget, they make causal observers."""
+"""The interface of the benchmark's methods: training from a system and a budget gives a causal observer."""
 
 import json
 from abc import ABC, abstractmethod
@@ -80,7 +80,7 @@ class Task:
 
     @cached_property
     def data(self) -> Data:
-        """Training trajectories, simulated when first asked for."""
+        """Training trajectories, simulated at the first call."""
         budget = self.budget
         return simulated(
             self.system,
@@ -93,11 +93,11 @@ class Task:
 
     @property
     def rng(self) -> np.random.Generator:
-        """A fresh generator; the same one at every call."""
+        """A new generator with the same seed at every call."""
         return generator(Stream.TRAINING, self.seed, 1)
 
     def fit(self, name: str, module: nn.Module, loss: Loss, learning_rate: float, share: float = 1.0) -> None:
-        """Minimise a loss by Adam; goes on from a checkpoint if there is one."""
+        """Minimise a loss by Adam; resumes from a checkpoint if there is one."""
         self.folder.mkdir(parents=True, exist_ok=True)
         identity = json.dumps([describe(self.system), asdict(self.budget), self.seed], sort_keys=True)
         limits: dict[str, Any] = {"steps": self.budget.steps, "cpu_seconds": self.budget.cpu_seconds * share}
@@ -108,14 +108,14 @@ class Task:
 
 
 class Method(ABC, Generic[Trained]):
-    """A way to make observers; docs/results/benchmark.md shows how to add one."""
+    """A method of training observers; docs/results/benchmark.md shows how to add one."""
 
     name: ClassVar[str]
     label: ClassVar[str]
     tuned_for: ClassVar[tuple[float, ...] | None] = None
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Propose at most three; the benchmark takes the one with the least error on validation trajectories."""
+        """Propose one to three; the benchmark takes the one with the least error on validation trajectories."""
         return ({},)
 
     @abstractmethod
@@ -124,13 +124,13 @@ class Method(ABC, Generic[Trained]):
 
     @abstractmethod
     def observer(self, trained: Trained, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
-        """Make an observer. The arguments are given by position, so that a class may name them as it likes.
+        """Make an observer. The arguments are positional, so that a class may choose their names.
 
         Shapes: ``measurement_noise`` of length ny.
         """
 
     def save(self, trained: Trained, path: Path) -> None:
-        """Write the result of a training, whole or not at all; by default a dictionary of arrays."""
+        """Write the result of a training atomically; by default it is a dictionary of arrays."""
         if not isinstance(trained, dict):
             raise TypeError(f"{type(self).__name__} trains a {type(trained).__name__}: override save and load")
         storage.save(path, trained, key=_KEY, described={"method": self.name})

@@ -11,21 +11,21 @@ from observers.estimator import Estimator
 from training.evaluation.levels import Level
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 
-# Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
-# white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
-# linearisation: the trajectories have no process noise.
+# Levels of the white process noise that a filter assumes, in multiples of each state's scale per square root of the
+# pace. The trajectories have no process noise; the level accounts for the filter's errors of linearisation. It differs
+# from the bounded process noise of environments.
 DIFFUSION = (1e-4, 1e-3, 1e-2)
 
 
 def diffusion_intensity(trained: Arrays, system: System) -> np.ndarray:
-    """Q, (nx, nx), per second, of the level of diffusion that was chosen."""
+    """Q, (nx, nx), per second, for the chosen level of diffusion."""
     return np.diag((trained["diffusion"] * np.array(system.scale)) ** 2 / system.pace)
 
 
 class EKF(Method[Arrays]):
-    """Extended Kalman filter with the exact model and noise level; its diffusion is chosen on validation.
+    """Extended Kalman filter with the exact model and noise level; its diffusion is chosen on validation runs.
 
-    The start is unknown to it: the centre of X, with the covariance of a uniform draw from X.
+    It starts at the centre of X, with the covariance of a uniform distribution on X.
     """
 
     name: ClassVar[str] = "ekf"
@@ -33,11 +33,11 @@ class EKF(Method[Arrays]):
     filter: ClassVar[type[ExtendedKalmanFilter]] = ExtendedKalmanFilter
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Three levels of diffusion, in multiples of the scale per square root of a second of its pace."""
+        """Three levels of diffusion, in multiples of the scale per square root of the pace."""
         return tuple({"diffusion": level} for level in DIFFUSION)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
-        """Nothing to learn."""
+        """Return the level; there is nothing to learn."""
         return {"diffusion": np.array([configuration["diffusion"]])}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
@@ -48,7 +48,7 @@ class EKF(Method[Arrays]):
 
 
 class UKF(EKF):
-    """Unscented Kalman filter with the exact model and noise level, tuned as the EKF is."""
+    """Unscented Kalman filter with the exact model and noise level, tuned like the EKF."""
 
     name: ClassVar[str] = "ukf"
     label: ClassVar[str] = "UKF"

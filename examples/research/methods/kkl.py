@@ -1,4 +1,4 @@
-"""The methods that make KKL observers in the package's own format: its default, and the paper's SPINN."""
+"""The methods whose KKL observers have the package's own format: its default, and the paper's SPINN."""
 
 import math
 from dataclasses import replace
@@ -18,14 +18,14 @@ from training.lessons import train
 from training.presets import preset
 from training.spectrum import evenly_spaced
 
-# Intervals of the eigenvalues of A in 1/s among which methods with a real spectrum choose; the first is the paper's.
+# Candidate intervals of real eigenvalues of A in 1/s; the first is the paper's.
 SPECTRA = ((-3.0, -1.5), (-8.0, -1.0), (-20.0, -2.0))
-# Those of SPINN, which needs a smooth T: the paper's, and two so fast that z depends on little of the past.
+# Candidates of SPINN, which needs a smooth T: the paper's, and two so fast that z depends on little of the past.
 SMOOTH_SPECTRA = ((-3.0, -1.5), (-20.0, -2.0), (-40.0, -6.0))
 
 
 def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...]:
-    """Space 2 nx + 1 eigenvalues for each output evenly in the logarithm."""
+    """2 nx + 1 logarithmically spaced eigenvalues for each output."""
     return evenly_spaced(2 * system.nx + 1, slowest / system.pace, fastest / system.pace)
 
 
@@ -33,11 +33,11 @@ class KKLMethod(Method[Artifact]):
     """A method that trains an artifact."""
 
     def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
-        """The package's observer for a noise level, cut at the highest of its training, without process noise."""
+        """The package's observer for a noise level, limited to the highest of its training, without process noise."""
         return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0).estimator
 
     def save(self, trained: Artifact, path: Path) -> None:
-        """As an artifact that ``observers.load`` reads."""
+        """Write an artifact for ``observers.load``."""
         trained.save(path)
 
     def load(self, path: Path) -> Artifact:
@@ -46,7 +46,7 @@ class KKLMethod(Method[Artifact]):
 
 
 def within(config: Config, budget: Budget, seed: int) -> Config:
-    """Give a configuration of the package the benchmark's data, networks and limit of CPU time, without tracking."""
+    """A configuration with the benchmark's data, networks and limit of CPU time, and without tracking."""
     return replace(
         config,
         tracking=False,
@@ -65,16 +65,16 @@ def within(config: Config, budget: Budget, seed: int) -> Config:
 
 
 def trained(task: Task, config: Config) -> Artifact:
-    """Train by the package's pipeline, on a CPU as all methods."""
+    """Train by the package's pipeline, on the CPU like all methods."""
     return train(task.system, config, task.folder, resume=True, device=torch.device("cpu")).artifact
 
 
 class Default(KKLMethod):
-    """The package's own: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
+    """The package's method: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
 
-    It simulates trajectories of its own, as many as everyone gets for each of its two inverses: free ones, some of
-    which start where inputs have led from X, and driven ones. Each inverse has half of the time, though the
-    benchmark sees the one of free motion only. One configuration: the preset, which was chosen during the package's
+    It simulates its own trajectories, as many as every method has for each of its two inverses: driven ones, and free
+    ones, of which some start where inputs have led from X. Each inverse has half of the time, although the benchmark
+    uses only that of free motion. The only configuration is the preset, which was chosen during the package's
     development.
     """
 
@@ -88,19 +88,19 @@ class Default(KKLMethod):
 
 
 class Shipped(KKLMethod):
-    """The maps that ship, trained at a larger budget: ``--methods shipped``."""
+    """The shipped default maps, trained at a larger budget: ``--methods shipped``."""
 
     name: ClassVar[str] = "shipped"
     label: ClassVar[str] = "default maps, as shipped"
     suffix: ClassVar[str] = ""
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
-        """Nothing is trained."""
+        """Read the shipped map; there is nothing to train."""
         return Artifact.read(resolve(task.system.name + self.suffix))
 
 
 class ShippedSPINN(Shipped):
-    """The SPINN maps that ship, likewise: ``--methods shipped-spinn``."""
+    """The shipped SPINN maps: ``--methods shipped-spinn``."""
 
     name: ClassVar[str] = "shipped-spinn"
     label: ClassVar[str] = "SPINN, as shipped"
@@ -108,7 +108,7 @@ class ShippedSPINN(Shipped):
 
 
 class ShippedLarge(Shipped):
-    """T_inv alone, likewise: ``--methods shipped-large``."""
+    """T_inv alone of the shipped large maps: ``--methods shipped-large``."""
 
     name: ClassVar[str] = "shipped-large"
     label: ClassVar[str] = "T_inv alone, as shipped"
@@ -120,9 +120,9 @@ class ShippedLarge(Shipped):
 
 
 class SPINN(KKLMethod):
-    """The paper's: a physics-informed T, then T_inv on z' = T(x') (``kkl-gym train --pipeline spinn``).
+    """The paper's method: a physics-informed T, then T_inv on z' = T(x') (``kkl-gym train --pipeline spinn``).
 
-    It simulates as many trajectories as everyone gets, from starts in X as theirs.
+    It simulates as many trajectories as every method has, with the same distribution of starts in X.
     """
 
     name: ClassVar[str] = "spinn"

@@ -20,16 +20,16 @@ from training.trajectories.motions import filter_states
 
 TRAJECTORIES_PER_BATCH = 128
 AGES_PER_BATCH = 32
-SOFT_FLOOR = 1e-4  # of the largest principal component of z, below which components are not scaled up further
-# Errors are taken absolutely, and squared within this part of a state's standard deviation. Squared all over, they are
-# ruled by peaks: Rössler's x3 rests near 0.02 between spikes of 20.
+SOFT_FLOOR = 1e-4  # components of z below this share of the largest are not scaled up further
+# The loss is the absolute error, and quadratic below this share of a state's standard deviation. Peaks would dominate a
+# quadratic loss: Rössler's x3 rests near 0.02 between spikes of 20.
 ROUNDING = 0.01
-SPECTRUM_PACE = 0.1  # of the spectrum's learning rate in the decoder's, which has to follow it
+SPECTRUM_PACE = 0.1  # learning rate of the spectrum over that of the decoder, which has to follow it
 LEARNING_RATE = 1e-2
 
 
 class NODE(KKLMethod):
-    """z' = diag(theta) z + B y with theta < 0 learned together with T_inv, by the error of x_hat along trajectories.
+    """z' = diag(theta) z + B y, with theta < 0 and T_inv learned together from the error of x_hat along trajectories.
 
     K. Miao and K. Gatsis, "Learning robust state observers using neural ODEs", L4DC 2023. The filter is
     linear and diagonal, so it is integrated exactly between samples instead of by an ODE solver.
@@ -46,7 +46,7 @@ class NODE(KKLMethod):
         return tuple({"spectrum": list(interval)} for interval in SPECTRA)
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
-        """Spectrum and inverse together."""
+        """Learn spectrum and inverse together."""
         torch.manual_seed(task.seed)
         system, problem = task.system, _Problem(task, self.noise, *configuration["spectrum"])
         task.fit("node", problem, problem.loss, LEARNING_RATE)
@@ -70,7 +70,7 @@ class NODE(KKLMethod):
 
 
 class NODENoise(NODE):
-    """The variant made robust by noise on y in training."""
+    """The robust variant, with noise on y in training."""
 
     name: ClassVar[str] = "node-noise"
     label: ClassVar[str] = "NODE, noise"
@@ -79,10 +79,10 @@ class NODENoise(NODE):
 
 
 class _Problem(nn.Module):
-    """T_inv, and the logarithms of the rates -theta, the same for each output.
+    """T_inv, and the logarithms of the rates -theta, which all outputs share.
 
-    The components of z are nearly collinear. Its principal directions, for the initial spectrum, are scaled to unit
-    variance down to ``SOFT_FLOOR`` of the largest: full whitening would have to follow the spectrum as it is learned.
+    The components of z are nearly collinear. Its principal directions under the initial spectrum are scaled to unit
+    variance, down to ``SOFT_FLOOR`` of the largest. Full whitening would have to follow the learned spectrum.
     """
 
     def __init__(self, task: Task, noise: float, fastest: float, slowest: float) -> None:
@@ -111,7 +111,7 @@ class _Problem(nn.Module):
         return -(self._log_rates + SPECTRUM_PACE * self.change).exp()
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Error of the scaled estimate at some ages of some trajectories, from z0 = -A^-1 B y0."""
+        """Error of the scaled estimate at random ages of random trajectories, from z0 = -A^-1 B y0."""
         rows = torch.randint(len(self._y), (TRAJECTORIES_PER_BATCH,), generator=generator)
         chosen = torch.randperm(len(self._ages), generator=generator)[:AGES_PER_BATCH].sort().values
         ages = self._ages[chosen.numpy()]
@@ -142,10 +142,9 @@ def rollout(
     y: torch.Tensor,
     ages: np.ndarray,
 ) -> torch.Tensor:
-    """Run z_k+1 = transition z_k + early y_k + late y_k+1 and take its states at some ages.
+    """Run z_k+1 = transition z_k + early y_k + late y_k+1, and return its states at some ages.
 
-    Between two ages the filter moves in one jump, by powers of the transition, so that fifty seconds of samples cost
-    no more operations than there are ages.
+    Powers of the transition advance the filter from age to age in one operation, however many samples lie between.
 
     Shapes: ``transition`` (nz, nz), ``early``, ``late`` (nz, ny), ``z0`` (n, nz), ``y`` (n, steps + 1, ny), ``ages``
     (m,); returns (m, n, nz).

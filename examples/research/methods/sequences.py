@@ -1,6 +1,6 @@
-"""Neural networks on the sequence of outputs: one training and one observer for several cells.
+"""Neural networks on sequences of outputs: several cells share one training and one observer.
 
-A cell maps features of samples and its state before them to as many hidden vectors and its state after them.
+A cell maps the features of samples and its state before them to a hidden vector for each sample and its new state.
 """
 
 import math
@@ -17,12 +17,12 @@ from observers.estimator import Estimate, Estimator
 from training.evaluation.levels import Level
 from training.maps.networks import Network, tensor
 
-ROWS, CHUNK = 64, 100  # of a batch, and samples of back-propagation
-WIDTH = 64  # of features and hidden vectors
+ROWS, CHUNK = 64, 100  # rows of a batch, and samples of truncated back-propagation
+WIDTH = 64  # width of features and hidden vectors
 LEARNING_RATE = 3e-3
 READOUT = 128  # neurons of the layer between the hidden vector and the estimate
-FAINT_NOISE = 0.01  # of the system's own level: the feature of noise is linear below it and logarithmic above
-ROUNDING = 1e-3  # of a state's standard deviation, below which the length of an error is rounded off
+FAINT_NOISE = 0.01  # share of the system's own level, below which the noise feature is linear; above, it is logarithmic
+ROUNDING = 1e-3  # share of a state's standard deviation, below which the error's length is smoothed
 
 
 class Cell(nn.Module):
@@ -62,8 +62,8 @@ class LRUCell(Cell):
     """Blocks of diagonal complex linear recurrences, each followed by a gated layer and a residual connection."""
 
     blocks: ClassVar[int] = 2
-    decay: ClassVar[tuple[float, float]] = (0.003, 0.3)  # per sample, at first, spaced evenly in the logarithm
-    turn: ClassVar[float] = 0.3  # rad per sample, the largest at first
+    decay: ClassVar[tuple[float, float]] = (0.003, 0.3)  # initial range per sample, logarithmically spaced
+    turn: ClassVar[float] = 0.3  # rad per sample, initially the largest
 
     def __init__(self, width: int) -> None:
         super().__init__(width)
@@ -75,7 +75,7 @@ class LRUCell(Cell):
         self.gates = nn.ModuleList(nn.Linear(3 * width, 2 * width) for _ in range(self.blocks))
 
     def start(self, n: int) -> torch.Tensor:
-        """Zero; real and imaginary parts side by side."""
+        """Zeros, with real and imaginary parts side by side."""
         return torch.zeros(n, self.blocks, self.width, 2)
 
     def forward(self, features: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -84,7 +84,7 @@ class LRUCell(Cell):
         for i, (norm, inlet, gate) in enumerate(zip(self.norms, self.inlets, self.gates, strict=True)):
             decay = self.log_decay[i].exp()
             factor = torch.polar((-decay).exp(), self.angle[i])
-            gain = (1.0 - (-2.0 * decay).exp()).sqrt()  # by which the state has the size of what drives it
+            gain = (1.0 - (-2.0 * decay).exp()).sqrt()  # gives the state the size of its input
             seen = norm(features)
             driving = gain * torch.complex(*inlet(seen).chunk(2, -1))
             x, states = torch.view_as_complex(state[:, i].contiguous()), []
@@ -102,7 +102,7 @@ def _parts(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class TransformerCell(Cell):
-    """Blocks of causal attention over the last samples, whose keys and values are the state, and of a hidden layer."""
+    """Blocks of causal attention and a hidden layer; the state holds keys and values of the last samples."""
 
     blocks: ClassVar[int] = 2
     heads: ClassVar[int] = 4
@@ -110,7 +110,7 @@ class TransformerCell(Cell):
 
     def __init__(self, width: int) -> None:
         super().__init__(width)
-        self.bias = nn.Parameter(torch.zeros(self.blocks, self.heads, self.window + 1))  # by a sample's age
+        self.bias = nn.Parameter(torch.zeros(self.blocks, self.heads, self.window + 1))  # bias by the age of a sample
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2 * self.blocks))
         self.inlets = nn.ModuleList(nn.Linear(width, 3 * width) for _ in range(self.blocks))
         self.outlets = nn.ModuleList(nn.Linear(width, width) for _ in range(self.blocks))
@@ -123,7 +123,7 @@ class TransformerCell(Cell):
         return torch.zeros(n, self.blocks, self.window, 2 * self.width)
 
     def forward(self, features: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """All blocks; no sample attends to one that is more than a window older."""
+        """Apply all blocks; a sample attends only to samples within a window before it."""
         samples, after = len(features), []
         age = torch.arange(samples)[:, None] + self.window - torch.arange(self.window + samples)
         hidden_by_age = (age < 0) | (age > self.window)
@@ -144,7 +144,7 @@ class TransformerCell(Cell):
 
 
 class Model(nn.Module):
-    """A cell between scaled samples of y with the level of their noise, and scaled estimates. Buffers hold scales."""
+    """A cell from scaled samples of y and their noise level to scaled estimates. Buffers hold the scales."""
 
     def __init__(self, kind: type[Cell], width: int, ny: int, nx: int) -> None:
         super().__init__()
@@ -166,24 +166,24 @@ class Model(nn.Module):
 
 
 class SequenceMethod(Method[Arrays]):
-    """A cell that is trained by truncated back-propagation along trajectories.
+    """A method that trains a cell by truncated back-propagation along trajectories.
 
-    Rows are of all ages, so that every batch has transients and settled motion. Half of the trajectories have no noise,
-    the others a level up to the system's own, which is an input. The loss is the mean length of the scaled error, as
-    transients would dominate its square.
+    Rows have random ages, so that every batch has transients and settled motion. Half of the trajectories have no
+    noise, the others a random level up to the system's own; the level is an input of the network. The loss is the mean
+    length of the scaled error, because transients would dominate its square.
     """
 
     kind: ClassVar[type[Cell]]
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
-        """The network and its scales."""
+        """Train the network; returns its weights and scales."""
         torch.manual_seed(task.seed)
         problem = _Problem(self.kind, task)
         task.fit(self.name, problem, problem.loss, LEARNING_RATE)
         return {key: value.detach().numpy() for key, value in problem.model.state_dict().items()}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
-        """The network, one sample at a time."""
+        """The network as an observer, one sample at a time."""
         own = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
         level = np.minimum(np.divide(noise, own, out=np.zeros(system.ny), where=own > 0), 1.0)
         model = Model(self.kind, WIDTH, system.ny, system.nx)
@@ -216,9 +216,9 @@ class Transformer(SequenceMethod):
 
 
 class _Problem(nn.Module):
-    """The model, and the places of the rows along the trajectories, buffers that are part of a checkpoint.
+    """The model, and the positions of rows along the trajectories, which are buffers for the checkpoint.
 
-    A row follows a trajectory from its start for a random part of it, and then begins another one.
+    A row follows a random part of a trajectory from its start, and then begins another one.
     """
 
     def __init__(self, kind: type[Cell], task: Task) -> None:
@@ -232,7 +232,7 @@ class _Problem(nn.Module):
         self._y = tensor(data.y, cpu)
         self._x = (tensor(data.x, cpu) - self.model.x_offset) / self.model.x_scale
         self._noise = tensor(np.broadcast_to(task.system.measurement_noise, data.y.shape[-1:]), cpu)
-        self._number = torch.full((len(data.y),), -1)  # of each sample among the recorded ones
+        self._number = torch.full((len(data.y),), -1)  # index of each sample among the recorded ones
         self._number[torch.as_tensor(data.ages)] = torch.arange(len(data.ages))
         self._steps = torch.arange(min(CHUNK, len(data.y)))[:, None]
         self.register_buffer("places", torch.zeros(3, ROWS, dtype=torch.long))  # trajectory, age, and age at the end
@@ -268,7 +268,7 @@ class _Problem(nn.Module):
 
 
 def level_feature(level: torch.Tensor) -> torch.Tensor:
-    """The networks' input for levels of noise, in multiples of the system's own."""
+    """The networks' input for noise levels, which are in multiples of the system's own."""
     return torch.asinh(level / FAINT_NOISE)
 
 

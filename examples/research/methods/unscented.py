@@ -10,9 +10,9 @@ from training.kalman import ExtendedKalmanFilter, Gaussian
 class UnscentedKalmanFilter(ExtendedKalmanFilter):
     """A batch of unscented Kalman filters (Wan and van der Merwe, 2000).
 
-    Their sigma points are those with alpha = 1, beta = 2 and kappa = 3 - nx, or 0 where that is negative. Where h is
-    undefined at one, it is taken at their mean. A filter starts again if its corrected mean leaves the system's
-    declared bounds, or if its covariance is no longer positive definite. The rest is as in the base class.
+    Sigma points have alpha = 1, beta = 2 and kappa = 3 - nx, or 0 if that is negative. If h is undefined at a point, it
+    is evaluated at the mean instead. A filter restarts if its corrected mean leaves the system's declared bounds, or if
+    its covariance is no longer positive definite. The rest is as in the base class.
     """
 
     @np.errstate(over="ignore", invalid="ignore")
@@ -32,7 +32,7 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         if lost.any():
             x0, P0, _ = self.start(int(lost.sum()))
             restarted = self._updated(x0, P0, y[lost])
-            sound = self._inside(*restarted)  # else the start stays without the sample
+            sound = self._inside(*restarted)  # otherwise the restart ignores the sample
             x[lost] = np.where(sound[:, None], restarted[0], x0)
             P[lost] = np.where(sound[:, None, None], restarted[1], P0)
         return x, P

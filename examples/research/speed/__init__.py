@@ -1,1 +1,1 @@
-"""How long steps of environments and observers take."""
+"""CPU times of steps of environments and observers."""

@@ -1,4 +1,4 @@
-"""Tasks that return the CPU seconds of a step: of environments, and of observers beside Kalman filters."""
+"""Tasks that return the CPU seconds of a step: of environments, observers and Kalman filters."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -18,8 +18,8 @@ from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
 
-BATCHES = 10  # of one step each, by filters that take one sample at a time
-FEWER = 10  # times as few samples, where Python takes a single one
+BATCHES = 10  # batches of one step, for filters that take one sample at a time
+FEWER = 10  # divides the number of samples for single steps in Python
 
 
 Name = TypeVar("Name", bound=Hashable)
@@ -28,7 +28,7 @@ Name = TypeVar("Name", bound=Hashable)
 def in_turns(
     tasks: Mapping[Name, Callable[[], float]], turns: int, report: Callable[[int], object] = lambda done: None
 ) -> dict[Name, list[float]]:
-    """Let tasks take turns, because a shared machine's speed drifts; the first turn is not counted."""
+    """Run tasks in turns, because a shared machine's speed drifts; the first turn does not count."""
     seconds: dict[Name, list[float]] = {name: [] for name in tasks}
     for turn in range(turns + 1):
         for i, (name, task) in enumerate(tasks.items(), 1):
@@ -40,14 +40,14 @@ def in_turns(
 
 
 def seconds_of(task: Callable[[], object], count: int) -> float:
-    """CPU seconds of one of the steps that a task takes."""
+    """CPU seconds of a task, divided by its number of steps."""
     began = time.process_time()
     task()
     return (time.process_time() - began) / count
 
 
 def environment_task(env: Any, actions: Sequence[np.ndarray]) -> Callable[[], float]:
-    """Steps of an environment; vector environments reset by themselves."""
+    """A task of an environment's steps; vector environments reset by themselves."""
     single = isinstance(env, gym.Env)
 
     def steps() -> None:
@@ -64,10 +64,10 @@ def environment_task(env: Any, actions: Sequence[np.ndarray]) -> Callable[[], fl
 
 
 def observer_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
-    """Steps of an observer and of extended Kalman filters along the same samples, of motions from X.
+    """Tasks of steps of an observer and of extended Kalman filters, along the same samples of motions from X.
 
-    Of observers the first half is not timed: there those that track may still ask T_inv at each sample. What takes a
-    single sample in Python, by far the slowest, is timed on fewer of them.
+    The first half of an observer's steps is not timed, because a tracker may still evaluate T_inv at each sample.
+    Single steps in Python, by far the slowest, are timed on fewer samples.
     """
     u = np.array(system.u_max) * np.random.default_rng(1).uniform(-1, 1, (steps + 1, rows, system.nu))
     y = noisy_samples(artifact, system, rows, steps, u=u[1:])
@@ -102,9 +102,9 @@ def observer_tasks(artifact: Artifact, system: System, *, rows: int, steps: int)
 
 
 def record_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
-    """Estimates along records, in seconds for a sample of a row: the observer and, where installed, dynamax's EKF.
+    """Tasks of estimates along records, in seconds per sample: the observer and, if installed, dynamax's EKF.
 
-    Both run on the equations of the observer's tracker.
+    Both use the equations of the observer's tracker.
     """
     y, motion, observer = noisy_samples(artifact, system, rows, steps), artifact.motion, KKLObserver(artifact)
     taken = y if rows > 1 else y[:, 0]
@@ -126,7 +126,7 @@ def noisy_samples(artifact: Artifact, system: System, rows: int, steps: int, u: 
 
 
 def _dynamax(artifact: Artifact) -> Callable[[np.ndarray], np.ndarray]:
-    """The estimates of dynamax's jitted EKF along a record (steps, ny), or along each of several."""
+    """Wrap dynamax's compiled EKF as a function from one or several records (steps, ny) to estimates."""
     import jax
     from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
 
@@ -182,7 +182,7 @@ def _stepping(observer: Any, y: np.ndarray, u: np.ndarray, *, error_bars: bool =
 
 
 class _Filterpy:
-    """filterpy's EKF, with this package's step of the equations and their Jacobian: what a user would write."""
+    """EKF of filterpy with this package's step and Jacobian of the equations, as a user would write it."""
 
     def __init__(self, kind: Any, system: System, dt: float, *, Q: np.ndarray, R: np.ndarray) -> None:
         self._system, self._dt = system, dt
@@ -201,7 +201,7 @@ class _Filterpy:
         found.P = found.F @ found.P @ found.F.T + found.Q
         found.x = np.array(advance(system, state, u.tolist(), self._w, self._dt))
         found.update(y, lambda x: self._matrix(self._h, x.tolist()), lambda x: np.array(system.h(x)))
-        if not ((self._low <= found.x) & (found.x <= self._high)).all():  # samples are no motion's
+        if not ((self._low <= found.x) & (found.x <= self._high)).all():  # the samples do not follow a motion
             found.x, found.P = (np.array(each) for each in self._start)
 
     def _matrix(self, rows: Any, x: list[float]) -> np.ndarray:

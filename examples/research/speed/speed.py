@@ -21,8 +21,8 @@ from training.progress import ProgressBars, progress_bars
 
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
-OTHERS = ("large",)  # kinds of maps that ship beside the default ones
-HOUR = 72  # records are as many times as long as the turn of an environment: an hour at 100 Hz by default
+OTHERS = ("large",)  # kinds of shipped maps besides the default ones
+HOUR = 72  # length of records over a turn of an environment: an hour at 100 Hz by default
 
 Tasks = Mapping[str, Callable[[], float]]
 
@@ -31,12 +31,12 @@ Tasks = Mapping[str, Callable[[], float]]
 class Speed:
     """Time environments, bare and with an observer, against Gymnasium's Pendulum-v1 and batched CartPole-v1.
 
-    Actions are drawn beforehand. The environments take turns, several times over, and each ratio is the median of
-    those to the reference in the same turn, because a shared machine's speed drifts. A system of yours has rows with an
-    observer if one is named. The references are timed with the memory of `kkl_gym.KKLMemory` as well.
+    Actions are drawn before the timing. The environments run in turns, because a shared machine's speed drifts: each
+    ratio is the median over turns of the ratio to the reference in the same turn. Your own system has rows with an
+    observer if you name one. The references are also timed with the memory of `kkl_gym.KKLMemory`.
 
-    Times are this process's CPU time, in which others on the machine take no part: run it with one thread. Further
-    tables have observers without any environment, beside extended Kalman filters on the same samples.
+    Times are CPU times of this process, which other processes hardly affect: run it with one thread. Further tables
+    compare observers without an environment with extended Kalman filters on the same samples.
     """
 
     system: OneSystem = None
@@ -48,10 +48,10 @@ class Speed:
     num_envs: int = 1024
     """Rows of the vector environments."""
     vector_steps: int = 1000
-    """Steps of each vector environment in a turn, from starts in the training box on."""
+    """Steps of each vector environment in a turn, which begin at starts in the training box."""
 
     def run(self, console: Console) -> dict[str, float]:
-        """Measure and print; returns the ratios."""
+        """Measure the times, print tables and return the ratios."""
         for name in ("steps", "turns", "num_envs", "vector_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -80,7 +80,7 @@ class Speed:
         return ratios
 
     def _environments(self, envs: Mapping[str, Any], steps: int, progress: ProgressBars) -> dict[str, float]:
-        """Time environments, of which the first is the reference."""
+        """Time environments; the first one is the reference."""
         tasks = {}
         for name, env in envs.items():
             env.action_space.seed(0)
@@ -101,7 +101,7 @@ class Speed:
         counts: Mapping[int, int],
         progress: ProgressBars,
     ) -> None:
-        """Time observers without environments, beside Kalman filters: a number of samples by the number of rows."""
+        """Time observers and Kalman filters without environments; ``counts`` has the number of samples by rows."""
         lines = []
         for name, system in systems.items():
             artifact = Artifact.read(resolve(name))
@@ -129,11 +129,11 @@ def _print(titles: Sequence[str], rows: Sequence[Sequence[str]], progress: Progr
 def variants(
     one: Shown, make: Callable[[], Any], observe: Callable[..., Any], *, with_z: bool = False
 ) -> dict[str, Any]:
-    """A system's environment by name: bare, and with each observer that there is."""
+    """Variants of a system's environment by name: bare, and with each available observer."""
     wrapped: dict[str, dict[str, Any]] = {}
     if one.observed:
         artifact = Artifact.read(resolve(_default(one)))
-        default = {"observer": one.observer, "ignore_input": not artifact.nu}  # estimates are not judged here
+        default = {"observer": one.observer, "ignore_input": not artifact.nu}  # the estimates do not matter here
         if with_z:
             wrapped["z"] = {**default, "estimate": "z"}
         wrapped["x_hat"] = default
@@ -149,7 +149,7 @@ def _default(one: Shown) -> str:
 
 
 def _others(one: Shown) -> dict[str, str]:
-    """Maps that ship for a system beside its default, by kind."""
+    """Shipped maps of a system besides its default, by kind."""
     names = {kind: f"{one.system.name}-{kind}" for kind in OTHERS}
     there = shipped_maps() if one.observer is None and one.observed else {}
     return {kind: name for kind, name in names.items() if name in there}

@@ -15,8 +15,8 @@ from observers import KKLObserver, load
 from training import TorchMemory, TorchObserver
 from training.files import table
 
-MOTIONS, SETTLED, STEPS = 1024, 60, 5  # motions, steps before those that are timed, and these
-NY, NU, TAU, TAU_U = 8, 2, (1.0, 2.0, 4.0, 8.0), (1.0, 4.0)  # of the memory
+MOTIONS, SETTLED, STEPS = 1024, 60, 5  # number of motions, steps before the timing, and timed steps
+NY, NU, TAU, TAU_U = 8, 2, (1.0, 2.0, 4.0, 8.0), (1.0, 4.0)  # sizes and time constants of the memory
 WAYS = ("NumPy", "Numba", "Torch")
 
 Task = Callable[[], float]
@@ -24,20 +24,20 @@ Task = Callable[[], float]
 
 @dataclass(frozen=True)
 class TorchSpeed:
-    """Time a step of the default observers and of the memory as modules of Torch, beside NumPy and Numba.
+    """Compare the times of a step in Torch, NumPy and Numba, for the default observers and for the memory.
 
-    Prints microseconds a row, of one thread on a CPU: medians of turns, in each of which all are timed.
+    Prints microseconds per row on one CPU thread: medians over turns, each of which times every variant.
     """
 
     rows: tuple[int, ...] = (1024, 65_536)
-    """Rows of the batches."""
+    """Numbers of rows in a batch."""
     turns: int = 3
     """Number of turns."""
 
     def run(self, console: Console) -> list[list[str]]:
-        """Measure and print."""
+        """Measure the times, print a table and return its rows."""
         if self.turns < 1 or not self.rows or min(self.rows) < 1:
-            raise ValueError(f"turns must be positive, rows positive, got {self.turns} and {self.rows}")
+            raise ValueError(f"turns and rows must be positive, got {self.turns} and {self.rows}")
         torch.set_num_threads(1)
         lines = []
         for name in (*kkl_gym.SYSTEMS, "memory"):

@@ -80,8 +80,8 @@ def trained(tmp_path):
 
 
 @pytest.mark.parametrize(("parts", "match"), [
-    ({"policy.pth": pickle.dumps(_Bomb(), protocol=2)}, "no agent of stable-baselines3: Weights only load failed"),
-    ({"policy.pth": None}, r"no agent of stable-baselines3: .*policy.pth"),
+    ({"policy.pth": pickle.dumps(_Bomb(), protocol=2)}, "not an agent of stable-baselines3: Weights only load failed"),
+    ({"policy.pth": None}, r"not an agent of stable-baselines3: .*policy.pth"),
     ({"data": b'{"policy_kwargs": {"activation_fn": "<class \'torch.nn.ELU\'>"}}'}, "activation .*ELU.* is unknown"),
     ({"data": b"{"}, "agent.zip"),
 ])  # fmt: skip

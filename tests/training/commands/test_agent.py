@@ -61,7 +61,7 @@ def test_an_agent_in_any_environment(information, capsys):
     main(["agent", "evaluate", f"runs/agents/CartPole-v1-{information}-0/agent.safetensors", "--episodes", "3"])
     shown = capsys.readouterr().out
     assert shown.count("return") == 2
-    with pytest.raises(SystemExit, match="holds an agent already"):
+    with pytest.raises(SystemExit, match="already holds an agent"):
         main(["agent", "train", "CartPole-v1", "--information", information])
 
 
@@ -88,5 +88,5 @@ def test_an_agent_on_the_state_is_recorded_as_a_policy(tmp_path, monkeypatch):
     for k in range(len(record.t) - 1):
         obs = np.float32([record.y[k, 0], record.x[k, 0], record.y[k, 1], record.x[k, 1]])
         assert record.u[k].argmax() == policy(obs[None])[0]
-    with pytest.raises(ValueError, match="see the state of that"):
+    with pytest.raises(ValueError, match="see its state"):
         RecordCommand("Acrobot-v1", **{**options, "measured": "0", "hidden": "1"}).run(Console())

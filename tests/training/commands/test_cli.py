@@ -19,7 +19,7 @@ from training.cli import COMMANDS, EXTRAS, main, read
 
 ROOT = Path(__file__).parents[3]
 PAGE = runpy.run_path(str(ROOT / "docs" / "site" / "commands.py"))
-RESUME = "; --resume goes on from the last checkpoint, if there is one"
+RESUME = "; --resume continues from the last checkpoint, if there is one"
 
 # Help of everything, then of each command; what is not to be imported on the way, at first as it may be missing.
 HELP = """

@@ -126,7 +126,7 @@ def test_why_there_are_no_runs():
     assert int(smape[1][-1]) > 0
     assert any("left out: starts in 2X \\ X: no state of oscillator in 2X lies beyond X" in line for line in below)
     unstable = evaluate("map.safetensors", system=f"{__file__}:Unstable", trajectories=5, duration=20.0)
-    with pytest.raises(ValueError, match=r"nothing is left to evaluate of map.safetensors"):
+    with pytest.raises(ValueError, match=r"there is nothing to evaluate for map.safetensors"):
         unstable.run(console := Console(record=True))
     text = " ".join(console.export_text().split())
     assert "left out: starts in X: each of 5 runs left bounds = ((-30, 30), (-30, 30))" in text
@@ -138,9 +138,9 @@ def test_a_level_beyond_the_maps_range_is_left_out_and_named(saved):
     (smape, _), below = printed(path, measurement_noise=(0.0, 1.0, 1.5), **small)
     assert [row[1] for row in smape[1:]] == ["0", "1", "0", "1"]
     assert f"{path}, left out: measurement noise 1.5 is beyond the map's range, 0 to 1" in below
-    with pytest.raises(ValueError, match="nothing is left"):
+    with pytest.raises(ValueError, match="nothing to evaluate"):
         printed(path, measurement_noise=(1.5,), **small)
-    with pytest.raises(ValueError, match="this one takes none"):
+    with pytest.raises(ValueError, match="this one has no inputs"):
         printed(path, policy="controller")
 
 

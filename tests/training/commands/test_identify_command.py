@@ -42,5 +42,5 @@ def test_an_observer_of_a_bias_is_not_adapted():
     training = artifact.training | {"pipeline": "input-aware", "eigenvalues": [-1.0], "bias": 1.0}
     replace(artifact, system=plant.name, parameters=plant.parameters, training=training).save("biased.safetensors")
     np.savez("y.npz", t=0.01 * np.arange(301), y=np.sin(0.01 * np.arange(301)))
-    with pytest.raises(SystemExit, match=r"which identification does not"):
+    with pytest.raises(SystemExit, match=r"but identification does not"):
         main(["identify", "van_der_pol", "--observer", "biased.safetensors", "--data", "y.npz"])

@@ -96,7 +96,7 @@ def test_discrete_time_and_starts_of_its_own():
     assert "problem" not in {one.verdict for one in found.values()}
     assert found["equations"].found == "step and h work on floats, arrays, symbols"
     assert found["observability"].found.startswith("x2: at best an error of ")
-    with pytest.raises(ValueError, match="no others"):
+    with pytest.raises(ValueError, match="makes only steps"):
         findings(system, dt=0.2)
 
 

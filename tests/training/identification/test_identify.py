@@ -119,7 +119,7 @@ def test_what_makes_no_sense():
     doubled = Record("doubled", free.t, np.hstack([free.y, free.y]))
     stiffness = {"stiffness": (1.0, 9.0)}
     for unknown, given, message in (
-        ({}, [free], "name a parameter"),
+        ({}, [free], "name an unknown parameter"),
         ({"mass": (0.0, 1.0)}, [free], "no parameter 'mass'"),
         ({"stiffness": (5.0, 6.0)}, [free], "between finite limits, got 4 in 5.0 to 6.0"),
         ({"stiffness": (0.0, float("inf"))}, [free], "between finite limits, got 4 in 0.0 to inf"),
