@@ -114,6 +114,7 @@ PROFILES: dict[str, Profile] = {
         eigenvalues=evenly_spaced(13, -1.5, -25.0),  # faster than the others', as its flow is
         spinn_settings={"eigenvalues": evenly_spaced(9, -9.0, -40.0)},
         settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
+        large_settings={"inverse_steps": 24_000},
         fault_deadline=2.0,
     ),
 }
