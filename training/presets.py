@@ -116,6 +116,7 @@ PROFILES: dict[str, Profile] = {
         eigenvalues=_spaced(13, -1.5, -25.0),  # faster than the others', as its flow is
         spinn_settings={"eigenvalues": _spaced(9, -9.0, -40.0)},
         settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
+        large_settings={"inverse_steps": 24_000},
         fault_deadline=2.0,
     ),
 }
