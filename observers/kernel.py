@@ -41,7 +41,7 @@ def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any)
 def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     """The kernel for numbers of states, outputs and inputs, and for as many rows at once.
 
-    Matrices of more than one hold vectors of a number of each row.
+    The matrices of several rows hold vectors, with a number of each row.
     """
     kappa, points, wide = max(3.0 - nx, 0.0), 2 * nx + 1, (2 * nx + 1) * W
     far, other = math.sqrt(nx + kappa), 0.5 / (nx + kappa)
