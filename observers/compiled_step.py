@@ -12,21 +12,22 @@ from observers.tracker import Tracker
 
 _LANES = 8  # rows that are stepped together
 MOST_OPERATIONS = 400  # longer expressions, such as a network as f, would take many seconds to compile
+MOST_ROWS = 32  # of a covariance: larger ones, of eight trackers at once, would exceed the stack of a thread
 
 
 class CompiledStep:
     """The compiled step of :class:`observers.kkl.KKL` with a tracker; it changes rows of the state in place.
 
-    It needs Numba. Raises ValueError if an expression is too long to compile.
+    It needs Numba. Raises ValueError if an expression is too long to compile, or a covariance too large.
     """
 
     def __init__(self, artifact: Artifact, decoders: Decoders, tracker: Tracker) -> None:
         motion, watch, linear = tracker.motion, tracker.supervision, artifact.filter
         nx, ny, nu = self._sizes = artifact.nx, artifact.ny, artifact.nu
         self._motion, self._linear, self._h = motion, linear, artifact.h
-        for expression in (None if motion.equations is None else motion.equations.field, artifact.h):
-            if expression is not None and expression.operations > MOST_OPERATIONS:
-                raise ValueError("the expression takes too long to compile")
+        expressions = None if motion.equations is None else motion.equations.field, artifact.h
+        if max(nx, ny) > MOST_ROWS or any(each and each.operations > MOST_OPERATIONS for each in expressions):
+            raise ValueError("an expression takes too long to compile, or a covariance exceeds the stack")
         maps = decoders.driven, decoders.free or decoders.driven
         scaling, affine = np.zeros((3, nx + nu)), np.zeros((nx, 1))
         network = np.zeros(0, np.float32), np.zeros(1, int)
@@ -64,8 +65,7 @@ class CompiledStep:
         if equations is not None:
             substeps = equations.steps(samples)
             h = linear.dt / substeps
-        of_filter = _of_filter(linear.transition, linear.drive)
-        return (*self._flags, substeps), (h, samples, *self._numbers), *self._model, of_filter, *self._parts
+        return (*self._flags, substeps), (h, samples, *self._numbers), *self._model, _of_filter(linear), *self._parts
 
     def __call__(
         self, linear: LinearFilter, rows: np.ndarray, y: np.ndarray, u: np.ndarray, record: Any = None
@@ -89,8 +89,8 @@ def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]
     return ages, np.array([error(ages, ages.shape).reshape(len(ages), -1) for error in errors])
 
 
-def _of_filter(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _of_filter(linear: LinearFilter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gains of z, outputs and inputs on z, and the few entries of the transition off its diagonal."""
-    diagonal = transition.diagonal()
-    places = np.array(np.nonzero(transition - np.diag(diagonal)))
-    return np.vstack([diagonal, drive]), places, transition[*places]
+    diagonal = linear.transition.diagonal()
+    places = np.array(np.nonzero(linear.transition - np.diag(diagonal)))
+    return np.vstack([diagonal, linear.drive]), places, linear.transition[*places]

@@ -224,14 +224,14 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
         """Whiten innovations: the corrected state is x + V white, with the covariance P - V V^T."""
         for k in range(ny):
-            white[k] = choose(finite(y[k]), 0.0, y[k] - expected[k], 0.0)
-        for k in range(ny):
-            root = finite(y[k]) / math.sqrt(S[k * ny + k] + r[k])
-            white[k] *= root
+            white[k] = y[k] - expected[k]
+        for k in range(ny):  # the expected value of a missing output may be undefined
+            seen, root = finite(y[k]), 1.0 / math.sqrt(S[k * ny + k] + r[k])
+            white[k] = choose(seen, 0.0, white[k] * root, 0.0)
             for i in range(nx):
-                V[i * ny + k] *= root
+                V[i * ny + k] = choose(seen, 0.0, V[i * ny + k] * root, 0.0)
             for j in range(k + 1, ny):
-                share = S[j * ny + k] * root
+                share = choose(seen, 0.0, S[j * ny + k] * root, 0.0)
                 white[j] -= share * white[k]
                 for i in range(nx):
                     V[i * ny + j] -= share * V[i * ny + k]

@@ -92,8 +92,7 @@ class KKL(Estimator[np.ndarray]):
 
     def take_over(self, other: "KKL", state: np.ndarray) -> np.ndarray:
         """Return rows that continue those of another observer with the same filter; the tracker may start here."""
-        y = state[:, other.y]
-        new = self.begin(y, state[:, other.z], state[:, other.age])
+        new = self.begin(state[:, other.y], state[:, other.z], state[:, other.age])
         if self.tracker is not None and other.tracker is not None:
             new[:, self.tracked] = self.tracker.take_over(state[:, other.tracked])
         return new
@@ -103,6 +102,9 @@ class KKL(Estimator[np.ndarray]):
     ) -> np.ndarray:
         """Return rows after samples and inputs; see :class:`Estimator`."""
         u = np.zeros((len(y), self.artifact.nu)) if u is None else u
+        shapes = (len(y), self.width), (len(y), self.artifact.ny), (len(y), self.artifact.nu)
+        if (state.shape, y.shape, u.shape) != shapes:  # machine code would read beyond the arrays
+            raise ValueError(f"state, y and u must have shapes {shapes}, got {state.shape}, {y.shape} and {u.shape}")
         begun = ~np.isnan(state[:, self.age])
         if begun.all():
             return self.step(state, y, u, dt)
@@ -168,8 +170,7 @@ class KKL(Estimator[np.ndarray]):
 
     def estimate(self, state: np.ndarray) -> Estimate:
         """Return estimates, covariances and scores; see :class:`Estimator`."""
-        has_covariance = self.tracker is not None or self.artifact.inverse.error_covariance is not None
-        covariance = self.covariance(state) if has_covariance else None
+        covariance = None if self.artifact.inverse.error_covariance is None else self.covariance(state)
         score = None if self.monitor is None else self.monitor.score(state[:, self.watched])
         return Estimate(self.decode(state), covariance, score)
 
@@ -244,7 +245,7 @@ class KKL(Estimator[np.ndarray]):
 
     @functools.cached_property
     def _machine(self) -> CompiledStep | None:
-        """The compiled step of a tracker; None without Numba, with ``compiled=False``, or for a long expression.
+        """The compiled step of a tracker; None without Numba, with ``compiled=False``, or where it would be too large.
 
         The linear filter by itself is a matrix product, which is as fast in NumPy.
         """

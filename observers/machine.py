@@ -14,12 +14,12 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 @cache
 def available() -> bool:
-    """Whether Numba is installed."""
+    """Whether Numba is installed and compiles, which NUMBA_DISABLE_JIT=1 prevents."""
     try:
-        import numba  # noqa: F401
+        from numba import config
     except ImportError:
         return False
-    return True
+    return not config.DISABLE_JIT  # type: ignore[attr-defined]
 
 
 def kernel(**options: Any) -> Callable[[_F], _F]:

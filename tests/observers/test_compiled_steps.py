@@ -102,6 +102,73 @@ def test_trackers_agree_to_rounding(kind):
     assert_alike(tuple(map(np.array, zip(*steps, strict=True))), [each[1:] for each in expected], 1e-9)
 
 
+def constant(inverse):
+    """A T_inv whose last layer ignores its inputs, so that float32 rounds nothing."""
+    *weights, last = inverse.mlp.weights
+    return replace(inverse, mlp=MLP([*weights, 0.0 * last], inverse.mlp.biases, inverse.mlp.activation))
+
+
+def mixed(observer, y, u, rows):
+    """Estimates and covariances of some rows of a batch that start at different times, have gaps, gates and jumps."""
+    y, u = y[:, rows], u[:, rows]
+    found = [(observer.reset(y[0]), observer.covariance)]
+    for k in range(1, len(y)):
+        starts, waits = (rows + k) % 80 == 20, (3 * rows + k) % 5 == 0
+        observer.restart(y[k, starts], starts)
+        observer.advance(y[k], u[k - 1], ~starts & ~waits)
+        observer.advance(None, u[k - 1], waits, dt=0.02)
+        found.append((observer.decode(), observer.covariance))
+    return tuple(map(np.array, zip(*found, strict=True)))
+
+
+@pytest.mark.parametrize(("kind", "gate"), [(KINDS[0], None), (KINDS[5], 4.0), (KINDS[7], 4.0)], ids=str)
+def test_rows_of_all_ages_agree_to_rounding(kind, gate):
+    """Seventeen rows are two whole groups of lanes and one that is not; no row depends on its neighbours."""
+    artifact = tracking(**kind)
+    y, u, _ = record(artifact, 90, (17,))
+    maps = {name: constant(each) for name in ("inverse", "free_inverse") if (each := getattr(artifact, name))}
+    artifact = replace(artifact, **maps)
+    rows, k = np.arange(17), np.arange(90)[:, None]
+    gaps = np.random.default_rng(4).random(y.shape) < 0.2
+    gaps[0] = gaps[(rows + k) % 80 == 20] = False  # first samples are whole
+    y[70, ::4] += 3.0
+    y[gaps] = np.nan
+    fast, slow = (KKLObserver(artifact, 0.1, gate=gate, compiled=choice) for choice in (True, False))
+    found, expected = (mixed(each, y, u, rows) for each in (fast, slow))
+    assert_alike(found, expected, 1e-9)
+    if gate is not None:
+        assert fast.rejected.sum() > 0
+        np.testing.assert_array_equal(fast.rejected, slow.rejected)
+    some = rows[[2, 3, 16]]
+    for whole, part in zip(found, mixed(fast, y, u, some), strict=True):
+        np.testing.assert_allclose(part, whole[:, some], rtol=1e-12, atol=1e-12)
+
+
+def test_undefined_outputs_may_be_missing():
+    """The tracker predicts by its motion where h is undefined at the state and its output is missing."""
+    artifact = tracking(outputs=2, nonlinear=True)
+    h = Expression([artifact.h.components[0], ["log", ["+", 1.0, ["x", 0]]]])
+    found = []
+    for choice in (True, False):
+        observer = KKLObserver(replace(artifact, h=h), 0.1, compiled=choice)
+        observer.reset(np.zeros((2, 2)), np.array([[-6.0, 0.0], [-7.0, 0.5]]))
+        found.append([observer.step(None, np.full((2, 1), 0.3)) for _ in range(5)])
+    np.testing.assert_allclose(*found, rtol=1e-9)
+
+
+def test_machine_code_serves_no_other_sizes(monkeypatch):
+    """It would read beyond the arrays, or exceed the stack; without a compiler, NumPy serves."""
+    estimator = KKLObserver(EQUATIONS(), 0.1, compiled=True).estimator
+    state = estimator.advance(estimator.start(3), np.zeros((3, 2)))
+    for rows, y, u in ((3, (2, 2), (2, 1)), (3, (3, 2), (2, 1)), (3, (3, 1), (3, 1)), (2, (3, 2), (3, 1))):
+        with pytest.raises(ValueError, match="must have shapes"):
+            estimator.advance(state[:rows], np.zeros(y), np.zeros(u))
+    monkeypatch.setattr(observers.compiled_step, "MOST_ROWS", 1)
+    assert KKLObserver(EQUATIONS(), 0.1).estimator._machine is None
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
+    assert not observers.machine.available.__wrapped__()
+
+
 @pytest.mark.parametrize("make", [EQUATIONS, FLOW, static], ids=["equations", "flow", "static"])
 @pytest.mark.parametrize("batch", [(), (3,)])
 def test_records_are_steps(make, batch):
