@@ -1,7 +1,7 @@
 """The compiled step of a tracker, where Numba is installed: it orders the tracker's numbers for the kernel."""
 
 import functools
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ MOST_OPERATIONS = 400  # longer expressions, such as a network as f, would take 
 class CompiledStep:
     """The compiled step of :class:`observers.kkl.KKL` with a tracker; it changes rows of the state in place.
 
-    Raises ImportError without Numba, and ValueError if an expression is too long to compile.
+    It needs Numba. Raises ValueError if an expression is too long to compile.
     """
 
     def __init__(self, artifact: Artifact, decoders: Decoders, tracker: Tracker) -> None:
@@ -27,13 +27,13 @@ class CompiledStep:
         for expression in (None if motion.equations is None else motion.equations.field, artifact.h):
             if expression is not None and expression.operations > MOST_OPERATIONS:
                 raise ValueError("the expression takes too long to compile")
-        maps = [_of_map(each) for each in (decoders.driven, decoders.free or decoders.driven)]
-        scaling, affine = np.zeros((4, nx + nu)), np.zeros((nx, 1))
+        maps = decoders.driven, decoders.free or decoders.driven
+        scaling, affine = np.zeros((3, nx + nu)), np.zeros((nx, 1))
         network = np.zeros(0, np.float32), np.zeros(1, int)
         if (flow := motion.flow) is not None:
             scaling[0, :nx], scaling[1, :nx], scaling[2, :nx] = motion.x_offset, motion.x_scale, flow.gain
-            scaling[3, :nu], affine, network = 1.0 / flow.u_scale, np.array(flow.linear, order="C"), flow.mlp.packed()
-        widths = [width for *_, shape in (network, *(of for of, _ in maps)) for width in shape[1:]]
+            scaling[1, nx:], affine, network = flow.u_scale, np.array(flow.linear, order="C"), flow.mlp.packed()
+        widths = [width for *_, shape in (network, *(each.network for each in maps)) for width in shape[1:]]
         self._flags = len(linear.A), int(max(nx + nu, *widths))
         C = np.zeros((ny, nx)) if artifact.C is None else np.array(artifact.C, dtype=float, order="C")
         self._model = np.array([motion.low, motion.high, tracker.q]), tracker.r, C
@@ -41,12 +41,11 @@ class CompiledStep:
             *(linear.dt, watch.limit, float(watch.window), watch.share, watch.trend_share),
             *(watch.trend_square_share, watch.trend_gain, watch.trend_limit, tracker.gate),
         )
-        self._parts = tuple(of for each in zip(*maps, strict=True) for of in each), (scaling, affine, *network)
-        self._window, self._seen = watch.window, linear.size + ny + 1 + tracker.nis + 2  # the column of samples seen
-        self._usual, self._first, self._no_record = self._at(linear), np.zeros(1, int), np.empty((1, 0, 0))
-        self._one, self._many = self._code(1), cast(Any, None)
+        self._parts = (*(each.network for each in maps), *_covariances(maps)), (scaling, affine, *network)
+        self._usual, self._no_record = self._at(linear), np.empty((1, 0, 0))
+        self._code = functools.cache(self._compiled)
 
-    def _code(self, W: int) -> Any:
+    def _compiled(self, W: int) -> Any:
         """The kernel for groups of W rows, with the addresses of the compiled motion and output."""
         from observers import kernel, kernel_functions
 
@@ -71,29 +70,23 @@ class CompiledStep:
     def __call__(
         self, linear: LinearFilter, rows: np.ndarray, y: np.ndarray, u: np.ndarray, record: Any = None
     ) -> None:
-        """Advance rows by samples and inputs, at the interval of a filter; ``record`` stores the rows at each sample.
+        """Advance rows by samples and inputs, at the interval of a filter.
 
-        Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu), ``record`` (steps, n, width).
+        A record stores the rows or the estimates at each sample. Shapes: ``rows`` (n, width), ``y`` (steps, n, ny),
+        ``u`` (steps, n, nu), ``record`` (steps, n, width) or (steps, n, nx).
         """
         # Numba would compile again for arrays that are read-only or not contiguous.
         y, u = (each if each.flags.carray else np.array(each, order="C") for each in (y, u))
         model = self._usual if linear is self._linear else self._at(linear)
-        given = rows, y, u, self._no_record if record is None else record
-        few = self._first if len(rows) == 1 else np.arange(len(rows))
-        if len(rows) >= _LANES and self._motion.equations is not None:
-            if self._many is None:
-                self._many = self._code(_LANES)
-            settled = rows[:, self._seen] >= self._window
-            few, many = few[~settled], few[settled]
-            self._many(*model, many, *given)  # even without rows, so that the first batch compiles both kernels
-        self._one(*model, few, *given)
+        step = self._code(1 if len(rows) == 1 else _LANES)
+        step(*model, rows, y, u, self._no_record if record is None else record)
 
 
-def _of_map(decoder: Decoder) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, np.ndarray]]:
-    """Network of a map, and its covariances by age."""
-    error = decoder.error
-    assert error is not None  # maps that track have a covariance
-    return decoder.network, (np.array(error.ages), error.covariance.reshape(len(error.ages), -1).copy())
+def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]:
+    """Ages, and each map's covariances there, (2, ages, nx^2)."""
+    errors = [each.error for each in maps if each.error is not None]  # maps that track have one
+    ages = np.unique([age for error in errors for age in error.ages])
+    return ages, np.array([error(ages, ages.shape).reshape(len(ages), -1) for error in errors])
 
 
 def _of_filter(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -13,8 +13,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from observers.kernel_functions import OPTIONS, decode, evaluate, padded
-from observers.lanes import choose, doubles, stack
+from observers.kernel_functions import OPTIONS, decode, evaluate
+from observers.lanes import choose, doubles, offset, stack
 from observers.machine import kernel, part
 from observers.network import UNROLLED
 from observers.tracker import INFLATION, RELINEARISATIONS
@@ -41,14 +41,13 @@ def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any)
 def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     """The kernel for numbers of states, outputs and inputs, and for groups of W rows.
 
-    W > 1 serves rows beyond the first window of a tracker with equations. Every entry of a matrix is then a vector with
-    a number for each row.
+    Every entry of a matrix is a vector with a number for each of the W rows.
     """
-    kappa, points, wide, single = max(3.0 - nx, 0.0), 2 * nx + 1, padded(nx, W), W == 1
+    kappa, points, wide = max(3.0 - nx, 0.0), 2 * nx + 1, (2 * nx + 1) * W
     far, other = math.sqrt(nx + kappa), 0.5 / (nx + kappa)
     middle, middle_squares = kappa / (nx + kappa), kappa / (nx + kappa) + 2.0
     square, cross, inputs, turns, inflation = nx * nx, nx * ny, max(nu, 1), RELINEARISATIONS, INFLATION
-    of_states, of_outputs, of_innovations, of_network = (nx + nu) * wide, ny * wide, ny * ny, nx + inputs
+    of_states, of_outputs, of_innovations, of_network = (nx + nu) * points, ny * points, ny * ny, nx + nu
     nis = nx + square  # its place in a row of the tracker
     of_row, rejections, trends = nis + 4 + 2 * ny, nis + 4, nis + 4 + ny
 
@@ -69,7 +68,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     @_part
     def smoothed(P: Any, L: Any, inverse: Any, across: Any, V: Any, turned: bool, G: Any) -> None:
         """G = across P^-1 V, or across^T P^-1 V."""
-        b = stack(nx, 1)
+        b = stack(nx, W)
         factorise(P, L, inverse)
         for k in range(ny):
             for i in range(nx):
@@ -90,60 +89,56 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def spread_out(x: Any, P: Any, L: Any, inverse: Any, at: Any) -> None:
-        """Sigma points (nx, lanes); points beyond 2 nx + 1, which only fill registers, are the mean."""
+        """Sigma points (nx, points)."""
         factorise(P, L, inverse)
         for i in range(nx):
-            for p in range(wide):
-                at[i * wide + p] = x[i]
+            for p in range(points):
+                at[i * points + p] = x[i]
             for j in range(i + 1):
                 entry = far * L[i * nx + j]
-                at[i * wide + 1 + j] += entry
-                at[i * wide + 1 + nx + j] -= entry
+                at[i * points + 1 + j] += entry
+                at[i * points + 1 + nx + j] -= entry
 
     @_inlined
     def moments(at: Any, n: int, mean: Any, S: Any) -> None:
-        """Mean (n,) and covariance (n, n) of points (n, lanes); subtracts the mean from the points."""
+        """Mean (n,) and covariance (n, n) of points (n, points); subtracts the mean from the points."""
         for i in range(n):
             total = 0.0
             for p in range(1, points):
-                total += at[i * wide + p]
-            mean[i] = middle * at[i * wide] + other * total
-            for p in range(wide):
-                at[i * wide + p] -= mean[i]
+                total += at[i * points + p]
+            mean[i] = middle * at[i * points] + other * total
+            for p in range(points):
+                at[i * points + p] -= mean[i]
             for j in range(i + 1):
                 total = 0.0
                 for p in range(1, points):
-                    total += at[i * wide + p] * at[j * wide + p]
-                S[i * n + j] = S[j * n + i] = middle_squares * at[i * wide] * at[j * wide] + other * total
+                    total += at[i * points + p] * at[j * points + p]
+                S[i * n + j] = S[j * n + i] = middle_squares * at[i * points] * at[j * points] + other * total
 
     @_inlined
     def together(L: Any, at: Any, n: int, across: Any) -> None:
-        """Covariance (nx, n) of the sigma points of L with their images, given as differences (n, lanes)."""
+        """Covariance (nx, n) of the sigma points of L with their images, given as differences (n, points)."""
         for j in range(n):
             for i in range(nx):
                 total = 0.0
                 for k in range(i + 1):
-                    total += L[i * nx + k] * (at[j * wide + 1 + k] - at[j * wide + 1 + nx + k])
+                    total += L[i * nx + k] * (at[j * points + 1 + k] - at[j * points + 1 + nx + k])
                 across[i * n + j] = other * far * total
 
     @_part
-    def flow_step(at: Any, u: Any, flow: Any, scratch: Any) -> None:
+    def flow_step(at: Any, flow: Any, scratch: Any) -> None:
         """One step of a learned flow for all sigma points, in place."""
         scaling, linear, packed, shape = flow
-        q = stack(of_network, 1)
-        for j in range(nu):
-            q[nx + j] = u[j] * scaling[3, j]
-        for p in range(points):
-            for i in range(nx):
-                q[i] = (at[i * wide + p] - scaling[0, i]) / scaling[1, i]
+        q, given = stack(of_network, 1), offset(scratch, 0)
+        for p in range(wide):
             for i in range(nx + nu):
-                scratch[3, i] = q[i]
-            evaluate(scratch[3, : nx + nu], packed, shape, scratch, scratch[4, :nx])
+                q[i] = given[i] = (at[i * wide + p] - scaling[0, i]) / scaling[1, i]
+            moved = evaluate(packed, shape, scratch)
             for i in range(nx):
                 total = q[i] + linear[i, 0]
                 for j in range(nx + nu):
                     total += linear[i, 1 + j] * q[j]
-                total += scaling[2, i] * scratch[4, i]
+                total += scaling[2, i] * moved[i]
                 at[i * wide + p] = scaling[0, i] + scaling[1, i] * total
 
     @_inlined
@@ -158,11 +153,11 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         return choose(value, -np.inf, choose(np.inf, value, 1.0, 0.0), 0.0)
 
     @_inlined
-    def within(states: Any, at: Any, count: int) -> None:
-        """Limit states (nx, lanes) to their bounds."""
+    def within(states: Any, at: Any) -> None:
+        """Limit states (nx, points) to their bounds."""
         for i in range(nx):
-            for p in range(count):
-                at[i * wide + p] = clipped(states, at[i * wide + p], i)
+            for p in range(points):
+                at[i * points + p] = clipped(states, at[i * points + p], i)
 
     @_inlined
     def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
@@ -170,15 +165,14 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         states, flow, substeps, address, h, share = model
         inverse, at = stack(nx, W), stack(of_states, W)
         spread_out(x, P, L, inverse, at)
-        within(states, at, wide)
+        within(states, at)
+        for j in range(nu):
+            for p in range(points):
+                at[(nx + j) * points + p] = u[j]
         if substeps >= 0:
-            for j in range(nu):
-                for p in range(wide):
-                    at[(nx + j) * wide + p] = u[j]
             call(address, doubles(at), doubles(at), substeps, h)
-        if single:
-            for _ in range(-substeps):
-                flow_step(at, u, flow, scratch)
+        for _ in range(-substeps):
+            flow_step(doubles(at), flow, scratch)
         moments(at, nx, mean, moved)
         together(L, at, nx, across)
         for i in range(nx):
@@ -205,12 +199,12 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         inverse, at, to, near = stack(nx, W), stack(of_states, W), stack(of_outputs, W), stack(of_outputs, W)
         spread_out(x, P, L, inverse, at)
         call(address, doubles(at), doubles(to), points, 0.0)
-        within(states, at, points)  # sigma points may lie where h is undefined
+        within(states, at)  # sigma points may lie where h is undefined
         call(address, doubles(at), doubles(near), points, 0.0)
         for k in range(ny):
             for p in range(points):
-                i = k * wide + p
-                near[i] = choose(finite(near[i]), 0.0, near[i], to[k * wide])
+                i = k * points + p
+                near[i] = choose(finite(near[i]), 0.0, near[i], to[k * points])
                 to[i] = choose(finite(to[i]), 0.0, to[i], near[i])
         moments(to, ny, y, S)
         together(L, to, ny, V)
@@ -266,16 +260,20 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         across, L, inverse = stack(square, W), stack(square, W), stack(nx, W)
         again, again_moved, again_across = stack(nx, W), stack(square, W), stack(square, W)
         S, V, G, D = stack(of_innovations, W), stack(cross, W), stack(cross, W), stack(cross, W)
-        white, last = stack(ny, W), 0
-        if single:
-            last = turns if now[nis + 2] < window else 0
-        for i in range(nx):
-            start[i] = now[i]
-        for i in range(square):
-            spread[i] = now[nx + i]
+        white, last, sound, ages = stack(ny, W), 0, 1.0, doubles(offset(now, nis + 2))
+        for w in range(W):
+            last = turns if ages[w] < window else last
         for turn in range(last + 1):
+            for i in range(nx):
+                start[i] = now[i]
+            for i in range(square):
+                spread[i] = now[nx + i]
+            if turn:  # the sample corrects the start of the step too, about which the motion is linearised
+                smoothed(moved, L, inverse, across, V, False, G)
+                shift(start, 1.0, G, white)
+                add(spread, -1.0, G, G)
             predict(start, spread, u, model, scratch, L, again, again_moved, again_across)
-            if single and turn:  # linearise the motion about the smoothed start of the step
+            if turn:  # linearise the motion about the smoothed start of the step
                 smoothed(spread, L, inverse, again_across, G, True, D)
                 shift(again, -1.0, D, white)
                 add(again_moved, 1.0, D, D)
@@ -284,24 +282,16 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 total = 0.0
                 for i in range(nx):
                     total += again[i] + inverse[i]
-                if not np.isfinite(total):
-                    break
+                sound = choose(window, now[nis + 2], finite(total), 0.0)
             for i in range(nx):
-                mean[i] = again[i]
+                mean[i] = choose(sound, 0.0, again[i], mean[i])
             for i in range(square):
-                moved[i], across[i] = again_moved[i], again_across[i]
+                moved[i] = choose(sound, 0.0, again_moved[i], moved[i])
+                across[i] = choose(sound, 0.0, again_across[i], across[i])
             expect(mean, moved, h, states, L, expected, S, V)
             if turn == 0 and gate < np.inf:
                 reject(now, y, expected, S, r, gate, window)
             whiten(y, expected, S, r, white, V)
-            if single and turn < last:
-                smoothed(moved, L, inverse, across, V, False, G)
-                for i in range(nx):
-                    start[i] = now[i]
-                for i in range(square):
-                    spread[i] = now[nx + i]
-                shift(start, 1.0, G, white)
-                add(spread, -1.0, G, G)
         shift(mean, 1.0, V, white)
         add(moved, -1.0, V, V)
         total = 0.0
@@ -335,114 +325,121 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
             now[nx + i] = choose(sound, 0.0, grown * moved[i], now[nx + i])
 
     @_part
-    def is_driven(z: Any, nz: int) -> bool:
-        """Whether an input has acted; also true if the system has no input."""
-        acted = len(z) == nz
-        for i in range(nz, len(z)):
-            acted = acted or z[i] != 0.0
-        return acted
-
-    @_part
-    def supervise(now: Any, z: Any, age: float, nz: int, dt: float, window: float, lost: bool, states: Any, maps: Any,
-                  scratch: Any, x_hat: Any) -> None:  # fmt: skip
+    def supervise(
+        rows: Any, count: int, sizes: Any, dt: float, window: float, limit: float, states: Any, maps: Any, scratch: Any
+    ) -> None:
         """Take T_inv's estimate if the tracker diverged, or if T_inv has the smaller covariance in the first window."""
-        driven = is_driven(z, nz)  # else use the T_inv of free motion
-        ages, table = maps[2] if driven else maps[3]
-        seen, at = min(now[nis + 2], window) * dt, 0
-        while at < len(ages) - 2 and seen > ages[at + 1]:
-            at += 1
-        P, L, inverse, own = stack(square, 1), stack(square, 1), stack(nx, 1), stack(square, 1)
-        part = 0.0 if len(ages) == 1 else min((seen - ages[at]) / (ages[at + 1] - ages[at]), 1.0)
-        upper = min(at + 1, len(ages) - 1)
-        for i in range(square):
-            P[i], own[i] = (1.0 - part) * table[at, i] + part * table[upper, i], now[nx + i]
-        larger = 0.0  # log of T_inv's determinant over the tracker's
-        factorise(P, L, inverse)
-        for i in range(nx):
-            larger -= math.log(inverse[i])
-        factorise(own, L, inverse)
-        for i in range(nx):
-            larger += math.log(inverse[i])
-        if lost or larger < 0.0:
-            decode(z if driven else z[:nz], age, maps[0] if driven else maps[1], scratch, x_hat)
-            for i in range(nx):
-                now[i] = clipped(states, x_hat[i], i)
+        (driven, free, ages, covariances), (nz, size) = maps, sizes
+        base = size + ny + 1
+        P, L, inverse, own, quotient = stack(square, W), stack(square, W), stack(nx, W), stack(nx, W), stack(1, W)
+        z, x_hat, covariance, surer, acted = stack(size, 1), stack(nx, 1), doubles(P), doubles(quotient), stack(W, 1)
+        for w in range(count):
+            row, at = offset(doubles(rows), w), 0
+            acted[w] = 1.0 if size == nz else 0.0  # until an input acts, T_inv is that of free motion
+            for i in range(nz, size):
+                acted[w] = acted[w] if row[i * W] == 0.0 else 1.0
+            table = 0 if acted[w] else 1
+            seen = min(row[(base + nis + 2) * W], window) * dt
+            while at < len(ages) - 2 and seen > ages[at + 1]:
+                at += 1
+            upper = min(at + 1, len(ages) - 1)
+            part = min((seen - ages[at]) / (ages[upper] - ages[at]), 1.0) if upper else 0.0
             for i in range(square):
-                now[nx + i] = P[i]
-        if lost:
-            now[nis] = now[nis + 1] = 1.0
-            for k in range(ny):
-                now[rejections + k] = window
-                now[trends + k] = 0.0
+                lower = covariances[table, at, i]
+                covariance[i * W + w] = lower + part * (covariances[table, upper, i] - lower)
+        factorise(P, L, inverse)
+        factorise(offset(rows, base + nx), L, own)
+        quotient[0] = own[0] / inverse[0]  # the root of that of the determinants
+        for i in range(1, nx):
+            quotient[0] *= own[i] / inverse[i]
+        for w in range(count):
+            row, now = offset(doubles(rows), w), offset(doubles(rows), base * W + w)
+            lost = not now[nis * W] <= limit
+            if lost or (now[(nis + 2) * W] < window and surer[w] < 1.0):
+                for i in range(size):
+                    z[i] = row[i * W]
+                age = row[(base - 1) * W] * dt
+                decode(z, age, driven if acted[w] else free, scratch, x_hat)
+                for i in range(nx):
+                    now[i * W] = clipped(states, x_hat[i], i)
+                for i in range(square):
+                    now[(nx + i) * W] = covariance[i * W + w]
+            if lost:
+                now[nis * W] = now[(nis + 1) * W] = 1.0
+                for k in range(ny):
+                    now[(rejections + k) * W] = window
+                    now[(trends + k) * W] = 0.0
 
     @_part
-    def follow(z: Any, before: Any, u: Any, y: Any, linear: Any, out: Any) -> None:
+    def follow(z: Any, before: Any, u: Any, y: Any, linear: Any) -> None:
         """Advance the linear filter by one interval, from the output ``before`` to y."""
         gains, places, mixing = linear
-        size = len(z)
+        size = gains.shape[1]
+        out = stack(size, W)
         for i in range(size):
-            out[i] = gains[0, i] * z[i]
-        for k in range(ny):
-            for i in range(size):
-                out[i] += gains[1 + k, i] * before[k] + gains[1 + ny + nu + k, i] * y[k]
-        for j in range(nu):
-            for i in range(size):
-                out[i] += gains[1 + ny + j, i] * u[j]
+            total = gains[0, i] * z[i]
+            for k in range(ny):
+                total += gains[1 + k, i] * before[k] + gains[1 + ny + nu + k, i] * y[k]
+            for j in range(nu):
+                total += gains[1 + ny + j, i] * u[j]
+            out[i] = total
         for i in range(len(mixing)):
             out[places[0, i]] += mixing[i] * z[places[1, i]]
+        for i in range(size):
+            z[i] = out[i]
 
     @_kernel
     def run(
         addresses: Any, flags: Any, numbers: Any, states: Any, r: Any, C: Any, linear: Any, maps: Any,
-        flow: Any, rows: Any, state: Any, y: Any, u: Any, record: Any
+        flow: Any, state: Any, y: Any, u: Any, record: Any
     ) -> None:  # fmt: skip
-        """Advance some rows of the state (n, width) by samples y (steps, n, ny) and inputs u (steps, n, nu).
+        """Advance rows of the state (n, width) by samples y (steps, n, ny) and inputs u (steps, n, nu).
 
-        A record (steps, n, width) stores the rows at each sample; (steps, n, 0) stores none.
+        A record (steps, n, width) stores the rows at each sample, (steps, n, nx) the estimates, (steps, n, 0) nothing.
         """
         nz, widest, substeps = flags
         h, samples, dt, limit = numbers[:4]
         watched = numbers[4:]
         model, of_output = (states, flow, substeps, addresses[0], h, samples), (addresses[1], C)
         size = linear[0].shape[1]
-        base, scratch = size + ny + 1, np.empty((5, widest + UNROLLED), np.float32)
-        z, x_hat, filled = np.empty(size), np.empty(nx), np.empty(ny)
-        now, sample, held, expected = stack(of_row, W), stack(ny, W), stack(inputs, W), stack(ny, W)
-        nows, ys, us, expecteds = doubles(now), doubles(sample), doubles(held), doubles(expected)
-        for first in range(0, len(rows), W):
-            count = min(W, len(rows) - first)
+        base, scratch = size + ny + 1, np.empty((2, widest + UNROLLED), np.float32)
+        width, column = base + of_row, base if record.shape[2] == nx else 0
+        kept, sample, held, expected = min(record.shape[2], width), stack(ny, W), stack(inputs, W), stack(ny, W)
+        rows = stack(width, W)
+        before, now = offset(rows, size), offset(rows, base)
+        values, ys, us = doubles(rows), doubles(sample), doubles(held)
+        judged, seen = doubles(offset(now, nis)), doubles(offset(now, nis + 2))
+        for first in range(0, len(state), W):
+            count = min(W, len(state) - first)
+            for w in range(W):
+                row = first + min(w, count - 1)  # unused lanes repeat the last row
+                for i in range(width):
+                    values[i * W + w] = state[row, i]
             for k in range(len(y)):
                 for w in range(W):
-                    row = rows[first + min(w, count - 1)]  # unused lanes repeat the last row
+                    row = first + min(w, count - 1)
                     for i in range(ny):
                         ys[i * W + w] = y[k, row, i]
                     for j in range(nu):
                         us[j * W + w] = u[k, row, j]
-                    for i in range(of_row):
-                        nows[i * W + w] = state[row, base + i]
                 track(now, sample, held, model, of_output, r, watched, scratch, expected)
+                for i in range(ny):
+                    expected[i] = choose(finite(expected[i]), 0.0, expected[i], before[i])
+                    sample[i] = choose(finite(sample[i]), 0.0, sample[i], expected[i])
+                follow(rows, before, held, sample, linear)
+                for i in range(ny):
+                    before[i] = sample[i]
+                rows[base - 1] += samples
+                settled = True
                 for w in range(count):
-                    row = rows[first + w]
-                    whole, before = state[row], state[row, size : size + ny]
-                    past, tracked = whole[:size], whole[base:]
-                    for i in range(ny):
-                        at = i * W + w
-                        filled[i] = ys[at]
-                        if np.isnan(ys[at]):
-                            filled[i] = expecteds[at] if np.isfinite(expecteds[at]) else before[i]
-                    follow(past, before, u[k, row], filled, linear, z)
-                    for i in range(size):
-                        past[i] = z[i]
-                    for i in range(ny):
-                        before[i] = filled[i]
-                    whole[base - 1] += samples
-                    for i in range(of_row):
-                        tracked[i] = nows[i * W + w]
-                    lost = not tracked[nis] <= limit
-                    if lost or tracked[nis + 2] < watched[0]:
-                        age = whole[base - 1] * dt
-                        supervise(tracked, past, age, nz, dt, watched[0], lost, states, maps, scratch, x_hat)
-                    for i in range(record.shape[2]):
-                        record[k, row, i] = whole[i]
+                    settled = settled and judged[w] <= limit and seen[w] >= watched[0]
+                if not settled:
+                    supervise(rows, count, (nz, size), dt, watched[0], limit, states, maps, scratch)
+                for w in range(count):
+                    for i in range(kept):
+                        record[k, first + w, i] = values[(column + i) * W + w]
+            for w in range(count):
+                for i in range(width):
+                    state[first + w, i] = values[i * W + w]
 
     return run

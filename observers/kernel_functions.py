@@ -8,6 +8,7 @@ import numpy as np
 from numba import types
 
 from observers.expression import Expression
+from observers.lanes import offset, stack
 from observers.machine import kernel, part, pointer
 from observers.network import UNROLLED
 
@@ -46,27 +47,25 @@ def _relu(x: Any) -> Any:
 
 
 @_part
-def _activate(h: Any, kind: int) -> None:
+def _activate(h: Any, width: int, kind: int) -> None:
     if kind == 0:
-        for j in range(len(h)):
+        for j in range(width):
             h[j] = _tanh(h[j])
     elif kind == 1:
-        for j in range(len(h)):
+        for j in range(width):
             h[j] = _silu(h[j])
     else:
-        for j in range(len(h)):
+        for j in range(width):
             h[j] = _relu(h[j])
 
 
 @_part
-def evaluate(x: Any, packed: Any, shape: Any, between: Any, out: Any) -> None:
-    """Evaluate a network for one sample. ``shape`` holds its activation and widths; x may be ``between``'s first row.
+def evaluate(packed: Any, shape: Any, between: Any) -> Any:
+    """Evaluate a network for one sample, which is ``between``'s first row. Returns a pointer to its outputs.
 
-    Shapes: ``between`` (3, largest width + UNROLLED).
+    ``shape`` holds its activation and widths. Shapes: ``between`` (2, largest width + UNROLLED).
     """
-    h, into, at = between[0], between[1], 0
-    for j in range(len(x)):
-        h[j] = x[j]
+    h, into, at = offset(between, 0), offset(between, between.shape[1]), 0
     for layer in range(1, len(shape) - 1):
         inputs, width = shape[layer], shape[layer + 1]
         for j in range(inputs, inputs + UNROLLED):
@@ -76,24 +75,23 @@ def evaluate(x: Any, packed: Any, shape: Any, between: Any, out: Any) -> None:
         at += width
         for i in range(0, inputs, UNROLLED):
             a, b, c, d = h[i], h[i + 1], h[i + 2], h[i + 3]
-            first, second = packed[at : at + width], packed[at + width : at + 2 * width]
-            third, fourth = packed[at + 2 * width : at + 3 * width], packed[at + 3 * width : at + 4 * width]
+            first, second = offset(packed, at), offset(packed, at + width)
+            third, fourth = offset(packed, at + 2 * width), offset(packed, at + 3 * width)
             for j in range(width):
                 into[j] += a * first[j] + b * second[j] + c * third[j] + d * fourth[j]
             at += 4 * width
         if layer < len(shape) - 2:
-            _activate(into[:width], shape[0])
+            _activate(into, width, shape[0])
         h, into = into, h
-    for j in range(len(out)):
-        out[j] = h[j]
+    return h
 
 
 @_part
 def decode(z: Any, age: float, network: Any, between: Any, out: Any) -> None:
     """T_inv of one sample: the first layer takes z and age in double precision, the others are float32."""
     first, units, ages, packed, shape = network
-    width, size = first.shape[1], len(z)
-    sums = np.empty(width)
+    size, width = first.shape[0] - 2, first.shape[1]
+    sums = stack(width, 1)
     age = math.log1p(min(age, ages[1]) / ages[0])
     for j in range(width):
         sums[j] = first[0, j] + age * first[1, j]
@@ -104,17 +102,14 @@ def decode(z: Any, age: float, network: Any, between: Any, out: Any) -> None:
     if size % 2:
         for j in range(width):
             sums[j] += z[size - 1] * first[size + 1, j]
-    entered, found = between[0, :width], between[2, : len(out)]
+    outputs = offset(between, 0)
     for j in range(width):
-        entered[j] = sums[j]
+        outputs[j] = sums[j]
     if len(shape) > 2:
-        _activate(entered, shape[0])
-        evaluate(entered, packed, shape, between, found)
-    else:
-        for j in range(len(out)):
-            found[j] = entered[j]
-    for j in range(len(out)):
-        out[j] = units[0, j] + units[1, j] * found[j]
+        _activate(outputs, width, shape[0])
+        outputs = evaluate(packed, shape, between)
+    for j in range(units.shape[1]):
+        out[j] = units[0, j] + units[1, j] * outputs[j]
 
 
 @_kernel
@@ -123,12 +118,7 @@ def decode_one(z: Any, age: float, network: Any, out: Any) -> None:
     widest = network[0].shape[1]
     for width in network[4][1:]:
         widest = max(widest, width)
-    decode(z, age, network, np.empty((3, widest + UNROLLED), np.float32), out)
-
-
-def padded(nx: int, W: int) -> int:
-    """Number of sigma points of nx states, for a single row rounded up to fill the processor's registers."""
-    return -(-(2 * nx + 1) // 4) * 4 if W == 1 else 2 * nx + 1
+    decode(offset(z, 0), age, network, np.empty((2, widest + UNROLLED), np.float32), offset(out, 0))
 
 
 @functools.cache
@@ -137,7 +127,7 @@ def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> 
 
     States and inputs are in one array (nx + nu, points, W).
     """
-    wide, field, inputs = padded(nx, W) * W, expression.python("field", nx, nu), [f"u{j}" for j in range(nu)]
+    wide, field, inputs = (2 * nx + 1) * W, expression.python("field", nx, nu), [f"u{j}" for j in range(nu)]
     states = [f"x{i}" for i in range(nx)]
     given = ", ".join(states + inputs)
     lines = ["def step(s, p, h):", *(f"    {name} = s[{i * wide} + p]" for i, name in enumerate(states + inputs))]
@@ -161,8 +151,8 @@ def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> 
 
 @functools.cache
 def output(expression: Expression, nx: int, W: int) -> Any:
-    """Compiled outputs (ny, points, W) of the first sigma points (nx, points, W) of W rows."""
-    wide, ny = padded(nx, W) * W, len(expression.components)
+    """Compiled outputs (ny, points, W) of the sigma points (nx, points, W) of W rows."""
+    wide, ny = (2 * nx + 1) * W, len(expression.components)
     function = expression.python("function", nx, 0)
     given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))
     lines = [
@@ -172,8 +162,8 @@ def output(expression: Expression, nx: int, W: int) -> Any:
     ]
     at = _function("\n".join(lines), "at", function=function)
 
-    def measure(s: Any, out: Any, count: int, h: float) -> None:
-        for p in range(count * W):
+    def measure(s: Any, out: Any, _: int, h: float) -> None:
+        for p in range(wide):
             at(s, out, p)
 
     return pointer(measure, _SIGNATURE, **OPTIONS)

@@ -11,6 +11,7 @@ from observers.compiled_step import CompiledStep
 from observers.decoder import Decoders
 from observers.estimator import Estimate, Estimator
 from observers.filter import LinearFilter
+from observers.machine import available
 from observers.monitor import Monitor
 from observers.tracker import Tracker
 
@@ -221,6 +222,11 @@ class KKL(Estimator[np.ndarray]):
 
         Shapes: ``y`` (steps, n, ny), ``u`` (steps - 1, n, nu), ``dts`` (steps - 1,); returns (steps, n, ...).
         """
+        if dts is None and self._machine is not None and of == self.decode:
+            estimates = np.empty((len(y), *state[:, self._x].shape))
+            estimates[0] = state[:, self._x]
+            self._machine(self.artifact.filter, state.copy(), y[1:], u, estimates[1:])
+            return estimates
         parts, rows = [of(state)[None]], max(1, _CHUNK // max(1, len(state)))
         for first in range(1, len(y), rows):
             samples, inputs = y[first : first + rows], u[first - 1 : first - 1 + rows]
@@ -242,11 +248,11 @@ class KKL(Estimator[np.ndarray]):
 
         The linear filter by itself is a matrix product, which is as fast in NumPy.
         """
-        if self._choice is False or self.tracker is None:
+        if self._choice is False or self.tracker is None or not available():
             return None
         try:
             return CompiledStep(self.artifact, self.decoders, self.tracker)
-        except (ImportError, ValueError):
+        except ValueError:
             return None
 
     def __getstate__(self) -> dict[str, Any]:

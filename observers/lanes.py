@@ -87,14 +87,28 @@ def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 @_intrinsic(prefer_literal=True)
 def stack(typing: Any, count: Any, rows: Any) -> Any:
-    """Memory for a constant number of doubles or lanes, which the compiler may keep in registers."""
+    """Memory for some doubles or lanes; the compiler may keep a constant number of them in registers."""
     kind = _Lanes(rows.literal_value) if rows.literal_value > 1 else types.float64
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        size = ir.Constant(ir.IntType(64), count.literal_value)
-        return cgutils.alloca_once(builder, context.get_value_type(kind), size=size)
+        if isinstance(count, types.IntegerLiteral):
+            return cgutils.alloca_once(builder, context.get_value_type(kind), size=count.literal_value)
+        return builder.alloca(context.get_value_type(kind), size=arguments[0])
 
     return types.CPointer(kind)(count, rows), code
+
+
+@_intrinsic
+def offset(typing: Any, memory: Any, count: Any) -> Any:
+    """A pointer to entry ``count`` of an array or of other memory. A slice would count references, which is slow."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        start = arguments[0]
+        if isinstance(memory, types.Array):
+            start = context.make_array(memory)(context, builder, start).data
+        return builder.gep(start, arguments[1:])
+
+    return types.CPointer(memory.dtype)(memory, types.int64), code
 
 
 @_intrinsic
