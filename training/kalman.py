@@ -89,6 +89,9 @@ class ExtendedKalmanFilter:
         means, covariances, _ = zip(*states, strict=True)
         return np.array(means), np.array(covariances)
 
+    def _inside(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
+        return np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
+
     @np.errstate(over="ignore", invalid="ignore")  # diverged filters overflow, and restart
     def _predicted(self, x: np.ndarray, P: np.ndarray, u: np.ndarray, dt: float) -> Gaussian:
         """Means and covariances after dt under held inputs (nu, n)."""
@@ -102,8 +105,7 @@ class ExtendedKalmanFilter:
 
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
         """Means and covariances given the samples y (n, ny); filters out of bounds restart."""
-        x0, P0 = self._start
-        inside = np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
+        (x0, P0), inside = self._start, self._inside(x, P)
         x, P = np.where(inside[:, None], x, x0), np.where(inside[:, None, None], P, P0)
         aside, R = np.diag(self._aside), self._R
         beside = self._system.output(x[:, None] + np.stack([aside, -aside])[:, None])

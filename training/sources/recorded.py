@@ -351,8 +351,8 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
     signals = records[0].signals
     if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
         raise ValueError(
-            f"{', '.join(other)} is not a weighted sum of {', '.join(signals.hidden)}, by which a tracker predicts "
-            "samples: add the measured signals, in the same units, to the hidden ones"
+            f"{', '.join(other)} is not a weighted sum of {', '.join(signals.hidden)} without an offset, by which a "
+            "tracker predicts samples: add the measured signals, in the same units, to the hidden ones"
         )
     return C, least
 

@@ -51,10 +51,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Motions:
-    """How trajectories of a system start, and how they are driven and disturbed.
-
-    The process noise of each has one of the ``levels``; without these, a share has random levels up to the system's.
-    """
+    """How trajectories start, are driven and disturbed; ``levels`` of process noise replace random ones of a share."""
 
     system: System
     dt: float
