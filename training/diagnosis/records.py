@@ -38,7 +38,7 @@ SEEN = 0.1  # a signal is known up to a constant if its changes have at most thi
 # Severity and advice, by the first word of a signal's verdict.
 VERDICTS: dict[str, tuple[Verdict, str]] = {
     "determined": ("ok", ""),
-    "up": ("note", "an observer can follow it from a known start; measure a signal that depends on its value, too"),
+    "up": ("note", "an observer follows it from a known start; measure a signal that depends on its value, too"),
     "partly": ("note", "measure one more signal that depends on it, or accept the remaining error"),
     "not": ("problem", "measure a signal that depends on it, or leave it out"),
     "never": ("note", "leave it out"),

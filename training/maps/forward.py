@@ -164,6 +164,6 @@ def transients(T: np.ndarray, z0: np.ndarray, *, linear: LinearFilter, ages: np.
     Shapes: ``T`` (m, n, nz), ``z0`` (n, nz), ``ages`` (m,); returns (m, n, nz).
     """
     poles, V = np.linalg.eig(linear.A)
-    left = np.exp(ages[:, None] * linear.dt * poles)  # what is left of each mode
+    left = np.exp(ages[:, None] * linear.dt * poles)  # remainder of each mode
     start = np.linalg.solve(V, (z0 - T[0]).T).T
     return T + np.real((left[:, None] * start) @ V.T)

@@ -222,7 +222,7 @@ class KKLTrainingCallback(BaseCallback):
 
 
 def _in_use(env: VecEnv) -> tuple[list[KKLObserver], Callable[[Artifact], object]]:
-    """The observers in use, and the function that replaces them; ValueError if there are none."""
+    """The observers in use, and the function that replaces them; ValueError without any."""
     inside = getattr(env.unwrapped, "env", None)  # a vector environment of Gymnasium
     while isinstance(inside, gym.vector.VectorWrapper):
         if isinstance(inside, KKLVectorObservation):

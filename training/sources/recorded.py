@@ -191,7 +191,7 @@ class RecordedSource:
         """Arguments of :class:`observers.Motion`, except the flow; ValueError if it cannot track."""
         if self.config.arbitrary_zero:
             raise ValueError(
-                f"a tracker compares {', '.join(self.config.arbitrary_zero)} with a prediction, so the zero matters: "
+                f"a tracker compares {', '.join(self.config.arbitrary_zero)} with its prediction, so the zero matters: "
                 "train without arbitrary_zero"
             )
         if not self.held_out:

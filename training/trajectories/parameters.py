@@ -34,7 +34,7 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
         if width := half_widths.get(name, half_widths.get(EVERY, 0.0)):
             if not value:
                 raise ValueError(
-                    f"the parameter {name} of {system.name} is 0, which has no relative range: leave it out by {name}=0"
+                    f"the parameter {name} of {system.name} is 0, which has no relative range: leave it out, {name}=0"
                 )
             ranges[name] = (value - width * abs(value), value + width * abs(value))
     return ranges
