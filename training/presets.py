@@ -16,7 +16,7 @@ from training.trajectories.motions import Controller, checked_policy, linear_qua
 
 Preset = Literal["fast", "paper"]
 Size = Literal["default", "large"]
-# A T_inv for use without a tracker, whose work width, slow complex modes and long training do here.
+# For use without a tracker, T_inv needs more width, slow complex modes and longer training.
 LARGE: dict[str, Any] = {"width": 128, "trajectories": 4000, "inverse_steps": 18_000}
 PAPER: dict[str, Any] = {
     "width": 512, "depth": 4, "activation": "silu", "optimiser": "adam", "batch": 4096, "learning_rate": 1e-3
@@ -72,7 +72,7 @@ def _spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
 PROFILES: dict[str, Profile] = {
     "reverse_duffing": Profile(
         eigenvalues=_spaced(13, -0.2, -8.0),
-        # The paper's eigenvalues suffice: no two of its motions diverge or converge.
+        # The paper's eigenvalues suffice, as motions of this system neither diverge nor converge.
         spinn_settings={"eigenvalues": tuple(np.linspace(-1.5, -3.0, 5).tolist())},
         controller=homogeneous,
         fault_deadline=10.0,  # about a period at amplitude 1

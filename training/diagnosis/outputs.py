@@ -17,7 +17,7 @@ from training.spectrum import smooth_spectrum
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
 MIN_STEPS = 10  # least number of samples of a motion
-# Least standard deviations of a direction after all of y, over those of the start, of a problem and of a note.
+# A direction is a problem or a note if more of its standard deviation at the start is left after all of y.
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in that direction
 VAGUE = 0.3  # larger errors without noise, in standard deviations of the state, are noted

@@ -271,8 +271,8 @@ def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.nda
 
     Weights on the nearest others reproduce each sample's z, as a plane through them would. The same weights applied to
     their x miss the sample's x by the part that z does not determine, of the sample and of the others, and by the
-    curvature of x, which falls with the square of the distance. The first part has 1 + the sum of squared weights times
-    the variance to find, and is divided by that. One neighbour of weight 1 gives the Delta test.
+    curvature of x, which falls with the square of the distance. The variance of the first part is the one sought, times
+    1 + the sum of squared weights, so squares are divided by that. One neighbour of weight 1 gives the Delta test.
 
     Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
     """

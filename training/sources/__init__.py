@@ -17,7 +17,7 @@ OF_MEDIAN = 1.4826  # standard deviation of a normal distribution, over the medi
 class Runs:
     """Whole motions to calibrate on, measured without noise, at one or two levels of process noise.
 
-    Usual motions start in X. Motions are sound if their plant certainly has no faults.
+    ``usual`` motions start in X; ``sound`` runs come from a plant that certainly has no faults.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
     ``process_noise`` (n,), ``usual`` (n,): True from X, False from beyond.

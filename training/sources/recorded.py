@@ -27,18 +27,18 @@ FEWEST = 50  # calibration needs at least so many samples at which a stretch may
 BEYOND = 0.5  # estimates may leave the range of the states by this fraction of it
 INCREMENTS = 400_000  # largest number of increments that a flow is learned from
 WINDOW = 10  # innovations are averaged over at least so many samples
-# The residual of y = C x is noise, unless it exceeds the first part of the output's standard deviation, or a fit with
-# squares of the states reduces it below the second part.
+# The residual of y = C x is noise, unless it exceeds the first fraction of the output's standard deviation, or squares
+# of the states reduce it below the second fraction of itself.
 UNEXPLAINED, SQUARES = 0.7, 0.8
 LITTLE = 0.1  # a smaller residual, over the output's standard deviation, always counts as noise
 ROUNDING, OUTLIER = 1e-6, 6.0  # in multiples of an output's size, and of the residual's standard deviation
 LEAST_NOISE = 1e-4  # least noise assumed, in standard deviations of the outputs: with R = 0 the gain would not fall
 MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: modes of each output, and their rates over the signals' rate
-RECORD_MEMORIES = 3.0  # a record is at least so many settling times long, unless all modes would outpace the signals
+RECORD_MEMORIES = 3.0  # so many settling times fit into a record, unless this needs modes faster than the signals
 # For rollouts, whose hidden signals an agent needs within a few steps: modes of each output, and their rates per step.
 # A few modes that lie far apart forget the start soon, and distinguish single steps.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
-EPISODE_MEMORIES = 1.5  # an episode is at least so many settling times long
+EPISODE_MEMORIES = 1.5  # so many settling times fit into an episode
 RECORDED_NOISE = 0.1  # largest noise added to that of the records, in standard deviations of the output
 RECORDED: dict[str, Any] = {
     "samples": 60, "width": 96, "depth": 2, "learning_rate": 3e-3, "inverse_steps": 3000, "members": 3,
