@@ -169,7 +169,7 @@ BLIND = NO_INPUT | {
     ("name", "verdict", "changes", "options", "found", "advice"),
     [
         ("equations", "problem", {"f": lambda self, x: (x[1], -sqrt(x[0] + 0.5))}, {}, " % of 2X, such as",
-         "draw the bounds, and X, where the equations hold, or change the equations"),
+         "choose X and the bounds where the equations hold, or change the equations"),
         ("bounds", "problem", UPRIGHT, LONG, "50 of 50 free and 50 of 50 driven leave them",
          "widen the bounds, shrink X, or take a policy"),
         ("sampling", "note", {}, {"dt": 0.7, "duration": 60.0}, "dt = 0.7 s", "samples are few: take dt = 0.1 s"),
