@@ -212,7 +212,7 @@ def test_motions_that_need_too_many_substeps():
     assert (found.check, "would need more than" in found.found) == ("sampling", True)
 
 
-def test_equations_that_divide_by_zero_in_the_middle_of_X():  # noqa: N802
+def test_equations_that_divide_by_zero_in_the_middle_of_X():
     found = findings(made(g=lambda self, x: ((0.0,), (1 / x[0],))))[-1]
     assert (found.check, found.verdict, found.found) == ("sampling", "problem", "float division by zero")
 

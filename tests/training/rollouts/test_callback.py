@@ -249,6 +249,7 @@ def test_environments_that_are_refused(pendulum, tmp_path):
         (hiding, {}, r"environment 0 has no 'x': KKLObservation gives the true obs\[2\] as 'x'"),
         (ActionRepeat(wrapped("Pendulum-v1", pendulum), 2), {}, "showed sample 4 after 2: put wrappers that skip"),
         (noise, {"measurement_noise_max": 0.01}, r"measurement_noise_max = 0\.01 is less than the noise 0\.05"),
+        (wrapped("Pendulum-v1", pendulum), {"held_out": 0.0}, "held_out must be positive, got 0"),
         (two, {}, "has signals"),
         (wrapped("Pendulum-v1", pendulum), {"width": -1}, "width"),
     ):
