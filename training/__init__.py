@@ -1,4 +1,4 @@
-"""Learning KKL observers offline: data, forward and inverse maps, evaluation. Needs the extra ``train``."""
+"""Learning KKL observers offline: motions, maps, calibration, evaluation. Needs the extra ``train``."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -54,7 +54,7 @@ __all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on demand: torch takes seconds, and parts of the package do without."""
+    """Import a public name on first use: torch takes seconds to import, and parts of the package do not need it."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

@@ -1,4 +1,4 @@
-"""The lesson of calibration: covariances and limits of a monitor, from motions on which nothing was trained."""
+"""Calibration: error covariances and the limits of the monitor, from motions that no training used."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,13 +19,13 @@ from training.sources import Runs, Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
 from training.trajectories.motions import filter_states
 
-LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of measurement noise, in multiples of the largest in training
-AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds at the usual pace
-PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
-FEWEST = 50  # least number of errors for a covariance or a quantile
-LEAST_VARIANCE = 1e-6  # added to each state's variance, in squares of its range
-WINDOW, WARM_UP = 0.5, 5.0  # the monitor's window and warm-up, in seconds at the usual pace
-MARGIN = 1.05  # factor on the limits, which rest on finitely many motions
+LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # measurement noise, in multiples of the largest level in training
+AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # in multiples of the pace
+PER_AGE = 6  # samples of each run around each age; at one single age all motions may be in the same phase
+FEWEST = 50  # a covariance or a quantile needs at least so many errors
+LEAST_VARIANCE = 1e-6  # added to each state's variance, as a fraction of the square of its range
+WINDOW, WARM_UP = 0.5, 5.0  # of the monitor, in multiples of the pace
+MARGIN = 1.05  # factor on the limits, as finitely many motions determine them
 
 
 def calibrate(
@@ -36,36 +36,36 @@ def calibrate(
     false_alarms: float | None = None,
     console: Any = None,
 ) -> Artifact:
-    """Find the covariances of an observer's errors and the limits of its monitor.
+    """Estimate the covariances of an observer's errors and the limits of its monitor.
 
-    Motions that nothing was trained on are followed from their start at several levels of measurement noise. From them
-    follow the covariance of T_inv's errors by level and age; the factor of the tracker's covariance, likewise; and
-    the limits of the residual y - h(x_hat) in sound operation.
+    The observer follows motions that no training used, from their start and at several levels of measurement noise.
+    Its errors give the covariance of T_inv's errors, and a factor on the tracker's covariance, both by level and age.
+    Its residuals y - h(x_hat) give the limits of fault-free operation.
 
     Parameters
     ----------
     artifact : Artifact
-        An observer.
+        The observer to calibrate.
     source : Source or System
-        What it was made for.
+        The source or system that the observer was trained for.
     motion : Motion, optional
-        By which it is to track; by default the one that it has, if any.
+        The motion model of its tracker; by default that of ``artifact``, if any.
     false_alarms : float, optional
-        Probability that a sound motion of twenty seconds, at the pace of the shipped systems, exceeds a limit; by
-        default that of its training.
+        Probability that a fault-free motion of twenty seconds, at the pace of the shipped systems, exceeds a limit; by
+        default the probability that was set for its training.
     console : rich.console.Console or ProgressBars, optional
-        Where progress is shown.
+        Where progress is shown; by default nowhere.
 
     Returns
     -------
     Artifact
-        The same with covariances and limits.
+        A copy of the observer with covariances and limits.
 
     Raises
     ------
     ValueError
-        If most motions leave the system's bounds, or too few are held out; :class:`observers.ArtifactError` (a
-        ValueError) if the observer was made for another system.
+        If ``false_alarms`` is not between 0 and 1, most motions leave the system's bounds, or too few are held out;
+        :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
     """
     if isinstance(source, System):
         artifact.check(source.name, source.parameters, dt=artifact.filter.dt, ny=source.ny, nu=source.nu)
@@ -84,7 +84,7 @@ def calibrate(
 
 
 class _Calibration:
-    """Tables of an observer's errors, from the same runs at each level of measurement noise."""
+    """Tables of an observer's errors, which it makes on the same runs at each level of measurement noise."""
 
     def __init__(self, artifact: Artifact, source: Source, runs: Runs, false_alarms: float) -> None:
         self.artifact, self.source, self.runs, self.false_alarms = artifact, source, runs, false_alarms
@@ -96,12 +96,12 @@ class _Calibration:
         self.levels = np.multiply.outer(LEVELS, largest)
 
     def calibrated(self, motion: Motion | None, progress: ProgressBars) -> Artifact:
-        """The artifact with all tables, and with a motion."""
+        """Return the artifact with all tables and the motion."""
         artifact = replace(self.artifact, motion=None, limits=None)
         monitored = artifact.knows_output and self.runs.sound
         if self.informed:
             artifact = self.with_covariances(artifact)
-            if motion is not None:  # factors are of P as the filter has it
+            if motion is not None:  # the factors to find apply to the tracker's own covariance
                 artifact = replace(artifact, motion=replace(motion, factors=Factors.ones()))
         if artifact.motion is None and not monitored:
             return artifact
@@ -117,7 +117,7 @@ class _Calibration:
         return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
 
     def groups(self) -> Iterator[tuple[int, dict[str, Any], np.ndarray, np.ndarray, np.ndarray]]:
-        """Index of a level of measurement noise, both levels of noise, their runs (n,), outputs and inputs."""
+        """Yield the index of a measurement noise level, both noise levels, and their runs' mask (n,), y and u."""
         runs, rng = self.runs, np.random.default_rng(0)
         for i, level in enumerate(self.levels):
             y = runs.y + level * rng.standard_normal(runs.y.shape)
@@ -128,7 +128,7 @@ class _Calibration:
                 yield i, levels, rows, y[:, rows], runs.u[:, rows]
 
     def with_covariances(self, artifact: Artifact) -> Artifact:
-        """The covariance of T_inv's errors by level and age, of each map."""
+        """Add the covariance of T_inv's errors by level and age to each map."""
         seconds, x = self.ages * self.dt, self.runs.x[self.ages]
         errors, finite = np.empty((len(LEVELS), *x.shape)), np.isfinite(x).all(-1)
         for i, levels, rows, y, u in self.groups():
@@ -144,12 +144,12 @@ class _Calibration:
             return replace(inverse, error_covariance=covariance)
 
         free = artifact.free_inverse
-        if free is not None:  # a map of its own for what no input has moved
+        if free is not None:  # this map serves motions until an input has acted
             free, finite = with_table(free, finite & ~moved), finite & moved
         return replace(artifact, inverse=with_table(artifact.inverse, finite), free_inverse=free)
 
     def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Squared distances (levels, ages, n) of the estimates' errors; extremes (3, levels, n, ny) of residuals."""
+        """Squared Mahalanobis distances of errors (levels, ages, n); extremes of residuals (3, levels, n, ny)."""
         from scipy.signal import lfilter  # takes half a second to import
 
         runs, pace = self.runs, self.source.pace
@@ -173,7 +173,7 @@ class _Calibration:
         return distances, extremes
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
-        """A function of the values (ages, n, ...) about each knot; where these are too few, that of the next knot."""
+        """``find`` of the values (ages, n, ...) around each knot, or around the nearest knot with enough values."""
         finite = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
         cells = [np.isin(self.ages, span)[:, None] & finite for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
@@ -183,7 +183,7 @@ class _Calibration:
         return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
     def limits(self, extremes: np.ndarray) -> Limits:
-        """Limits that a sound motion exceeds with a sixth of the probability, and of an output's share in it, each."""
+        """Limits, each of which a fault-free motion exceeds with the probability false_alarms / (6 ny)."""
         share, sound = self.false_alarms / (6 * self.artifact.ny), self.noisy if self.noisy.any() else ~self.noisy
         largest, low, high = extremes[:, :, sound]
         mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))
@@ -194,7 +194,7 @@ class _Calibration:
 
 
 def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Ages in samples at which tables have entries, and for each of these those that are looked at about it."""
+    """Ages in samples at which tables have entries, and for each of them the ages around it that contribute."""
     last = max(1, min(4 * steps // 5, round(AGES[-1] * pace)))
     knots = np.array(sorted({k for k in (round(age * pace) for age in AGES) if k < last} | {last}))
     between = np.sqrt(knots[1:] * np.maximum(knots[:-1], 0.5))
@@ -205,10 +205,10 @@ def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
-    """Value that a motion's extreme exceeds with a small probability, by a Gumbel distribution of its logarithm.
+    """Value (ny,) that a motion's extreme exceeds with probability ``share``; ``extremes`` are (n, ny).
 
-    Median and 90 % quantile decide, not a few motions that are lost. It is at most ten times the largest extreme, for
-    outputs that stand still in most motions. Shapes: ``extremes`` (n, ny); returns (ny,).
+    A Gumbel distribution is fitted to the logarithms by the median and the 90 % quantile, so that a few lost motions do
+    not matter. The value is at most ten times the largest extreme, as some outputs stand still in most motions.
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
     middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)
@@ -218,7 +218,7 @@ def rare(extremes: np.ndarray, share: float) -> np.ndarray:
 
 
 def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """e^T P^-1 e, (...,): of Gaussian errors it has the chi-square distribution with nx degrees."""
+    """e^T P^-1 e, (...,), which for Gaussian errors has a chi-square distribution with nx degrees of freedom."""
     scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # units may differ by orders of magnitude
     scaled = error / scale
     correlation = covariance / (scale[..., :, None] * scale[..., None, :])
@@ -226,16 +226,16 @@ def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def chi_square(shares: Any, degrees: int) -> np.ndarray:
-    """Quantiles of the chi-square distribution, of which scipy.stats has more and takes longer to import."""
+    """Quantiles of the chi-square distribution; scipy.stats, which has them too, takes longer to import."""
     return np.asarray(2 * gammaincinv(degrees / 2, shares))
 
 
 def _covariance(error: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Mean outer product of errors (n, nx), scaled so that the region of 90 % holds 90 % of them."""
+    """Mean outer product of errors (n, nx), scaled so that its 90 % region holds 90 % of them."""
     covariance = error.T @ error / len(error) + least
     return np.asarray(covariance * _excess(squared_distance(error, covariance), error.shape[1]))
 
 
 def _excess(distances: np.ndarray, degrees: int) -> float:
-    """The 90 % quantile of squared distances over that of the chi-square distribution."""
+    """The 90 % quantile of squared distances, divided by the 90 % quantile of the chi-square distribution."""
     return float(np.quantile(distances, COVERAGE, method="weibull") / chi_square(COVERAGE, degrees))

@@ -20,7 +20,7 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
-# One for all outputs, or one for each. The names appear in error messages.
+# A number for all outputs, or one for each. Error messages show the tags.
 EACH = Discriminator(lambda value: "each" if isinstance(value, list | tuple) else "all")
 Levels = Annotated[
     Annotated[Positive, Tag("all")] | Annotated[tuple[Positive, ...], Field(min_length=1), Tag("each")], EACH
@@ -34,24 +34,24 @@ Biases = Annotated[
     frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 )
 class Config:
-    """A training run; together with the system it determines the artifact.
+    """The settings of a training; together with the source they determine the artifact.
 
     The defaults are those of the preset "fast" of input-aware maps. A source reads the settings of its motions.
 
     Raises
     ------
     pydantic.ValidationError
-        A ValueError that names every setting that makes no sense, its value, and what it should be.
+        A ValueError that names every invalid setting, its value, and what it should be.
     """
 
     pipeline: Pipeline
-    """How the observer is learned. input-aware: T_inv(z_y, z_u) fitted along driven, noisy trajectories, transients
-    included, and T_inv(z_y) along free ones. spinn: the paper's way, a physics-informed T and then T_inv on
-    z' = T(x'), without inputs."""
+    """How the observer is learned. input-aware: T_inv(z_y, z_u) is fitted along driven, noisy trajectories, transients
+    included, and T_inv(z_y) along free ones. spinn: as in the paper, first T by a physics-informed network, then T_inv
+    on z' = T(x'), without inputs."""
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
     """Real eigenvalues of A, in 1/s; B is all ones for each output."""
     pairs: tuple[tuple[Annotated[float, Field(lt=0)], Positive], ...] = ()
-    """Complex pairs a +- iw of eigenvalues of A, as (a, w) in 1/s and rad/s: they average noise at that frequency."""
+    """Complex pairs a +- iw of eigenvalues of A, as (a, w) in 1/s and rad/s. A pair averages noise at its frequency."""
     dt: Positive = 0.01
     """Sampling interval in seconds."""
     trajectories: Count = 500
@@ -69,7 +69,7 @@ class Config:
     optimiser: Optimiser = "soap"
     """Optimiser of all networks: adam, or soap, which needs a fraction of the batches."""
     batch: Annotated[int, Field(ge=64, multiple_of=32)] = 1024
-    """Samples in a batch. The forward map has as many collocation points beside them."""
+    """Samples in a batch. The forward map's batches have as many collocation points, too."""
     learning_rate: Positive = 5e-3
     """Highest learning rate; after a short warm-up it decays to zero along a cosine."""
     forward_steps: Annotated[int, Field(ge=0)] = 0
@@ -77,67 +77,67 @@ class Config:
     inverse_steps: Count = 1500
     """Batches for each inverse map."""
     collocation: Literal["motions", "box"] = "motions"
-    """Where the forward map's equation must hold, and x' lies (spinn). box: uniform in X, as in the paper."""
+    """Where the forward map's equation must hold and x' lies (spinn). box: uniform in X, as in the paper."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
     """Most trajectories start in this multiple of the training box X, the others in X (spinn)."""
     solved_output_layer: bool = True
-    """Whether the output layer of a trained forward map is solved for by least squares in the end (spinn)."""
+    """Whether least squares determine the forward map's output layer after its training (spinn)."""
     transients: bool = True
     """Whether T_inv is fitted at every age since reset and every level of noise (spinn); otherwise to T(x) alone."""
     scaling: Scaling = "relative"
-    """How states are scaled. relative: in units of their standard deviation, and errors of T_inv count relative to the
-    state's size. range: in units of half their range, and all errors count alike. Input-aware maps are relative."""
+    """How states are scaled. relative: by their standard deviation; errors of T_inv count relative to the state's size.
+    range: by half their range; all errors count alike. Input-aware maps are relative."""
     physics_weight: NotNegative = 0.1
     """Weight nu of the PDE residual in the forward map's risk (spinn)."""
     inputs: bool = True
-    """Whether the filter of an input-aware map takes in the system's inputs; else it is fitted to free motion only."""
+    """Whether the filter of an input-aware map takes in the system's inputs; if not, it learns free motions only."""
     policy: str | None = None
-    """A policy for plants that no random input holds within their bounds (input-aware): "controller" for the system's
-    own (by default a linear-quadratic regulator at the target), or script.py:function or module:function, from states
-    (n, nx) to actions (n, nu) in [-1, 1]. It acts on states with an error and explores, but for one trajectory in
-    twelve. There are no free motions then."""
+    """A policy for plants that random inputs drive out of their bounds (input-aware): "controller" for the system's own
+    (by default a linear-quadratic regulator at the target), or script.py:function or module:function, from states
+    (n, nx) to actions (n, nu) in [-1, 1]. It sees states with errors and explores, except in one trajectory in
+    twelve. With a policy there are no free motions."""
     free_inverse: bool = True
-    """Whether an input-aware map has a second inverse, of z_y alone, until an input acts. Never under a policy."""
+    """Whether an input-aware map has a second inverse of z_y alone, used until an input acts; never with a policy."""
     lead_in_input: NotNegative = 0.0
-    """Some free trajectories start where inputs have led: for 20 s constant ones, up to this multiple of their bounds;
-    0: for 10 s random ones within their bounds."""
+    """Inputs lead the starts of some free trajectories out of X: constant ones for 20 s, up to this multiple of their
+    bounds; 0: random ones for 10 s within their bounds."""
     process_noise_share: Share = 0.35
-    """Share of an input-aware map's trajectories with process noise, up to the system's; 0: no level is an input."""
+    """Share of an input-aware map's trajectories with process noise, up to the system's; 0: T_inv takes no level."""
     measurement_noise_max: Levels = 1.0
-    """Largest standard deviation of the measurement noise that a map is trained for, of all outputs or of each."""
+    """Largest standard deviation of the measurement noise that a map is trained for, for all outputs or for each."""
     noise_free_share: Share = 0.2
-    """Share of the samples without measurement noise, where a map is given its level."""
+    """Share of the samples without measurement noise, for maps that take its level."""
     high_noise_emphasis: Positive = 2.0
     """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
     measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
     windows: Count = 8000
-    """Starts of the filter for each age (recorded motions)."""
+    """Number of filter starts for each age (recorded motions)."""
     members: Count = 1
-    """Networks of other seeds that are averaged into one, as wide as all together: they extrapolate differently."""
+    """Number of networks with different seeds, averaged into one wide network: they extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()
-    """Measured signals of which the map depends on the changes alone, such as angles of encoders (recorded motions)."""
+    """Measured signals with an arbitrary zero, such as encoder angles; T_inv uses their changes (recorded motions)."""
     held_out: Annotated[float, Field(ge=0, lt=1)] = 0.2
-    """Share of the records that is not trained on, on which covariances are calibrated and errors measured; whole
-    records where there are five or more, else the end of each."""
+    """Share of the records that is held out for calibration and errors: whole records where there are five or more,
+    otherwise the end of each."""
     tracking: bool = True
-    """Whether a Kalman filter on the equations, or on a learned flow, tracks from T_inv's estimate (all but spinn)."""
+    """Whether a Kalman filter on the equations, or on a learned flow, tracks from T_inv's estimate (not with spinn)."""
     flow_steps: Count = 5000
-    """Batches for a flow, which is learned where there are no equations."""
+    """Batches for a flow, which replaces equations that are unknown or that no expression can hold."""
     runs: Annotated[int, Field(ge=100)] = 400
     """Simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability that a sound motion of twenty seconds, at the pace of the shipped systems, raises an alarm."""
+    """Probability that a fault-free motion of twenty seconds, at the pace of the shipped systems, raises an alarm."""
     truncation: Positive = 1e-6
-    """Part epsilon of the filter's start that may be left where the forward map's data begins (paper, sec. 5.2)."""
+    """Largest remainder epsilon of the filter's start where the forward map's data begins (paper, sec. 5.2)."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
-    """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
-    values, as a part of these; "all" stands for each that is not named. Some motions keep the values themselves."""
+    """Parameters of the system that differ from motion to motion (input-aware), by name, with their largest relative
+    deviations; "all" stands for each that is not named. Some motions keep the system's own values."""
     bias: Biases = 0.0
-    """Largest constant bias of all outputs, or of each, which become states (input-aware, no uncertain parameters)."""
+    """Largest constant bias of all outputs, or of each; biases become states (input-aware, no uncertain parameters)."""
     estimate_parameters: bool = False
-    """Whether the map gives the uncertain parameters too."""
+    """Whether T_inv estimates the uncertain parameters, too."""
     cpu_seconds: Positive | None = None
-    """CPU seconds after which the training of all networks together ends, steps done or not."""
+    """CPU seconds after which the training of all networks together ends, even before the last step."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of everything random."""
 
@@ -172,24 +172,24 @@ class Config:
 
 
 def setting_types() -> dict[str, Any]:
-    """Type of each setting, by name, with its limits."""
+    """The type of each setting with its limits, by name."""
     return {entry.name: entry.type for entry in dataclasses.fields(Config)}
 
 
 def read_changes(path: Path) -> dict[str, Any]:
-    """Settings from a TOML or JSON file."""
+    """Read settings from a TOML or JSON file."""
     language, loads = ("TOML", tomllib.loads) if path.suffix == ".toml" else ("JSON", json.loads)
     try:
         settings = loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # that of the language, or of a text in another encoding
-        raise ValueError(f"{path} is no {language}: {error}") from None
+    except ValueError as error:  # a syntax error, or a text in another encoding
+        raise ValueError(f"{path} is not valid {language}: {error}") from None
     if not isinstance(settings, dict):
         raise ValueError(f"{path} must hold settings by name, got a {type(settings).__name__}")
     return checked_changes(settings, str(path))
 
 
 def checked_changes(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Settings by name, as JSON has their values, each of its type and within its limits."""
+    """Check the names of settings, and their JSON values against their types and limits."""
     # A file of settings must not name code to run: --policy does.
     names = sorted(set(setting_types()) - {"pipeline", "policy"})
     for name in settings:
@@ -200,15 +200,15 @@ def checked_changes(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
-    """The configuration in an artifact's account of its training, with some settings changed."""
+    """The configuration in the training metadata of an artifact, with some settings changed."""
     settings = {name: training[name] for name in setting_types() if training.get(name) is not None}
     if not {"pipeline", "eigenvalues"} <= set(settings):
-        raise ValueError("the observer holds no settings of its training, so that it cannot be trained again")
+        raise ValueError("the observer holds no settings of its training, so it cannot be trained again")
     return Config(**{**_validated(settings, "the observer's training"), **changes})
 
 
 def _validated(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Settings that came through JSON, each of its type and within its limits."""
+    """Check JSON values of settings against their types and limits."""
     types, checked = setting_types(), {}
     for name, value in settings.items():
         try:

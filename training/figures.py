@@ -1,4 +1,4 @@
-"""One style for all figures, on a light ground or a dark one, and how figures and moving pictures are written."""
+"""One style for all figures, light or dark, and functions that write figures and animations."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 Theme = Literal["light", "dark"]
-RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"  # places in the cycle of colours, which follows the theme
-# All eight can be distinguished with each kind of colour blindness. The same places of matplotlib's own cycle, in which
-# environments render outside of this style, have like colours.
+RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"  # indices into the theme's colour cycle
+# All eight can be distinguished with each kind of colour blindness. They are like the colours of the same indices in
+# matplotlib's own cycle, which environments use when they render outside this style.
 CYCLES: dict[Theme, tuple[str, ...]] = {
     "light": ("#0072b2", "#e69f00", "#009e73", "#c2187a", "#56b4e9", "#7a4a1e", "#1a1a1a", "#9a9a9a"),
     "dark": ("#4aa3df", "#f0a83c", "#2fbf93", "#ff6db8", "#a6dcff", "#b98a5a", "#eceae4", "#8a909c"),
 }
-GROUNDS: dict[Theme, str] = {"light": "#ffffff", "dark": "#1e2129"}  # those of the site
+GROUNDS: dict[Theme, str] = {"light": "#ffffff", "dark": "#1e2129"}  # the backgrounds of the site
 RULES: dict[Theme, str] = {"light": "#e4e4e4", "dark": "#363b47"}
 ALIKE: dict[str, Any] = {
     "axes.axisbelow": True,
@@ -39,25 +39,25 @@ ALIKE: dict[str, Any] = {
     "lines.linewidth": 1.2,
     "lines.markersize": 4.0,
 }
-SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # of each colour on the ground, in moving pictures
+SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # shares of each colour mixed with the background, in animations
 
 
 def theme_around() -> Theme:
-    """The theme of the block of :func:`style` around, which its ground shows."""
+    """The theme of the enclosing :func:`style` block, which the background colour tells."""
     import matplotlib
 
     return "dark" if matplotlib.rcParams["figure.facecolor"] == GROUNDS["dark"] else "light"
 
 
 def style(theme: Theme | None = None) -> AbstractContextManager[None]:
-    """Draw in the style of this package until the end of a block, by default in the theme of the block around."""
+    """Draw in the style of this package inside a ``with`` block, by default in the enclosing block's theme."""
     import matplotlib
 
     return matplotlib.rc_context(looks(theme or theme_around()))
 
 
 def looks(theme: Theme = "light") -> dict[Any, Any]:
-    """Settings of matplotlib that make this style: for notebooks, as in ``plt.rcParams |= looks()``."""
+    """Matplotlib settings of this style; notebooks use ``plt.rcParams |= looks()``."""
     from cycler import cycler
 
     ink = CYCLES[theme][int(TRUTH[1])]
@@ -69,7 +69,7 @@ def looks(theme: Theme = "light") -> dict[Any, Any]:
 
 @contextmanager
 def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
-    """Make a figure in this style, which is written at the end of the block."""
+    """Make a figure in this style, and write it at the end of the ``with`` block."""
     from matplotlib.figure import Figure
 
     with style():
@@ -80,11 +80,7 @@ def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
 
 
 def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
-    """Write a moving picture that repeats itself, whole or not at all.
-
-    All frames have the same few colours, the ground and shades of the style's own: what does not move then costs
-    nothing, and small things keep their colours.
-    """
+    """Write a looping GIF, whole or not at all; one small palette for all frames makes still parts cost nothing."""
     from matplotlib.colors import to_rgb
     from PIL import Image
 

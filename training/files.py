@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and folders that one process works in at a time."""
+"""Atomic writing of files, and folders in which only one process works at a time."""
 
 import json
 import os
@@ -14,12 +14,12 @@ from filelock import FileLock, Timeout
 
 from observers.storage import UNFINISHED, replacing
 
-CHECKPOINTS = "[!.]*.checkpoint.*"  # of a run or an agent, without those that are being written
-ABANDONED = 3600.0  # seconds after which no process writes to a temporary file any more
+CHECKPOINTS = "[!.]*.checkpoint.*"  # of a run or an agent; names of unfinished files begin with a dot
+ABANDONED = 3600.0  # seconds since the last write after which a temporary file counts as abandoned
 
 
 def write(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file, whole or not at all; makes its folder."""
+    """Write a text file, whole or not at all, and make its folder."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
@@ -31,20 +31,20 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def require_writable(folder: str | os.PathLike[str]) -> None:
-    """Raise OSError before long work if its results could not be written; leaves nothing behind."""
+    """Raise OSError if files cannot be written to a folder: call it before long work."""
     path = Path(folder)
     existing = next((one for one in (path, *path.parents) if one.exists()), path)
     try:
         tempfile.TemporaryFile(dir=existing, prefix=UNFINISHED).close()
-    except OSError as problem:  # which names the temporary file
+    except OSError as problem:  # its message names the temporary file, not the folder
         raise OSError(problem.errno, problem.strerror, str(folder)) from problem
 
 
 def clear_unfinished(folder: str | os.PathLike[str]) -> None:
-    """Remove temporary files and folders of killed processes that were last written to an hour ago or more."""
+    """Remove temporary files and folders of killed processes, last written to at least an hour ago."""
     for unfinished in Path(folder).glob(f"{UNFINISHED}*"):
-        with suppress(OSError):  # another process may clear away, too, and some belong to another user
-            written = [unfinished, *unfinished.rglob("*")]  # the time of a folder is not that of its files
+        with suppress(OSError):  # another process may remove files too, and some belong to other users
+            written = [unfinished, *unfinished.rglob("*")]  # writing to a file does not change its folder's time
             if time.time() - max(path.lstat().st_mtime for path in written) > ABANDONED:
                 if unfinished.is_dir() and not unfinished.is_symlink():
                     shutil.rmtree(unfinished)
@@ -54,7 +54,7 @@ def clear_unfinished(folder: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from working in a folder, and remove what killed ones have left half-written."""
+    """Lock a folder against other processes, and remove the unfinished files of killed ones."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
         lock = FileLock(folder / ".lock", timeout=0).acquire()
@@ -67,7 +67,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterator[None]:
-    """Lock a job's folder and write what identifies the job; ValueError if the folder holds another."""
+    """Lock a job's folder and write the job's identity; ValueError if the folder holds another job."""
     with locked(folder):
         check_identity(folder / "job.json", described, what)
         write(folder / "job.json", json.dumps(described, indent=2) + "\n")
@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a training run's folder and write its configuration. A folder without checkpoints is free for any run."""
+    """Lock a training run's folder and write its configuration; a folder without checkpoints may serve any run."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)
@@ -90,7 +90,7 @@ def refuse_checkpoints(folder: Path) -> None:
     """Raise ValueError if a folder holds the checkpoints of a run."""
     if any(folder.glob(CHECKPOINTS)):
         raise ValueError(
-            f"{folder} holds the checkpoints of a run: go on with it (resume=True, --resume), remove it, or take "
+            f"{folder} holds the checkpoints of a run: resume it (resume=True, --resume), remove it, or take "
             "another folder (--out)"
         )
 
@@ -104,7 +104,7 @@ def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
         there = json.loads(path.read_text())
         changed = [name for name in sorted({*there, *here}) if there.get(name) != here.get(name)]
     except (ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged, remove it if nothing in its folder is worth keeping: {error}") from None
+        raise ValueError(f"{path} is damaged; remove it if nothing in its folder is worth keeping: {error}") from None
     if changed:
         differences = "; ".join(f"{name} = {there.get(name)} there, {here.get(name)} here" for name in changed)
         raise ValueError(f"{path.parent} holds {what}: {differences}. Take another --out, or remove it")

@@ -1,4 +1,4 @@
-"""Extended Kalman filters that know the equations of motion: what a control engineer would try first."""
+"""Extended Kalman filters that know the equations of motion, as a baseline, and the Cramér-Rao bound."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,12 +13,12 @@ from training.sources.simulated import unknown_start
 Gaussian = tuple[np.ndarray, np.ndarray]
 """Means (n, nx) and covariances (n, nx, nx)."""
 
-ASIDE = 1e-4  # of X's half-widths, steps of the central differences
-NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in multiples of the system's default
+ASIDE = 1e-4  # step of the central differences, in half-widths of X
+NOISE_FLOOR = 0.002  # least measurement noise that a filter assumes, in multiples of the system's default
 
 
 def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
-    """Covariance (ny, ny) of the measurement noise that a filter assumes: at least a part of the system's default."""
+    """Covariance (ny, ny) of the measurement noise that a filter assumes, with ``NOISE_FLOOR`` as its floor."""
     least = NOISE_FLOOR * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
@@ -30,7 +30,7 @@ def process_intensity(system: System, process_noise: float, dt: float) -> np.nda
 
 
 class Belief(NamedTuple):
-    """Means (n, nx), covariances (n, nx, nx), and whether rows have begun (n,)."""
+    """Means (n, nx), covariances (n, nx, nx), and a mask of the rows that have had a sample (n,)."""
 
     x: np.ndarray
     P: np.ndarray
@@ -40,9 +40,9 @@ class Belief(NamedTuple):
 class ExtendedKalmanFilter:
     """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3), an :class:`observers.estimator.Estimator`.
 
-    P = Phi P Phi^T + Q dt; Phi and the slope of h are central differences. A filter starts again where its predicted
-    mean leaves the system's declared bounds or its covariance is no longer finite. Outputs that are NaN, or undefined
-    at the mean, correct nothing.
+    The prediction is P = Phi P Phi^T + Q dt; central differences give Phi and the slope of h. A filter restarts where
+    its predicted mean leaves the system's bounds or its covariance is no longer finite. Outputs that are NaN, or
+    undefined at the mean, are skipped.
 
     Shapes: ``Q`` (nx, nx), ``R`` (ny, ny) or (n, ny, ny), ``start`` (nx,) and (nx, nx).
     """
@@ -62,13 +62,13 @@ class ExtendedKalmanFilter:
         return Belief(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), np.zeros(n, dtype=bool))
 
     def advance(self, state: Belief, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Belief:
-        """Predict over dt, by default that of the samples, in rows that have begun; then correct."""
+        """Predict over dt, by default the sampling interval, in rows that have had a sample; then correct."""
         x, P, begun = state
         if begun.any():
             held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
             moved, spread = self._predicted(x, P, held, self._dt if dt is None else dt)
             x, P = np.where(begun[:, None], moved, x), np.where(begun[:, None, None], spread, P)
-        begun = begun | np.isfinite(y).any(-1)  # a sample that is missing begins no row
+        begun = begun | np.isfinite(y).any(-1)  # a row begins with its first sample that is not missing
         return Belief(*self._corrected(x, P, np.where(begun[:, None], y, np.nan)), begun)
 
     def estimate(self, state: Belief) -> Estimate:
@@ -78,8 +78,8 @@ class ExtendedKalmanFilter:
     def along(self, y: np.ndarray, u: np.ndarray, x: np.ndarray | None = None) -> Gaussian:
         """Means (steps + 1, n, nx) and covariances along samples (steps + 1, n, ny) and inputs (steps, n, nu).
 
-        With motions x (steps + 1, n, nx) derivatives are taken along these. With the plant's own noise the covariances
-        are then the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
+        Given motions x (steps + 1, n, nx), the filter linearises about them. If it also assumes the plant's own noise,
+        the covariances are the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
         """
         state, states = self.start(y.shape[1]), []
         for k in range(len(y)):
@@ -92,9 +92,9 @@ class ExtendedKalmanFilter:
     def _inside(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
         return np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
 
-    @np.errstate(over="ignore", invalid="ignore")  # of filters that are lost, which start again
+    @np.errstate(over="ignore", invalid="ignore")  # diverged filters overflow, and restart
     def _predicted(self, x: np.ndarray, P: np.ndarray, u: np.ndarray, dt: float) -> Gaussian:
-        """Mean and covariance after dt under held inputs, (nu, n)."""
+        """Means and covariances after dt under held inputs (nu, n)."""
         (n, nx), aside = x.shape, np.diag(self._aside)[..., None]
         starts = np.concatenate([x.T[:, None], x.T[:, None] + aside, x.T[:, None] - aside], 1)
         flat = starts.reshape(nx, -1)
@@ -104,7 +104,7 @@ class ExtendedKalmanFilter:
         return ends[:, 0].T, Phi @ P @ Phi.mT + self._Q * dt
 
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
-        """Mean and covariance given the samples y, (n, ny); lost filters start again."""
+        """Means and covariances given the samples y (n, ny); filters out of bounds restart."""
         (x0, P0), inside = self._start, self._inside(x, P)
         x, P = np.where(inside[:, None], x, x0), np.where(inside[:, None, None], P, P0)
         aside, R = np.diag(self._aside), self._R
@@ -114,9 +114,9 @@ class ExtendedKalmanFilter:
         missing = ~(np.isfinite(innovation) & np.isfinite(H).all(-1))
         if missing.any():
             innovation, H = np.where(missing, 0.0, innovation), np.where(missing[..., None], 0.0, H)
-            R = np.where(missing[:, None, :] | missing[..., None], np.eye(R.shape[-1]), R)  # apart from those measured
+            R = np.where(missing[:, None, :] | missing[..., None], np.eye(R.shape[-1]), R)
         S = H @ P @ H.mT + R
         K = np.linalg.solve(S, H @ P).mT
         x = x + (K @ innovation[..., None])[..., 0]
         I_KH = np.eye(x.shape[1]) - K @ H
-        return x, I_KH @ P @ I_KH.mT + K @ R @ K.mT  # Joseph's form stays positive
+        return x, I_KH @ P @ I_KH.mT + K @ R @ K.mT  # Joseph's form keeps P positive semidefinite

@@ -1,4 +1,4 @@
-"""From a source of motions to an observer: the lessons of the map and of the flow, and all lessons in order."""
+"""From a source of motions to an observer: the lessons on map and flow, and ``train``, which runs all lessons."""
 
 import dataclasses
 import platform
@@ -28,22 +28,22 @@ from training.sources import OF_MEDIAN, Pairs, Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
 from training.spectrum import Spectrum, check_continuous
 
-# The flow's network, and its training.
+# Hidden layers and training of the flow's network.
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
-LEAST = 0.01  # added to the mean square of a scaled increment, so that errors of tiny ones do not dominate
-LEAST_ERROR = 0.01  # least error of a flow that a tracker assumes, over the size of the increments
+LEAST = 0.01  # added to the mean square of a scaled increment, so that errors of tiny increments do not dominate
+LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, over the size of the increments
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a training leaves behind.
+    """The result of a training.
 
     Parameters
     ----------
     artifact : Artifact
         The observer.
     losses : dict of str to list of (int, float)
-        For each stage that trained a network, its error after so many batches.
+        For each stage that trained a network, numbers of batches and the errors after them.
     seconds : dict of str to float
         CPU seconds of each stage.
     """
@@ -62,44 +62,44 @@ def train(
     device: torch.device | None = None,
     console: Console | ProgressBars | None = None,
 ) -> Result:
-    """Learn an observer: a filter, T_inv, a motion to track by, covariances and the limits of a monitor.
+    """Learn an observer: a filter, T_inv, a tracker's motion model, covariances and the limits of a monitor.
 
-    The lessons, in order: the map (:func:`training.learn_map`); the motion, which is the system's equations, or a
-    learned flow where they are unknown or no expression can hold them (:func:`training.learn_flow`); the calibration
-    (:func:`training.calibrate`). Each network has checkpoints of its own in ``folder``.
+    The lessons, in order, are the map (:func:`training.learn_map`), the motion, and the calibration
+    (:func:`training.calibrate`). The motion consists of the system's equations, or of a learned flow if these are
+    unknown or no expression can hold them (:func:`training.learn_flow`). Each network has its own checkpoints.
 
     Parameters
     ----------
     source : System or Source
         Where motions come from.
     config : Config, optional
-        How; by default the system's preset "fast", or that of the source.
+        The settings; by default the system's preset "fast", or the configuration of the source.
     folder : Path, optional
-        Where checkpoints and a log go, created if missing; by default nothing is kept.
+        Folder for checkpoints and a log, created if missing; by default nothing is kept.
     resume : bool, default False
-        Whether to go on from the checkpoints in ``folder`` if there are any; without it they are an error.
+        Whether to resume from checkpoints in ``folder``; if there are some without ``resume``, ValueError is raised.
     device : torch.device, optional
         Where networks are trained; by default on a GPU if there is one.
     console : rich.console.Console or ProgressBars, optional
-        Where progress is shown. By default it is shown nowhere, but for log.txt in ``folder``.
+        Where progress is shown; by default only in log.txt in ``folder``.
 
     Returns
     -------
     Result
-        The observer, and how the errors fell.
+        The observer, the losses by stage, and the CPU seconds by stage.
 
     Raises
     ------
     ValueError
-        If there are checkpoints, but not ``resume`` or not of this configuration, if another process is at work in the
-        folder, if motions leave the system's bounds, or if a source comes with another configuration than its own.
+        If ``folder`` holds checkpoints without ``resume`` or of another configuration, another process works in it,
+        motions leave the system's bounds, or ``config`` differs from the configuration of a source.
     FloatingPointError
-        If the loss is no longer a number.
+        If the loss becomes NaN.
     """
     if isinstance(source, System):
         source = SimulatedSource(source, config or preset(source))
     elif config not in (None, source.config):
-        raise ValueError("a source has a configuration of its own: pass config with a System alone")
+        raise ValueError("a source has a configuration of its own: pass config only with a System")
     config = source.config
     noise_levels("measurement_noise_max", config.measurement_noise_max, source.ny)
     identity = {**source.identity(), **dataclasses.asdict(config)}
@@ -132,7 +132,7 @@ def train(
 
 
 def _motion(source: Source, run: Run) -> Motion | None:
-    """The motion of a tracker: the source's equations, or else a flow; None where such an observer cannot track."""
+    """The tracker's motion model: the source's equations, or else a flow; None where the observer cannot track."""
     try:
         parts = source.tracking()
     except ValueError as reason:
@@ -148,7 +148,7 @@ def _motion(source: Source, run: Run) -> Motion | None:
 
 @dataclass(frozen=True)
 class Maps:
-    """A filter and the maps that were learned for it."""
+    """A filter and the maps that were learned for it; ``free_inverse`` and ``forward`` are None if not learned."""
 
     filter: LinearFilter
     inverse: InverseMap
@@ -157,17 +157,17 @@ class Maps:
 
 
 def learn_map(source: Source, run: Run) -> Maps:
-    """Learn T_inv along motions of a source, transients and every level of noise included.
+    """Learn T_inv along motions of a source, transients and all noise levels included.
 
-    With inputs there are two maps: of driven motion, and of z_y alone for as long as no input has acted. In the paper's
-    way (pipeline "spinn") T is learned first, on motions and on its equation, and z = T(x) replaces the filter's.
+    With inputs there are two maps: one for driven motion, and one of z_y alone, used until an input acts. The pipeline
+    "spinn" follows the paper: it first learns T from motions and its equation, and then T_inv from z = T(x).
 
     Parameters
     ----------
     source : Source
         Where motions come from.
     run : Run
-        The training under way, with the configuration.
+        The run of the training, which holds the configuration.
 
     Returns
     -------
@@ -179,7 +179,7 @@ def learn_map(source: Source, run: Run) -> Maps:
     ValueError
         If the motions leave the system's bounds, or are too short for the filter.
     FloatingPointError
-        If the loss is no longer a number.
+        If the loss becomes NaN.
     """
     config, free = run.config, None
     spectrum = Spectrum(config.eigenvalues, config.pairs)
@@ -199,12 +199,12 @@ def learn_map(source: Source, run: Run) -> Maps:
 
 
 def _papers_maps(source: Source, linear: LinearFilter, run: Run) -> Maps:
-    """T, trained on motions and on its equation, and T_inv on z = T(x)."""
+    """Train T on motions and on its equation, then T_inv on z = T(x)."""
     if not isinstance(source, SimulatedSource):
         raise ValueError("the pipeline 'spinn' needs the equations of a system; train with 'input-aware'")
     check_continuous(source.system)
     config, system, ages, progress = run.config, source.system, source.ages, run.progress
-    settled = ages >= truncation_step(  # the filter's start no longer matters
+    settled = ages >= truncation_step(  # from here on the filter's start no longer matters
         system, linear, steps=source.steps, epsilon=config.truncation, box_factor=config.box_factor
     )
     pairs, rng = _pairs(source, linear, run), generator(Stream.TRAINING, config.seed, 3)
@@ -239,13 +239,13 @@ def _pairs(source: Source, linear: LinearFilter, run: Run, free: bool = False) -
 def _sampler(
     source: Source, linear: LinearFilter, run: Run, pairs: Pairs, error: np.ndarray | None = None
 ) -> TrajectorySampler:
-    """Batches along motions; z may have an error of some covariance beside."""
+    """Batches along motions; ``error`` is the covariance of an error of z, if it has one."""
     with run.progress.phase("preparing batches"):
         return TrajectorySampler(pairs, linear, run.config, device=run.device, error=error, **source.sampling(linear))
 
 
 def _fitted(name: str, sampler: Sampler, run: Run, share: float, member: int = 0) -> MLP:
-    """A network that gives x on the sampler's batches."""
+    """Train a network that estimates x on the sampler's batches."""
     config, device = run.config, run.device
     inputs, x, *_ = sampler(torch.Generator(device).manual_seed(0))
     network = Network.of(config, inputs.shape[1], x.shape[1]).to(device)
@@ -255,30 +255,32 @@ def _fitted(name: str, sampler: Sampler, run: Run, share: float, member: int = 0
 
 
 def learn_flow(source: Source, run: Run) -> Motion:
-    """Learn the motion of a tracker over a sample: an affine fit, and a network on what that leaves.
+    """Learn a tracker's motion over one sample: an affine fit, and a network for its residuals.
 
     Parameters
     ----------
     source : Source
         Where motions come from.
     run : Run
-        The training under way, with the configuration.
+        The run of the training, which holds the configuration.
 
     Returns
     -------
     Motion
-        With factors of one, which :func:`training.calibrate` replaces.
+        The motion model, with factors of one, which :func:`training.calibrate` replaces.
 
     Raises
     ------
     ValueError
-        If no two samples in a row have all states, or such an observer cannot track.
+        If no two consecutive samples have all states, or an observer from this source cannot track.
+    FloatingPointError
+        If the loss becomes NaN.
     """
     parts, device = source.tracking(), run.device
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
     parts = {"x_offset": learned.x.mean(0), "x_scale": spread(learned.x)} | parts
-    offset, scale = parts["x_offset"], parts["x_scale"]  # of a simulated source, in which its process noise is
+    offset, scale = parts["x_offset"], parts["x_scale"]  # a simulated source scales its process noise by its own
     u_scale = np.abs(learned.u).max(0, initial=0.0)
     u_scale = np.where(u_scale > 0, u_scale, 1.0)
     inputs = np.column_stack([(learned.x - offset) / scale, learned.u / u_scale])

@@ -1,7 +1,4 @@
-"""Choices for a system: its profile, its controller, and the configurations behind the commands' options.
-
-docs/guides/own_system.md shows how to add a profile.
-"""
+"""Choices for each system: its profile, its controller, and the configurations behind the commands' options."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -11,6 +8,7 @@ import numpy as np
 
 from kkl_gym.loading import load_function
 from kkl_gym.system import NOISE_SHARE, System
+from observers.checks import noise_levels
 from observers.names import suggestion
 from training.config import Config, Pipeline
 from training.spectrum import FASTEST_MODE, evenly_spaced, papers_spectrum, smooth_spectrum
@@ -18,7 +16,7 @@ from training.trajectories.motions import Controller, checked_policy, linear_qua
 
 Preset = Literal["fast", "paper"]
 Size = Literal["default", "large"]
-# A T_inv that stands alone. By default a tracker does what width, slow complex modes and long training do here.
+# For use without a tracker, T_inv needs more width, slow complex modes and longer training.
 LARGE: dict[str, Any] = {"width": 128, "trajectories": 4000, "inverse_steps": 18_000}
 PAPER: dict[str, Any] = {
     "width": 512, "depth": 4, "activation": "silu", "optimiser": "adam", "batch": 4096, "learning_rate": 1e-3
@@ -31,14 +29,14 @@ PAPER_SPINN: dict[str, Any] = {
     "forward_steps": 200 * 3_000_000 // 4096, "inverse_steps": 200 * 5_000_000 // 4096,
     "collocation": "box", "scaling": "range", "solved_output_layer": False, "transients": False,
 }  # fmt: skip
-NOISE_RANGE = 2.0  # largest measurement noise that maps are trained for, over the system's default
-# FASTEST_MODE in discrete time, where a step may change everything and the last samples matter most.
+NOISE_RANGE = 2.0  # largest measurement noise in training, in multiples of the system's default
+# Replaces FASTEST_MODE in discrete time, where one step may change everything and the last samples matter most.
 FASTEST_OF_STEPS = 3.0
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Choices for one system; the defaults serve any. docs/guides/own_system.md explains them on an example."""
+    """Choices for one system; the defaults serve any system. docs/guides/own_system.md explains them by an example."""
 
     eigenvalues: tuple[float, ...] | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -52,8 +50,8 @@ class Profile:
 def homogeneous(system: System) -> Controller:
     """The feedback u = b x1 - 2 (x2 + cbrt(a x1)), cut at the input bound, for x1' = a x2^3, x2' = -b x1 + u.
 
-    The linearisation at the origin cannot be stabilised, so there is no linear law. With the drift's -b x1 cancelled,
-    x2 follows -cbrt(a x1), on which x1' = -a^2 x1.
+    A linear law does not exist, as the linearisation at the origin cannot be stabilised. The feedback cancels -b x1 and
+    makes x2 follow -cbrt(a x1), where x1' = -a^2 x1.
     """
     (u_max,) = system.u_max
     a, b = (system.parameters[name] for name in ("a", "b"))
@@ -67,31 +65,31 @@ def homogeneous(system: System) -> Controller:
 
 
 def _spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
-    """Eigenvalues as the shipped maps have them."""
+    """Rounded eigenvalues, as the shipped maps have them."""
     return tuple(np.round(evenly_spaced(n, slowest, fastest), 6).tolist())
 
 
 PROFILES: dict[str, Profile] = {
     "reverse_duffing": Profile(
         eigenvalues=_spaced(13, -0.2, -8.0),
-        # The paper's: no two of its motions part or fall together.
+        # The paper's eigenvalues suffice, as motions of this system neither diverge nor converge.
         spinn_settings={"eigenvalues": tuple(np.linspace(-1.5, -3.0, 5).tolist())},
         controller=homogeneous,
         fault_deadline=10.0,  # about a period at amplitude 1
     ),
     "van_der_pol": Profile(
-        # Fast ones follow the jumps of y, slow ones average its noise; number and ends by errors of trained observers.
+        # Fast modes follow the jumps of y, slow ones average its noise; errors of trained observers decided the range.
         eigenvalues=_spaced(15, -0.4, -20.0),
-        # Slower modes have a rougher T; more of them average more of the noise.
+        # Slower modes would have a rougher T; more modes average more of the noise.
         spinn_settings={
             "eigenvalues": _spaced(11, -4.0, -16.0),
             "noise_free_share": 0.2,
             "high_noise_emphasis": 4.5,
         },
-        # Noise hides its phase most of all: more samples at high noise help. No input within its bound leads the
-        # oscillator out of X, so stronger ones do.
+        # More samples at high noise help, as noise hides mostly the phase. No input within its bound leads the
+        # oscillator out of X, so stronger inputs do.
         settings={"lead_in_input": 4.0, "noise_free_share": 0.05, "high_noise_emphasis": 4.0},
-        # Of a T_inv that stands alone. Slow complex modes at frequencies of y average its noise.
+        # For use without a tracker: slow complex modes at frequencies of y average its noise.
         large_settings={
             "pairs": ((-0.1, 0.718), (-0.1, 2.128), (-0.1, 0.6836), (-0.3, 0.718)),
             "inverse_steps": 32_000,
@@ -101,8 +99,8 @@ PROFILES: dict[str, Profile] = {
     ),
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
-        # Real modes hardly separate its three parameters under noise; slow pairs at frequencies of y do. The best
-        # decoder's error on plants 10 % off falls from 2.3 to 1.9 % by two of them; batches and trajectories add 3 %.
+        # Real modes hardly separate the three parameters under noise; slow pairs at frequencies of y do: two of them
+        # reduce the best decoder's error on plants 10 % off from 2.3 to 1.9 %. More batches and trajectories add 3 %.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
@@ -113,7 +111,7 @@ PROFILES: dict[str, Profile] = {
         fault_deadline=2.0,
     ),
     "lorenz": Profile(
-        eigenvalues=_spaced(13, -1.5, -25.0),  # faster than the others', as its flow is
+        eigenvalues=_spaced(13, -1.5, -25.0),  # its flow is faster than the others'
         spinn_settings={"eigenvalues": _spaced(9, -9.0, -40.0)},
         settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
         large_settings={"inverse_steps": 24_000},
@@ -128,17 +126,14 @@ def profile(system: System) -> Profile:
 
 
 def controller(system: System) -> Controller:
-    """A feedback that brings a system to its target.
-
-    It is the saturated linear-quadratic regulator, or the law that the system's profile names.
-    """
+    """The feedback to the system's target: its profile's, by default a saturated linear-quadratic regulator."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs to control it by")
     return profile(system).controller(system)
 
 
 def named_policy(system: System, name: str) -> Controller:
-    """A policy under which motions of a system are simulated."""
+    """Load and check a policy: a system's own controller, or a function of a script."""
     if ":" not in name and name != "controller":
         raise ValueError(
             f"unknown policy {name!r}{suggestion(name, ['controller'])}: it is controller, or script.py:function"
@@ -147,7 +142,7 @@ def named_policy(system: System, name: str) -> Controller:
         policy = controller(system) if name == "controller" else load_function(name)
     except np.linalg.LinAlgError as error:
         raise ValueError(
-            f"no linear-quadratic regulator holds {system.name} at its target {system.target} ({error}): set the "
+            f"no linear-quadratic regulator holds {system.name} at its target {system.target} ({error}): set another "
             "target, or give a policy of your own as script.py:function"
         ) from error
     return checked_policy(policy, system, name)
@@ -163,42 +158,44 @@ def preset(
 ) -> Config:
     """Return the configuration behind ``--pipeline``, ``--preset`` and ``--size`` for a system.
 
-    "fast" is what ships: about half a minute of CPU time, or ten minutes for the size "large" and five for spinn.
-    "paper" has the sizes of the paper's sec. 8, which leaves open the batch (here 4,096), the spacing of the
-    eigenvalues (even) and the decay of the learning rate (a cosine).
+    Maps that ship were trained with "fast", which takes about half a minute of CPU time, ten minutes for the size
+    "large", and five for spinn. "paper" has the sizes of the paper's sec. 8; the paper does not state the batch (here
+    4,096), the spacing of the eigenvalues (here even) and the decay of the learning rate (here a cosine).
 
     Parameters
     ----------
     system : System
-        Any system.
+        The system to observe.
     pipeline : {"input-aware", "spinn"}
         How T_inv is learned.
     name : {"fast", "paper"}
         The preset.
     size : {"default", "large"}
-        Of an input-aware T_inv: large is one that stands alone, for use without a model.
+        Size of an input-aware T_inv; "large" is for use without a tracker.
     changes : mapping of str to object, optional
-        Settings that are to differ, but for those of None. A spectrum that is not given suits them.
+        Settings to replace; None keeps a setting. Eigenvalues that are not given follow from the others.
 
     Returns
     -------
     Config
-        For :func:`training.train`.
+        The configuration, for :func:`training.train`.
 
     Raises
     ------
     ValueError
-        If a name is unknown, or no spectrum follows from the system's rate.
+        If a name is unknown, a setting is invalid, or no spectrum follows from the system's rate.
     """
     for what, value, known in (("pipeline", pipeline, Pipeline), ("preset", name, Preset), ("size", size, Size)):
         if value not in get_args(known):
             raise ValueError(f"there is no {what} {value!r}; there are {', '.join(get_args(known))}")
     given = {key: value for key, value in (changes or {}).items() if value is not None}
     own, paper, uncertain = profile(system), name == "paper", given.get("uncertain")
+    usual = zip(np.broadcast_to(system.measurement_noise, system.ny).tolist(), system.output_range, strict=True)
+    largest = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]  # a system may declare no noise
     chosen: dict[str, Any] = {
         "dt": system.dt,
         "duration": system.duration,
-        "measurement_noise_max": _largest_noise(system),
+        "measurement_noise_max": noise_levels("measurement_noise_max", largest, system.ny),
     }
     if pipeline == "input-aware":
         chosen |= own.settings
@@ -222,20 +219,10 @@ def preset(
 
 
 def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
-    """Return real eigenvalues of A for an input-aware map.
-
-    The system's profile gives them, or they follow from how fast f changes in X and from how often y is sampled.
-    """
+    """Real eigenvalues of A for an input-aware map: its profile's, or from the rate of f in X and from dt."""
     chosen = profile(system).eigenvalues
     if chosen is not None:
         return chosen
     fastest = min(1.5 * system.typical_rate, (FASTEST_OF_STEPS if system.discrete else FASTEST_MODE) / dt)
     spaced = evenly_spaced(4 * system.nx + 3, -fastest / 22.5, -fastest)
     return tuple(float(f"{value:.6g}") for value in spaced)
-
-
-def _largest_noise(system: System) -> float | tuple[float, ...]:
-    """A multiple of the usual noise, of all outputs or each; of a share of the range where the system declares none."""
-    usual = zip(np.broadcast_to(system.measurement_noise, system.ny).tolist(), system.output_range, strict=True)
-    levels = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]
-    return levels[0] if len(set(levels)) == 1 else tuple(levels)

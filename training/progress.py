@@ -1,8 +1,4 @@
-"""Progress bars; where none can be drawn, a line a minute, which the log of a run gets as well.
-
-A line has what a bar has: ``simulating lorenz: 30 of 100, 0:00:30 passed, 0:01:10 left``. A thread writes it, so that
-a phase that does not report is not silent.
-"""
+"""Progress bars on a terminal; elsewhere, and in the log of a run, one line a minute with the same content."""
 
 import math
 import threading
@@ -19,11 +15,11 @@ from rich.progress import Progress, Task, TaskID
 LOG = "log.txt"  # in the folder of a run
 
 FIRST_LINE, NEXT_LINE = 60.0, 60.0  # seconds before the first line of a phase, and between lines
-BEAT = 1.0  # seconds between looks at the clock
+BEAT = 1.0  # seconds between checks whether a line is due
 
 
 class ProgressBars(Progress):
-    """Bars with counts, the time that passed and the time that is left; lines where the console is no terminal."""
+    """Bars with counts, elapsed time and remaining time; lines where the console is not a terminal."""
 
     def __init__(self, console: Console | None, log: Path | None = None, **options: Any) -> None:
         self._drawn = console is not None and (console.is_interactive or console.is_jupyter)
@@ -43,7 +39,7 @@ class ProgressBars(Progress):
 
     @contextmanager
     def phase(self, description: str, total: float = 1) -> Iterator[Callable[[float], None]]:
-        """Show a phase for as long as the context lasts."""
+        """Show a phase while the context lasts; the context's value reports how much is done."""
         task = self.add_task(description, total=total)
         try:
             yield lambda done: self.update(task, completed=done)
@@ -58,24 +54,24 @@ class ProgressBars(Progress):
         self._write(text, printed=True)
 
     def start(self) -> None:
-        """Begin to draw, or to write."""
+        """Begin to draw; a thread writes lines, so that phases that report nothing still appear."""
         super().start()
         threading.Thread(target=self._beat, daemon=True).start()
 
     def stop(self) -> None:
-        """End it."""
+        """End the bars and the thread."""
         self._ended.set()
         self.tell()
-        if self._drawn:  # old versions of rich end even disabled bars with a line
+        if self._drawn:  # old versions of rich print a line even at the end of disabled bars
             super().stop()
 
     def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
         super().__exit__(kind, error, traceback)
-        if error is not None and self._logged:  # an invalid command leaves no log behind
+        if error is not None and self._logged:  # an invalid command must not create a log
             self._write(f"ended by {type(error).__name__}{': ' if str(error) else ''}{error}", printed=False)
 
     def tell(self) -> None:
-        """Write a line for each task that is due, or that ended."""
+        """Write a line for each task that is due or has ended."""
         with self._lock:
             for task in self.tasks:
                 passed = task.elapsed or 0.0
@@ -100,7 +96,7 @@ class ProgressBars(Progress):
 
 @contextmanager
 def progress_bars(console: Console | ProgressBars | None, log: Path | None = None) -> Iterator[ProgressBars]:
-    """Make bars, unless there are some already."""
+    """Make progress bars, or pass on those that are given."""
     if isinstance(console, ProgressBars):
         yield console
     else:

@@ -1,4 +1,4 @@
-"""A training under way: its folder, progress and checkpoints, and one optimisation loop for every network."""
+"""A running training: its folder, progress and checkpoints, and the optimisation loop of all networks."""
 
 import hashlib
 import io
@@ -25,17 +25,39 @@ from training.files import claimed_run
 from training.progress import LOG, ProgressBars, progress_bars
 
 LOG_EVERY = 100  # batches
-CHECKPOINT_SECONDS = 20.0  # between two checkpoints, at least
-CHECKPOINT = ".checkpoint.pt"  # end of a checkpoint's name
-WARM_UP = 0.01  # part of a stage in which the learning rate rises
+CHECKPOINT_SECONDS = 20.0  # least time between two checkpoints
+CHECKPOINT = ".checkpoint.pt"  # suffix of checkpoint files
+WARM_UP = 0.01  # first part of a stage, in which the learning rate rises
 
-# A batch is drawn with the generator it is given and nothing else, so that a resumed run goes on as it would have.
+# Draws a batch with the given generator alone, so that a resumed run continues exactly as if it had not stopped.
 Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
 
 
 @dataclass
 class Run:
-    """A training under way; ``with Run.begin(config) as run`` makes one for a lesson by itself."""
+    """A running training; ``with Run.begin(config) as run`` makes one for single lessons.
+
+    Attributes
+    ----------
+    config : Config
+        The settings.
+    folder : Path
+        Folder of the checkpoints.
+    fingerprint : str
+        Hash of the run's identity, which checkpoints must match.
+    progress : ProgressBars
+        Where progress is shown.
+    device : torch.device
+        Where networks are trained.
+    resume : bool
+        Whether stages resume from their checkpoints.
+    losses : dict of str to list of (int, float)
+        For each stage, numbers of batches and the errors after them.
+    seconds : dict of str to float
+        CPU seconds of each stage.
+    samples : dict of str to int
+        Number of distinct samples of the stages that count them.
+    """
 
     config: Config
     folder: Path
@@ -45,7 +67,7 @@ class Run:
     resume: bool = False
     losses: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    samples: dict[str, int] = field(default_factory=dict)  # distinct ones of each stage
+    samples: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     @contextmanager
@@ -59,7 +81,7 @@ class Run:
         device: torch.device | None = None,
         resume: bool = False,
     ) -> Iterator["Run"]:
-        """Begin in a folder, which is locked, with a log; without one nothing is kept."""
+        """Begin a run in a folder, which is locked and receives a log; without a folder nothing is kept."""
         described = json.dumps(identity or {}, sort_keys=True)
         fingerprint = hashlib.sha256(described.encode()).hexdigest()[:16]
         device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -73,7 +95,7 @@ class Run:
     def minimise(
         self, name: str, problem: nn.Module, loss: Loss, steps: int, *, share: float = 1.0, **settings: Any
     ) -> None:
-        """Train a stage's network within its share of the CPU time, with the configuration's settings or others."""
+        """Train a stage's network within a share of the CPU time; ``settings`` replace the configuration's."""
         config = self.config
         seconds = math.inf if config.cpu_seconds is None else config.cpu_seconds * share
         usual = {key: getattr(config, key) for key in ("learning_rate", "seed", "optimiser")}
@@ -84,7 +106,7 @@ class Run:
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
-        """Add the CPU seconds of what happens inside to those of a stage."""
+        """Add the CPU seconds of the ``with`` block to those of a stage."""
         began = time.process_time()
         yield
         self.seconds[name] += time.process_time() - began
@@ -92,7 +114,7 @@ class Run:
 
 @dataclass(kw_only=True)
 class Stage:
-    """One optimisation within a run, and how far it has come: batches, CPU seconds, and the error by batch."""
+    """One optimisation within a run, and its state: batches done, history of errors, and start of its CPU time."""
 
     name: str
     steps: int
@@ -108,19 +130,14 @@ class Stage:
 
     @property
     def part(self) -> float:
-        """Share of the stage that is done, by steps or by CPU time."""
+        """Share of the stage that is done, by steps or by CPU time, whichever is larger."""
         return max(self.step / self.steps, min(1.0, (time.process_time() - self.began) / self.cpu_seconds))
 
 
 def optimise(
     stage: Stage, module: nn.Module, loss: Loss, progress: Progress, *, resume: bool
 ) -> list[tuple[int, float]]:
-    """Minimise a loss over the parameters of a module, with checkpoints.
-
-    Every tensor in ``module.state_dict()`` is part of the checkpoint, buffers included. Data and initial weights of a
-    seed are the same on a GPU as on a CPU; batches are not, as the generators differ, so that errors agree but for
-    chance.
-    """
+    """Minimise a loss over a module's parameters, with checkpoints; the same seed draws other batches on a GPU."""
     generator = torch.Generator(next(module.parameters()).device).manual_seed(stage.seed)
     optimiser = _optimiser(stage, module)
     parts: dict[str, Any] = {"module": module, "optimiser": optimiser}
@@ -166,7 +183,7 @@ def optimise(
 
 def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
     if stage.optimiser == "adam":
-        on_gpu = next(module.parameters()).is_cuda  # where a fused step is one kernel
+        on_gpu = next(module.parameters()).is_cuda  # there a fused step is one kernel
         return torch.optim.Adam(module.parameters(), lr=stage.learning_rate, fused=on_gpu)
     from pytorch_optimizer import SOAP
 
@@ -175,21 +192,21 @@ def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
 
 def save_checkpoint(path: Path, state: Mapping[str, Any], *, fingerprint: str) -> None:
     """Write tensors and plain values in torch's own format, whole or not at all."""
-    content = io.BytesIO()  # torch reports a full disk as "unexpected pos"
+    content = io.BytesIO()  # writing to a file, torch would report a full disk as "unexpected pos"
     torch.save({**state, "fingerprint": fingerprint}, content)
     with replacing(path) as temporary:
         temporary.write_bytes(content.getbuffer())
 
 
 def load_checkpoint(path: Path, *, fingerprint: str | None = None) -> dict[str, Any]:
-    """Read a checkpoint, of which nothing runs."""
+    """Read a checkpoint without running any code from it."""
     try:
         content = path.read_bytes()
     except OSError as error:
         raise ValueError(f"the checkpoint {path} cannot be read: {error.strerror}") from error
     with restoring(path):
         with zipfile.ZipFile(io.BytesIO(content)) as file:
-            if part := file.testzip():  # torch writes the checksums of its parts, and does not check them
+            if part := file.testzip():  # torch writes checksums, but does not verify them
                 raise ValueError(f"the checksum of {part} is wrong")
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
         belongs_to = state.pop("fingerprint")
@@ -200,11 +217,11 @@ def load_checkpoint(path: Path, *, fingerprint: str | None = None) -> dict[str, 
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Turn errors while a checkpoint's state is restored into one that names the file."""
+    """Turn errors in restoring a checkpoint into a ValueError that names the file."""
     try:
         yield
     except Exception as error:  # pickle, zip and torch raise many kinds
         line = (str(error) if not isinstance(error, KeyError) else f"it lacks {error}").partition("\n")[0]
         raise ValueError(
-            f"the checkpoint {path} is damaged or of another version, remove it to train that stage again: {line}"
+            f"the checkpoint {path} is damaged or of another version; remove it to train that stage again: {line}"
         ) from error

@@ -1,4 +1,4 @@
-"""Streams of random numbers: whatever the seeds, no two purposes share one."""
+"""Streams of random numbers: no two purposes share one, whatever their seeds."""
 
 from enum import IntEnum
 
@@ -6,11 +6,11 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """First entry of the seeds of each purpose. Entries never change: published results rest on them."""
+    """First seed entry of each purpose. Published results depend on these numbers, which never change."""
 
     TRAINING = 1
     EVALUATION = 2
-    VALIDATION = 3  # on which the benchmark chooses
+    VALIDATION = 3  # for choices, such as those of the benchmark
     CERTIFICATE = 4
     CALIBRATION = 5
     FAULTS = 6
@@ -18,7 +18,7 @@ class Stream(IntEnum):
 
 
 def generator(stream: Stream, *seed: int) -> np.random.Generator:
-    """Make the generator of a stream for a seed, and for a part of its draws."""
+    """Make the generator of a stream for a seed, and for further entries that separate its parts."""
     for entry in seed:
         if not 0 <= entry < 2**32:
             raise ValueError(f"seed = {entry} must be a whole number from 0 to 2**32 - 1")

@@ -1,4 +1,4 @@
-"""The eigenvalues of A: the filter that they make, and whether T is smooth for them, judged before any training."""
+"""The eigenvalues of A: the filter that they define, and whether T is smooth for them, before any training."""
 
 import functools
 from collections.abc import Iterable, Iterator
@@ -14,20 +14,20 @@ from training.maps.coordinates import settling_time
 from training.seeds import Stream, generator
 from training.trajectories.motions import filter_states, recording_ages
 
-FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
-SMOOTH = 0.85  # least exponent of a smooth T: differences in z fall as distance^0.85 where neighbours come closer
-MOTIONS = 300  # that are followed
-ASKING = 40  # of them whose states look for neighbours, among the states of the others
-SAMPLES = 160  # states along a motion
-FAR = 64  # the nearest neighbour is compared with the one of this rank
-FEWEST_STATES = 1000  # from which exponents are taken
-FOLLOWED = 300.0  # length of motions in multiples of 1 / rate
-FINEST = 0.05  # least sampling interval in multiples of 1 / rate; finer ones only cost time
-AT_REST = 1e-6  # part of X's half-width below which the variation of a state no longer counts
-SLOWEST, FASTEST = 1 / 6, 8.0  # slow ends of the first and the last interval, in multiples of the rate
-STEP = 2**0.5  # from one interval to the next
-FORGOTTEN = 30.0  # times 1 / |slow end|, by which a filter has forgotten its start
-SPREAD = 4.0  # fast end of an interval over its slow end
+FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode remembers only the last samples
+SMOOTH = 0.85  # least exponent p of a smooth T, where differences in z fall as distance^p between close states
+MOTIONS = 300  # number of simulated motions
+ASKING = 40  # number of motions whose states are compared with neighbours on the other motions
+SAMPLES = 160  # number of states along a motion
+FAR = 64  # rank of the far neighbour, with which the nearest one is compared
+FEWEST_STATES = 1000  # least number of states for an exponent
+FOLLOWED = 300.0  # length of motions after the transient, in multiples of 1 / rate
+FINEST = 0.05  # least sampling interval, in multiples of 1 / rate; finer ones only cost time
+AT_REST = 1e-6  # a state that varies less, in half-widths of X, counts as constant
+SLOWEST, FASTEST = 1 / 6, 8.0  # slow ends of the first and of the last interval, in multiples of the rate
+STEP = 2**0.5  # ratio of the slow ends of consecutive intervals
+FORGOTTEN = 30.0  # a filter has forgotten its start after this multiple of 1 / |slow end|
+SPREAD = 4.0  # ratio of an interval's fast end to its slow end
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def evenly_spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
 
 
 def papers_spectrum(system: System) -> tuple[float, ...]:
-    """2 nx + 1 eigenvalues in [-3, -1.5] (paper, sec. 8), in one over the seconds of the system's pace."""
+    """2 nx + 1 eigenvalues, evenly spaced in [-3, -1.5] (paper, sec. 8), over the system's pace."""
     return tuple((np.linspace(-1.5, -3.0, 2 * system.nx + 1) / system.pace).tolist())
 
 
@@ -71,8 +71,8 @@ def check_continuous(system: System) -> None:
 def smoothness(system: System, spectra: Iterable[Spectrum], dt: float) -> Iterator[np.ndarray]:
     """For each spectrum, exponents (ny * modes,) of differences in z between neighbouring states of different motions.
 
-    Motions without input are simulated once, half of them from X and half from 1.5 X, and the filters run beside
-    them. Those states count at which a filter has forgotten its start to one part in a million. NaN where too few do.
+    Motions without input are simulated once, half of them from X and half from 1.5 X, and all filters run along them.
+    Only states count at which at most a millionth of a filter's start is left; with too few of them exponents are NaN.
     """
     check_continuous(system)
     rate = system.typical_rate
@@ -84,7 +84,7 @@ def smoothness(system: System, spectra: Iterable[Spectrum], dt: float) -> Iterat
     x0 = np.concatenate([system.draw_starts(rng, MOTIONS // 2, factor) for factor in (1.0, 1.5)])
     x = simulate(system, rng.permutation(x0), steps, step)
     inside = np.isfinite(x).all(-1)
-    x = np.where(inside[..., None], x, x[0])  # states beyond the bounds do not count; h and the filter need numbers
+    x = np.where(inside[..., None], x, x[0])  # states out of bounds do not count, but h and the filter need numbers
     y, no_input = system.output(x), np.zeros((steps, MOTIONS, 0))
     x, settled = x[ages], [inside[ages] & (ages * step >= time)[:, None] for time in times]
     if max(one.sum() for one in settled) < FEWEST_STATES:
@@ -97,8 +97,8 @@ def smoothness(system: System, spectra: Iterable[Spectrum], dt: float) -> Iterat
 
 
 def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, settled: np.ndarray) -> np.ndarray:
-    """Compare the z (ages, motions, size) of neighbours among the settled states of x (ages, motions, nx)."""
-    asking, others = settled[:, :ASKING], settled[:, ASKING:]  # neighbours are of different motions
+    """Exponents by which the z (ages, motions, size) of neighbouring settled states x (ages, motions, nx) differ."""
+    asking, others = settled[:, :ASKING], settled[:, ASKING:]  # neighbours must lie on different motions
     low, high = system.box()
     least = AT_REST * (high - low) / 2
     too_few = settled.sum() < FEWEST_STATES or not asking.any() or others.sum() < FAR
@@ -109,16 +109,16 @@ def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, settled: np.ndar
     z = z / np.where(z_scale > 0, z_scale, 1.0)
     distances, rows = scipy.spatial.cKDTree(x[:, ASKING:][others]).query(x[:, :ASKING][asking], k=[1, FAR])
     differences = z[:, ASKING:][others][rows] - z[:, :ASKING][asking][:, None]
-    # By the distance to the far neighbour, so that few states far from all others do not outweigh the rest.
+    # Relative to the distance of the far neighbour, so that a few isolated states do not outweigh the rest.
     reach = np.maximum(distances[:, 1:], np.finfo(float).tiny)
     closer = np.sqrt(((distances[:, :1] / reach) ** 2).mean(0))
     first, last = np.sqrt(((differences / reach[..., None]) ** 2).mean(0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(last > 0, np.log(first / last) / np.log(closer), 1.0)  # of a constant output: 1
+        return np.where(last > 0, np.log(first / last) / np.log(closer), 1.0)  # 1 for a constant output
 
 
 def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spectrum]:
-    """Spectra to choose from, slow ones first: 2 nx + 1 real eigenvalues for each output, even in the logarithm."""
+    """Candidate spectra, slow ones first: 2 nx + 1 real eigenvalues for each output, evenly spaced logarithmically."""
     rate = system.typical_rate
     fastest = min(FASTEST, FASTEST_MODE / (SPREAD * dt * rate))
     slowest = min(SLOWEST, fastest)
@@ -129,10 +129,7 @@ def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spect
 
 @functools.cache
 def smooth_spectrum(system: System, dt: float, duration: float = np.inf) -> Spectrum:
-    """Choose the slowest of the :func:`intervals` for which T is smooth, as slow modes average noise best.
-
-    Where T is smooth for none, the one with the largest exponents is chosen, and of equal ones the fastest.
-    """
+    """Choose the slowest of the :func:`intervals` for which T is smooth, or else the one with the largest exponents."""
     spectra, least = intervals(system, dt, duration), list[float]()
     for spectrum, exponents in zip(spectra, smoothness(system, spectra, dt), strict=True):
         least.append(float(np.nan_to_num(exponents, nan=-np.inf).min()))

@@ -47,7 +47,7 @@ def test_the_decoder_is_the_observer_long_after_its_start():
     x = simulate(system, np.array([[2.0, 0.0]]), 6000, 0.01)
     y, linear = system.output(x), observer.artifact.filter
     z = filter_states(linear, y, np.zeros((6000, 1, linear.nu)), np.array([6000]))[0]
-    np.testing.assert_allclose(decoder(observer.artifact, 0.5)(z), observer.estimate(y)[-1], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(decoder(observer.artifact, 0.5)(z), observer.estimate(y)[-1], atol=0.01)
 
 
 def test_the_command_on_an_own_map(tmp_path, capsys):

@@ -59,10 +59,11 @@ def test_each_method_trains_and_its_file_observes(name, tmp_path):
 
 @pytest.mark.research
 @pytest.mark.parametrize(
-    ("name", "steps"), [("default", 600), ("node", 600), ("gru", 150), ("lru", 150), ("transformer", 80)]
+    ("name", "steps", "trajectories"),
+    [("default", 1500, 1000), ("node", 600, 100), ("gru", 150, 100), ("lru", 150, 100), ("transformer", 80, 100)],
 )
-def test_each_learned_method_learns(name, steps, tmp_path):
-    method, system, trained, dt = trained_on_oscillator(name, tmp_path, steps=steps)
+def test_each_learned_method_learns(name, steps, trajectories, tmp_path):
+    method, system, trained, dt = trained_on_oscillator(name, tmp_path, steps=steps, trajectories=trajectories)
     x = oscillations(dt)
     late = (run(method.observer(trained, system, dt, 0.0), system.output(x)) - x)[len(x) // 2 :]
     assert np.sqrt((late**2).mean() / (x**2).mean()) < 0.2

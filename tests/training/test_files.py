@@ -149,7 +149,7 @@ def test_a_job_keeps_its_folder(tmp_path):
 def test_identities_that_are_damaged(text, tmp_path):
     path = tmp_path / "job.json"
     path.write_text(text)
-    with pytest.raises(ValueError, match=r"job.json is damaged, remove it"):
+    with pytest.raises(ValueError, match=r"job.json is damaged; remove it"):
         check_identity(path, {"seed": 0}, "another job")
 
 

@@ -176,7 +176,7 @@ def test_a_source_gives_the_same_motions_to_every_training(whole):
     train(source, device=CPU)
     for expected, found in zip(parts(whole["equations"][1].artifact), parts(train(source, device=CPU).artifact)):
         np.testing.assert_array_equal(expected, found)
-    with pytest.raises(ValueError, match="pass config with a System alone"):
+    with pytest.raises(ValueError, match="pass config only with a System"):
         train(source, toy(system))
 
 

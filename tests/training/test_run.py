@@ -58,7 +58,7 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
     (tmp_path / f"{UNFINISHED}1234-line{training.run.CHECKPOINT}").write_bytes(b"half")  # of a process that was killed
     assert 4.0 <= seconds_spent(tmp_path) < 4.1
     (tmp_path / f"other{training.run.CHECKPOINT}").write_bytes(b"half")
-    with pytest.raises(ValueError, match="is damaged or of another version, remove it"):
+    with pytest.raises(ValueError, match="is damaged or of another version; remove it"):
         seconds_spent(tmp_path)
 
 

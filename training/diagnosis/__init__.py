@@ -1,4 +1,4 @@
-"""Whether a system, recorded data or an environment can be observed and learned: diagnosis before a training."""
+"""Diagnosis before a training: whether a system, records or an environment can be observed and learned."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -57,7 +57,7 @@ def check(
 
 
 def _findings(name: str, subject: Subject) -> Iterator[Finding]:
-    """Findings of one check; a problem where it fails."""
+    """Findings of one check; an error in the check is a problem."""
     try:
         yield from CHECKS[name](subject)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:

@@ -1,10 +1,9 @@
 """One line of a diagnosis, and its numbers as text."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-RESOLUTION = 1e-3  # of z in a network, in standard deviations: the error that remains without noise
+RESOLUTION = 1e-3  # error of z as a network reads it, in standard deviations: it remains without noise
 
 Verdict = Literal["ok", "note", "problem"]
 
@@ -20,15 +19,10 @@ class Finding:
 
 
 def percent(share: float) -> str:
-    """Two digits, in percent."""
+    """Format a share in percent, with two digits."""
     return (f"{100 * share:.0f}" if abs(share) >= 1 else f"{100 * share:.2g}") + " %"
 
 
 def error(share: float) -> str:
-    """An error in percent, down to the resolution of a network."""
+    """Format an error in percent; one below the resolution of a network as an upper bound."""
     return percent(share) if share >= RESOLUTION else f"< {percent(RESOLUTION)}"
-
-
-def point(x: Iterable[float]) -> str:
-    """A state."""
-    return f"({', '.join(f'{value:.3g}' for value in x)})"

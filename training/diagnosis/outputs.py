@@ -15,16 +15,18 @@ from training.records import Record
 from training.sources.simulated import unknown_start
 from training.spectrum import smooth_spectrum
 
-FOLLOWED, MAX_STEPS = 20, 2000  # motions that are followed, and samples of each
-MIN_STEPS = 10  # samples
-UNSEEN, HARDLY = 0.9, 0.3  # of the standard deviation of a start that remains in some direction after all of y
-INVOLVED = 0.3  # least component of a state in that direction
-VAGUE = 0.3  # error of a state without noise, in its standard deviations
-LOCALLY, GLOBALLY = 0.1, 0.3  # largest error by the equations, least one by neighbours, of a state with a symmetry
+FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
+MIN_STEPS = 10  # least number of samples of a motion
+# A direction is a problem or a note if more of its standard deviation at the start is left after all of y.
+UNSEEN, HARDLY = 0.9, 0.3
+INVOLVED = 0.3  # a finding names the states with larger components in that direction
+VAGUE = 0.3  # larger errors without noise, in standard deviations of the state, are noted
+# A state has a symmetry if its error by the equations is at most the first, and by neighbours at least the second.
+LOCALLY, GLOBALLY = 0.1, 0.3
 
 
 def observability(subject: Subject) -> Iterator[Finding]:
-    """The least error of each state at some levels of noise, and states that y does not determine."""
+    """The least error of each state at each level of noise, and the states that y does not determine."""
     names = subject.system.state_names
     errors, left = least_errors(subject)
     weights = np.ones(errors.shape[1])  # the rest of a motion is like the second half of its beginning
@@ -51,8 +53,8 @@ def observability(subject: Subject) -> Iterator[Finding]:
 def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
     """The posterior Cramér-Rao bound along motions, without process noise.
 
-    Returns root mean squares (levels, steps, nx) in the states' standard deviations along motions, without noise and at
-    each level, and the covariance (nx, nx) at the end without noise, in units of the variances of the start.
+    Returns the bounds (levels, steps, nx) in standard deviations of the states along motions, the first level without
+    noise, and the covariance (nx, nx) at the end without noise, relative to the variances of the start.
     """
     system, levels = subject.system, (0.0, *subject.noise)
     x, u = subject.followed[0][: MAX_STEPS + 1, :FOLLOWED], subject.followed[1][:MAX_STEPS, :FOLLOWED]
@@ -67,7 +69,7 @@ def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
             f"motions of {subject.duration:g} s have only {length - 1} samples of {subject.dt:g} s; take a longer "
             "duration, or a smaller dt"
         )
-    floor = [RESOLUTION * (size or 1.0) for size in system.output_range]  # of y without noise, as a network reads it
+    floor = [RESOLUTION * (size or 1.0) for size in system.output_range]  # no network reads y more accurately
     R = np.repeat([np.diag(np.maximum(level, floor) ** 2) for level in levels], n, axis=0)
     bound = ExtendedKalmanFilter(system, subject.dt, Q=np.zeros_like(start), R=R)
     _, P = bound.along(*(np.tile(each, (1, len(levels), 1)) for each in (system.output(x), u, x)))
@@ -78,7 +80,7 @@ def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], Finding]:
-    """Directions of the state that y does not or hardly determine, by the states involved."""
+    """Directions of the state that y determines hardly or not at all, by the states involved."""
     findings = dict[tuple[int, ...], Finding]()
     values, directions = np.linalg.eigh(left)
     for share, direction in zip(np.sqrt(np.maximum(values, 0.0)), directions.T, strict=True):
@@ -96,7 +98,7 @@ def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], F
 
 
 def spectrum(subject: Subject) -> Iterator[Finding]:
-    """The eigenvalues that a training takes, and those from which on T is smooth."""
+    """The eigenvalues that a training takes, and the slowest for which T is smooth."""
     system, dt = subject.system, subject.dt
     taken = eigenvalues(system, dt)
     text = f"{len(taken)} eigenvalues of A for each output, {taken[0]:.3g} to {taken[-1]:.3g} 1/s"
@@ -107,10 +109,7 @@ def spectrum(subject: Subject) -> Iterator[Finding]:
 
 
 def _symmetries(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Finding]:
-    """States that y determines near each state, but not among several distant states, as by a symmetry.
-
-    Motions without input are judged as records.
-    """
+    """States that y determines locally but not globally, as with a symmetry; motions without input serve as records."""
     system, x = subject.system, subject.followed[0]
     t = subject.dt * np.arange(len(x))
     records = [Record("motion", t, system.output(one), x=one) for one in np.moveaxis(x, 1, 0)]

@@ -1,4 +1,4 @@
-"""Which hidden signals outputs and inputs determine, from records or rollouts, without a training."""
+"""Which hidden signals the outputs and inputs determine, from records or rollouts, without a training."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,19 +22,20 @@ from training.seeds import Stream, generator
 from training.sources.recorded import FEW, evenly, recorded_preset, split
 from training.spectrum import Spectrum
 
-STEPS = 10_000  # played in an environment, by default
-MAX_QUERIES, MAX_OTHERS = 500, 40_000  # samples that are predicted, and those that may be their neighbours
-QUERY_SHARE = 0.2  # of the records; neighbours come from the others
-MIN_QUERIES = 50  # samples, for a judgement
-MIN_OTHERS = 5  # times the coordinates of z
-NOISE_SHARES = 0.01, 0.1  # of an output's standard deviation, where no level is named
-MIN_NEIGHBOURS = 32  # or twice as many as z has coordinates, so that planes rest on enough of them
-ROUNDING = 1e-9  # of z, in a linear regression
-DETERMINED, UNDETERMINED = 0.05, 0.8  # of a signal's standard deviation: largest and least errors of these verdicts
-AS_GOOD = 1.1  # times the least error, up to which a window is as good as any
-SEEN = 0.1  # largest error of a signal's change, in the signal's own error, for it to be known up to a constant
+STEPS = 10_000  # number of steps played in an environment by default
+MAX_QUERIES, MAX_OTHERS = 500, 40_000  # largest numbers of samples to predict, and of their possible neighbours
+QUERY_SHARE = 0.2  # share of the records with samples to predict; neighbours come from the others
+MIN_QUERIES = 50  # least number of samples to predict
+MIN_OTHERS = 5  # least number of possible neighbours, over that of coordinates of z
+NOISE_SHARES = 0.01, 0.1  # default noise levels, in standard deviations of the output
+MIN_NEIGHBOURS = 32  # or twice as many as z has coordinates, so that they determine a plane
+ROUNDING = 1e-9  # relative rounding of z in a linear regression, as a ridge
+# Largest error of a determined signal, and least error of an undetermined one, in its standard deviations.
+DETERMINED, UNDETERMINED = 0.05, 0.8
+AS_GOOD = 1.1  # a window with at most so many times the least error is as good as the best
+SEEN = 0.1  # a signal is known up to a constant if its changes have at most this fraction of its own error
 
-# By the first word of a signal's verdict.
+# Severity and advice, by the first word of a signal's verdict.
 VERDICTS: dict[str, tuple[Verdict, str]] = {
     "determined": ("ok", ""),
     "up": ("note", "an observer follows it from a known start; measure a signal that depends on its value, too"),
@@ -46,7 +47,7 @@ VERDICTS: dict[str, tuple[Verdict, str]] = {
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict on one hidden signal."""
+    """The verdict on one hidden signal, with its best window in steps and its errors by noise level."""
 
     signal: str
     verdict: str
@@ -56,7 +57,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Observability:
-    """Which hidden signals outputs and inputs determine.
+    """Which hidden signals the outputs and inputs determine.
 
     Errors are root mean squares in standard deviations of the signals.
 
@@ -65,18 +66,18 @@ class Observability:
     measured, inputs, hidden : tuple of str
         Names of the signals.
     dt : float
-        Seconds in a step.
+        Sampling interval in seconds.
     windows : tuple of int, length m
-        Steps back that outputs and inputs are known; 0 is the output alone.
+        Numbers of past steps of which outputs and inputs are known; with 0, only the present output is.
     noise : tuple of (float or tuple of float), length k
         Levels of measurement noise; the first is 0.
     errors : ndarray, shape (k, m, nx)
-        Of the best estimate after so many steps.
+        Errors of the best estimates by noise level and window.
     changes : ndarray, shape (m, nx)
-        Its errors of a signal's change over the window, in standard deviations of that change, without noise; NaN where
-        no signal changes, and over windows whose start the filter has forgotten.
+        Errors of the best estimates of each signal's change over the window, without noise, in standard deviations of
+        that change; NaN for signals that do not change, and for windows whose start the filter has forgotten.
     warnings : tuple of str
-        Judgements for which the data are too few.
+        Results for which the data are too few.
     """
 
     measured: tuple[str, ...]
@@ -95,7 +96,7 @@ class Observability:
         return tuple(map(self._judged, range(len(self.hidden))))
 
     def findings(self) -> Iterator[Finding]:
-        """The same as lines of a diagnosis."""
+        """Yield the results as lines of a diagnosis."""
         known = " and ".join(", ".join(names) for names in (self.measured, self.inputs) if names)
         yield Finding("signals", "ok", f"{', '.join(self.hidden)} from {known}, in steps of {self.dt:.3g} s")
         for one in self.judgements:
@@ -143,27 +144,27 @@ def observability(
     seed: int = 0,
     console: Console | ProgressBars | None = None,
 ) -> Observability:
-    """Find which hidden signals of any environment its outputs and actions determine, before an observer is trained.
+    """Find which hidden signals of an environment its outputs and actions determine, before any training.
 
     Parameters
     ----------
     env_id : str
-        As ``gym.make`` takes it.
+        Id of the environment, as for ``gym.make``.
     measured, hidden : sequence of str or int
         Signals that an observer measures, and those that it estimates, as for :func:`training.learn`.
     policy : str or callable
-        Chooses the actions, see :func:`training.rollouts.policy_of`. The result holds where it has been.
+        The policy that acts, as for :func:`training.learn`. The result holds where it has been.
     episodes, steps : int, optional
-        Length of the play, to whichever is reached first; by default 10,000 steps.
+        Length of the play, whichever is reached first; by default 10,000 steps.
     env_kwargs : mapping of str to object, optional
         Arguments of the environment.
     measurement_noise : sequence of (float or tuple of float), optional
-        Standard deviations on each sample of y, of all outputs or each, beside 0; by default 1 % and 10 % of those of
-        the outputs.
+        Standard deviations of the noise on y to compare with 0, each for all outputs or by output; by default 1 % and
+        10 % of the outputs' standard deviations.
     seed : int
-        Of the rollouts and of the comparison.
+        Seed of the rollouts and of the comparison.
     console : rich.console.Console or ProgressBars, optional
-        For the progress; by default none is printed.
+        Where progress is shown; by default nowhere.
 
     Returns
     -------
@@ -173,7 +174,7 @@ def observability(
     Raises
     ------
     ValueError
-        If an argument is invalid, or as :func:`training.diagnosis.of_records`.
+        If an argument is invalid, or the play is too short to judge the signals.
     """
     if not hidden:
         raise ValueError("name the hidden signals, as in hidden=[2]")
@@ -189,8 +190,8 @@ def of_records(
 ) -> Observability:
     """Find which recorded states the recorded outputs and inputs determine.
 
-    The filter of a training on the records starts at any sample. So many steps later its state z is compared with that
-    of similar samples in other records, with noise of the covariance that z then has.
+    For each window, the filter of a training on the records starts that many steps before a sample. The state z that it
+    then has is compared with z at similar samples in other records, with the noise that z has after such a window.
     """
     integer("seed", seed, 0)
     check_signals(records)
@@ -210,7 +211,8 @@ def of_records(
         if compared is None:
             break
         errors.append(compared[0])
-        changes.append(np.where(window <= settled / SETTLED, compared[1], np.nan))  # the filter forgets later starts
+        remembered = window <= settled / SETTLED  # the filter forgets starts of longer windows
+        changes.append(np.where(remembered, compared[1], np.nan))
     if not errors:
         raise ValueError(
             f"{sum(len(record.t) for record in records)} samples in {len(records)} records are too few to judge "
@@ -219,7 +221,7 @@ def of_records(
     warnings = list[str]()
     if len(records) < FEW:
         warnings.append(
-            f"there are fewer than {FEW} records: samples are compared with others of the same, and a constant of a "
+            f"there are fewer than {FEW} records: samples are compared within a record, so that a constant of the "
             "record looks determined; record more"
         )
     if len(errors) < len(windows):
@@ -229,7 +231,7 @@ def of_records(
 
 
 def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[Level, ...]:
-    """No noise, and the given levels or shares of the outputs' standard deviations."""
+    """No noise, then the given levels, or by default shares of the outputs' standard deviations."""
     y = np.concatenate([record.y for record in records])
     if given is None:
         given = [tuple(float(f"{share * size:.3g}") for size in np.nanstd(y, 0)) for share in NOISE_SHARES]
@@ -240,10 +242,7 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
 
 
 def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Evenly spread samples with a state now and ``steps`` before, when the filter started.
-
-    Returns filter states (n, size), and states with how much these have changed since (n, 2 nx).
-    """
+    """Filter states (n, size) at evenly spread samples, ``steps`` after a start; states and their changes (n, 2 nx)."""
     rows = windows.rows(steps)
     rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
     rows = evenly(rows, min(most, len(rows)))
@@ -254,10 +253,7 @@ def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.nd
 def compare(
     queries: Windows, others: Windows, window: int, *, noise: Sequence[Level], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Errors at each level of noise (k, nx), and without any those of changes (nx,).
-
-    The first level is 0. Returns None where there are too few samples.
-    """
+    """Errors at each noise level (k, nx), the first being 0, and of changes at 0 (nx,); None with too few samples."""
     (z, x), (others_z, others_x) = _samples(queries, window, MAX_QUERIES), _samples(others, window, MAX_OTHERS)
     if len(z) < MIN_QUERIES or len(others_z) <= MIN_OTHERS * others_z.shape[1]:
         return None
@@ -266,7 +262,7 @@ def compare(
         noisy = bool(np.any(level))
         own = np.einsum("j,jab->ab", np.broadcast_to(np.square(level), len(covariance)), covariance)
         scaled = coordinates(others_z, own if noisy else covariance.sum(0))
-        signal = 1 / (1 + scaled.noise_gain**2) if noisy else 1.0  # share of it in each coordinate
+        signal = 1 / (1 + scaled.noise_gain**2) if noisy else 1.0  # the signal's share of each coordinate
         R = root(own).T
         at, others_at = (signal * scaled(each + rng.standard_normal(each.shape) @ R) for each in (z, others_z))
         errors.append(left_by(at, x, others_at, others_x))
@@ -275,12 +271,12 @@ def compare(
 
 
 def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.ndarray) -> np.ndarray:
-    """Errors (nx,) of x given z, in standard deviations, from samples of both and of others.
+    """Errors (nx,) of x given z, in standard deviations, from samples of both and from other samples near them.
 
-    The nearest others of each sample are weighted so that their weighted z is its own: a plane through them. Their
-    weighted x is then off by the part of x that z does not determine, of the sample itself and of the others, and by
-    the curvature of x between them, which falls with the square of their distance. The first part is divided by 1 + the
-    sum of squared weights, as which it counts the variance. With one neighbour of weight 1 that is the Delta test.
+    Weights on the nearest others reproduce each sample's z, as a plane through them would. The same weights applied to
+    their x miss the sample's x by the part that z does not determine, of the sample and of the others, and by the
+    curvature of x, which falls with the square of the distance. The variance of the first part is the one sought, times
+    1 + the sum of squared weights, so squares are divided by that. One neighbour of weight 1 gives the Delta test.
 
     Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
     """
@@ -288,7 +284,7 @@ def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.nda
     design = np.column_stack([np.ones(len(others_z)), others_z])
     gram = design.T @ design + ROUNDING * len(design) * np.eye(len(design.T))
     coefficients = np.linalg.solve(gram, design.T @ others_x)
-    others_x = others_x - design @ coefficients  # neighbours predict the nonlinear rest
+    others_x = others_x - design @ coefficients  # neighbours predict only the nonlinear rest
     x = x - np.column_stack([np.ones(len(z)), z]) @ coefficients
     linear: np.ndarray = np.sqrt((x**2).mean(0)) / deviation
     n, modes = z.shape
@@ -297,7 +293,7 @@ def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.nda
     k = min(len(others_z), max(MIN_NEIGHBOURS, 2 * (modes + 1)))
     near = cKDTree(others_z).query(z, k=k)[1]
     apart = others_z[near] - z[:, None]
-    # The smallest weights with the sum 1 for which neighbours cancel to RESOLUTION.
+    # The smallest weights with sum 1 for which the neighbours' weighted deviations cancel up to RESOLUTION.
     weights = np.linalg.solve(apart @ apart.mT + RESOLUTION**2 * modes * np.eye(k), np.ones((n, k, 1)))[..., 0]
     weights /= weights.sum(1, keepdims=True)
     squared = (np.einsum("nk,nkj->nj", weights, others_x[near]) - x) ** 2 / (1 + (weights**2).sum(1))[:, None]

@@ -1,4 +1,4 @@
-"""A system before any training: its equations, inputs, motions, sampling and outputs."""
+"""Checks of a system before any training: its equations, inputs, motions, sampling and outputs."""
 
 import importlib.util
 from collections.abc import Iterator
@@ -12,16 +12,17 @@ from kkl_gym.compiled import SamplingStep, batch_step, single_step
 from kkl_gym.equations import components, input_matrix
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
-from training.diagnosis.finding import Finding, Verdict, percent, point
+from training.diagnosis.finding import Finding, Verdict, percent
 from training.evaluation.levels import Level
 from training.trajectories.motions import DRIVEN, Controller, random_inputs, under_policy
 
-COMPARED = 100  # points of X, and as many of 2X, at which the equations are evaluated
-POINTS = 1000  # of X, for outputs
-MOTIONS = 100  # half of them driven, where there are inputs
-MANY = 0.5  # share of motions that leave the bounds, beyond which it is a problem
-COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1  # changes of y from sample to sample, in its standard deviations
-STILL = 1e-9  # range of an output in its size
+COMPARED = 100  # the equations are evaluated at so many points of X, and at as many of 2X
+POINTS = 1000  # points of X at which outputs are evaluated
+MOTIONS = 100  # number of motions; where there are inputs, half of them are driven
+MANY = 0.5  # a larger share of motions that leave the bounds is a problem
+# Changes of y from sample to sample, in its standard deviations: a problem, a note, and the advised ones.
+COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1
+STILL = 1e-9  # an output with a smaller range, over its size, does not move
 
 COST = {
     "floats": "single environments and observers do not run",
@@ -31,7 +32,7 @@ COST = {
 
 
 def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
-    """Points of X or a multiple of it, (n, nx), the same each time."""
+    """Points (n, nx) of X or a multiple of it, the same in each call."""
     x = system.draw_starts(np.random.default_rng(1), n, factor)
     if np.shape(x) != (n, system.nx):
         call = f"draw_starts(rng, {n}, {factor:g})"
@@ -42,8 +43,8 @@ def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
 class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
-    ``motions`` are states (steps + 1, MOTIONS, nx), NaN from where they leave the bounds, and inputs, in equal shares
-    of each of the ``kinds``. Those that ``stay`` (MOTIONS,) have the outputs ``y``.
+    ``motions`` are states (steps + 1, MOTIONS, nx), NaN after they leave the bounds, and inputs; each of the ``kinds``
+    has an equal share. The mask ``stay`` (MOTIONS,) selects those that stay within the bounds, whose outputs are ``y``.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class Subject:
 
     @cached_property
     def motions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Simulate them when they are needed."""
+        """Simulate the motions at the first use."""
         system, rng, steps = self.system, np.random.default_rng(3), max(1, round(self.duration / self.dt))
         x0 = system.draw_starts(rng, MOTIONS)
         if self.policy:
@@ -77,23 +78,23 @@ class Subject:
 
     @property
     def stay(self) -> np.ndarray:
-        """Which motions stay within the bounds."""
+        """Mask of the motions that stay within the bounds."""
         return np.isfinite(self.motions[0][-1]).all(-1)
 
     @property
     def y(self) -> np.ndarray:
-        """Outputs (steps + 1, n, ny) of the motions that stay."""
+        """Outputs (steps + 1, n, ny) of the motions that stay within the bounds."""
         return self.system.output(self.motions[0][:, self.stay])
 
     @property
     def followed(self) -> tuple[np.ndarray, np.ndarray]:
-        """States and inputs of those of the first kind that stay."""
+        """States and inputs of the motions of the first kind that stay within the bounds."""
         rows = np.flatnonzero(self.stay[: MOTIONS // len(self.kinds)])
         return self.motions[0][:, rows], self.motions[1][:, rows]
 
 
 def declaration(subject: Subject) -> Iterator[Finding]:
-    """States, inputs and parameters."""
+    """The states, inputs and parameters of the system."""
     system = subject.system
     inputs = ", ".join(f"{u_max:g}" for u_max in system.u_max)
     values = ", ".join(f"{name} = {value:g}" for name, value in system.parameters.items())
@@ -123,8 +124,9 @@ def equations(subject: Subject) -> Iterator[Finding]:
             bad = ~np.isfinite(np.array(rows)).all(0)
             if bad.any():
                 shares = f"{percent(bad[:COMPARED].mean())} of X and {percent(bad[COMPARED:].mean())} of 2X"
-                text = f"f or h is not a finite number in {shares}, such as at x = {point(x[bad][0])}"
-                advice = "draw the bounds, and X, where the equations hold, or change the equations"
+                point = ", ".join(f"{value:.3g}" for value in x[bad][0])
+                text = f"f or h is not a finite number in {shares}, such as at x = ({point})"
+                advice = "choose X and the bounds where the equations hold, or change the equations"
                 yield Finding("equations", "problem", text, advice)
             for j in range(0 if system.discrete else system.nu):
                 if not np.any(rows[system.nx + j : system.nx * (1 + system.nu) : system.nu]):
@@ -136,7 +138,7 @@ def equations(subject: Subject) -> Iterator[Finding]:
 
 
 def _everything(system: System, x: Any) -> list[Any]:
-    """All values of the equations at a state, one after the other."""
+    """All values of the equations at a state, in one list."""
     if system.discrete:
         return [*components(system.step, x, [0.5 * u_max for u_max in system.u_max]), *components(system.h, x)]
     g = [gij for row in input_matrix(system, x) for gij in row]
@@ -192,7 +194,7 @@ def sampling(subject: Subject) -> Iterator[Finding]:
 
 
 def outputs(subject: Subject) -> Iterator[Finding]:
-    """How far each output ranges, and how noisy it is."""
+    """The range of each output, and how noisy it is."""
     system, y, moving = subject.system, subject.system.output(of_X(subject.system, POINTS)), subject.y
     levels = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
     for i, level in enumerate(levels):

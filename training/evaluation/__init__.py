@@ -1,1 +1,1 @@
-"""Judging an observer: errors on unseen trajectories, coverage, faults, reports."""
+"""Evaluation of an observer: errors on unseen trajectories, coverage of covariances, faults, reports."""

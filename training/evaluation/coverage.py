@@ -1,4 +1,4 @@
-"""How many errors lie in the regions that covariances state, and how large the errors are against these."""
+"""Consistency of covariances: the shares of errors in their confidence regions, and the mean NEES."""
 
 from kkl_gym.system import System
 from observers import Artifact
@@ -7,8 +7,8 @@ from training.calibration import chi_square, squared_distance
 from training.evaluation.errors import UnseenTrajectories, estimates
 from training.evaluation.levels import Level
 
-REGIONS = {"50": 0.5, "90": 0.9, "99": 0.99}  # shares of the errors by their names in tables
-INTERVAL = 0.95  # of the mean NEES of a consistent filter
+REGIONS = {"50": 0.5, "90": 0.9, "99": 0.99}  # nominal shares of errors, by their names in tables
+INTERVAL = 0.95  # the mean NEES of a consistent filter lies within its limits with this probability
 
 
 def coverage(
@@ -22,8 +22,8 @@ def coverage(
 ) -> list[dict[str, float]]:
     """Compare covariances with errors on test trajectories; arguments are those of :func:`training.errors`.
 
-    Returns for each span of time the percentages of errors in the regions, of all states and of each ("90", "90 x1"),
-    the mean NEES, and the limits of that of a consistent filter.
+    Returns for each span of samples the percentages of errors in the regions, of all states together ("90") and of
+    each ("90 x1"), the mean NEES, and the limits between which that of a consistent filter lies.
     """
     x_hat, P = estimates(
         artifact, system, trajectories, measurement_noise=measurement_noise, seed=seed, covariances=True

@@ -8,7 +8,7 @@ import numpy as np
 from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.checks import noise_levels
+from observers.checks import noise_level, noise_levels
 from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
@@ -18,18 +18,18 @@ from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
 from training.trajectories.motions import Controller, draw_process_noise, random_inputs, under_policy
 
 TRANSIENT = 0.2  # part of a trajectory that the errors "after the transient" leave out
-MAX_TRIES = 1000  # starts in a row within X, after which none is expected beyond it
+MAX_TRIES = 1000  # after so many starts in a row within X, none is expected outside it
 
 Domain = Literal["X", "1.5X", "2X"]
 
 
 class NoStartsError(ValueError):
-    """There are no starts in a domain, or none from which trajectories stay within the bounds."""
+    """A domain holds no starts, or trajectories from all of them leave the bounds."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of each trajectory that stayed within bounds, (n,) and (n, nx)."""
+    """SMAPE over all samples and after the transient, (n,), and NRMSE after it, (n, nx), by trajectory."""
 
     full: np.ndarray
     late: np.ndarray
@@ -38,7 +38,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class UnseenTrajectories:
-    """Test trajectories, ``x`` (steps + 1, n, nx), measured without noise, and which of those drawn are inside."""
+    """Test trajectories ``x`` (steps + 1, n, nx) within the bounds; the mask ``inside`` is of all that were drawn."""
 
     x: np.ndarray
     u: np.ndarray
@@ -54,7 +54,7 @@ class UnseenTrajectories:
 
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts (n, nx), uniform in X, or in a multiple of X (as in the paper) without X itself."""
+    """Starts (n, nx), as the system draws them in X, or in a multiple of X (as in the paper) outside X itself."""
     if domain == "X":
         return system.draw_starts(rng, n)
     low, high = system.box()
@@ -87,12 +87,12 @@ def unseen_trajectories(
     policy: Controller | None = None,
     plant: System | None = None,
 ) -> UnseenTrajectories:
-    """Simulate test trajectories, whose random numbers training never draws.
+    """Simulate test trajectories from random numbers that no training draws.
 
     Parameters
     ----------
     system : System
-        The model of the observers. It has the starts, the scale of the noise and the inputs, and moves without a plant.
+        The model of the observers. It determines the starts, the scale of the noise and the inputs.
     dt : float
         Sampling interval in seconds.
     n : int
@@ -104,26 +104,28 @@ def unseen_trajectories(
     domain : {"X", "1.5X", "2X"}
         Where they start, see :func:`starts`.
     driven : bool
-        Whether inputs act: random bounded steps and sines in turn. Under a policy, whether it errs and explores.
+        Whether inputs act: random bounded steps and sines in turn. With a policy: whether it errs and explores.
     stream : Stream
-        Random numbers to draw: those of evaluation or those of validation.
+        The stream of random numbers: that of evaluation or that of validation.
     process_noise : float
         Level of the process noise, in multiples of the system's scale per second.
     policy : callable, optional
-        Acts on the system, see :func:`training.trajectories.motions.under_policy`; by default nothing does.
+        From states (n, nx) to actions (n, nu) in [-1, 1], which drive the trajectories.
     plant : System, optional
-        Moves in the place of the system, such as the same with other parameters (:meth:`kkl_gym.System.replace`).
+        The system to simulate, such as ``system`` with other parameters (:meth:`kkl_gym.System.replace`); by default
+        ``system``.
 
     Returns
     -------
     UnseenTrajectories
-        Those that stayed within the declared bounds of the plant, and which these are.
+        The trajectories that stayed within the bounds of the plant: ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu), and
+        the mask ``inside`` of them among all that were drawn.
 
     Raises
     ------
     ValueError
-        On an unknown domain, or unless n, duration, seed and level make sense, or if the plant has other numbers of
-        states, inputs or outputs than the system.
+        If ``domain``, ``n``, ``duration``, ``seed`` or ``process_noise`` is invalid, or the plant's numbers of states,
+        inputs or outputs differ from the system's.
     """
     moving = plant or system
     sizes, expected = ((each.nx, each.nu, each.ny) for each in (moving, system))
@@ -134,8 +136,7 @@ def unseen_trajectories(
     check_duration(duration, dt)
     if domain not in get_args(Domain):
         raise ValueError(f"domain must be one of {', '.join(get_args(Domain))}, got {domain!r}")
-    if not 0 <= process_noise < np.inf:
-        raise ValueError(f"process_noise must be finite and not negative, got {process_noise!r}")
+    process_noise = noise_level("process_noise", process_noise)
     rng = generator(stream, seed)
     x0 = starts(system, domain, n, rng)
     steps = round(duration / dt)
@@ -161,15 +162,15 @@ def errors(
     seed: int,
     skip: float | None = None,
 ) -> Errors:
-    """Errors of an observer on test trajectories. It is given the levels of noise, and nothing of another plant.
+    """Errors of an observer on test trajectories. The observer knows the noise levels, but not that the plant differs.
 
     Parameters
     ----------
     artifact : Artifact or None
         The observer; None for an extended Kalman filter that knows the system's equations, the inputs, both levels of
-        noise, and that starts are uniform in X.
+        noise, and the mean and covariance of the starts in X.
     system : System
-        Its model.
+        The model of the observer.
     trajectories : UnseenTrajectories
         Test trajectories.
     measurement_noise : float or sequence of float, length ny
@@ -177,12 +178,13 @@ def errors(
     seed : int
         Seed of the measurement noise.
     skip : float, optional
-        Seconds left out of ``late``; by default a fifth of the trajectories' length.
+        Length of the transient in seconds; by default a fifth of the trajectories' length.
 
     Returns
     -------
     Errors
-        One for each trajectory.
+        For each trajectory ``full`` (n,), the SMAPE over all samples; ``late`` (n,), the SMAPE after the transient; and
+        ``nrmse`` (n, nx) after the transient; all in percent.
 
     Raises
     ------
@@ -196,11 +198,11 @@ def errors(
 def noise_limit(
     system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int, skip: float | None = None
 ) -> Errors:
-    """Errors of an estimator that attains the posterior Cramér-Rao bound, which no unbiased causal one falls below.
+    """Errors of an estimator that attains the posterior Cramér-Rao bound, the least of any unbiased causal estimator.
 
-    Its errors are drawn from N(0, P), where P is the bound along each trajectory: it follows from the plant's exact
-    equations, its inputs, both levels of noise, and the variance of starts in X. Estimators with a bias, as of starts
-    uniform in a box, may have smaller errors in the first samples.
+    The errors are drawn from N(0, P), where P is the bound along each trajectory. The bound follows from the plant's
+    exact equations, its inputs, both noise levels, and the covariance of the starts in X. A biased estimator, such as
+    one that knows that starts are uniform in a box, may have smaller errors in the first samples.
 
     Parameters
     ----------
@@ -212,7 +214,7 @@ def noise_limit(
     Returns
     -------
     Errors
-        One for each trajectory.
+        For each trajectory, as :func:`errors` returns them.
 
     Raises
     ------
@@ -243,7 +245,7 @@ def estimates(
     seed: int,
     covariances: bool = False,
 ) -> tuple[np.ndarray, Any]:
-    """Estimates along test trajectories, (steps + 1, n, nx), and on request their covariances; as :func:`errors`."""
+    """Estimates (steps + 1, n, nx) along test trajectories, and their covariances or None; see :func:`errors`."""
     level, dt, u = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt, trajectories.u
     y, process_noise = measured(system, trajectories, level, seed), trajectories.process_noise
     if artifact is None:
@@ -254,7 +256,7 @@ def estimates(
 
 
 def measured(system: System, trajectories: UnseenTrajectories, measurement_noise: Level, seed: int) -> np.ndarray:
-    """Outputs of trajectories with noise, (steps + 1, n, ny)."""
+    """Noisy outputs (steps + 1, n, ny) of trajectories."""
     y = (trajectories.plant or system).output(trajectories.x)
     return y + np.asarray(measurement_noise) * generator(Stream.EVALUATION, seed, 1).standard_normal(y.shape)
 
@@ -262,7 +264,7 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Errors in % of estimated parameters after the transient: those of the plant, or else the system's last states."""
+    """Errors of estimated parameters after the transient, in percent of the plant's, or else of the last states."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
         raise ValueError(f"each of {trajectories.escaped} runs left bounds = {system.bounds}")

@@ -1,4 +1,4 @@
-"""Sensor faults, and how soon an observer's monitor detects them."""
+"""Simulated sensor faults, and the delay after which an observer's monitor detects them."""
 
 from collections.abc import Callable
 from typing import Literal, get_args
@@ -16,7 +16,7 @@ from training.trajectories.motions import Controller, Motions
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
-BIAS = 0.2  # of the output's range
+BIAS = 0.2  # size of a bias, in multiples of the output's range
 
 
 def simulate_faults(
@@ -30,12 +30,12 @@ def simulate_faults(
     policy: Controller | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> pd.DataFrame:
-    """Simulate sensors that fail in the middle of a trajectory, and the scores of an observer's monitor."""
+    """Simulate sensors that fail in the middle of a trajectory; return the scores and delays of the monitor."""
     deadline = profile(system).fault_deadline or duration / 5
     if not deadline <= duration / 2:
         raise ValueError(
-            f"a fault in the middle of {duration} s leaves less than the {deadline:g} s within which it is to be "
-            "detected; take a longer duration"
+            f"a fault in the middle of {duration} s leaves less than the deadline of {deadline:g} s to detect it; take "
+            "a longer duration"
         )
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
     steps = round(duration / dt)

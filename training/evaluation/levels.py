@@ -1,4 +1,4 @@
-"""Levels of measurement noise: reading, showing, and a map's range of them."""
+"""Levels of measurement noise: parsing, formatting, and the range that a map was trained for."""
 
 from collections.abc import Sequence
 
@@ -8,11 +8,11 @@ from kkl_gym.system import System
 from observers import Artifact
 from observers.checks import noise_levels
 
-Level = float | tuple[float, ...]  # standard deviation on each sample of y: of all outputs, or of each of them
+Level = float | tuple[float, ...]  # standard deviation of the noise on y: one for all outputs, or one for each
 
 
 def read_level(text: str) -> Level:
-    """Read a number, or one for each output with commas between them."""
+    """Parse one number, or one for each output, separated by commas."""
     try:
         levels = tuple(float(number) for number in text.split(","))
     except ValueError:
@@ -23,12 +23,12 @@ def read_level(text: str) -> Level:
 
 
 def show_level(level: float | Sequence[float]) -> str:
-    """For tables and titles: ``0.5``, or ``0.1, 0.3`` where outputs have levels of their own."""
+    """Format a level for tables and titles: ``0.5``, or ``0.1, 0.3`` where it differs by output."""
     return ", ".join(f"{each:g}" for each in np.atleast_1d(level))
 
 
 def as_cell(level: Level) -> float | str:
-    """For CSV files: a number wherever there is but one."""
+    """A level as CSV files hold it: a number, or a text where it differs by output."""
     return show_level(level) if isinstance(level, tuple) else level
 
 
@@ -38,7 +38,7 @@ def multiple(system: System, factor: float) -> Level:
 
 
 def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
-    """Return the given level, or the system's own within the map's range: the largest, where the map takes but one."""
+    """Return the given level, or the system's own cut to the map's range; its largest if the map takes only one."""
     if given is not None:
         return noise_levels("measurement_noise", given, system.ny)
     own = multiple(system, 1.0)
@@ -49,7 +49,7 @@ def level_for(artifact: Artifact, system: System, given: Level | None = None) ->
 
 
 def beyond(artifact: Artifact, level: Level) -> str:
-    """Why a level of measurement noise is invalid for a map; empty if it is not."""
+    """Return the reason why a level of measurement noise is invalid for a map, or an empty text."""
     try:
         if artifact.inverse.within(level) == level:
             return ""

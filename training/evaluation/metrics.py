@@ -1,7 +1,4 @@
-"""Measures of an estimate against the truth, one for each trajectory.
-
-An estimate that is not finite counts as one infinitely far away.
-"""
+"""Error measures of each trajectory; an estimate that is not finite counts as infinitely far from the state."""
 
 import numpy as np
 
@@ -11,7 +8,7 @@ from training.maps.coordinates import STILL
 def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     """Symmetric mean absolute percentage error (paper, sec. 8.3), in percent, between 0 and 200.
 
-    Mean over the steps of 2 |x - x_hat| / (|x| + |x_hat|) with Euclidean norms.
+    It is the mean over the steps of 2 |x - x_hat| / (|x| + |x_hat|) with Euclidean norms.
 
     Parameters
     ----------
@@ -23,7 +20,7 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     Returns
     -------
     ndarray, shape (n,)
-        Percent.
+        Error of each trajectory in percent.
 
     Raises
     ------
@@ -38,11 +35,11 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
 
 
 def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Root mean square error of each state over that state's standard deviation, in percent.
+    """Root mean square error of each state, in percent of that state's standard deviation.
 
-    The standard deviation is over all steps of all trajectories, those that are skipped included, so that motions that
-    come to rest do not make a small error a large one. Unlike one norm of all states, it knows no units. In tables
-    stands the median over the trajectories.
+    The standard deviation is over all steps of all trajectories, skipped ones included, so that small errors stay small
+    where motions come to rest. Unlike a norm of all states, it does not depend on units. Tables show the median over
+    the trajectories.
 
     Parameters
     ----------
@@ -54,7 +51,7 @@ def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     Returns
     -------
     ndarray, shape (n, nx)
-        Percent; NaN for a state that does not move.
+        Errors in percent; NaN for a state that does not move.
 
     Raises
     ------
@@ -71,7 +68,7 @@ def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
 
 
 def by_state(values: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of a CSV file from the values (n, nx) of :func:`nrmse`: nrmse1, nrmse2, ..., in the states' order."""
+    """Columns nrmse1, nrmse2, ... of a CSV file from the values (n, nx) of :func:`nrmse`."""
     return {f"nrmse{i + 1}": column for i, column in enumerate(values.T)}
 
 

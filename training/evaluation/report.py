@@ -1,4 +1,4 @@
-"""The picture of a training: errors of the networks, and estimates of motions that they were not trained on."""
+"""The figure of a training: losses of the networks, and estimates along motions that no training used."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from training.sources.simulated import SimulatedSource
 
 
 def write_report(path: Path, result: Result, source: Source | System) -> None:
-    """Draw the losses, and estimates of two motions of the calibration: without noise, and with the usual."""
+    """Draw the losses, and the estimates of two calibration motions: one without noise, and one at the usual level."""
     artifact = result.artifact
     if isinstance(source, System):
         source = SimulatedSource(source, settings_of(artifact.training))

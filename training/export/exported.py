@@ -21,7 +21,7 @@ from observers.unscented import weights as sigma_weights
 
 @dataclass(frozen=True)
 class Exported:
-    """An observer to export, the precision of its network and signals, and the levels of noise that it assumes."""
+    """An observer to export, the precision of its networks and signals, and the noise levels that it assumes."""
 
     artifact: Artifact
     name: str
@@ -49,20 +49,20 @@ class Exported:
 
     @property
     def maps(self) -> dict[str, InverseMap]:
-        """The inverse maps by their names: "driven", and where there is one "free", of motion without input."""
+        """The inverse maps by name: "driven", and "free" for motion without input where the artifact has one."""
         maps = {"driven": self.artifact.inverse, "free": self.artifact.free_inverse}
         return {name: inverse for name, inverse in maps.items() if inverse is not None}
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """Levels of measurement noise: one for all outputs, or one for each where T_inv takes so many."""
+        """Levels of measurement noise: one for all outputs, or one for each if T_inv takes one for each."""
         if self.artifact.inverse.noise_gain.ndim == 2:
             return tuple(np.broadcast_to(self.measurement_noise, self.artifact.ny).tolist())
         return (float(np.max(self.measurement_noise)),)
 
     @property
     def signals(self) -> dict[str, list[str]]:
-        """Names of the outputs y, the inputs u, and of x_hat: states, biases of outputs, then parameters."""
+        """Names of the outputs y, the inputs u, and the entries of x_hat: states, output biases, then parameters."""
         artifact, system = self.artifact, SYSTEMS.get(self.artifact.system)
         biases = np.flatnonzero(np.broadcast_to(artifact.training.get("bias", 0.0), artifact.ny))
         states = list(system.state_names) if system else _numbered("x", artifact.nx - len(biases))
@@ -76,7 +76,7 @@ class Exported:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """A description for the exported file, which JSON can hold."""
+        """Metadata of the exported file, in types that JSON has."""
         artifact = self.artifact
         metadata: dict[str, Any] = {"name": self.name, "artifact": self.source, "sha256": self.checksum}
         metadata |= {"system": artifact.system, "parameters": dict(artifact.parameters), "dt": artifact.filter.dt}
@@ -84,7 +84,7 @@ class Exported:
 
 
 def output_expression(artifact: Artifact) -> Expression | None:
-    """h(x), or None if the artifact does not hold it."""
+    """The output h(x), or None if the artifact does not hold it."""
     if artifact.C is None:
         return artifact.h
     rows = artifact.C.tolist()
@@ -92,7 +92,7 @@ def output_expression(artifact: Artifact) -> Expression | None:
 
 
 def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
-    """Weights of sigma points, and constants of divergence detection."""
+    """Weights of the sigma points, and constants of divergence detection."""
     watch = Supervision.of(motion, dt)
     weights = dict(zip(("middle", "middle_squares", "other"), sigma_weights(motion.nx), strict=True))
     others = {"trend_gain": watch.trend_gain, "inflation": INFLATION, "relinearisations": RELINEARISATIONS}
@@ -100,7 +100,7 @@ def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
 
 
 def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
-    """Scaling of the states; bounds, and mean and covariance of where motions start, of scaled states."""
+    """Scaling of the states; in scaled states the bounds, and the mean and covariance of starts."""
     low, high, mean = ((x - motion.x_offset) / motion.x_scale for x in (motion.low, motion.high, motion.mean))
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}
@@ -108,7 +108,7 @@ def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
 
 
 def identifier(name: str) -> str:
-    """Make an identifier of C of an observer's name: ``lorenz-spinn`` becomes ``lorenz_spinn``."""
+    """Make a C identifier from an observer's name: ``lorenz-spinn`` becomes ``lorenz_spinn``."""
     word = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
     return word if word[:1].isalpha() else f"observer_{word}".rstrip("_")
 

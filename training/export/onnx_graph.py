@@ -1,4 +1,4 @@
-"""The step as an ONNX graph: :class:`TorchObserver`, exported by Torch."""
+"""The step as an ONNX graph, which Torch exports from :class:`TorchObserver`."""
 
 import json
 import logging
@@ -16,13 +16,13 @@ OPSET = 18
 
 
 def onnx_model(exported: Exported) -> Any:
-    """Export the graph, with metadata."""
+    """Export the graph with metadata."""
     import onnx_ir
     from onnx import checker, helper
     from onnxscript import opset18
 
     def scalar(s: float, dtype: int = 1, layout: str = "", device: str = "", pin_memory: bool = False) -> Any:
-        """Torch's own translation makes floats of doubles."""
+        """Keep doubles, which Torch's own translation turns into floats."""
         value: Any = onnx_ir.tensor(s, dtype=onnx_ir.DataType(dtype))
         return opset18.Constant(value=value)
 
@@ -33,7 +33,7 @@ def onnx_model(exported: Exported) -> Any:
     example: dict[str, Tensor | None] = {"state": step.start(2)}
     example |= {name: torch.zeros(2, width, dtype=dtype) if width else None for name, width in widths.items()}
     batch = torch.export.Dim("batch")
-    # Torch warns that it lacks torchvision, and of itself.
+    # Torch warns of a missing torchvision, and of its own code.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -46,13 +46,13 @@ def onnx_model(exported: Exported) -> Any:
             dynamic_shapes=[None if value is None else {0: batch} for value in example.values()],
             custom_translation_table={torch.ops.aten.scalar_tensor.default: scalar},
             dynamo=True,
-            optimize=False,  # ONNX Runtime does so in a second, Torch in ten
+            optimize=False,  # ONNX Runtime optimises in a second, Torch in ten
             verbose=False,
         )
     assert program is not None
     model = program.model_proto
     for node in model.graph.node:
-        del node.metadata_props[:]  # the source in Torch, most of the file
+        del node.metadata_props[:]  # Torch's source lines, which make up most of the file
     model.graph.name = exported.name
     model.graph.doc_string = f"One step of the KKL observer {exported.source}; a row whose state is zeros starts again."
     model.producer_name, model.producer_version = "kkl-gym", kkl_gym.__version__
@@ -63,7 +63,7 @@ def onnx_model(exported: Exported) -> Any:
 
 
 class _Step(TorchObserver):
-    """A step, and the covariances after it."""
+    """A step that also returns the covariances after it."""
 
     def forward(  # type: ignore[override]
         self, state: Tensor, y: Tensor, u: Tensor | None, measurement_noise: Tensor | None, process_noise: Tensor | None

@@ -17,26 +17,30 @@ class TorchObserver(Module):
     """An observer's step as a module of Torch: batched, differentiable, on any device.
 
     The state is explicit: ``state, x_hat = observer(state, y, u)`` does for n rows what
-    :meth:`observers.KKLObserver.step` does, without monitor and known starts. A row of zeros has seen nothing, and
-    begins with the sample that it is given, which must be whole: :meth:`start` returns such rows, and
-    ``state * ~done[:, None]`` restarts some. A NaN in later ``y`` is a missing sample.
+    :meth:`observers.KKLObserver.step` does, without monitor and known starts. A state row of zeros marks a start: its
+    next sample is the first, and must not lack an output. :meth:`start` returns such rows, and
+    ``state * ~done[:, None]`` restarts the rows of finished episodes. A NaN in later ``y`` is a missing sample.
 
-    Gradients lead through the whole step, and to the weights. The filter's state and the tracker's covariance are
-    float64 whatever ``dtype`` is; after ``observer.float()``, T_inv's estimates are inaccurate.
+    The whole step is differentiable, also by the weights. The filter's state and the tracker's covariance are float64
+    whatever ``dtype`` is; after ``observer.float()``, T_inv's estimates are inaccurate.
 
     Parameters
     ----------
     artifact : Artifact
         The observer.
-    measurement_noise, process_noise, tracking : optional
-        As for :class:`observers.KKLObserver`.
+    measurement_noise : float or sequence of float, optional
+        Standard deviation of the noise on y, as for :class:`observers.KKLObserver`.
+    process_noise : float, optional
+        Level of the process noise, as for :class:`observers.KKLObserver`.
+    tracking : bool, optional
+        Whether to track, as for :class:`observers.KKLObserver`.
     dtype : torch.dtype, default torch.float32
-        Type of the networks and of the estimates; float32 as in NumPy, or float64.
+        Type of the networks and of the estimates: float32, as in NumPy, or float64.
 
     Raises
     ------
     ValueError
-        If an argument is invalid, as for :class:`observers.KKLObserver`, or ``dtype`` is not one of the two.
+        If an argument is invalid, as for :class:`observers.KKLObserver`, or ``dtype`` is neither float32 nor float64.
 
     Examples
     --------
@@ -74,11 +78,11 @@ class TorchObserver(Module):
         self.put(measurement_noise=level[None], process_noise=np.array([[checked.process_noise]]))
 
     def start(self, n: int) -> Tensor:
-        """Return the state of n rows that have seen nothing: zeros, (n, width)."""
+        """Return the state of n rows before their first sample: zeros, (n, width)."""
         return self.update.new_zeros(n, sum(self.widths))
 
     def estimate(self, state: Tensor) -> Tensor:
-        """Return the estimates of states (n, width): (n, nx), with estimated parameters behind them."""
+        """Return the estimates (n, nx) that states (n, width) hold, followed by estimated parameters."""
         x = torch.split(state, self.widths, 1)[3]
         if self.tracker is not None:
             x = self.tracker.states(x[:, : self.nx].T).T
@@ -92,9 +96,9 @@ class TorchObserver(Module):
         Parameters
         ----------
         state : Tensor, shape (n, width)
-            States that a step has returned.
+            States that a step returned.
         measurement_noise, process_noise : Tensor, optional
-            The levels of that step.
+            The noise levels of that step, as for :meth:`forward`.
 
         Returns
         -------
@@ -129,14 +133,14 @@ class TorchObserver(Module):
         u : Tensor, shape (n, nu), optional
             The inputs held since the samples before, by default zero.
         measurement_noise, process_noise : Tensor, shapes (n or 1, 1 or ny) and (n or 1, 1), optional
-            Levels for each row in place of those of the observer; of measurement noise one, or one for each output.
+            Noise levels of each row, by default the observer's; of measurement noise one, or one for each output.
 
         Returns
         -------
         state : Tensor, shape (n, width)
             The next state.
         x_hat : Tensor, shape (n, nx)
-            The estimates, and behind the states estimated parameters.
+            The estimates, followed by estimated parameters.
         """
         begins = state[:, :1] == 0
         samples, before, z, rest = torch.split(torch.where(begins, 0.0, state), self.widths, 1)
@@ -152,7 +156,7 @@ class TorchObserver(Module):
         if self.tracker is not None:
             tracked, expected = self.tracker.advance(rest.T, y.T, u.T, begins[:, 0], levels[0].T, levels[1].T)
             y = filled(expected.T)
-        elif self.h is not None:  # once more, from T_inv of what the guess leads to
+        elif self.h is not None:  # a second prediction uses T_inv of the state that the first one leads to
             guess = filtered(filled(self.h(rest.T).T))
             y = filled(self.h(self._of_map(guess, TorchMap.__call__, age, *levels).T).T)
         else:
@@ -167,13 +171,13 @@ class TorchObserver(Module):
         return state, self.estimate(state)
 
     def _levels(self, measurement_noise: Tensor | None, process_noise: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Levels of noise, by default those of the observer; the first is cut at the largest in training."""
+        """Noise levels, by default those of the observer; measurement noise is cut at its largest level in training."""
         level = self.measurement_noise if measurement_noise is None else measurement_noise.to(self.update.dtype)
         process_level = self.process_noise if process_noise is None else process_noise.to(self.update.dtype)
         return torch.minimum(level, self.driven.measurement_noise_max), process_level
 
     def _of_map(self, z: Tensor, method: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
-        """Values (n, m) of a map's method: in each row of that of free motion until an input has acted."""
+        """Values (n, m) of a map's method: the free map's in rows on which no input has acted yet."""
         driven = method(self.driven, z, *arguments)
         if self.free is None:
             return driven
@@ -181,7 +185,7 @@ class TorchObserver(Module):
 
 
 class TorchMap(Module):
-    """T_inv, and the covariance of its error: rows (n, .)."""
+    """T_inv and the covariance of its error, for rows (n, .)."""
 
     def __init__(self, inverse: InverseMap, dtype: torch.dtype) -> None:
         super().__init__()
@@ -197,7 +201,7 @@ class TorchMap(Module):
             self.put(levels=error.levels, ages=error.ages, error=table)
 
     def forward(self, z: Tensor, age: Tensor, level: Tensor, process_level: Tensor) -> Tensor:
-        """The estimates (n, nx), of filter states (n, size) at ages (n, 1) in seconds."""
+        """The estimates (n, nx) from filter states (n, size) at ages (n, 1) in seconds."""
         inputs = [(z @ self.whiten - self.offset) / (1.0 + level**2 @ self.squared_gain)]
         for name, value in zip(FEATURES[2:], (level, process_level, age), strict=True):
             if name in self.features:
@@ -206,10 +210,10 @@ class TorchMap(Module):
         return self.x_offset + self.x_scale * self.network(torch.cat(inputs, 1))
 
     def share(self, level: Tensor) -> Tensor:
-        """Levels (n, 1) in multiples of the largest in training, of the noisiest output."""
+        """Levels (n, 1) over the largest in training, by the output where this ratio is greatest."""
         return (level / self.measurement_noise_max).amax(1, keepdim=True)
 
     def covariance(self, _: Tensor, age: Tensor, level: Tensor) -> Tensor:
-        """The covariances of its error, (n, nx^2), at ages (n, 1) in seconds."""
+        """The covariances (n, nx^2) of T_inv's errors at ages (n, 1) in seconds."""
         by_age = between(self.share(level), self.levels, self.error)
         return between(age, self.ages, by_age.reshape(by_age.shape[0], len(self.ages), -1))

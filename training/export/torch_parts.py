@@ -1,4 +1,4 @@
-"""Networks, expressions, tables and factors as functions of Torch that export, compile and differentiate."""
+"""Networks, expressions, tables and matrix factors in Torch, for export, compilation and gradients."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -12,11 +12,11 @@ from observers.expression import Expression
 from observers.network import MLP
 from training.maps.networks import from_mlp
 
-LEAST_PIVOT = 1e-30  # a variance of scaled states
+LEAST_PIVOT = 1e-30  # least variance of scaled states that a factorisation divides by
 
 
 def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A function of tensors that also takes numbers, as doubles, and conditions."""
+    """A function of tensors that also takes numbers, which become doubles, and bools."""
 
     def tensor(value: Any) -> Tensor:
         return torch.tensor(value, dtype=torch.bool if isinstance(value, bool) else torch.float64)
@@ -24,21 +24,21 @@ def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return lambda *arguments: function(*(each if isinstance(each, Tensor) else tensor(each) for each in arguments))
 
 
-# By NumPy's names, which the source of expressions holds.
+# Torch's functions under NumPy's names, which the source of expressions calls.
 _SAME = "sin cos tan exp log sqrt tanh abs sign floor minimum maximum where arctan2 logical_and logical_or logical_not"
 _FUNCTIONS = {name: getattr(torch, name) for name in _SAME.split()} | {"power": torch.pow, "mod": torch.remainder}
 _NUMPY = SimpleNamespace(**{name: _of_tensors(function) for name, function in _FUNCTIONS.items()})
 
 
 class Module(nn.Module):
-    """A module with buffers of doubles."""
+    """A module whose buffers are doubles."""
 
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any: ...
 
     def put(self, **arrays: np.ndarray) -> None:
-        """Add buffers."""
+        """Add arrays as buffers."""
         for name, values in arrays.items():
             self.register_buffer(name, torch.tensor(np.asarray(values, dtype=float)))
 
@@ -51,7 +51,7 @@ class Network(Module):
         self.layers: Any = from_mlp(mlp, dtype=dtype).requires_grad_(True)
 
     def forward(self, h: Tensor) -> Tensor:
-        """Evaluate in the type of the weights; returns the type that was given."""
+        """Evaluate in the type of the weights; the result has the type of ``h``."""
         result: Tensor = self.layers(h.to(self.layers[0].weight.dtype))
         return result.to(h.dtype)
 
@@ -62,13 +62,13 @@ class TorchExpression(Expression):
     _numpy = _NUMPY
 
     def __call__(self, x: Tensor, u: Tensor | None = None) -> Tensor:  # type: ignore[override]
-        """Evaluate it."""
+        """Evaluate the expression."""
         rows = [*x[: self.states], *(() if u is None else u[: self.inputs])]
         return torch.stack([(torch.zeros_like(x[0]) + value).to(x.dtype) for value in self._function(*rows)])
 
 
 def between(at: Tensor, points: Tensor, values: Tensor) -> Tensor:
-    """Values (k, m) at rising points (k,), interpolated at (n, 1): (n, m); beyond the last its value stays."""
+    """Interpolate values (k, m) at rising points (k,): (n, m) at ``at`` (n, 1), constant beyond the ends."""
     if len(points) == 1:
         return values[..., 0, :]
     passed = ((at - points[:-1]) / (points[1:] - points[:-1])).clamp(0.0, 1.0)
@@ -81,10 +81,10 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def eliminated(P: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
-    """L and B L^-T, one above the other, of covariances P = L L^T (m, m, n) and matrices B (k, m, n) of more rows.
+    """Factors L of covariances P = L L^T (m, m, n), and below them B L^-T of the matrices B = ``rows`` (k, m, n).
 
-    Returns also where P is positive definite, (n,). Where it is not, pivots are replaced by small ones, so that
-    gradients stay finite. Above its diagonal L holds rounding errors.
+    Returns also where P is positive definite, (n,). Elsewhere small pivots replace its own, so that gradients stay
+    finite. Above its diagonal L holds rounding errors.
     """
     rest, columns, pivots = torch.cat([P, *rows]), [], []
     for j in range(len(P)):

@@ -1,4 +1,4 @@
-"""The tracker's recursion (:mod:`observers.tracker`) in Torch, for all rows alike; they are the last axis here."""
+"""The tracker's recursion (:mod:`observers.tracker`) in Torch, for a batch of rows along the last axis."""
 
 import math
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from training.export.exported import tracker_arrays, tracker_numbers
 from training.export.torch_parts import Module, Network, TorchExpression, between, eliminated, product
 
 Tracked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Scaled states, covariance, NIS, mean square of the trend, number of samples seen, trend (ny, n)."""
+"""Scaled states, covariance, NIS, mean square of the trend, number of samples, trend (ny, n)."""
 Prediction = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Means (nx, n), covariances (nx, nx, n), those with the states before (nx, nx, n), and where they are sound (n,)."""
+"""Means (nx, n), covariances (nx, nx, n), cross-covariances with the states before (nx, nx, n), validity (n,)."""
 
 
 class TorchTracker(Module):
-    """The tracker of an artifact: between :meth:`advance` and :meth:`supervise` the filter takes in the sample."""
+    """The tracker of an artifact; between :meth:`advance` and :meth:`supervise` the KKL filter takes in the sample."""
 
     def __init__(self, artifact: Artifact, dtype: torch.dtype) -> None:
         super().__init__()
@@ -48,19 +48,19 @@ class TorchTracker(Module):
         self.put(levels=factors.levels, ages=factors.ages, factors=factors.factors[0], most=factors.factors[-1])
 
     def covariance(self, state: Tensor, age: Tensor, share: Tensor, process_share: Tensor) -> Tensor:
-        """Calibrated covariances (n, nx^2) at ages (n, 1), and at levels (n, 1) in multiples of the largest."""
+        """Calibrated covariances (n, nx^2) at ages (n, 1) and at noise levels (n, 1) over the largest."""
         table = self.factors + process_share.clamp(max=1.0)[..., None] * (self.most - self.factors)
         factor = between(age, self.ages, between(share, self.levels, table).log()[..., None]).exp()
         return factor * (self._unpacked(state)[1] * self.units).flatten(0, 1).T
 
     def states(self, s: Tensor) -> Tensor:
-        """Scaled states (nx, n) in their units."""
+        """Convert scaled states (nx, n) to their units."""
         return s * self.x_scale + self.x_offset
 
     def advance(
         self, state: Tensor, y: Tensor, u: Tensor, begins: Tensor, measurement_noise: Tensor, process_noise: Tensor
     ) -> tuple[Tracked, Tensor]:
-        """Predict, and correct by y (ny, n), NaN where missing; also returns predicted outputs. NIS is inf if lost."""
+        """Predict, then correct by y (ny, n), NaN where missing; return predicted outputs, too. NIS is inf if lost."""
         Q = self.eye * ((process_noise.clamp(min=self.least_process_noise) * self.process_noise) ** 2 + self.error**2)
         R = self.eye_y * torch.maximum(measurement_noise, self.least_measurement_noise) ** 2
         numbers, (x0, P0, nis, square, seen, trend) = self.numbers, self._unpacked(state)
@@ -92,12 +92,12 @@ class TorchTracker(Module):
         ), expected
 
     def supervise(self, tracked: Tracked, x_hat: Tensor, covariance: Callable[[Tensor], Tensor]) -> Tensor:
-        """Take T_inv's estimates (nx, n) where its covariances, given ages, are smaller, or the filter diverged."""
+        """Take T_inv's estimates (nx, n) where their covariances, given ages, are smaller or the tracker diverged."""
         x, P, nis, square, seen, trend = tracked
-        learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)  # z depends on so much for certain
+        learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)  # z holds at least so many samples
         lost, learned = ~(nis <= self.numbers["limit"]), learned.reshape(P.shape) / self.units
         of_learned, own = (eliminated(each)[0].diagonal().log().sum(1) for each in (learned, P))
-        taken = lost | ((seen < self.window) & (of_learned < own))  # by their determinants
+        taken = lost | ((seen < self.window) & (of_learned < own))  # determinants are compared
         x = torch.where(taken, self._within((x_hat - self.x_offset) / self.x_scale), x)
         P = torch.where(taken, learned, P).flatten(0, 1)
         nis, square = torch.where(lost, 1.0, nis), torch.where(lost, 1.0, square)
@@ -108,7 +108,7 @@ class TorchTracker(Module):
         return x, P.reshape(self.nx, self.nx, -1), statistics[0], statistics[1], statistics[2], trend
 
     def _predicted(self, x: Tensor, P: Tensor, u: Tensor, Q: Tensor, G: Tensor, white: Tensor) -> Prediction:
-        """Predict x and P, with the motion linearised about x + G white and P - G G^T."""
+        """Predict x and P; the motion is linearised about the mean x + G white and the covariance P - G G^T."""
         rows, sound = eliminated(P - product(G, G), G.transpose(0, 1).expand(-1, -1, x.shape[1]))
         L, H = rows[: self.nx], rows[self.nx :]
         mean, S, E = self._transformed(x + (G * white).sum(1), L, self._moved, u)
@@ -118,7 +118,7 @@ class TorchTracker(Module):
     def _relinearised(
         self, x: Tensor, P: Tensor, prediction: Prediction, new: Tensor, y: Tensor, u: Tensor, Q: Tensor, R: Tensor
     ) -> Prediction:
-        """Predict again where rows are new, with the motion linearised about the start that the sample corrects."""
+        """Predict new rows again, with the motion linearised about the start as the sample corrects it."""
         nx, (mean, S, across, sound) = self.nx, prediction
         V, white, _, known = self._corrected(mean, S, y, R)
         rows, solvable = eliminated(S, across, V.transpose(0, 1))
@@ -128,7 +128,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """V and white, by which samples make mean + V white and P - V V^T; expected outputs; where V is sound."""
+        """V and white, which correct to mean + V white and P - V V^T; expected outputs; validity of V (n,)."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)
@@ -145,18 +145,18 @@ class TorchTracker(Module):
     def _transformed(
         self, x: Tensor, L: Tensor, function: Callable[[Tensor, Tensor], Tensor], u: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """A function of Gaussians, by sigma points: means, covariances, and E, L E^T being the covariance with x."""
+        """Means and covariances of a function of Gaussians by sigma points, and E with the covariance L E^T with x."""
         middle, far, count = x[:, None], self.far * L, 1 + 2 * self.nx
         to = function(torch.cat([middle, middle + far, middle - far], 1).flatten(1), u.repeat(1, count))
         to = to.reshape(len(to), count, -1)
-        if function == self._output:  # where it is undefined, that of the mean
+        if function == self._output:  # where h is undefined, its value at the mean serves
             to = torch.where(to.isfinite(), to, to[:, :1])
         mean = (to * self.weights).sum(1)
         off, (plus, minus) = to - mean[:, None], torch.split(to[:, 1:], self.nx, 1)
         return mean, product(off * self.square_weights, off), self.far * self.numbers["other"] * (plus - minus)
 
     def _moved(self, s: Tensor, u: Tensor) -> Tensor:
-        """Scaled states (nx, n) a sample later."""
+        """Scaled states (nx, n) one sample later."""
         s = self._within(s)
         if hasattr(self, "flow"):
             q = torch.cat([s, u / self.u_scale])
@@ -165,7 +165,7 @@ class TorchTracker(Module):
         return (moved - self.x_offset) / self.x_scale
 
     def _output(self, s: Tensor, _: Tensor) -> Tensor:
-        """Outputs of scaled states (nx, n); where they are undefined, those within the bounds."""
+        """Outputs of scaled states (nx, n); where undefined, those of the states cut to the bounds."""
         assert self.h is not None
         y, near = (self.h(self.states(each)) for each in (s, self._within(s)))
         return torch.where(y.isfinite(), y, near)

@@ -1,1 +1,1 @@
-"""Learning the maps: networks, coordinates, batches, the forward map T, its inverse, and the optimisation loop."""
+"""Learning the maps: networks, coordinates, the forward map T, its inverse T_inv, and their batches."""

@@ -1,4 +1,4 @@
-"""What networks read and give: coordinates of z with the noise in them, and scaled states."""
+"""Inputs and outputs of the networks: whitened coordinates of z with their noise, and scaled states."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -9,10 +9,9 @@ import scipy
 from observers import LinearFilter
 from training.config import Scaling
 
-# Modes of z that vary less than this part of the largest are left out, as they hold rounding errors.
-SMALLEST_MODE = 1e-7
-STILL = 1e-12  # part of a component's size below which its standard deviation is rounding
-SETTLED = np.log(1e3)  # time constants after which a filter has forgotten its start to one part in a thousand
+SMALLEST_MODE = 1e-7  # modes of z with smaller singular values, over the largest, hold rounding errors
+STILL = 1e-12  # a smaller standard deviation, over the component's size, is rounding error
+SETTLED = np.log(1e3)  # time constants after which a thousandth of a filter's start is left
 LEAST = 0.1  # added to the mean square of a scaled state, so that errors of small states do not dominate
 
 
@@ -20,8 +19,8 @@ LEAST = 0.1  # added to the mean square of a scaled state, so that errors of sma
 class Coordinates:
     """Coordinates of z in which the signal has unit covariance and stationary noise a diagonal one.
 
-    The components of z are nearly collinear, with variances that spread over ten orders of magnitude; a network
-    in float32 cannot read them unless they are whitened.
+    A network in float32 cannot read z itself: its components are nearly collinear, and their variances spread over ten
+    orders of magnitude.
 
     Shapes: ``offset`` (size,), ``whiten`` (modes, size), ``noise_gain`` (modes,).
     """
@@ -31,7 +30,7 @@ class Coordinates:
     noise_gain: np.ndarray
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
-        """Filter states (..., size) to coordinates (..., modes)."""
+        """Map filter states (..., size) to coordinates (..., modes)."""
         return np.asarray((z - self.offset) @ self.whiten.T)
 
 
@@ -50,13 +49,13 @@ def coordinates(z: np.ndarray, noise: np.ndarray, silent: np.ndarray | None = No
 
 
 def spread(z: np.ndarray) -> np.ndarray:
-    """Standard deviations of a filter's states (n, size), in any units; 1 where one does not move."""
+    """Standard deviations (size,) of a filter's states (n, size); 1 where a component does not move."""
     deviation = z.std(0)
     return np.where(deviation > STILL * np.abs(z).max(0), deviation, 1.0)
 
 
 def settling_time(linear: LinearFilter) -> float:
-    """Time in seconds after which the filter has forgotten its start to one part in a thousand."""
+    """Time in seconds after which a thousandth of the filter's start is left."""
     return float(SETTLED / linear.slowest)
 
 
@@ -74,7 +73,7 @@ def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
 
 
 def stationary_covariance(linear: LinearFilter) -> np.ndarray:
-    """Limit of :func:`noise_covariance` at great ages, (ny, size, size)."""
+    """Limit (ny, size, size) of :func:`noise_covariance` at large ages."""
     phi, (early, late, _) = linear.transition, _columns(linear)
     drive = phi @ late + early
     return np.array([scipy.linalg.solve_discrete_lyapunov(phi, one) for one in drive @ drive.mT]) + late @ late.mT
@@ -86,7 +85,7 @@ def _columns(linear: LinearFilter) -> list[np.ndarray]:
 
 
 def root(covariance: np.ndarray) -> np.ndarray:
-    """Matrices R with R R^T = covariance, (..., size, size), also where rounding made small eigenvalues negative."""
+    """Matrices R (..., size, size) with R R^T = covariance; eigenvalues that rounding made negative count as 0."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
@@ -102,7 +101,7 @@ class StateScale:
 
     @classmethod
     def of(cls, x: np.ndarray, scaling: Scaling, *, nx: int | None = None) -> Self:
-        """Find the scale of some states. Shapes: ``x`` (..., nx)."""
+        """Make the scale of some states (..., nx)."""
         axes = tuple(range(x.ndim - 1))
         if scaling == "relative":
             offset, scale = x.mean(axes), x.std(axes)

@@ -1,4 +1,4 @@
-"""The forward map T as a physics-informed network (paper, sec. 5): its equation, its risk, its output layer."""
+"""The forward map T as a physics-informed network (paper, sec. 5): its equation, risk and output layer."""
 
 import math
 from collections.abc import Callable
@@ -15,18 +15,18 @@ from training.config import Config
 from training.maps.coordinates import StateScale, spread
 from training.maps.networks import Network, compiled, tensor
 
-SOLVED = 20_000  # pairs, and points, from which the output layer is solved for in the end
-RIDGE = 1e-5  # of the least squares for it, over the mean column of their matrix
+SOLVED = 20_000  # number of pairs, and of points, in the least squares for the output layer
+RIDGE = 1e-5  # of these least squares, over the root mean square column norm of their matrix
 
 
 def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
-    """A system's f or h, which take and give components, on states (n, nx), as (n, components)."""
+    """Evaluate a system's f or h, which work on components, on states (n, nx); returns (n, components)."""
     values = components(equations, x.unbind(-1))
     return torch.stack([(x.new_zeros(len(x)) + value).to(x.dtype) for value in values], -1)
 
 
 def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Values of a network at x and their derivatives along f; by hand, as torch.compile has no forward mode."""
+    """Values of a network at x and derivatives along f, by hand, as torch.compile lacks forward-mode derivatives."""
     for layer in network:
         if isinstance(layer, nn.Linear):
             x, f = layer(x), f @ layer.weight.T
@@ -43,10 +43,10 @@ def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[tor
 class ForwardProblem(nn.Module):
     """The physics-informed risk R_S1(theta) (paper, eq. emp-risk-theta) of a forward network.
 
-    mean |z - T(x)|^2 over simulated pairs + nu * mean |dT/dx f(x) - A T(x) - B h(x)|^2 over collocation points. Each z
-    counts in units of its standard deviation, in both terms. The residual of each component is divided by the local
-    speed of the scaled motion plus the rate of its mode, so that fast regions do not drown the rest (the authors'
-    released code weights by the speed as well).
+    It is mean |z - T(x)|^2 over simulated pairs + nu * mean |dT/dx f(x) - A T(x) - B h(x)|^2 over collocation points.
+    Both terms measure each component of z in its standard deviation. Each component's residual is divided by the local
+    speed of the scaled motion plus the rate of its mode, so that fast regions do not dominate (the authors' released
+    code weights by the speed as well).
 
     Shapes: ``pairs`` (n, nx) and (n, nz), ``points`` (m, nx).
     """
@@ -76,7 +76,7 @@ class ForwardProblem(nn.Module):
         self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """The risk on a batch of pairs and as many collocation points."""
+        """The risk on a batch of pairs and of as many collocation points."""
         shape, device = (self.config.batch,), self._x.device
         rows = torch.randint(len(self._x), shape, generator=generator, device=device)
         points = torch.randint(len(self._points), shape, generator=generator, device=device)
@@ -91,7 +91,7 @@ class ForwardProblem(nn.Module):
         return data + self.config.physics_weight * physics, data.sqrt()
 
     def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """dT/dx f - A T - B h (n, nz), in units of z per second, and |f| in scaled states (n,), at x (n, nx)."""
+        """At x (n, nx): dT/dx f - A T - B h (n, nz), in units of z per second, and |f| (n,) of scaled states."""
         f, h = on_tensors(self.system.f, x) / self._x_scale, on_tensors(self.system.h, x)
         value, derivative = along(self.network, (x - self._x_offset) / self._x_scale, f)
         T, derivative = self._z_offset + self._z_scale * value, self._z_scale * derivative
@@ -99,12 +99,12 @@ class ForwardProblem(nn.Module):
 
     @torch.no_grad()
     def solve_output_layer(self, rng: np.random.Generator, report: Callable[[int], object] = lambda done: None) -> None:
-        """Put the output layer where it minimises the risk for the features phi that the other layers have learned.
+        """Minimise the risk over the output layer, given the features phi that the other layers have learned.
 
         In the coordinates of A's eigenvectors, dT/dx f = A T + B h is one linear equation for each component of T: with
         T_i = w . phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point. Pairs add
-        T_i = z_i. Both are solved in the mean square, in float64 and on more samples than a batch has, by a QR
-        factorisation with a small ridge.
+        T_i = z_i. A QR factorisation with a small ridge solves the least squares in float64, on more samples than a
+        batch has.
         """
         *hidden, last = self.network.to(device="cpu", dtype=torch.float64)
         assert isinstance(last, nn.Linear)
@@ -137,15 +137,14 @@ class ForwardProblem(nn.Module):
         self.network.to(device=device, dtype=torch.float32)
 
     def forward_map(self) -> ForwardMap:
-        """The learned map for NumPy."""
+        """Return the learned map for NumPy."""
         return ForwardMap(self.network.export(), self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
 
 
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:
-    """First sample k* by which at most epsilon is left of the filter's start along every trajectory.
+    """First sample k* at which at most ``epsilon`` of the filter's start is left along every trajectory.
 
-    t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, where the logarithm's argument is
-    printed upside down).
+    t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, which prints the logarithm's argument inverted).
     """
     x0 = system.draw_starts(np.random.default_rng(0), 10_000, box_factor)
     z0 = float(np.linalg.norm(linear.start(system.output(x0)), axis=-1).max())
@@ -160,13 +159,11 @@ def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon
 
 
 def transients(T: np.ndarray, z0: np.ndarray, *, linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
-    """Filter states along trajectories by T alone: z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)).
-
-    For an exact T this is the filter's own state at every age, so that none needs to be simulated (paper, sec. 3).
+    """Filter states z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)) along trajectories, exact for an exact T (paper, sec. 3).
 
     Shapes: ``T`` (m, n, nz), ``z0`` (n, nz), ``ages`` (m,); returns (m, n, nz).
     """
     poles, V = np.linalg.eig(linear.A)
-    left = np.exp(ages[:, None] * linear.dt * poles)  # of each mode
+    left = np.exp(ages[:, None] * linear.dt * poles)  # remainder of each mode
     start = np.linalg.solve(V, (z0 - T[0]).T).T
     return T + np.real((left[:, None] * start) @ V.T)

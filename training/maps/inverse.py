@@ -1,4 +1,4 @@
-"""The inverse T_inv: batches along motions or of T(x), and what its training minimises on them."""
+"""The inverse T_inv: batches along motions or of T(x), and the loss of its network."""
 
 import math
 from typing import Any, NamedTuple, Protocol
@@ -20,16 +20,16 @@ from training.maps.coordinates import (
 from training.maps.networks import Network, compiled, tensor
 from training.trajectories.motions import Pairs
 
-MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
-AGE_UNIT = 5  # samples, in the age feature log(1 + t / unit)
-# Of samples with several outputs, the share in which all outputs have the same part of their largest noise levels.
+MEASUREMENT_NOISE_UNIT = 0.04  # unit in the noise feature log(1 + sigma_v / unit), over the usual level
+AGE_UNIT = 5  # unit in the age feature log(1 + t / unit), in samples
+# With several outputs, the share of samples in which all outputs have the same fraction of their largest noise levels.
 ALIKE = 0.5
-SAMPLES = 100_000  # of z, from which coordinates are found
-PROCESS_NOISE_UNIT = 0.1  # of the highest level, in the process noise feature log(1 + level / unit)
+SAMPLES = 100_000  # largest number of samples of z that determine its coordinates
+PROCESS_NOISE_UNIT = 0.1  # unit in the process noise feature log(1 + level / unit), over the highest level
 
 
 class Batch(NamedTuple):
-    """Samples on which the inverse is fitted, with the weight and the cell of each."""
+    """Samples to fit the inverse to, with the weight and the cell of each."""
 
     inputs: torch.Tensor
     x: torch.Tensor
@@ -38,7 +38,7 @@ class Batch(NamedTuple):
 
 
 class Sampler(Protocol):
-    """Batches for T_inv, in cells whose errors are made equally small, and the map that a network on them makes."""
+    """Draws batches for T_inv, in cells that count equally in the loss, and makes an inverse map of a network."""
 
     cells: int = 1
     kinds_of_plant: int = 1
@@ -46,31 +46,30 @@ class Sampler(Protocol):
     _map: dict[str, Any]
 
     def __call__(self, generator: torch.Generator) -> Batch:
-        """One batch."""
-        ...
+        """Draw a batch."""
 
     def inverse_map(self, mlp: MLP) -> InverseMap:
-        """The map of a network that was trained on these batches."""
+        """Make the inverse map of a network that was trained on these batches."""
         return InverseMap(mlp=mlp, **self._map)
 
 
 class TrajectorySampler(Sampler):
-    """Batches along trajectories: every age since reset, every noise level up to ``measurement_noise_max``.
+    """Batches along trajectories, with all ages since reset and all noise levels up to ``measurement_noise_max``.
 
-    Noise is drawn from the covariance that the filter gives it at each age, and added to noise-free z. The network
-    that fits such data in the mean square is the conditional mean of x.
+    Noise is added to noise-free z; its covariance is that of the filter's response to measurement noise at each age. A
+    network that fits such data in the mean square approximates the conditional mean of x.
 
-    The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall into
-    ``cells`` of like age and levels, and the loss divides each by its cell's recent error. Where parameters differ,
-    motions of the system's own, whose errors can be smaller, have cells of their own.
+    The least errors differ by orders of magnitude between ages and noise levels. Samples therefore fall into ``cells``
+    of similar age and levels, and the loss divides a sample's error by its cell's recent error. Motions with the
+    system's own parameters, whose errors can be smaller, have cells of their own.
 
     Shapes: ``error`` (size, size), ``silent`` (size, k).
     """
 
     AGES_PER_BATCH = 32
-    LEVELS = 6  # cells of noise level, the one without noise aside
+    LEVELS = 6  # cells of noise level, without the cell of no noise
     AGE_CELLS = 8
-    PROCESS_CELLS = 3  # no process noise, weak and strong
+    PROCESS_CELLS = 3  # no, weak and strong process noise
 
     def __init__(
         self,
@@ -119,7 +118,7 @@ class TrajectorySampler(Sampler):
         self._x, self._weight = tensor(scale(data.x), device), tensor(scale.weight(data.x), device)
         self._gain, self._gains = tensor(gain, device), tensor(np.atleast_2d(gains)[:, None], device)
         self._level_max, self._level_unit = (tensor(values[:, None], device) for values in (largest, unit))
-        # Noise in units of the stationary one, so that its covariances are well conditioned.
+        # Noise in units of stationary noise, so that its covariances are well conditioned.
         relative = whiten / np.where(gain > 0, gain, 1.0)[:, None]
         saturated = np.minimum(data.ages, int(np.ceil(2 * settling_time(linear) / linear.dt)))
         self._noise_root = tensor(root(relative @ noise_covariance(linear, saturated) @ relative.T), device)
@@ -134,14 +133,14 @@ class TrajectorySampler(Sampler):
             part = data.process_noise / process_noise_max
             self._process = tensor(np.log1p(part / PROCESS_NOISE_UNIT), device)
             trajectory_cell, self._trajectory_cells = (part > 0).astype(int) + (part > 0.5), self.PROCESS_CELLS
-        if data.nominal is not None:  # the system's own parameters
+        if data.nominal is not None:  # cells of motions with the system's own parameters
             trajectory_cell, self.kinds_of_plant = 2 * trajectory_cell + data.nominal, 2
             self._trajectory_cells *= 2
         self._trajectory_cell = torch.as_tensor(trajectory_cell, device=device)
         self.cells = self.AGE_CELLS * (1 + self.LEVELS) * self._trajectory_cells
 
     def __call__(self, generator: torch.Generator) -> Batch:
-        """One batch."""
+        """Draw a batch."""
         device = self._x.device
         m, n, _ = self._x.shape
         ages = torch.randint(m, (self.AGES_PER_BATCH, 1), generator=generator, device=device)
@@ -170,7 +169,7 @@ class TrajectorySampler(Sampler):
         )
 
     def _draw_levels(self, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Levels of measurement noise, (ages, ny, rows), and how far along their two decades they are, 0 to 1."""
+        """Positions of noise levels along their two decades, 0 to 1, and the levels, (ages, ny, rows) each."""
         shape = (self.AGES_PER_BATCH, len(self._level_max), self._per_age)
         quiet = self._config.noise_free_share
         position = (torch.rand(shape, generator=generator, device=generator.device) - quiet) / (1 - quiet)
@@ -184,16 +183,16 @@ class TrajectorySampler(Sampler):
 
 
 def _float_or_tuple(values: np.ndarray) -> float | tuple[float, ...]:
-    """A number for one output, a tuple for several, as inverse maps hold them."""
+    """A number for one output or a tuple for several, as inverse maps hold them."""
     return tuple(values.tolist()) if len(values) > 1 else float(values[0])
 
 
 class ForwardMapSampler(Sampler):
-    """The paper's second data set S_2: drawn x', z' = T(x') by the map (sec. 5.2), without transients.
+    """The paper's second data set S_2 (sec. 5.2): drawn points x' with z' = T(x'), without transients.
 
     The filter's z differs from T(x) by the error of T, which an inverse fitted to T(x') alone would magnify by its
-    Lipschitz constant (paper, lemma R-eta-bound). z' is therefore blurred by Gaussian noise with the covariance of that
-    error, measured on the forward map's own data, and each coordinate is shrunk to its linear conditional mean.
+    Lipschitz constant (paper, lemma R-eta-bound). Gaussian noise with the covariance of that error, measured on the
+    forward map's own data, is therefore added to z', and each coordinate is shrunk to its linear conditional mean.
 
     Shapes: ``error`` (nz, nz), its covariance, ``points`` (n, nx).
     """
@@ -218,7 +217,7 @@ class ForwardMapSampler(Sampler):
         }
 
     def __call__(self, generator: torch.Generator) -> Batch:
-        """One batch."""
+        """Draw a batch."""
         device = self._x.device
         rows = torch.randint(len(self._x), (self._batch,), generator=generator, device=device)
         modes = self._modes[rows]
@@ -228,7 +227,7 @@ class ForwardMapSampler(Sampler):
 
 
 class InverseProblem(nn.Module):
-    """The inverse network with the running mean square error of each cell."""
+    """The inverse network, with a running mean square error for each cell."""
 
     def __init__(self, network: Network, sampler: Sampler, device: torch.device) -> None:
         super().__init__()
@@ -240,19 +239,19 @@ class InverseProblem(nn.Module):
         self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, each cell relative to its own running error; geometric mean of these errors."""
+        """Mean square error of a batch, relative to its cells' running errors; geometric mean of the running errors."""
         risk, error = self._risk(*self.sampler(generator))
         return {"loss": risk, "error": error}
 
     def risk(
         self, inputs: torch.Tensor, x: torch.Tensor, weight: torch.Tensor, cell: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The loss of a batch, and its error."""
+        """The loss of a batch, and the geometric mean of the cells' running errors."""
         apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
         square = weight * apart[:, :nx].mean(-1)
-        if self.sampler.parameters:  # cells of their own, for they are as hard where states are easy
+        if self.sampler.parameters:  # they have cells of their own: they are hard also where states are easy
             square = torch.cat([square, apart[:, nx:].mean(-1)])
-            # Not apart for the system's own: a map would give these for every plant that is near.
+            # All plants share these cells, or the map would return the system's own parameters for near plants.
             cell = torch.cat([cell, self.sampler.cells + cell // self.sampler.kinds_of_plant])
         detached = square.detach()
         count = torch.zeros_like(self.error).index_add_(0, cell, torch.ones_like(detached))
@@ -260,6 +259,6 @@ class InverseProblem(nn.Module):
         keep = torch.where(count > 0, 0.99, 1.0)
         self.error.mul_(keep).add_((1 - keep) * mean)
         self.visited.logical_or_(count > 0)
-        # Cells without data do not count.
+        # The mean leaves out cells that have had no data.
         error = (torch.where(self.visited, self.error.log(), 0.0).sum() / self.visited.sum()).exp().sqrt()
         return (square / self.error[cell]).mean(), error

@@ -1,4 +1,4 @@
-"""Torch networks and their way into artifacts."""
+"""Torch networks, and their conversion to and from the networks of artifacts."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU, "re
 
 
 class Network(nn.Sequential):
-    """A multilayer perceptron that begins with Glorot's normal weights and no biases."""
+    """A multilayer perceptron, initialised with Glorot's normal weights and zero biases."""
 
     def __init__(self, inputs: int, outputs: int, *, width: int, depth: int, activation: str) -> None:
         widths = [inputs] + [width] * depth
@@ -35,11 +35,11 @@ class Network(nn.Sequential):
         return cls(inputs, outputs, width=config.width, depth=config.depth, activation=config.activation)
 
     def linear_layers(self) -> list[nn.Linear]:
-        """The layers that hold weights, in order."""
+        """The linear layers in order."""
         return [layer for layer in self if isinstance(layer, nn.Linear)]
 
     def export(self) -> MLP:
-        """The same network for NumPy."""
+        """Return the same network for NumPy."""
         layers = self.linear_layers()
         return MLP(
             [layer.weight.detach().float().cpu().numpy() for layer in layers],
@@ -49,7 +49,7 @@ class Network(nn.Sequential):
 
 
 def averaged(members: Sequence[MLP]) -> MLP:
-    """The mean of some networks of one shape, as one network: their hidden layers stand side by side."""
+    """The mean of networks of one shape as one network, with their hidden layers side by side."""
     first, *hidden, last = zip(*(member.weights for member in members), strict=True)
     *biases, offsets = zip(*(member.biases for member in members), strict=True)
     return MLP(
@@ -60,12 +60,12 @@ def averaged(members: Sequence[MLP]) -> MLP:
 
 
 def compiled(function: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
-    """On a GPU replay a function and its derivatives as CUDA graphs, with TF32 products; on a CPU leave it as it is."""
+    """Compile a function and its derivatives to CUDA graphs with TF32 products; on a CPU return it unchanged."""
     if device.type != "cuda":
         return function
     torch.set_float32_matmul_precision("high")
     run = torch.compile(function, mode="reduce-overhead")
-    return torch._dynamo.config.patch(suppress_errors=True)(run)  # as it is, where the compiler fails
+    return torch._dynamo.config.patch(suppress_errors=True)(run)  # unchanged if the compiler fails
 
 
 def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
@@ -74,7 +74,7 @@ def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
 
 
 def from_mlp(mlp: MLP, *, dtype: torch.dtype = torch.float32) -> nn.Sequential:
-    """Put a multilayer perceptron for NumPy into torch, not to be trained further."""
+    """Convert a multilayer perceptron for NumPy to torch, with frozen weights."""
     layers: list[nn.Module] = []
     for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
         layer = nn.Linear(weight.shape[1], weight.shape[0], dtype=dtype)

@@ -1,4 +1,4 @@
-"""Checks of well-formed records: their signals, values and steps of time."""
+"""Checks of well-formed records: signals, values and time steps."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -10,13 +10,13 @@ from training.records.record import LONGEST_GAP, ROLES, Record, median_step
 
 Warn = Callable[[str], object]
 
-OTHER_CLOCK = 30.0  # times the steps of a record, the longest sampling interval that it is put on
+OTHER_CLOCK = 30.0  # a sampling interval of more steps of a record suggests another unit of time
 WHOLE_TURN = 0.9 * 2 * np.pi, 2 * np.pi + 0.1  # least and largest jump of a wrapped angle
-FAR_OFF = 10.0  # ranges of all other samples, between these and a value that marks missing ones
+FAR_OFF = 10.0  # a value farther from all others than so many of their ranges may mark missing samples
 
 
 def check_signals(records: Sequence[Record], system: System | None = None) -> None:
-    """Raise ValueError unless all records have the same columns, and as many of them as a system has signals."""
+    """Raise ValueError unless all records have the same columns, and their numbers fit the system."""
     if not records:
         raise ValueError("no records are given")
     first = records[0]
@@ -34,7 +34,7 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
 
 
 def check_alike(record: Record, names: Mapping[str, Sequence[str]], environment: Any, other: str) -> None:
-    """Raise ValueError unless a record has the signals ``names`` by role and is of an environment, as ``other`` is."""
+    """Raise ValueError unless a record has the signals ``names`` (by role) and the environment that ``other`` has."""
     for role, there in names.items():
         if (here := getattr(record.signals, role)) != tuple(there):
             here, there = (", ".join(each) or "none" for each in (here, there))
@@ -48,7 +48,7 @@ def check_alike(record: Record, names: Mapping[str, Sequence[str]], environment:
 
 
 def check_motion(records: Sequence[Record], warn: Warn) -> None:
-    """Raise ValueError if a signal never moves; warn of wrapped angles and of values that mark missing samples."""
+    """Raise ValueError if a signal never moves; warn of wrapped angles and of values that may mark missing samples."""
     least, most = WHOLE_TURN
     for letter, role in (("y", "measured"), ("x", "hidden")):
         for j, column in enumerate(getattr(records[0].signals, role)):
@@ -80,7 +80,7 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
 
 
 def check_dt(records: Sequence[Record], dt: float) -> None:
-    """Raise ValueError unless records were sampled often enough for a sampling interval."""
+    """Raise ValueError unless the time steps of records fit a sampling interval."""
     for record in records:
         step = median_step(record)
         if not dt / OTHER_CLOCK < step <= LONGEST_GAP * dt:

@@ -1,4 +1,4 @@
-"""Episodes of an environment as records, and the Minari data sets in which they are exchanged. Nothing in one runs."""
+"""Episodes of an environment as records, and as Minari data sets. Reading runs no code from a data set."""
 
 import copy
 import json
@@ -22,14 +22,14 @@ from training.records.record import Record, Signals
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
-PREFIX = "minari:"  # of the name of a data set among names of files
-KEY = "kkl_gym"  # of the metadata for which Minari has no place
-METADATA = "data/metadata.json"  # in the folder of a data set
+PREFIX = "minari:"  # marks names of data sets among names of files
+KEY = "kkl_gym"  # key of the metadata that Minari does not define
+METADATA = "data/metadata.json"  # path in the folder of a data set
 
 
 @dataclass(frozen=True)
 class Episode:
-    """The steps from a reset to the end. Shapes: ``rewards`` (n,), ``infos`` (n + 1, ...)."""
+    """The n steps from a reset to the end. Shapes: ``rewards`` (n,), ``infos`` (n + 1, ...)."""
 
     observations: Any
     actions: Any
@@ -40,7 +40,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Episodes of one environment."""
+    """Episodes of one environment, with its spaces and the names of the signals."""
 
     name: str
     environment: Mapping[str, Any] | None
@@ -52,7 +52,7 @@ class Rollouts:
     spec: "EnvSpec | None" = None
 
     def records(self, wanted: Signals | None = None) -> list[Record]:
-        """Read the wanted signals of each episode, by default those of the rollouts."""
+        """Make a record of each episode with the wanted signals, by default those of the rollouts."""
         wanted, space = wanted or Signals(), self.observation_space
         if wanted.time:
             raise ValueError(f"{self.name}: episodes have equal steps and no column of time; leave --time out")
@@ -99,7 +99,7 @@ def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
         folder = _folder(name.removeprefix(PREFIX)) if name.startswith(PREFIX) else Path(name)
         written = json.loads((folder / METADATA).read_text(encoding="utf-8"))
         if "observation_space" not in written or "action_space" not in written:
-            raise ValueError("its spaces are missing")  # Minari would make the environment, whatever that runs
+            raise ValueError("its spaces are missing")  # Minari would make the environment, which runs its code
         dataset = minari.MinariDataset((folder / METADATA).parent)
         metadata, spec = dataset.storage.metadata, dataset.env_spec
         own = metadata.get(KEY, {})
@@ -109,7 +109,7 @@ def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
             Episode(one.observations, one.actions, one.rewards, bool(one.terminations[-1:].any()), one.infos or {})
             for one in dataset.iterate_episodes()
         ]
-    except Exception as error:  # whatever a damaged file leads to
+    except Exception as error:  # a damaged file may raise anything
         raise ValueError(f"{name} cannot be read as a Minari data set: {error}") from error
     if not episodes:
         raise ValueError(f"{name} holds no episode")
@@ -129,7 +129,7 @@ def write_dataset(rollouts: Rollouts, *, policy: str) -> Path:
         minari.namespace.create_namespace(namespace)
     for name in ("entry_point", "vector_entry_point"):
         if callable(getattr(spec, name, None)):
-            setattr(spec, name, None)  # JSON has no place for classes and functions
+            setattr(spec, name, None)  # JSON cannot hold classes and functions
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=UNFINISHED) as temporary:
         whole = Path(temporary) / "whole"
@@ -160,11 +160,11 @@ def write_dataset(rollouts: Rollouts, *, policy: str) -> Path:
 
 
 def dataset_folder(name: str) -> Path:
-    """The folder of a data set that is to be written; an error if none can be written there."""
+    """The folder for a new data set; an error if the name is invalid, taken, or cannot be written."""
     try:
         _minari().dataset.minari_dataset.parse_dataset_id(name)
     except (TypeError, ValueError):
-        raise ValueError(f"a Minari data set is called as in pendulum/random-v0, got {name!r}") from None
+        raise ValueError(f"a Minari data set needs a name such as pendulum/random-v0, got {name!r}") from None
     folder = _folder(name)
     if folder.exists():
         raise ValueError(f"there is a data set {name} already; name another (--dataset), or `minari delete {name}`")

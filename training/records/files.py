@@ -1,4 +1,4 @@
-"""Records from NPZ, CSV and Parquet files and Minari data sets. Nothing in a file runs."""
+"""Records from NPZ, CSV and Parquet files and Minari data sets. Reading runs no code from a file."""
 
 import csv
 import re
@@ -18,7 +18,7 @@ from training.records.checks import Warn, check_motion, check_signals
 from training.records.episodes import is_dataset, read_dataset
 from training.records.record import ROLES, Record, Signals
 
-MISSING = ["na", "none", "NONE", "Null", "Nan", "Na"]  # beside what pandas takes for missing cells
+MISSING = ["na", "none", "NONE", "Null", "Nan", "Na"]  # missing cells, beside those that pandas recognises
 SEPARATORS = ",;\t"
 TIMES = ("t", "time")  # usual names of the column of time
 Columns = Mapping[str, Any]
@@ -31,7 +31,7 @@ def read_records(
     system: System | None = None,
     warn: Warn | None = None,
 ) -> list[Record]:
-    """Read records, one from each file or episode, and check them."""
+    """Read a record from each file, or from each episode of a data set, and check them."""
     paths = [Path(path) for path in files]
     if not paths:
         raise ValueError(f"name a file of recorded data, {', '.join(READERS)}, or a data set, minari:ID (--data)")
@@ -52,13 +52,13 @@ def read_records(
 
 
 def _read(path: Path, wanted: Signals) -> Record:
-    """Read the wanted signals of a file, and those of the usual names where none are named."""
+    """Read the wanted signals of a file; roles without names take the usual columns."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(
             f"{path} is not a record: its name must end in {', '.join(READERS)}, or be minari:ID of a data set"
         )
-    if not path.is_file():  # to read a pipe may never end
+    if not path.is_file():  # reading a pipe may never end
         raise ValueError(f"{path} is a folder, a pipe or a device" if path.exists() else f"there is no file {path}")
     try:
         return _record(path, wanted, reader(path))
@@ -66,7 +66,7 @@ def _read(path: Path, wanted: Signals) -> Record:
         raise
     except UnicodeDecodeError:
         raise ValueError(f"{path} is not in UTF-8: save it in this encoding") from None
-    except Exception as error:  # whatever a damaged file leads to
+    except Exception as error:  # a damaged file may raise anything
         raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
 
 
@@ -93,7 +93,7 @@ def _record(path: Path, wanted: Signals, columns: Columns) -> Record:
 
 
 def _named(wanted: Signals, columns: tuple[str, ...]) -> Signals:
-    """The wanted signals, those of the usual names in place of empty ones; ValueError if a column is missing."""
+    """The wanted signals, or the usual columns for roles without names; ValueError if a column is missing."""
     signals = replace(
         wanted,
         time=wanted.time or next((name for name in TIMES if name in columns), TIMES[0]),
@@ -112,13 +112,13 @@ def _named(wanted: Signals, columns: tuple[str, ...]) -> Signals:
 
 
 def _column(signal: str, columns: Iterable[str]) -> tuple[str, Callable[..., np.ndarray]]:
-    """The column of a signal, and the function that is taken of it; a column may itself be called cos(...)."""
+    """The column of a signal, and the function to apply to it; a column may itself be named cos(...)."""
     match = None if signal in columns else re.fullmatch(rf"({'|'.join(FUNCTIONS)})\((.+)\)", signal)
     return (signal, np.asarray) if match is None else (match[2].strip(), FUNCTIONS[match[1]])
 
 
 def _numbered(letter: str, columns: tuple[str, ...]) -> tuple[str, ...]:
-    """The column that is a letter alone, or those of the letter with numbers."""
+    """The column named by the letter alone, or the columns named by the letter and a number."""
     if letter in columns:
         return (letter,)
     numbered = [name for name in columns if re.fullmatch(rf"{letter}[0-9]+", name)]
@@ -126,7 +126,7 @@ def _numbered(letter: str, columns: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _seconds(values: Any, column: str) -> np.ndarray:
-    """Times in seconds; dates, or their text in ISO 8601, count from the first."""
+    """Times in seconds; dates, or ISO 8601 texts of dates, count from the first."""
     import pandas as pd
 
     values = pd.Series(values)
@@ -198,7 +198,7 @@ def _csv(path: Path) -> Columns:
         if twice := sorted({name for name in names if name and names.count(name) > 1}):
             raise ValueError(f"more than one column {', '.join(twice)}")
         for row, cells in enumerate(csv.reader(file, **layout), 1):
-            if len(cells) not in (0, len(names)):  # pandas would fill or cut it
+            if len(cells) not in (0, len(names)):  # pandas would fill or cut such a row
                 raise ValueError(f"row {row} has {len(cells)} cells, the header {len(names)}: {shown(names)}")
     layout |= {"header": None, "skiprows": 1, "names": range(len(names)), "na_values": MISSING}
     frame = pd.read_csv(path, encoding="utf-8-sig", **layout)

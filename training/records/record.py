@@ -1,4 +1,4 @@
-"""A record: samples of a plant's outputs, and of its inputs and states where they were recorded."""
+"""A record: samples of a plant's outputs, and of its inputs and states if they were recorded."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -12,18 +12,18 @@ from scipy.interpolate import PchipInterpolator
 from observers import LinearFilter
 from observers.checks import real_array
 
-ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # of the arrays' columns, as Signals calls them
-MAX_SAMPLE = 1e100  # sums of squares are finite up to there
-LONGEST_GAP = 3.0  # steps between samples across which is interpolated
-ROUNDING = 1e-6  # of a step, by which times may be off
+ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # fields of Signals with the names of the columns
+MAX_SAMPLE = 1e100  # sums of squares stay finite up to this size
+LONGEST_GAP = 3.0  # samples at most so many steps apart are interpolated
+ROUNDING = 1e-6  # tolerance of times, in steps
 
 
 @dataclass(frozen=True)
 class Signals:
-    """The columns of records by their roles; files are searched for the usual names of empty ones.
+    """The names of a record's columns by role; an empty role stands for the usual names.
 
-    A measured, an input or a hidden signal is the name of a column, or ``cos(column)`` or ``sin(column)`` of an angle
-    in rad.
+    A measured, input or hidden signal is the name of a column, or ``cos(column)`` or ``sin(column)`` of an angle in
+    rad.
     """
 
     time: str = ""
@@ -65,16 +65,24 @@ class Record:
         names: dict[str, Any] = {"time": self.signals.time or "t"}
         columns = [("t", names["time"], self.t)]
         for letter, role in ROLES.items():
-            if (values := getattr(self, letter)) is not None:
-                names[role] = self._names(letter, role, values)
-                columns += [(letter, name, column) for name, column in zip(names[role], values.T, strict=True)]
+            if (values := getattr(self, letter)) is None:
+                continue
+            if values.ndim != 2 or len(values) != len(self.t) or not values.shape[1]:
+                raise ValueError(
+                    f"{self.name}: {letter} must have shape ({len(self.t)}, n) as there are {len(self.t)} times, "
+                    f"got {values.shape}"
+                )
+            names[role] = getattr(self.signals, role) or tuple(f"{letter}{i + 1}" for i in range(values.shape[1]))
+            if len(names[role]) != values.shape[1]:
+                raise ValueError(f"{self.name}: {letter} has {values.shape[1]} columns, but {role} = {names[role]}")
+            columns += [(letter, name, column) for name, column in zip(names[role], values.T, strict=True)]
         object.__setattr__(self, "signals", replace(self.signals, **names))
         for letter, name, column in columns:
             missing, back = np.isnan(column), np.append(False, np.diff(self.t) <= 0)
             for wrong, why in (
                 (abs(column) > MAX_SAMPLE, "{0:g} is not a valid sample"),
                 (missing & missing.all(), "no row holds a number"),
-                (missing & (letter in "tu"), "a number is missing, which may be in outputs and states alone"),
+                (missing & (letter in "tu"), "a number is missing; only outputs and states may lack some"),
                 (back & (letter == "t"), "time must increase, but {0:g} comes after {1:g}"),
             ):
                 if wrong.any():
@@ -82,21 +90,8 @@ class Record:
                     why = why.format(column[row], column[row - 1])
                     raise ValueError(f"{self.name}: column {name}, row {row + 1}: {why}")
 
-    def _names(self, letter: str, role: str, values: np.ndarray) -> tuple[str, ...]:
-        """Names of an array's columns, numbered where none are given; ValueError if the array's shape is invalid."""
-        if values.ndim != 2 or len(values) != len(self.t) or not values.shape[1]:
-            raise ValueError(
-                f"{self.name}: {letter} must have shape ({len(self.t)}, n) as there are {len(self.t)} times, "
-                f"got {values.shape}"
-            )
-        names: tuple[str, ...] = getattr(self.signals, role)
-        names = names or tuple(f"{letter}{i + 1}" for i in range(values.shape[1]))
-        if len(names) != values.shape[1]:
-            raise ValueError(f"{self.name}: {letter} has {values.shape[1]} columns, but {role} = {names}")
-        return names
-
     def part(self, rows: slice) -> "Record":
-        """Some rows of the record, two at least; without states where none of these rows has all of them."""
+        """At least two rows of the record; without states if no row has all of them."""
         u, x = (None if values is None else values[rows] for values in (self.u, self.x))
         if x is not None and np.isnan(x).any(-1).all():
             x = None
@@ -117,19 +112,19 @@ class Record:
 
 
 def median_step(*records: Record) -> float:
-    """Median of the steps of time in seconds, of one record or several."""
+    """Median time step in seconds of one record or several."""
     return float(np.median(np.concatenate([np.diff(record.t) for record in records])))
 
 
 def sampling_interval(*records: Record) -> float:
-    """The median step in seconds, of no more digits than the times agree on, two at least."""
+    """The median step in seconds, with as many digits as the times agree on, at least two."""
     uneven = max(map(jitter, records))
     digits = 12 if uneven < 1e-12 else int(np.clip(-np.log10(uneven), 2, 12))
     return float(f"{median_step(*records):.{digits}g}")
 
 
 def jitter(record: Record) -> float:
-    """Largest deviation of a step from the median step over it, gaps of samples aside."""
+    """Largest deviation of a time step from the median step, over the median step; gaps do not count."""
     steps = np.diff(record.t) / median_step(record)
     return float(np.max(abs(steps - np.maximum(steps.round(), 1.0))))
 
@@ -137,10 +132,10 @@ def jitter(record: Record) -> float:
 def resampled(record: Record, dt: float | None = None) -> Record:
     """Put a record on a uniform grid that begins with its first sample.
 
-    Outputs are linear between samples, as the filter takes them for: the value at a time of the grid is there one
-    sample later at most. States, which no observer sees, follow a monotone cubic (PCHIP). Both are NaN between samples
-    of their own column that are more than 3 dt apart. An input, held between samples, is averaged over each interval of
-    the grid. On a record that has this grid nothing but rounding changes.
+    Outputs are interpolated linearly, as the filter assumes, so that a value needs only the next sample. States, which
+    no observer sees, follow a monotone cubic (PCHIP). Both are NaN between samples of their own column that are more
+    than 3 dt apart. Inputs, held between samples, are averaged over each interval of the grid. A record that already
+    has this grid changes only by rounding.
     """
     dt = median_step(record) if dt is None else dt
     if not 0 < dt <= record.duration * (1 + ROUNDING):
@@ -154,7 +149,7 @@ def resampled(record: Record, dt: float | None = None) -> Record:
 
 
 def _interpolated(record: Record, name: str, values: np.ndarray, t: np.ndarray, *, smooth: bool) -> np.ndarray:
-    """A column at the times t of a grid; NaN in gaps."""
+    """Interpolate a column at the times t of a grid; NaN in gaps."""
     there = ~np.isnan(values)
     at, values, dt = record.t[there], values[there], t[1] - t[0]
     close = np.zeros(len(t), dtype=bool)
@@ -162,7 +157,7 @@ def _interpolated(record: Record, name: str, values: np.ndarray, t: np.ndarray, 
         after = np.clip(np.searchsorted(at, t - ROUNDING * dt), 1, len(at) - 1)
         inside = (t >= at[0]) & (t <= at[-1]) & (at[after] - at[after - 1] <= LONGEST_GAP * dt * (1 + ROUNDING))
         close = inside | (np.minimum(abs(t - at[after - 1]), abs(t - at[after])) <= ROUNDING * dt)
-    if close.sum() < 2 or not (smooth or (close[1:] & close[:-1]).any()):  # a filter takes one sample after the other
+    if close.sum() < 2 or not (smooth or (close[1:] & close[:-1]).any()):  # a filter needs consecutive samples
         raise ValueError(
             f"{record.name}: column {name}: no samples are less than {LONGEST_GAP:g} dt = {LONGEST_GAP * dt:.3g} s "
             "apart; take a larger dt"
@@ -171,7 +166,7 @@ def _interpolated(record: Record, name: str, values: np.ndarray, t: np.ndarray, 
 
 
 def _held(record: Record, t: np.ndarray, dt: float) -> np.ndarray | None:
-    """Means of held inputs over the intervals that begin at t; the last input holds on."""
+    """Means of held inputs over the intervals that begin at t; the last input is held beyond the end."""
     if record.u is None:
         return None
     ends = np.append(record.t, max(record.t[-1], t[-1]) + 2 * dt)
@@ -181,7 +176,7 @@ def _held(record: Record, t: np.ndarray, dt: float) -> np.ndarray | None:
 
 
 def pieces(records: Iterable[Record]) -> list[Record]:
-    """Split records where a row lacks an output: no filter runs across a gap."""
+    """Split records at rows that lack an output, as no filter runs across a gap."""
     parts = []
     for record in records:
         whole = ~np.isnan(record.y).any(-1)
@@ -191,10 +186,10 @@ def pieces(records: Iterable[Record]) -> list[Record]:
 
 
 class Windows:
-    """Samples of records one after the other, with a filter along each record between two gaps.
+    """All samples of some records, concatenated, with a filter that runs along each piece between gaps.
 
-    Shapes: ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx), NaN where it is unknown, ``before`` and ``after`` (n,), how
-    many samples without a gap there are on both sides, and ``z`` (n, size).
+    Shapes: ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx), NaN where unknown, ``z`` (n, size), and ``before`` and
+    ``after`` (n,): numbers of samples in the same piece before and after each.
     """
 
     def __init__(self, records: Iterable[Record], linear: LinearFilter, nx: int) -> None:
@@ -208,7 +203,7 @@ class Windows:
         self.u, self.x = np.concatenate([np.zeros((0, nu)), *u]), np.concatenate([np.zeros((0, nx)), *x])
 
     def rows(self, age: int = 0) -> np.ndarray:
-        """Samples with a state that have at least ``age`` before them."""
+        """Indices of samples with a known state and at least ``age`` samples before them."""
         return np.flatnonzero((self.before >= age) & ~np.isnan(self.x).any(-1))
 
     @cached_property
@@ -222,11 +217,7 @@ class Windows:
         return z
 
     def restarted(self, rows: np.ndarray, age: int) -> np.ndarray:
-        """The filter's states at ``rows`` if it had started ``age`` samples before.
-
-        The filter is linear: its state then differs by transition^age times the difference at that start, so that no
-        window is filtered by itself.
-        """
+        """The filter's states at ``rows`` if it had started ``age`` samples before, which follow by linearity."""
         began = rows - age
         power = np.linalg.matrix_power(self.linear.transition, age)
         return np.asarray(self.z[rows] + (self.linear.start(self.y[began]) - self.z[began]) @ power.T)

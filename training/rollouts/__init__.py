@@ -30,35 +30,36 @@ def learn(
     console: Console | ProgressBars | None = None,
     **settings: Any,
 ) -> Artifact:
-    """Learn an observer for any environment from rollouts in which the hidden signals are seen.
+    """Learn an observer for any environment from rollouts that contain the hidden signals.
 
     Parameters
     ----------
     env_id : str
-        As ``gym.make`` takes it.
+        Id of the environment, as for ``gym.make``.
     measured, hidden : sequence of str or int
-        What the observer sees, and what it estimates, one of each at least: indices in the flattened observation,
-        keys of a Dict, or ``info[key]``, see :func:`kkl_gym.named.resolved`.
+        Signals that the observer measures and that it estimates, at least one each: indices in the flattened
+        observation, keys of a Dict, or ``info[key]``, see :func:`kkl_gym.named.resolved`.
     policy : str or callable
-        Who acts, see :func:`training.rollouts.policy_of`. Estimates are good where it has been.
+        "random", "wandering", "script.py:function", an agent as in "ppo:FILE.zip", or a function from observations to
+        actions. Estimates are accurate where it has been.
     episodes, steps : int, optional
-        How much is played, to whichever is reached first; by default 100,000 steps.
+        Length of the play, whichever is reached first; by default 100,000 steps.
     env_kwargs : mapping of str to object, optional
         Arguments of the environment.
     seed : int
-        Of the rollouts and of the training.
+        Seed of the rollouts and of the training.
     out : str or Path, optional
-        A folder, which then receives checkpoints and ENV_ID.safetensors; by default nothing is written.
+        Folder for checkpoints and ENV_ID.safetensors; by default nothing is written.
     console : rich.console.Console or ProgressBars, optional
         Where progress is shown; by default nowhere.
     **settings : object
-        Of :class:`training.Config`, such as ``tracking=False``.
+        Settings of :class:`training.Config`, such as ``tracking=False``.
 
     Returns
     -------
     Artifact
-        The observer, which tracks where the measured signals are among the hidden ones or sums of them;
-        ``training["held_out_errors"]`` are its errors on episodes that were not trained on.
+        The observer. It tracks if each measured signal is a hidden one or a weighted sum of them.
+        ``training["held_out_errors"]`` are its errors on episodes that were held out.
 
     Raises
     ------
@@ -67,7 +68,7 @@ def learn(
     """
     from training.lessons import train  # torch takes seconds to import
 
-    # Errors before anything is played. Settings that follow from rollouts are not known yet.
+    # Invalid settings must raise before anything is played; the rollouts will determine the others.
     if not np.size(hidden):
         raise ValueError("name the hidden signals, which the observer is to estimate, as in hidden=[2]")
     settings = {"seed": seed} | settings

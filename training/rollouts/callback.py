@@ -1,4 +1,4 @@
-"""Observers that are refitted on an agent's own episodes while it learns, with stable-baselines3."""
+"""A callback of stable-baselines3 that refits an observer on an agent's own episodes while the agent learns."""
 
 import math
 import os
@@ -26,13 +26,13 @@ from training.records.checks import check_alike
 from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
-QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again
-LONGEST = 250  # steps of a piece: episodes without an end are cut, so that some of each can be held out
+QUICK = {"members": 1, "inverse_steps": 1000}  # less than in a first training, as refits repeat
+LONGEST = 250  # steps of a piece; long episodes are cut, so that some pieces of each can be held out
 
 
 @dataclass(frozen=True)
 class Refit:
-    """A refit: the observer in use after it, whether that is a new one, and errors on held-out episodes."""
+    """A refit: the observer in use after it, whether the new one was taken, and held-out errors before and after."""
 
     artifact: Artifact
     taken: bool
@@ -41,7 +41,7 @@ class Refit:
     steps: int
 
     def __str__(self) -> str:
-        """The errors, on one line."""
+        """Format the errors on one line."""
         errors = f"error {self.error:.3g} after {self.before:.3g}" if self.taken else f"error still {self.error:.3g}"
         return f"refitted the observer at step {self.steps}: {errors}"
 
@@ -49,51 +49,51 @@ class Refit:
 class KKLTrainingCallback(BaseCallback):
     """Refits the observer in :class:`kkl_gym.KKLObservation` on the episodes of the agent that is being trained.
 
-    Estimates are accurate where the rollouts have been that the observer was learned from; an agent in training goes
-    elsewhere. A refit fits T_inv, and with it the covariances and the flow, to all episodes that are kept, but for a
-    share that is held out for good; the new observer is used unless its error on that share is larger. Filters and
-    their states stay. Refits take place where an algorithm begins to collect, so that an on-policy one never learns
-    from a batch of two observers, and not before an episode is as long as the filter remembers.
+    An observer is accurate where its rollouts have been, but an agent in training goes elsewhere. A refit learns T_inv,
+    the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
+    replaces the old one unless its error on that share is larger. Filters and their states stay. A refit takes place
+    only where an algorithm begins to collect, so that no on-policy batch mixes two observers, and only after an episode
+    was as long as the filter's memory.
 
-    Logged are ``kkl/error``, the error on held-out episodes of the observer in use (root mean square over standard
-    deviation), and ``kkl/error_before``, that of the one before.
+    The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square over standard
+    deviation), and ``kkl/error_before``, that of the observer before the refit.
 
     Parameters
     ----------
     every : int, default 5000
-        Environment steps, of all environments together, from refit to refit.
+        Steps of all environments together between refits.
     keep : int, default 100_000
-        Steps that are kept; older ones are forgotten.
+        Number of steps to keep; older ones are dropped.
     records : sequence of training.records.Record, optional
-        Episodes from before, the oldest first, such as those that the observer was learned from. They are kept beside
-        the agent's own, and none of them is held out.
+        Earlier episodes, the oldest first, such as those that the observer was learned from. They count among the kept
+        steps; none of them is held out.
     rehearsal : int, default 0
-        Further steps at the end of each call of ``learn``, in which the agent acts without exploration, and which end
-        in a last refit.
+        Further steps at the end of each call of ``learn``, in which the agent acts without exploration; a last refit
+        follows.
     outputs : str, default "y"
-        The key of ``info`` under which outputs are recorded: by default those that the observer saw, noise included, to
-        which the map's noise level 0 then refers.
+        Key of ``info`` that holds the outputs to learn from. By default these are the outputs that the observer saw,
+        noise included, and the map's noise level 0 stands for that noise.
     path : str or path, optional
-        A ``.safetensors`` file that receives the observer in use at each refit, whole or not at all.
+        A ``.safetensors`` file to which each refit writes the observer in use, whole or not at all.
     on_refit : callable, optional
         Called with each :class:`Refit`.
     verbose : int, default 0
         Whether refits are printed, as for other callbacks.
     **settings : object
-        Of :class:`training.Config`, where they are to differ from those that the observer was learned with; by default
-        one network and 1,000 batches. What makes the filter stays: eigenvalues, dt and inputs.
+        Settings of :class:`training.Config` that replace those of the observer's training; by default one network and
+        1,000 batches. Settings of the filter, such as eigenvalues, dt and inputs, cannot change.
 
     Attributes
     ----------
     artifact : Artifact
-        The observer in use, from the beginning of the training on.
+        The observer in use, available once the training begins.
 
     Raises
     ------
     ValueError
-        If an argument is invalid. At the beginning of the training, if an environment has no KKLObservation, an
-        observer that was not learned from rollouts, or another one than the others, or if a record is of another plant.
-        At a step, if ``info`` lacks the hidden signals, or a wrapper skips samples.
+        If an argument is invalid. At the beginning of the training, if an environment lacks KKLObservation, if
+        observers differ or were not learned from rollouts, or if a record is of another plant. At a step, if ``info``
+        lacks the hidden signals, or a wrapper skips samples.
     """
 
     artifact: Artifact
@@ -121,7 +121,7 @@ class KKLTrainingCallback(BaseCallback):
             raise ValueError(f"on_refit must be a function of a Refit, got {shown(on_refit)}")
         if fixed := [name for name in OF_THE_FILTER if name in settings]:
             raise ValueError(f"{', '.join(fixed)} cannot change, as the filter stays: learn another observer instead")
-        Config("input-aware", eigenvalues=(-1.0,), **settings)  # an error now, not at the first refit
+        Config("input-aware", eigenvalues=(-1.0,), **settings)  # raises here rather than at the first refit
         self._every, self._keep = integer("every", every, 1), integer("keep", keep, 1)
         self._before, self._rehearsal, self._outputs = tuple(records), integer("rehearsal", rehearsal, 0), outputs
         self._path, self._on_refit, self._settings = path, on_refit, settings
@@ -150,7 +150,7 @@ class KKLTrainingCallback(BaseCallback):
                 artifact, keep=self._keep, held_out=config.held_out, outputs=self._outputs, before=self._before
             )
         self.artifact, self._config = artifact, config
-        # An observer that tracks is judged under the noise that it sees, where outputs are recorded without.
+        # A tracking observer is judged under the noise that it sees, which the recorded outputs may lack.
         noisy = self._outputs != "y" and artifact.motion is not None
         self._level = used[0].measurement_noise if noisy else 0.0
 
@@ -172,7 +172,7 @@ class KKLTrainingCallback(BaseCallback):
         env, scaling = self.training_env, self.model.get_vec_normalize_env()
         learns = scaling is not None and scaling.training
         if scaling is not None:
-            scaling.training = False  # its scales stay as they are
+            scaling.training = False  # keeps its scales
         try:
             observations, state, dones = env.reset(), None, np.ones(env.num_envs, dtype=bool)
             self._add((), dones)
@@ -183,11 +183,11 @@ class KKLTrainingCallback(BaseCallback):
         finally:
             if scaling is not None:
                 scaling.training = learns
-        self.model.set_env(env)  # which makes a training that goes on reset it
+        self.model.set_env(env)  # the next call of learn resets it
         self._refit_where_possible()
 
     def _add(self, infos: Sequence[dict[str, Any]], dones: Sequence[bool] | np.ndarray) -> None:
-        """Add a step of all environments; after a reset of all there are no ``infos``."""
+        """Add a step of all environments; ``infos`` is empty after a reset of all."""
         for row, done in enumerate(dones):
             if infos:
                 self._gathering.add(row, infos[row])
@@ -198,7 +198,7 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._gathering.steps + self._every
         kept, held_out = self._gathering.records()
         memory = settling_time(self.artifact.filter)
-        # Records from before are long enough to learn from, but not from where the agent is now.
+        # Earlier records may be long enough alone, but only the agent's own pieces are held out.
         needed = (kept, held_out) if self._before and self._config.held_out else (kept,)
         if all(any(record.duration >= memory for record in records) for records in needed):
             self._refit(kept, held_out)
@@ -210,7 +210,7 @@ class KKLTrainingCallback(BaseCallback):
         if (old.motion is not None and new.motion is None) or (
             old.inverse.error_covariance is not None and new.inverse.error_covariance is None
         ):
-            warnings.warn("the observer in use stays: too little is held out so far to calibrate another", stacklevel=2)
+            warnings.warn("the observer in use stays: too little is held out to calibrate a new one", stacklevel=2)
             return
         before, after = (_rms(recorded_errors(each, held_out, measurement_noise=self._level)) for each in (old, new))
         taken = not after > before
@@ -230,7 +230,7 @@ class KKLTrainingCallback(BaseCallback):
 
 def _in_use(env: VecEnv) -> tuple[list[KKLObserver], Callable[[Artifact], object]]:
     """The observers in use, and the function that replaces them; ValueError without any."""
-    inside = getattr(env.unwrapped, "env", None)  # a vector environment of Gymnasium's
+    inside = getattr(env.unwrapped, "env", None)  # a vector environment of Gymnasium
     while isinstance(inside, gym.vector.VectorWrapper):
         if isinstance(inside, KKLVectorObservation):
             return [inside.observer], inside.replace_observer
@@ -244,7 +244,7 @@ def _in_use(env: VecEnv) -> tuple[list[KKLObserver], Callable[[Artifact], object
 
 
 def _rms(errors: Mapping[str, float]) -> float:
-    """Root mean square of the errors of all hidden signals that move; NaN if none does."""
+    """Root mean square of the errors of all hidden signals that move, or NaN."""
     known = [error for error in errors.values() if not math.isnan(error)]
     return float(np.sqrt(np.mean(np.square(known)))) if known else math.nan
 
@@ -258,11 +258,11 @@ class _Piece:
     y: list[np.ndarray] = field(default_factory=list)
     x: list[np.ndarray] = field(default_factory=list)
     u: list[np.ndarray] = field(default_factory=list)
-    sample: int = 0  # the number of the last one
+    sample: int = 0  # number of the last sample
 
 
 class Gathering:
-    """Episodes of several environments as records, from what observers and environments put into ``info``."""
+    """Collects episodes of several environments as records, from the signals in ``info``."""
 
     def __init__(
         self, artifact: Artifact, *, keep: int, held_out: float, outputs: str = "y", before: Sequence[Record] = ()
@@ -271,7 +271,7 @@ class Gathering:
         self._signals = Signals("t", *(tuple(names[role]) for role in ROLES.values()))
         self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
         self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
-        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # the oldest first; and by environment
+        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; open ones by environment
         self._made = self.steps = 0
         check_dt(before, self._dt)
         for record in before:
@@ -286,17 +286,17 @@ class Gathering:
                 self._pieces.append(_Piece(record.name, False, [*y[rows]], [*x[rows]], [*u[steps]]))
 
     def begin(self, row: int, info: Mapping[str, Any]) -> None:
-        """Begin an episode, with its first sample where ``info`` holds it."""
+        """Begin an episode, with its first sample if ``info`` holds one."""
         piece = self._new(row)
         if self._outputs in info:
             piece.y, piece.x = [np.array(info[self._outputs])], [info.get("x", np.full(self._nx, np.nan))]
 
     def add(self, row: int, info: Mapping[str, Any]) -> None:
-        """Take in the sample after a step."""
+        """Add the sample after a step."""
         if missing := [key for key in (self._outputs, "u", "x", "sample") if key not in info]:
             raise ValueError(
                 f"info of environment {row} has no {', '.join(map(repr, missing))}: KKLObservation gives the true "
-                f"{', '.join(self._signals.hidden)} as 'x' where the environment inside shows them at each step; "
+                f"{', '.join(self._signals.hidden)} as 'x' if the environment inside provides them at each step; "
                 "training.agents.SB3VecEnv passes on its info_keys, ('y', 'u', 'x', 'sample')"
             )
         piece, sample = self._open[row], int(info["sample"])
@@ -315,7 +315,7 @@ class Gathering:
         self.steps += 1
 
     def records(self) -> tuple[list[Record], list[Record]]:
-        """Forget the oldest pieces; return records to fit and records held out, episodes under way included."""
+        """Drop the oldest pieces; return records to fit and held-out records, unfinished episodes included."""
         total, first = 0, len(self._pieces)
         while first and (not total or total + len(self._pieces[first - 1].u) <= self._keep):
             first -= 1
@@ -326,7 +326,7 @@ class Gathering:
         return kept, held_out
 
     def _new(self, row: int, y: Sequence[np.ndarray] = (), x: Sequence[np.ndarray] = ()) -> _Piece:
-        """Begin a piece; one that has no step yet is begun again."""
+        """Begin a piece, or restart the open one if it has no step yet."""
         if row not in self._open or self._open[row].u:
             held_out = bool(self._every) and self._made % self._every == 1
             self._open[row] = _Piece(f"{self._environment['id']}, piece {self._made}", held_out)

@@ -25,7 +25,7 @@ Env = gym.Env[Any, Any]
 Policy = Callable[[Any], Any]  # from an observation to an action
 RANDOM = "random"
 WANDERING = "wandering"
-LONGEST_HOLD = 30  # steps: the longest mean time for which a wandering policy holds an action
+LONGEST_HOLD = 30  # steps; a wandering policy holds actions for mean times up to this one
 
 
 def make(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Env:
@@ -37,7 +37,7 @@ def make(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Env:
 
 
 def policy_of(policy: str | Policy, env: Env) -> Policy:
-    """Random actions, a function by its place, or an agent of stable-baselines3 (``ppo:FILE.zip``)."""
+    """Make a policy from its name: random actions, a function, or an agent of stable-baselines3 (``ppo:FILE.zip``)."""
     if callable(policy):
         return policy
     if policy == RANDOM:
@@ -55,7 +55,7 @@ def policy_of(policy: str | Policy, env: Env) -> Policy:
 
 
 def _wandering(space: gym.Space[Any]) -> Iterator[Any]:
-    """Random actions, each held for a random number of steps, whose mean is drawn every hundred steps."""
+    """Random actions, each held for a random number of steps; every hundred steps a new mean number is drawn."""
     left, action = 0, None
     for call in itertools.count():
         if call % 100 == 0:
@@ -93,7 +93,7 @@ def play(
     default_steps: int = 100_000,
     **options: Any,
 ) -> Rollouts:
-    """Make an environment and play episodes in it, ``default_steps`` where neither episodes nor steps are given."""
+    """Make an environment and play in it, for ``default_steps`` if neither episodes nor steps are given."""
     steps = default_steps if episodes is None and steps is None else steps
     with make(env_id, env_kwargs) as env:
         policy = policy_in(env)
@@ -114,7 +114,7 @@ def roll_out(
     name: str = "",
     report: Callable[[float], object] = lambda done: None,
 ) -> Rollouts:
-    """Play episodes and keep observations, actions and the entries of ``info`` that are signals."""
+    """Play episodes; keep observations, actions, rewards, and the entries of ``info`` that are signals."""
     if episodes is None and steps is None:
         raise ValueError("give the amount to record: episodes or steps")
     most_episodes = math.inf if episodes is None else integer("episodes", episodes, 1)
@@ -130,13 +130,13 @@ def roll_out(
             over, total = terminated or truncated, total + 1
         played += 1
         if played == 1:
-            recorder.rollouts().records()  # an error now, not after hours
+            recorder.rollouts().records()  # raises here rather than after hours of play
         report(played if steps is None else total)
     return recorder.rollouts()
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Keeps the last ``keep`` steps at least that are played in an environment, by whole episodes."""
+    """Keeps the last episodes that were played in an environment, with ``keep`` steps or more."""
 
     def __init__(
         self,
@@ -162,14 +162,14 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         self._to_keep = math.inf if keep is None else integer("keep", keep, 1)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment; the episode before counts as far as it got."""
+        """Reset the environment; an unfinished episode is kept as far as it was played."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._under_way = _Steps([self._copied(observation, info)])
         self._played.append(self._under_way)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step the environment; raises RuntimeError before a reset, or after :meth:`rollouts` without one."""
+        """Step the environment; RuntimeError before a reset, which :meth:`rollouts` makes necessary, too."""
         if self._under_way is None:
             raise RuntimeError("reset the environment before its first step")
         made = copy.deepcopy(action)
@@ -182,14 +182,14 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         return observation, float(reward), terminated, truncated, info
 
     def rollouts(self, *, going_on: bool = False) -> Rollouts:
-        """The episodes played; the one under way counts as far as it got, and ends there unless ``going_on``."""
+        """Return the episodes, an unfinished one as far as it was played; it cannot continue unless ``going_on``."""
         self._under_way = self._under_way if going_on else None
         env, episodes = self.env, [self._episode(steps) for steps in self._played if steps.done]
         spaces = env.observation_space, env.action_space
         return Rollouts(self._name, self._identity, sampling_interval(env), *spaces, episodes, self._signals, env.spec)
 
     def _copied(self, observation: Any, info: Mapping[str, Any]) -> Any:
-        """An observation and entries of ``info``: environments may write into the same array at each step."""
+        """Copy an observation and entries of ``info``, as environments may write into the same array at each step."""
         return copy.deepcopy((observation, [info.get(key) for key in self._keys]))
 
     def _episode(self, steps: "_Steps") -> Episode:
@@ -201,7 +201,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
 @dataclass
 class _Steps:
-    """Observations with entries of ``info``, and actions with rewards, of an episode."""
+    """An episode's observations with entries of ``info``, and actions with rewards."""
 
     seen: list[Any]
     done: list[Any] = field(default_factory=list)
@@ -209,7 +209,7 @@ class _Steps:
 
 
 def _numbers(values: list[Any], key: str) -> np.ndarray:
-    """The entries of ``info`` under a key; NaN at a reset that lacks it."""
+    """The entries of ``info`` under a key as an array; NaN at a reset that lacks the key."""
     if all(value is None for value in values):
         raise ValueError(f"info has no {key!r}, at the reset or at a step")
     if values[0] is None and len(values) > 1 and values[1] is not None:
@@ -217,10 +217,10 @@ def _numbers(values: list[Any], key: str) -> np.ndarray:
     try:
         return np.array(values, dtype=float)
     except (TypeError, ValueError):
-        raise ValueError(f"info[{key}] is not a number at each step, or not of one shape") from None
+        raise ValueError(f"info[{key}] is not a number at each step, or changes its shape") from None
 
 
 def _stacked(space: gym.Space[Any], values: Sequence[Any]) -> Any:
-    """Values of a space as arrays, those of a Dict or Tuple in its structure."""
+    """Stack values of a space in arrays, with the structure of a Dict or Tuple."""
     empty: Any = create_empty_array(space, len(values), fn=np.zeros)
     return concatenate(space, values, empty)

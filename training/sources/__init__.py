@@ -1,4 +1,4 @@
-"""Where motions come from: equations, records, or rollouts of an environment; and what every source gives."""
+"""Sources of motions: equations, records, or rollouts of an environment; and the interface of all sources."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -10,14 +10,14 @@ from training.config import Config
 from training.trajectories.motions import Pairs as Pairs
 from training.trajectories.motions import Report as Report
 
-OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
+OF_MEDIAN = 1.4826  # standard deviation of a normal distribution, over the median of absolute values
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Whole motions, measured without noise.
+    """Whole motions to calibrate on, measured without noise, at one or two levels of process noise.
 
-    There are two levels of process noise at most. Usual motions start in X; a sound plant has no faults.
+    ``usual`` motions start in X; ``sound`` runs come from a plant that certainly has no faults.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
     ``process_noise`` (n,), ``usual`` (n,): True from X, False from beyond.
@@ -32,12 +32,12 @@ class Runs:
 
 
 class TooFewRunsError(ValueError):
-    """Too little is held out to calibrate on."""
+    """Too few motions are held out for calibration."""
 
 
 @dataclass(frozen=True)
 class Increments:
-    """States (n, nx), inputs (n, nu), and how states change over a sample, (n, nx)."""
+    """States (n, nx), inputs (n, nu), and changes of the states over one sample (n, nx)."""
 
     x: np.ndarray
     u: np.ndarray
@@ -45,25 +45,24 @@ class Increments:
 
 
 class Source(Protocol):
-    """Simulated motions of a system, recorded ones, or rollouts of an environment.
+    """The interface through which lessons take motions: simulated, recorded, or rollouts of an environment.
 
-    Lessons take motions from a source and never ask where these come from. Motions to calibrate on are not those to
-    train on.
+    Motions for calibration are never those for training.
 
     Attributes
     ----------
     name : str
-        Of the observer.
+        Name of the observer.
     config : Config
-        How the observer is learned.
+        Settings of the training.
     nx, ny, nu : int
         Numbers of states, of outputs, and of the inputs that the observer takes.
     dt : float
         Sampling interval in seconds.
     pace : float
-        Seconds in which signals change.
+        Time scale of the signals in seconds.
     process_noise : float
-        Usual level of process noise, an input of T_inv; 0 without process noise.
+        Usual level of process noise, which T_inv takes as an input; 0 without process noise.
     """
 
     name: str
@@ -76,28 +75,28 @@ class Source(Protocol):
     process_noise: float
 
     def identity(self) -> dict[str, Any]:
-        """Return the values that identify the source, for fingerprints and the files of a run."""
+        """Return the values that identify the source in fingerprints and in the files of a run."""
 
     def facts(self) -> dict[str, Any]:
-        """Return arguments of :class:`observers.Artifact` that describe the source."""
+        """Return the arguments of :class:`observers.Artifact` that describe the source."""
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """Return arguments of :class:`training.maps.inverse.TrajectorySampler`."""
+        """Return arguments of :class:`training.maps.inverse.TrajectorySampler` that depend on the source."""
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report) -> Pairs:
-        """Return motions to train T_inv on, with a filter beside them; ``free`` ones without input."""
+        """Return states of training motions and of a filter that runs along them; ``free`` motions have no input."""
 
     def runs(self, *, report: Report) -> Runs:
-        """Return motions to calibrate on."""
+        """Return motions for calibration; TooFewRunsError if too few are held out."""
 
     def equations(self) -> Equations:
-        """Return the equations of motion; ValueError with the reason where a flow is to be learned in their place."""
+        """Return the equations of motion; ValueError with the reason if a flow must replace them."""
 
     def increments(self, *, report: Report) -> tuple[Increments, Increments]:
-        """Return pairs of states a sample apart, to learn a flow from and to judge it by."""
+        """Return changes of the state over one sample, for learning a flow and for measuring its error."""
 
     def tracking(self) -> dict[str, Any]:
-        """Return arguments of :class:`observers.Motion` beside equations or flow; ValueError if nothing can track."""
+        """Return arguments of :class:`observers.Motion`, except equations or flow; ValueError if it cannot track."""
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
-        """Return errors on motions that are held out, for the artifact's account of its training."""
+        """Return errors on held-out motions, for the training metadata of the artifact."""

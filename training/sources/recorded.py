@@ -1,4 +1,4 @@
-"""Recorded motions: files, data sets, or rollouts of an environment, in which the hidden signals were seen."""
+"""Recorded motions from files, data sets, or rollouts of an environment, with their hidden signals."""
 
 import contextlib
 import functools
@@ -20,30 +20,31 @@ from training.sources import OF_MEDIAN, Increments, Pairs, Report, Runs, TooFewR
 from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
-FEW = 5  # records, below which none is held out as a whole
-STRETCHES, SAMPLES = 600, 2_000_000  # at most, of stretches to calibrate on and of their samples together
-STRETCH_MEMORIES = 2.0  # of the filter's memory, that stretches are long at most
-FEWEST = 50  # samples that a stretch may begin at
-BEYOND = 0.5  # of the states' range, by which estimates may leave it
-INCREMENTS = 400_000  # at most
-WINDOW = 10  # samples at least over which innovations are averaged
-# What C x leaves of an output is noise, unless it is nearly all, or squares of states explain a part of it.
-UNEXPLAINED, SQUARES = 0.7, 0.8  # of the output's standard deviation, and of the remainder
-LITTLE = 0.1  # of that standard deviation: less is taken for noise in any case
-ROUNDING, OUTLIER = 1e-6, 6.0  # of an output's size, and standard deviations of the remainder, by its median
-LEAST_NOISE = 1e-4  # assumed at least, in standard deviations of the outputs: with R = 0 the gain would not fall
-MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # of records: eigenvalues for each output, in multiples of the signals' rate
-RECORD_MEMORIES = 3.0  # of the filter in a record at least, unless its slowest mode were faster than the signals
-# Of rollouts, whose hidden signals an agent wants within steps: how many modes, the slowest and the fastest per step.
-# Few modes that are far apart forget the start soon, and tell single steps from each other.
+FEW = 5  # with fewer records than this, none is held out whole
+STRETCHES, SAMPLES = 600, 2_000_000  # largest number of stretches for calibration, and of all their samples
+STRETCH_MEMORIES = 2.0  # greatest length of a stretch, in settling times of the filter
+FEWEST = 50  # calibration needs at least so many samples at which a stretch may begin
+BEYOND = 0.5  # estimates may leave the range of the states by this fraction of it
+INCREMENTS = 400_000  # largest number of increments that a flow is learned from
+WINDOW = 10  # innovations are averaged over at least so many samples
+# The residual of y = C x is noise, unless it exceeds the first fraction of the output's standard deviation, or squares
+# of the states reduce it below the second fraction of itself.
+UNEXPLAINED, SQUARES = 0.7, 0.8
+LITTLE = 0.1  # a smaller residual, over the output's standard deviation, always counts as noise
+ROUNDING, OUTLIER = 1e-6, 6.0  # in multiples of an output's size, and of the residual's standard deviation
+LEAST_NOISE = 1e-4  # least noise assumed, in standard deviations of the outputs: with R = 0 the gain would not fall
+MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: modes of each output, and their rates over the signals' rate
+RECORD_MEMORIES = 3.0  # so many settling times fit into a record, unless this needs modes faster than the signals
+# For rollouts, whose hidden signals an agent needs within a few steps: modes of each output, and their rates per step.
+# A few modes that lie far apart forget the start soon, and distinguish single steps.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
-EPISODE_MEMORIES = 1.5  # of the filter in an episode at least
-RECORDED_NOISE = 0.1  # of an output's standard deviation: the largest noise beside that of the records
+EPISODE_MEMORIES = 1.5  # so many settling times fit into an episode
+RECORDED_NOISE = 0.1  # largest noise added to that of the records, in standard deviations of the output
 RECORDED: dict[str, Any] = {
     "samples": 60, "width": 96, "depth": 2, "learning_rate": 3e-3, "inverse_steps": 3000, "members": 3,
-    "noise_free_share": 0.5, "scaling": "range",  # errors count by their own size, not the state's
+    "noise_free_share": 0.5, "scaling": "range",  # errors count alike, whatever the size of the state
 }  # fmt: skip
-OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")  # settings
+OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")  # settings that determine the filter
 
 
 class RecordedSource:
@@ -54,18 +55,20 @@ class RecordedSource:
     records : sequence of Record
         Records with hidden states, all of the same signals.
     config : Config
-        The settings read are dt, samples, windows, held_out, inputs, arbitrary_zero, seed.
+        Settings of the training. The source itself reads eigenvalues, pairs, dt, samples, windows, held_out, inputs,
+        arbitrary_zero and seed.
     name : str
-        Of the observer.
+        Name of the observer.
     held_out : sequence of Record, optional
-        Records that are not trained on; by default a share of ``records``.
+        Records to hold out from training; by default a share of ``records``.
     C : ndarray, shape (ny, nx), optional
-        The output y = C x, where it is known; by default it is fitted.
+        Matrix of the output y = C x if it is known; by default it is fitted.
 
     Raises
     ------
     ValueError
-        If no hidden states were recorded, or a signal is unknown.
+        If no hidden states were recorded, records have different signals, a signal is unknown, or dt does not suit the
+        records.
     """
 
     def __init__(
@@ -94,7 +97,7 @@ class RecordedSource:
         self.pace = 1 / signal_rate(self.kept)
 
     def identity(self) -> dict[str, Any]:
-        """The name, and a fingerprint for each file, or for all episodes of a data set together."""
+        """The name, and a fingerprint of each file or data set."""
         each = dict[str, str]()
         for record in self.records:
             name = record.source or Path(record.name).name
@@ -103,24 +106,24 @@ class RecordedSource:
         return {"name": self.name, "records": records}
 
     def facts(self) -> dict[str, Any]:
-        """Arguments of :class:`observers.Artifact`."""
+        """Arguments of :class:`observers.Artifact` that describe the records."""
         signals = {role: getattr(self.signals, role) for role in ROLES.values()} | ({} if self.nu else {"inputs": ()})
         facts = {"system": self.name, "parameters": {}, "measurement_noise": 0.0, "signals": signals}
         facts["environment"] = self.records[0].environment
         if self.nu:
             inputs = [np.abs(each.u[:-1]).max(0, initial=0.0) for each in self.records if each.u is not None]
             facts["u_max"] = tuple(np.max(inputs, 0).tolist())
-        with contextlib.suppress(ValueError):  # tracking() raises it again, with the reason
+        with contextlib.suppress(ValueError):  # tracking() raises the same error
             facts["C"] = linear_output(self.kept, self.C)[0]
         return facts
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""
+        """Arguments of :class:`training.maps.inverse.TrajectorySampler` that depend on the records."""
         zero = [self.signals.measured.index(name) for name in self.config.arbitrary_zero]
         return {"measurement_noise": 0.0, "silent": linear.equilibrium[:, zero]}
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
-        """Recorded states, and the states of a filter that was switched on some samples before."""
+        """Recorded states, and the states of a filter that started some samples before."""
         windows, n = Windows(self.kept, linear, self.nx), self.config.windows
         ages = recording_ages(math.ceil(settling_time(linear) / self.dt), self.config.samples)
         chosen = [evenly(windows.rows(age), n) for age in ages]
@@ -133,13 +136,13 @@ class RecordedSource:
         return Pairs(ages, windows.x[np.stack(chosen)], np.stack(zs), np.zeros(n))
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
-        """Stretches of the records held out, side by side, from samples all over them."""
+        """Stretches of the held-out records, whose first samples are spread evenly over them."""
         windows = Windows(self.held_out, self.linear, self.nx)
         first = windows.rows()
         first = first[windows.after[first] > 0]
         if len(first) < FEWEST:
             raise TooFewRunsError(
-                f"the records held out have {len(first)} samples with states to begin at, too few to calibrate on "
+                f"the held-out records have {len(first)} samples with states to begin at, too few to calibrate on "
                 f"({FEWEST}): record more, or hold more out (--set held_out=0.3)"
             )
         longest = int(windows.after[first].max())
@@ -152,11 +155,11 @@ class RecordedSource:
         return Runs(x, windows.y[first + later], windows.u[first + later[:-1]], np.zeros(len(first)), usual)
 
     def equations(self) -> Equations:
-        """Records have none."""
+        """Raise ValueError, as records have no equations."""
         raise ValueError("records have no equations")
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
-        """Changes of the state from each sample to the next, of the records to train on and of those held out."""
+        """Changes of the state over one sample, in the training records and in the held-out ones."""
         return self._increments
 
     @functools.cached_property
@@ -168,7 +171,7 @@ class RecordedSource:
             rows = rows[~np.isnan(windows.x[rows]).any(-1)]
             if not len(rows):
                 raise ValueError(
-                    "no two samples in a row have all hidden signals: record them at each sample, or take a larger dt"
+                    "no consecutive samples have all hidden signals: record them at each sample, or take a larger dt"
                 )
             if len(rows) > INCREMENTS:
                 rows = generator(Stream.CALIBRATION, self.config.seed, 11).choice(rows, INCREMENTS, replace=False)
@@ -176,7 +179,7 @@ class RecordedSource:
         return both[0], both[1]
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
-        """Errors on the records held out, relative to the signals' standard deviations."""
+        """Errors on the held-out records, relative to the signals' standard deviations."""
         errors = recorded_errors(artifact, self.held_out)
         return {
             "records": self.identity()["records"],
@@ -185,10 +188,10 @@ class RecordedSource:
         }
 
     def tracking(self) -> dict[str, Any]:
-        """Arguments of :class:`observers.Motion` beside the flow; ValueError where nothing can track."""
+        """Arguments of :class:`observers.Motion`, except the flow; ValueError if it cannot track."""
         if self.config.arbitrary_zero:
             raise ValueError(
-                f"a tracker compares {', '.join(self.config.arbitrary_zero)} with its prediction, and needs the zero: "
+                f"a tracker compares {', '.join(self.config.arbitrary_zero)} with its prediction, so the zero matters: "
                 "train without arbitrary_zero"
             )
         if not self.held_out:
@@ -211,7 +214,7 @@ class RecordedSource:
         }
 
     def described(self) -> str:
-        """The signals and the records, for people."""
+        """Describe the signals and the records in a sentence."""
         signals, records = self.signals, self.records
         given = " and ".join(", ".join(names) for names in (signals.measured, signals.inputs) if names)
         seconds, step = sum(record.duration for record in records), median_step(*records)
@@ -221,27 +224,27 @@ class RecordedSource:
 
 
 def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> Config:
-    """Return a configuration for records, which decide dt, the eigenvalues of A, and the largest noise.
+    """Return a configuration for records, which determine dt, the eigenvalues of A, and the largest noise.
 
-    dt is the median step. The eigenvalues follow from the rate of the signals and the length of the records; those of
-    rollouts from dt and the length of episodes. The largest noise is a tenth of each output's standard deviation.
+    dt is the median time step. The eigenvalues follow from the rate of the signals and the length of the records; for
+    rollouts, from dt and the length of the episodes. The largest noise is a tenth of each output's standard deviation.
 
     Parameters
     ----------
     records : sequence of Record
         Records of the same signals.
     changes : mapping of str to object, optional
-        Settings that are to differ.
+        Settings to replace; None keeps a setting.
 
     Returns
     -------
     Config
-        For :func:`training.train` with a :class:`training.RecordedSource`.
+        The configuration, for :class:`training.RecordedSource`.
 
     Raises
     ------
     ValueError
-        If dt does not suit the records, or an output never changes.
+        If dt does not suit the records, an output never changes, or a setting is invalid.
     """
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     chosen: dict[str, Any] = {"dt": sampling_interval(*records), **RECORDED} | given
@@ -272,12 +275,12 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
 
 
 def evenly(rows: np.ndarray, n: int) -> np.ndarray:
-    """Choose n of some rows, evenly spread over all; none of none."""
+    """Choose n of some rows, evenly spread; none if there are no rows."""
     return rows[np.linspace(0, len(rows) - 1, n if len(rows) else 0).round().astype(int)]
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:
-    """Hold a share of the records out: whole ones drawn by the seed, or the end of each where there are few."""
+    """Hold out a share of the records: whole ones drawn by the seed, or the end of each if there are few."""
     if not share:
         return list(records), []
     if len(records) >= FEW:
@@ -292,7 +295,7 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
 
 
 def signal_rate(records: Sequence[Record]) -> float:
-    """How fast signals change, in 1/s: rms of the derivative over standard deviation, the median of those that move."""
+    """Rate of the signals in 1/s: rms of the derivative over standard deviation, the median of moving signals."""
     rates = list[float]()
     for letter in "yx":
         signals = [(getattr(record, letter), record.t) for record in records if getattr(record, letter) is not None]
@@ -314,10 +317,7 @@ def recorded_errors(
     *,
     measurement_noise: float | tuple[float, ...] = 0.0,
 ) -> dict[str, float]:
-    """Root mean square errors of hidden signals along records, over standard deviations; NaN where none is known.
-
-    Those of the first ``after`` seconds are left out, by default until the filter has settled.
-    """
+    """Errors of hidden signals (rms over standard deviation, or NaN) from ``after`` s on, or else once settled."""
     first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
     pairs, rng = [np.zeros((0, 2, artifact.nx))], np.random.default_rng(0)
     for record in pieces(records):
@@ -330,12 +330,12 @@ def recorded_errors(
     names = (artifact.signals or {})["hidden"]
     if not len(error):
         return dict.fromkeys(names, math.nan)
-    moves = np.ptp(x, 0) > 0  # rounding may leave a standard deviation of what stands still
+    moves = np.ptp(x, 0) > 0  # a constant may have a standard deviation by rounding
     return dict(zip(names, (np.sqrt(np.mean(error**2, 0)) / np.where(moves, x.std(0), np.nan)).tolist()))
 
 
 def linear_output(records: Sequence[Record], known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Fit C of y = C x, unless it is known: (ny, nx), and standard deviations of the rest, (ny,)."""
+    """Fit C (ny, nx) of y = C x unless it is known; return it with standard deviations of the residual (ny,)."""
     y, x = (np.concatenate([getattr(record, name) for record in records if record.x is not None]) for name in "yx")
     both = np.isfinite(np.column_stack([x, y])).all(-1)
     if not both.any():
@@ -353,14 +353,14 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
     signals = records[0].signals
     if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
         raise ValueError(
-            f"{', '.join(other)} is no sum of {', '.join(signals.hidden)} without an offset, with which a tracker "
-            "compares its samples: add the measured signals, in the same units, to the hidden ones"
+            f"{', '.join(other)} is not a weighted sum of {', '.join(signals.hidden)} without an offset, by which a "
+            "tracker predicts samples: add the measured signals, in the same units, to the hidden ones"
         )
     return C, least
 
 
 def _fitted(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """C of a fit that leaves outliers out, and standard deviations of the rest, (ny,)."""
+    """C of a fit that leaves outliers out, and standard deviations (ny,) of the residual."""
     size = np.sqrt(np.mean(x**2, 0))
     size, scale = np.where(size > 0, size, 1.0), np.where(scale > 0, scale, 1.0)
     kept = np.ones(len(x), dtype=bool)
@@ -374,5 +374,5 @@ def _fitted(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray
 
 
 def _usual(apart: np.ndarray) -> np.ndarray:
-    """Standard deviations of noise (n, ny), from medians: outliers do not count."""
+    """Standard deviations of noise (n, ny) from medians, on which outliers have no influence."""
     return np.asarray(OF_MEDIAN * np.median(np.abs(apart), axis=0))

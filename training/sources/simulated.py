@@ -1,4 +1,4 @@
-"""Motions of a system that is simulated."""
+"""A source of simulated motions."""
 
 import functools
 from contextlib import suppress
@@ -19,19 +19,18 @@ from training.trajectories.equations import describe, digest, field_expression, 
 from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
-LEAD_IN_SHARE = 0.4  # share of the free motions that start where inputs have led
-BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and a flow is learned
-# Of runs for calibration: every other one is driven, or under its policy alone.
+LEAD_IN_SHARE = 0.4  # share of the free motions whose start inputs have led out of X
+BEYOND = 2.0  # a third of the calibration runs start in this multiple of X, and a flow is learned in it
+# In calibration, every other run is driven; with a policy, every other one sees the exact state without exploration.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
-LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, over the usual
-# Least process noise that filters assume, at the system's pace: a tenth of the environments' default.
-LEAST_PROCESS_NOISE = 0.005
-WINDOW, RUN = 0.5, 20.0  # a tracker's window and a calibration run, in seconds at the shipped systems' pace
-# Most Runge-Kutta steps in a sample, and the error of scaled states at which more are taken, below the noise assumed.
-SUBSTEPS, INTEGRATION_ERROR = 64, 2e-5
-TOO_FAR_OFF = 0.01  # error of scaled states at SUBSTEPS, as a jump in f leaves, above which a flow is learned
-INCREMENTS, JUDGED = 200_000, 0.05  # pairs of states a sample apart, and the share of them that judges a flow
-DEVIATIONS = (1e-4, 0.3)  # log-uniform distances of these pairs from motions, in standard deviations of the states
+LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
+LEAST_PROCESS_NOISE = 0.005  # least level that filters assume, at pace 1: a tenth of the environments' default
+WINDOW, RUN = 0.5, 20.0  # lengths of a tracker's window and of a calibration run, in multiples of the pace
+SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sample
+INTEGRATION_ERROR = 2e-5  # a larger error of scaled states needs more steps; it lies below the noise assumed
+TOO_FAR_OFF = 0.01  # a larger error with SUBSTEPS steps, as jumps in f cause, makes a flow necessary
+INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
+DEVIATIONS = (1e-4, 0.3)  # log-uniform distances of increments from motions, in standard deviations of the states
 
 
 class SimulatedSource:
@@ -40,15 +39,16 @@ class SimulatedSource:
     Parameters
     ----------
     system : System
-        The equations.
+        The system to simulate.
     config : Config
-        What concerns motions: trajectories, duration, samples, runs, dt, inputs, policy, uncertain parameters, noise,
-        seed.
+        Settings of the training. The source itself reads those of motions: trajectories, duration, samples, runs, dt,
+        inputs, policy, uncertain parameters, bias, noise and seed.
 
     Raises
     ------
     ValueError
-        If a policy or a parameter that is to be uncertain is unknown.
+        If the policy is unknown or invalid, an uncertain parameter is unknown or 0, or ``bias`` does not fit the
+        outputs.
     """
 
     def __init__(self, system: System, config: Config) -> None:
@@ -72,7 +72,7 @@ class SimulatedSource:
         self.ages = recording_ages(self.steps, config.samples)
 
     def identity(self) -> dict[str, Any]:
-        """The system, its equations included, and what else motions depend on."""
+        """The system with its equations, and everything else on which motions depend."""
         system = self.system
         noise = {"process_noise": float(system.process_noise), "scale": list(map(float, system.scale))}
         identity = describe(system) | noise
@@ -84,9 +84,9 @@ class SimulatedSource:
         return identity
 
     def facts(self) -> dict[str, Any]:
-        """Arguments of :class:`observers.Artifact`."""
+        """Arguments of :class:`observers.Artifact` that describe the system."""
         system, output = self.model, dict[str, Any]()
-        with suppress(ValueError):  # which `tracking` raises again
+        with suppress(ValueError):  # tracking() raises the same error
             output = output_facts(system)
         return {
             "system": self.name,
@@ -99,7 +99,7 @@ class SimulatedSource:
         }
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """Arguments of :class:`training.maps.inverse.TrajectorySampler`."""
+        """Arguments of :class:`training.maps.inverse.TrajectorySampler` that depend on the system."""
         return {
             "measurement_noise": self.model.measurement_noise,
             "process_noise_max": self.process_noise,
@@ -107,7 +107,7 @@ class SimulatedSource:
         }
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
-        """Motions to train on with a filter beside them; free ones start in part where inputs have led."""
+        """States of training motions and of a filter along them; inputs lead some starts of free motions out of X."""
         config, rng = self.config, generator(Stream.TRAINING, self.config.seed, *([1] if free else []))
         how: dict[str, Any] = {"kinds": DRIVEN if self.has_free_map else KINDS, "policy": self.policy}
         if free:
@@ -122,7 +122,7 @@ class SimulatedSource:
         return replace(pairs, x=pairs.x[..., : self.nx + len(self.estimated)], nominal=nominal)
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
-        """Motions with the system's process noise, and as many without; of each a third from 2X, the others from X."""
+        """Motions without process noise and at the system's level; a third starts in 2X, the others in X."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed), max(1, round(RUN * self.pace / self.dt))
         plant, n = with_parameters(self.model, self.ranges) if self.ranges else self.model, self.config.runs
         how: dict[str, Any] = SOUND | {"levels": (0.0, self.process_noise), "box_factor": BEYOND}
@@ -140,7 +140,7 @@ class SimulatedSource:
         inside = np.isfinite(later).all(-1)
         for substeps in (2**i for i in range(SUBSTEPS.bit_length())):
             equations = Equations(field, substeps)
-            with np.errstate(all="ignore"):  # too long a step may go anywhere
+            with np.errstate(all="ignore"):  # too long a step may overflow
                 apart = np.abs(equations(x, u, self.dt) - later)[inside] / self._scale[1]
             off = np.quantile(apart.max(-1), 0.99)
             if off <= INTEGRATION_ERROR:
@@ -152,7 +152,7 @@ class SimulatedSource:
         return equations
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
-        """States about motions, and where they are a sample later."""
+        """Changes of the state over one sample, at states near motions."""
         rng = generator(Stream.CALIBRATION, self.config.seed, 5)
         along, u = self._states(300)
         rows = rng.integers(len(along), size=INCREMENTS)
@@ -168,14 +168,14 @@ class SimulatedSource:
         return Increments(*(each[held:] for each in both)), Increments(*(each[:held] for each in both))
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
-        """Nothing: ``kkl-gym evaluate`` measures errors."""
+        """No errors, as ``kkl-gym evaluate`` measures them."""
         return {}
 
     def tracking(self) -> dict[str, Any]:
-        """Arguments of :class:`observers.Motion` beside equations or flow; ValueError where nothing can track."""
+        """Arguments of :class:`observers.Motion`, except equations or flow; ValueError if it cannot track."""
         system = self.model
         if self.ranges:
-            raise ValueError(f"a motion is of one plant, not of a range of {', '.join(self.ranges)}")
+            raise ValueError(f"a tracker needs the equations of one plant, not of a range of {', '.join(self.ranges)}")
         output_facts(system)  # raises ValueError if an artifact cannot hold the output
         low, high = np.array(system.bounds, dtype=float).T
         offset, scale = self._scale
@@ -198,7 +198,7 @@ class SimulatedSource:
 
     @functools.cached_property
     def _scale(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and standard deviation of the states along motions from 2X, (nx,) each."""
+        """Mean and standard deviation, (nx,) each, of the states along motions from X and 2X."""
         along, _ = self._states(4)
         return along.mean(0), spread(along)
 
@@ -213,7 +213,7 @@ class SimulatedSource:
 
 
 def unknown_start(system: System) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (nx,) and covariance (nx, nx) of the states at which motions start."""
+    """Mean (nx,) and covariance (nx, nx) of the starts of motions."""
     low, high = system.box()
     if type(system).draw_starts is System.draw_starts:
         return (low + high) / 2, np.diag((high - low) ** 2 / 12)

@@ -1,4 +1,4 @@
-"""A system's equations: linearised, identified by samples, and written as data that an artifact can hold."""
+"""A system's equations: linearisation, fingerprints, and expressions that an artifact can hold."""
 
 import hashlib
 import json
@@ -12,11 +12,11 @@ from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import Components, System
 from observers import Expression
 
-ASIDE = 1e-5  # of X's widths, steps of central differences
-LINEAR_ROUNDING = 1e-9  # of an output's size: what may be left of a linear one
-EXPRESSION_ROUNDING = 1e-6  # of a component's range: what may lie between two ways to evaluate it
+ASIDE = 1e-5  # step of the central differences, in widths of X
+LINEAR_ROUNDING = 1e-9  # largest residual of a linear output, over its size
+EXPRESSION_ROUNDING = 1e-6  # largest difference of an expression from the equations, over a component's size
 
-# What sympy calls the functions that expressions know by other names.
+# Sympy's names of functions, and the names that expressions give them.
 _NAMES = {
     "Add": "+", "Mul": "*", "Pow": "**", "Mod": "%", "Abs": "abs", "Max": "maximum", "Min": "minimum",
     "StrictLessThan": "<", "LessThan": "<=", "StrictGreaterThan": ">", "GreaterThan": ">=",
@@ -25,7 +25,7 @@ _NAMES = {
 
 
 def describe(system: System) -> dict[str, Any]:
-    """Return the identity of a system, with its equations sampled at points of the training box."""
+    """Return the identity of a system, with a hash of its equations at points of X."""
     rng = np.random.default_rng(0)
     x = system.draw_starts(rng, 20)
     if system.discrete:
@@ -50,16 +50,13 @@ def digest(values: Sequence[Any]) -> str:
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:
-    """Values as they are on every machine: to six decimals, or to more where all are small."""
+    """Round to six decimals, or to more if all values are small, so that all machines agree."""
     size = np.abs(values).max()
     return np.round(values, 6 - min(0, math.floor(math.log10(size))) if 0 < size < np.inf else 6)
 
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Linearise a system at a state x without input: df/dx (nx, nx), g (nx, nu) and dh/dx (ny, nx).
-
-    In discrete time the first two are the derivatives of the step. Derivatives are central differences.
-    """
+    """Slopes at a state x without input: of f, or the step, by x (nx, nx) and by u (nx, nu), and of h by x (ny, nx)."""
     low, high = system.box()
     nx, at, sizes = system.nx, np.array(x, dtype=float), high - low
 
@@ -77,26 +74,26 @@ def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, n
 
 
 def output_matrix(system: System) -> np.ndarray | None:
-    """C, (ny, nx), if the output is h(x) = C x, else None."""
+    """C (ny, nx) if the output is h(x) = C x, else None."""
     x = system.draw_starts(np.random.default_rng(0), 100)
-    with np.errstate(all="ignore"):  # of ratios and logarithms, which need not exist at 0 and 1
+    with np.errstate(all="ignore"):  # ratios and logarithms may be undefined at 0 and 1
         C, y = system.output(np.eye(system.nx)).T, system.output(x)
         return C if (np.abs(y - x @ C.T) <= LINEAR_ROUNDING * np.abs(y).max(0)).all() else None
 
 
 def output_facts(system: System) -> dict[str, Any]:
-    """The output as an artifact takes it: C where h(x) = C x, else h as an expression, or ValueError."""
+    """The artifact's argument for the output: C if h(x) = C x, else h as an expression, or ValueError."""
     C = output_matrix(system)
     return {"h": output_expression(system)} if C is None else {"C": C}
 
 
 def output_expression(system: System) -> Expression:
-    """Write a system's output as an expression; ValueError with the reason if it cannot be written."""
+    """Write a system's output as an expression; ValueError with the reason if this is impossible."""
     return _expression(system, lambda x, u: components(system.h, x), lambda x, u: system.output(x), "h(x)")
 
 
 def field_expression(system: System, *, inputs: bool = True) -> Expression:
-    """Write f(x) + g(x) u, or step(x, u), as an expression; ValueError with the reason if it cannot be written."""
+    """Write f(x) + g(x) u, or step(x, u), as an expression; ValueError with the reason if this is impossible."""
     nu = system.nu
 
     def traced(x: Any, u: Any) -> list[Any]:
@@ -133,14 +130,14 @@ def _expression(
             expected = evaluated(states, acting)
         rounding = EXPRESSION_ROUNDING * np.nanmax(np.abs(expected), axis=0)
         if not np.isclose(expression(states, acting), expected, rtol=1e-9, atol=rounding, equal_nan=True).all():
-            raise ValueError("it is not the same on symbols as on arrays; write it with kkl_gym.elementary alone")
+            raise ValueError("it differs between symbols and arrays; write it with kkl_gym.elementary alone")
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"an observer of {system.name!r} cannot hold {what} as an expression: {error}") from error
     return expression
 
 
 def _tree(value: Any, places: dict[Any, tuple[str, int]]) -> Any:
-    """A sympy expression as :class:`observers.Expression` takes it."""
+    """Convert a sympy expression to the nested lists of :class:`observers.Expression`."""
     if value in places:
         return list(places[value])
     if getattr(value, "is_number", False):

@@ -1,8 +1,4 @@
-"""Simulated motions under random inputs, policies and noise, and the filter's states beside them.
-
-Process noise enters these motions; measurement noise enters the filter's state when :mod:`training.maps.inverse` draws
-a batch.
-"""
+"""Simulated motions under random inputs, policies and process noise, and noise-free filter states along them."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,30 +14,30 @@ from observers import LinearFilter
 from training.trajectories.equations import linearised
 
 Controller = Callable[[np.ndarray], np.ndarray]
-"""States (n, nx) in, actions (n, nu) in [-1, 1] out."""
+"""Maps states (n, nx) to actions (n, nu) in [-1, 1]."""
 Report = Callable[[float], object]
 Chunk = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 KINDS = ("zero", "steps", "zero", "sine")
 DRIVEN = ("steps", "sine", "pulses")
-CHUNK = 500  # trajectories simulated at once
-FIRST, FEWEST_INSIDE = 100, 0.05  # trajectories tried, of which at least this share must stay within the bounds
-# Seconds, at the pace of the shipped systems, for which inputs lead starts out of the training box.
+CHUNK = 500  # number of trajectories simulated at once
+FIRST, FEWEST_INSIDE = 100, 0.05  # after so many trajectories, at least this share must have stayed within bounds
+# Times for which inputs lead starts out of X, in multiples of the pace.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
-FAR = 0.6  # share of the trajectories that start in a larger box than X where there is one
-INPUT_WEIGHT = 0.1  # of a regulator, beside a weight of 1 on the states, both in units of their typical sizes
-POLICY_KINDS = ("steps", "sine")  # of a policy's errors and explorations
-POLICY_ERROR = (0.02, 0.5)  # of the states that a policy acts on, in multiples of the system's scale
-EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in input bounds
-# Every so many trajectories under a policy one is its own, the others are explored. On those alone the input tells the
-# state, which an agent's does not. Under the regulator on x_hat, at the default noise, cart-pole's angle is estimated
-# to 3.4 % of X's half-width with 4 here, to 3.2 % with 12 and to 3.1 % with none; by an exact EKF to 2.7 %.
+FAR = 0.6  # share of the trajectories that start in the larger box, if there is one
+INPUT_WEIGHT = 0.1  # a regulator's weight on inputs, relative to that on states, both scaled by typical sizes
+POLICY_KINDS = ("steps", "sine")  # signals of a policy's errors and of its exploration
+POLICY_ERROR = (0.02, 0.5)  # range of errors in the states that a policy sees, in multiples of the system's scale
+EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in multiples of input bounds
+# One trajectory in so many follows the policy exactly, the others have errors and exploration. An exact policy's input
+# reveals the state, which an agent's input does not. Under the regulator on x_hat, at the default noise, the error of
+# cart-pole's angle is 3.4 % of X's half-width with 4 here, 3.2 % with 12, and 3.1 % with none; an exact EKF has 2.7 %.
 POLICYS_OWN = 12
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """States and the filter's states beside them, at ages since the filter's start, measured without noise.
+    """States of motions and of a filter along them, at ages since its start, without measurement noise.
 
     Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
     """
@@ -55,10 +51,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Motions:
-    """Trajectories of a system from uniform starts in X, how they are driven and disturbed.
-
-    Each has one of the ``levels`` of process noise; without them, a share has levels of their own up to the system's.
-    """
+    """How trajectories start, are driven and disturbed; ``levels`` of process noise replace random ones of a share."""
 
     system: System
     dt: float
@@ -74,7 +67,7 @@ class Motions:
     lead_in_input: float = 0.0
 
     def with_inputs(self, nu: int) -> "Motions":
-        """The same, or free motions where an observer takes no input."""
+        """The same motions, or free ones if an observer takes no input."""
         return self if nu else replace(self, kinds=(), policy=None)
 
     def beside(
@@ -85,7 +78,7 @@ class Motions:
         rng: np.random.Generator,
         report: Report = lambda done: None,
     ) -> Pairs:
-        """Simulate trajectories and run the filter beside them."""
+        """Simulate trajectories and run the filter along them."""
         chunks = self.with_inputs(linear.nu).chunks(n, rng, report)
         x, z, level, _ = _together(
             (x[ages], filter_states(linear, self.system.output(x), u, ages), *rest) for x, u, *rest in chunks
@@ -93,14 +86,14 @@ class Motions:
         return Pairs(ages, x, z, level)
 
     def drawn(self, n: int, rng: np.random.Generator, report: Report = lambda done: None) -> Chunk:
-        """All of :meth:`chunks` together."""
+        """Concatenate all :meth:`chunks`."""
         return _together(self.chunks(n, rng, report))
 
     def chunks(self, n: int, rng: np.random.Generator, report: Report = lambda done: None) -> Iterator[Chunk]:
         """Simulate in chunks; trajectories that leave the system's bounds are replaced by new ones driven alike.
 
-        Shapes: returns ``x`` (steps + 1, at most CHUNK, nx), ``u`` (steps, at most CHUNK, nu), the level of process
-        noise (at most CHUNK,), and whether a trajectory starts in X (at most CHUNK,).
+        Yields ``x`` (steps + 1, m, nx), ``u`` (steps, m, nu), the levels of process noise (m,), and a mask of the
+        trajectories that start in X (m,), with m up to CHUNK.
         """
         system, steps, pending, tried = self.system, self.steps, np.arange(n), 0
         while len(pending):
@@ -140,7 +133,7 @@ class Motions:
         return np.asarray(self.system.process_noise * np.where(some, np.sqrt(rng.random(n)), 0.0))
 
     def _starts(self, rows: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Starts (n, nx), some from a larger box or led out of X by inputs; and which are in X."""
+        """Starts (n, nx), some in a larger box or led out of X by inputs, and a mask of those drawn in X."""
         system, share = self.system, self.lead_in_share
         x0, near = system.draw_starts(rng, len(rows)), np.ones(len(rows), dtype=bool)
         if self.box_factor > 1:
@@ -163,9 +156,9 @@ def _together(chunks: Iterator[Chunk]) -> Chunk:
 
 
 def filter_states(linear: LinearFilter, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
-    """Return the states at samples ``ages`` (m,) of a record, counted from its start, without repetition.
+    """Filter states (m, n, size) at the distinct samples ``ages`` (m,), from a start at the first sample.
 
-    Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), held after the output of its row; returns (m, n, size).
+    Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), held from the output of the same row on.
     """
     z = linear.start(y[0])
     out, slots = np.empty((len(ages), *z.shape)), {int(age): i for i, age in enumerate(ages)}
@@ -186,7 +179,7 @@ def random_inputs(
     kinds: Sequence[str] = KINDS,
     bounds: Sequence[float] | np.ndarray | None = None,
 ) -> np.ndarray:
-    """Draw random signals (steps, n, k) within bounds (k,), by default those of the inputs; held between samples."""
+    """Draw random signals (steps, n, k), held between samples, within bounds (k,), by default those of the inputs."""
     bounds = system.u_max if bounds is None else bounds
     out, t = np.zeros((steps, n, len(bounds))), np.arange(steps) * dt
     for row, j in np.ndindex(n, len(bounds)):
@@ -209,7 +202,7 @@ def random_inputs(
 def draw_process_noise(
     system: System, level: float | np.ndarray, *, n: int, steps: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Process noise (steps, n, nx) of levels (n,), uniform in a box and held over each sampling interval."""
+    """Draw process noise (steps, n, nx) of levels (n,), uniform in a box and held over each sampling interval."""
     bound = np.multiply.outer(level, system.scale)
     return np.asarray(bound * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))
 
@@ -228,10 +221,10 @@ def under_policy(
     plant: System | None = None,
     step: Step | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate trajectories under a policy that errs about the state and explores, but for its ``own``.
+    """Simulate trajectories under a policy with errors in the state that it sees and with exploration.
 
-    The input of a policy that acts on the true state would show the state to the observer, which filters that input.
-    So each trajectory has an error of its own in the state that the policy sees, and a signal added to its actions.
+    The exact policy's input would reveal the state to an observer, which filters that input. So each trajectory has its
+    own error in the state that the policy sees, and a signal added to its actions; those in the mask ``own`` have none.
 
     Shapes: ``x0`` (n, nx), ``own`` (n,), ``w`` (steps, n, nx); returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
     """
@@ -244,7 +237,7 @@ def under_policy(
     u = np.zeros((steps, n, system.nu))
 
     def act(k: int, x: np.ndarray) -> np.ndarray:
-        seen = np.where(np.isfinite(x), x, system.X_centre) + error[k]  # what has escaped may do anything
+        seen = np.where(np.isfinite(x), x, system.X_centre) + error[k]  # after an escape any action serves
         action = policy(seen)
         for row in np.flatnonzero(~np.isfinite(action).all(-1)):
             raise ValueError(f"the policy gives the action {action[row].tolist()} at x = {seen[row].tolist()}")
@@ -255,17 +248,14 @@ def under_policy(
 
 
 def recording_ages(steps: int, n: int) -> np.ndarray:
-    """Ages, n at most, at which to record: half of them even in the logarithm, which catches the transient."""
-    late = max(2, n - n // 2)  # the first and the greatest age at least
+    """At most n ages to record at: half of them evenly spaced, half logarithmically, to resolve the transient."""
+    late = max(2, n - n // 2)  # the first and the last age at least
     ages = np.concatenate([np.geomspace(1, steps, n - late), np.linspace(0, steps, late)])
     return np.unique(ages.round()).astype(int)
 
 
 def linear_quadratic(system: System) -> Controller:
-    """Linear-quadratic regulator of the linearisation at the target, u = -K (x - target) cut at the input bounds.
-
-    Its weights are 1/scale^2 on the state and INPUT_WEIGHT/u_max^2 on the input, on each step in discrete time.
-    """
+    """Saturated linear-quadratic regulator at the target; its weights are 1/scale^2 and INPUT_WEIGHT/u_max^2."""
     target, u_max = np.array(system.target), np.array(system.u_max)
     A, B, _ = linearised(system, system.target)
     Q, R = np.diag(1.0 / np.square(system.scale)), np.diag(INPUT_WEIGHT / u_max**2)
@@ -278,14 +268,14 @@ def linear_quadratic(system: System) -> Controller:
 
 
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:
-    """Raise ValueError unless a policy's actions on some states are valid; the returned one checks their shape."""
+    """Return a policy that checks the shape of its actions; ValueError if those on some states are invalid."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs for the policy {name!r} to act by")
 
     def act(x: np.ndarray) -> np.ndarray:
         try:
             actions = np.asarray(policy(x), dtype=float)
-        except Exception as error:  # whatever a user's function does wrong
+        except Exception as error:  # a user's function may raise anything
             where = f" ({line})" if (line := user_line(error)) else ""
             raise ValueError(
                 f"the policy {name!r} fails on states of shape {x.shape}: {type(error).__name__}: {error}{where}"
@@ -301,7 +291,7 @@ def checked_policy(policy: Controller, system: System, name: str) -> Controller:
     actions = act(x)
     for row in np.flatnonzero(~(np.abs(actions) <= 1.0).all(-1)):
         raise ValueError(
-            f"the policy {name!r} must give actions in [-1, 1], which stand for inputs up to u_max = {system.u_max}; "
-            f"at x = {x[row].tolist()} it gives {actions[row].tolist()}"
+            f"the policy {name!r} must return actions in [-1, 1], which scale inputs up to u_max = {system.u_max}; "
+            f"at x = {x[row].tolist()} it returns {actions[row].tolist()}"
         )
     return act

@@ -1,4 +1,4 @@
-"""A system's parameters, or biases of its outputs, as further states that stand still."""
+"""A system's parameters, or biases of its outputs, as additional constant states."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
@@ -10,19 +10,19 @@ from kkl_gym.system import Box, Components, System
 from observers.checks import shown
 from training.trajectories.motions import Controller
 
-# Of motions in training with one uncertain parameter, the share that has its own value; with more, the power of their
-# number, for it is the less likely that all are as said. Chosen on the four systems that ship: at 0.6 and a width of
-# 256 Lorenz's map no longer distinguished its own plant from the others.
+# Share of the training motions with the system's own value of an uncertain parameter. With several parameters it is
+# raised to their number, as it is less likely that all have their own values. Chosen on the four systems that ship: at
+# 0.6 and a width of 256, Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
-STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
-EVERY = "all"  # in the place of a parameter's name
-ROOM = 1e6  # half-widths of its range that a parameter may lie from the middle
+STILL = 1e-12  # scale of a parameter's process noise, in place of 0
+EVERY = "all"  # stands for every parameter that is not named
+ROOM = 1e6  # bounds of a parameter, in widths of its range from the middle
 
 Ranges = Mapping[str, tuple[float, float]]
 
 
 def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Ranges about the values that a system's parameters have; half-widths are parts of these values."""
+    """Ranges around the values of a system's parameters, with half-widths relative to these values."""
     known = system.parameters
     if half_widths and not known:
         raise ValueError(f"{system.name} has no parameters that could be uncertain")
@@ -41,22 +41,22 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
 
 
 def nominal_share(ranges: Ranges) -> float:
-    """Share of the motions in training that have the system's own parameters."""
+    """Share of the training motions that have the system's own parameters."""
     return NOMINAL_SHARE ** len(ranges)
 
 
 def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False) -> System:
-    """A system whose states are x and then some of its parameters, with derivative zero.
+    """A system whose states are x, followed by some of its parameters with derivative zero.
 
-    An observer of such a system estimates parameters, a motion of it has parameters of its own, and derivatives by its
-    states are derivatives by parameters as well. In training a share of the motions has the system's own parameters,
-    which are the likeliest; those of the others are more often near the ends of their ranges, where errors are largest.
+    An observer of such a system estimates parameters, and each of its motions has its own. In training, a share of the
+    motions has the system's own parameters, which are the likeliest; the parameters of the others lie more often near
+    the ends of their ranges, where errors are largest.
     """
     if not ranges:
         return system
 
     def model(x: Components) -> System:
-        changed = object.__new__(type(system))  # past the class's own check, which asks for floats
+        changed = object.__new__(type(system))  # bypasses the class's check, which requires floats
         changed.__dict__.update(system.__dict__, **dict(zip(ranges, x[system.nx :], strict=True)))
         return changed
 
@@ -68,7 +68,7 @@ def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False
 
 
 def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
-    """A system whose states are x and then a constant bias of each output that may have one, up to its half-width."""
+    """A system whose states are x, followed by a constant bias, up to its half-width, of each output that has one."""
     given = np.atleast_1d(np.asarray(half_widths, dtype=float))
     if len(given) not in (1, system.ny):
         raise ValueError(f"bias must be one number, or one of each of {system.ny} outputs, got {half_widths}")
@@ -96,7 +96,7 @@ def _with_constants(
     *,
     in_training: bool = False,
 ) -> System:
-    """A system with further states that stand still, the equations of ``model(x)`` and the outputs ``outputs(x)``."""
+    """A system with additional constant states, the equations of ``model(x)`` and the outputs ``outputs(x)``."""
     nx, limits = system.nx, [(float(low), float(high)) for low, high in ranges.values()]
     low, high = np.transpose(limits)
     middle, room = (low + high) / 2, ROOM * (high - low)
@@ -117,7 +117,7 @@ def _with_constants(
         measurement_noise = system.measurement_noise
 
         def draw_starts(self, rng: Any, n: int, factor: float = 1.0) -> Any:
-            x = super().draw_starts(rng, n)  # parameters keep to their ranges, and states to what the system draws
+            x = super().draw_starts(rng, n)  # the factor does not widen the ranges of parameters
             x[:, :nx] = system.draw_starts(rng, n, factor)
             if in_training:
                 along = (2 * x[:, nx:] - low - high) / (high - low)  # -1 to 1
@@ -133,7 +133,7 @@ def _with_constants(
             return outputs(x)
 
         def rate(self, x: Components) -> Any:
-            return system.rate(x[:nx])  # near enough, and a formula for it may decide on its parameters
+            return system.rate(x[:nx])  # approximately, as a formula for the rate may need parameters as numbers
 
         if system.discrete:
 
@@ -154,5 +154,5 @@ def _with_constants(
 
 
 def blind(policy: Controller, nx: int) -> Controller:
-    """A policy for a system with further states that sees the nx states alone."""
+    """A policy for a system with additional states that sees only the first nx states."""
     return lambda x: policy(x[:, :nx])

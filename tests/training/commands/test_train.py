@@ -47,7 +47,7 @@ def test_from_a_system_to_an_observer_that_tracks(capsys):
     assert re.fullmatch(r"20 trajectories of 5 s at dt = 0.1 s; \d+ modes of A .*", printed[2])
     assert re.fullmatch(r"CPU seconds: motions \S+, free \S+, inverse \S+, calibrating \S+", printed[3])
     assert printed[4] == "it tracks by the system's equations; T_inv initialises it"
-    assert re.fullmatch(rf"wrote {path} \(0\.\d\d MB\), report\.png and log\.txt beside it, in \S+ s", printed[5])
+    assert re.fullmatch(rf"wrote {path} \(0\.\d\d MB\), report\.png and log\.txt beside it, in \S+", printed[5])
     evaluation = re.fullmatch(r"kkl-gym (evaluate .*) measures its errors", printed[6])[1].split()
     assert printed[7:] == []
     logged = [line.split(" ", 2)[2] for line in path.with_name("log.txt").read_text().splitlines()]

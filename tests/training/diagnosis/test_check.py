@@ -169,7 +169,7 @@ BLIND = NO_INPUT | {
     ("name", "verdict", "changes", "options", "found", "advice"),
     [
         ("equations", "problem", {"f": lambda self, x: (x[1], -sqrt(x[0] + 0.5))}, {}, " % of 2X, such as",
-         "draw the bounds, and X, where the equations hold, or change the equations"),
+         "choose X and the bounds where the equations hold, or change the equations"),
         ("equations", "problem", {"u_max": (1.0, 1.0), "G": ((0.0, 0.0), (1.0, 0.0))}, {}, "input 2 moves no state",
          "give column 2 of G"),
         ("bounds", "problem", UPRIGHT, LONG, "50 of 50 free and 50 of 50 driven leave them",

@@ -46,7 +46,7 @@ def test_process_noise_disturbs_the_motion_and_is_passed_to_the_observer(make_ar
         ({"n": 0}, "cannot simulate 0 trajectories"),
         ({"duration": 0.0}, "duration must"),
         ({"domain": "3X"}, "domain must be one of X, 1.5X, 2X, got '3X'"),
-        ({"process_noise": np.nan}, "process_noise must be finite and not negative, got nan"),
+        ({"process_noise": np.nan}, "process_noise must be a finite number, not negative, got nan"),
         (
             {"plant": get_system("lorenz")},
             r"a plant of \(3, 1, 1\) states, inputs and outputs does not fit van_der_pol",

@@ -84,7 +84,7 @@ def test_regions_hold_what_they_should_on_new_records(tracking, level):
 def test_signals_that_are_not_among_the_hidden_ones_cannot_be_tracked(tmp_path):
     records = [swing(seed, jitter=0.1) for seed in range(6)]
     result, said = trained(records)
-    assert "does not track: position is no sum of speed without an offset" in said
+    assert "does not track: position is not a weighted sum of speed" in said
     artifact = result.artifact
     assert (artifact.motion, artifact.limits, list(result.losses)) == (None, None, ["inverse"])
     assert artifact.inverse.error_covariance is not None
@@ -103,7 +103,7 @@ def test_without_enough_that_is_held_out_there_are_no_covariances(tmp_path):
     records = [both(seed, n=300) for seed in range(3)]
     for share, reason in (
         (0.0, "held_out must be positive, got 0"),
-        (0.03, "the records held out have 24 samples with"),
+        (0.03, "the held-out records have 24 samples with"),
     ):
         result, said = trained(records, held_out=share, inverse_steps=20, flow_steps=20)
         assert "does not track: " in said
@@ -154,7 +154,7 @@ def test_increments_are_between_samples_that_are_known():
     np.testing.assert_allclose(found.change[: len(known)], np.diff(run.x, axis=0)[known], atol=1e-9)
     np.testing.assert_allclose(found.u[: len(known)], run.u[known], atol=1e-9)
     sparse = [replace(each, x=np.where(np.arange(600)[:, None] % 8, np.nan, each.x)) for each in records]
-    with pytest.raises(ValueError, match="no two samples in a row have all hidden signals"):
+    with pytest.raises(ValueError, match="no consecutive samples have all hidden signals"):
         RecordedSource(sparse, recorded_preset(sparse), "a").tracking()
 
 
@@ -167,7 +167,7 @@ def test_outputs_are_sums_of_states_or_an_error():
         np.testing.assert_allclose(C, [[1.0, 0.0]], atol=off)
         assert least == pytest.approx(noise, rel=0.1)
     for other in (run.y**2, run.y + 3.0, rng.standard_normal(run.y.shape)):
-        with pytest.raises(ValueError, match=r"position is no sum of position, speed"):
+        with pytest.raises(ValueError, match=r"position is not a weighted sum of position, speed"):
             linear_output([replace(run, y=other)])
     early = np.arange(600)[:, None] < 300
     apart = replace(run, x=np.where(early, run.x, np.nan), y=np.where(early, np.nan, run.y))
