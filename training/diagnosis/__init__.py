@@ -49,7 +49,7 @@ def check(
         check_interval(of, interval)
         check_duration(seconds, interval)
         _ = subject.motions
-    except SubstepsError as error:
+    except (SubstepsError, ArithmeticError) as error:  # equations may divide by zero in the middle of X
         yield _problem("sampling", error)
         return
     for name in list(CHECKS)[2:]:

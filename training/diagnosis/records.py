@@ -1,6 +1,6 @@
 """Which hidden signals the outputs and inputs determine, from records or rollouts, without a training."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 from scipy.spatial import cKDTree
 
-from observers.checks import integer, noise_levels
+from observers.checks import integer, noise_levels, shown
 from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
 from training.evaluation.levels import Level, show_level
 from training.maps.coordinates import SETTLED, coordinates, noise_covariance, root, settling_time
@@ -176,6 +176,8 @@ def observability(
     ValueError
         If an argument is invalid, or the play is too short to judge the signals.
     """
+    if not hidden:
+        raise ValueError("name the hidden signals, as in hidden=[2]")
     with progress_bars(console) as progress:
         signals: dict[str, Any] = {"measured": list(map(str, measured)), "hidden": list(map(str, hidden))}
         amount: dict[str, Any] = {"episodes": episodes, "steps": steps, "default_steps": STEPS, "seed": seed}
@@ -233,6 +235,8 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
     y = np.concatenate([record.y for record in records])
     if given is None:
         given = [tuple(float(f"{share * size:.3g}") for size in np.nanstd(y, 0)) for share in NOISE_SHARES]
+    elif not isinstance(given, Iterable):
+        raise ValueError(f"measurement_noise must be a list of levels, as in [0.1, 0.3], got {shown(given)}")
     levels = [noise_levels("measurement_noise", level, y.shape[1]) for level in given]
     return tuple(dict.fromkeys([0.0, *levels]))
 

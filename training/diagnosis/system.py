@@ -128,6 +128,10 @@ def equations(subject: Subject) -> Iterator[Finding]:
                 text = f"f or h is not a finite number in {shares}, such as at x = ({point})"
                 advice = "choose X and the bounds where the equations hold, or change the equations"
                 yield Finding("equations", "problem", text, advice)
+            for j in range(0 if system.discrete else system.nu):
+                if not np.any(rows[system.nx + j : system.nx * (1 + system.nu) : system.nu]):
+                    advice = f"give column {j + 1} of G, or of g(x), its numbers"
+                    yield Finding("equations", "problem", f"input {j + 1} moves no state", advice)
     if works:
         parts = "step and h" if system.discrete else "f, g and h"
         yield Finding("equations", "ok", f"{parts} work on {', '.join(works)}")

@@ -135,6 +135,8 @@ def _seconds(values: Any, column: str) -> np.ndarray:
     if not pd.api.types.is_numeric_dtype(values):
         dates = pd.to_datetime(values, format="ISO8601", errors="coerce", utc=True)
         if dates.notna().any():
+            for row in np.flatnonzero(dates.isna() & values.notna()):
+                raise ValueError(f"column {column}, row {row + 1}: {shown(values.iloc[row])} is not a date in ISO 8601")
             return np.asarray((dates - dates.iloc[0]).dt.total_seconds())
     return _numbers(values, column)
 

@@ -117,6 +117,8 @@ class KKLTrainingCallback(BaseCallback):
             raise ValueError(f"records must be a list of training.records.Record, got {shown(records)}")
         if path is not None and not (isinstance(path, str | os.PathLike) and os.fspath(path).endswith(".safetensors")):
             raise ValueError(f"path must end in .safetensors, got {shown(path)}")
+        if on_refit is not None and not callable(on_refit):
+            raise ValueError(f"on_refit must be a function of a Refit, got {shown(on_refit)}")
         if fixed := [name for name in OF_THE_FILTER if name in settings]:
             raise ValueError(f"{', '.join(fixed)} cannot change, as the filter stays: learn another observer instead")
         Config("input-aware", eigenvalues=(-1.0,), **settings)  # raises here rather than at the first refit
@@ -134,8 +136,13 @@ class KKLTrainingCallback(BaseCallback):
                 "one by training.learn, or by kkl-gym record and kkl-gym train"
             )
         config = settings_of(artifact.training, **QUICK | self._settings | {"tracking": artifact.motion is not None})
+        if artifact.inverse.error_covariance is not None and not config.held_out:
+            raise ValueError("covariances are calibrated on held-out episodes: held_out must be positive, got 0")
         for observer in used:
             check_replacement(artifact, observer.artifact)
+            level, largest = observer.measurement_noise, config.measurement_noise_max
+            if np.any(np.asarray(level) > np.asarray(largest)):
+                raise ValueError(f"measurement_noise_max = {largest} is less than the noise {level} in use")
         if hasattr(self, "_gathering"):
             check_replacement(self.artifact, artifact)
         else:

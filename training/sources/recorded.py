@@ -248,8 +248,10 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
     """
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     chosen: dict[str, Any] = {"dt": sampling_interval(*records), **RECORDED} | given
-    dt = chosen["dt"]
+    dt, step, environment = chosen["dt"], median_step(*records), records[0].environment
     check_dt(records, dt)
+    if environment is not None and not np.isclose(dt, step, rtol=1e-6):
+        raise ValueError(f"dt = {dt:g} s: {environment['id']} shows a sample every {step:g} s; leave dt out")
     if records[0].source:
         settled = EPISODE_MEMORIES * SETTLED / float(np.median([len(record.t) for record in records]))
         slowest = min(max(EPISODE_SLOWEST, settled), EPISODE_FASTEST / 4)

@@ -170,6 +170,8 @@ BLIND = NO_INPUT | {
     [
         ("equations", "problem", {"f": lambda self, x: (x[1], -sqrt(x[0] + 0.5))}, {}, " % of 2X, such as",
          "choose X and the bounds where the equations hold, or change the equations"),
+        ("equations", "problem", {"u_max": (1.0, 1.0), "G": ((0.0, 0.0), (1.0, 0.0))}, {}, "input 2 moves no state",
+         "give column 2 of G"),
         ("bounds", "problem", UPRIGHT, LONG, "50 of 50 free and 50 of 50 driven leave them",
          "widen the bounds, shrink X, or take a policy"),
         ("sampling", "note", {}, {"dt": 0.7, "duration": 60.0}, "dt = 0.7 s", "samples are few: take dt = 0.1 s"),
@@ -208,6 +210,11 @@ def test_starts_of_another_shape_end_the_check():
 def test_motions_that_need_too_many_substeps():
     (found,) = (one for one in findings(Oscillator(), dt=1e6) if one.verdict == "problem")
     assert (found.check, "would need more than" in found.found) == ("sampling", True)
+
+
+def test_equations_that_divide_by_zero_in_the_middle_of_X():
+    found = findings(made(g=lambda self, x: ((0.0,), (1 / x[0],))))[-1]
+    assert (found.check, found.verdict, found.found) == ("sampling", "problem", "float division by zero")
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,7 @@ BAD_CSV = {
     "no time": (["0,1,2,a", ",2,2,a"], "column time, row 2: a number is missing"),
     "all missing": (["0,,2,a", "1,nan,2,a"], "column theta, row 1: no row holds a number"),
     "no rows": ([], "column time has no rows"),
+    "a bad date": (["2024-05-01,1,2,a", "noon,2,2,a"], "column time, row 2: 'noon' is not a date in ISO 8601"),
     "a date is missing": (["2024-05-01,1,2,a", ",2,2,a"], "column time, row 2: a number is missing"),
     "one row": (["0,1,2,a"], "t must be two samples at least"),
     "rounding moves": ([f"{k},0.1,2,a" for k in range(99)], "column theta: 0.1 in all rows"),

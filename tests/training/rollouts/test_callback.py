@@ -237,6 +237,7 @@ def test_environments_that_are_refused(pendulum, tmp_path):
     plain = dataclasses.replace(Artifact.read(pendulum), training={})
     plain.save(tmp_path / "plain.safetensors")
     env, space = gym.make("Pendulum-v1"), spaces.Box(-1.0, 1.0, (2,))
+    noise = DummyVecEnv([partial(KKLObservation, gym.make("Pendulum-v1"), pendulum, measurement_noise=0.05)])
     hiding = KKLObservation(gym.wrappers.TransformObservation(env, lambda obs: obs[:2], space), pendulum)
     other = dataclasses.replace(plain, signals=plain.signals | {"hidden": ["sin(obs[2])"]})
     other.save(tmp_path / "other.safetensors")
@@ -247,6 +248,8 @@ def test_environments_that_are_refused(pendulum, tmp_path):
         (wrapped("Pendulum-v1", tmp_path / "plain.safetensors"), {}, "holds no settings of its training"),
         (hiding, {}, r"environment 0 has no 'x': KKLObservation gives the true obs\[2\] as 'x'"),
         (ActionRepeat(wrapped("Pendulum-v1", pendulum), 2), {}, "showed sample 4 after 2: put wrappers that skip"),
+        (noise, {"measurement_noise_max": 0.01}, r"measurement_noise_max = 0\.01 is less than the noise 0\.05"),
+        (wrapped("Pendulum-v1", pendulum), {"held_out": 0.0}, "held_out must be positive, got 0"),
         (two, {}, "has signals"),
         (wrapped("Pendulum-v1", pendulum), {"width": -1}, "width"),
     ):
@@ -259,6 +262,7 @@ def test_arguments_that_make_no_sense():
         ({"every": 10.5}, "every must be"),
         ({"records": ["a"]}, r"records must be a list of training\.records\.Record, got"),
         ({"path": "observer.zip"}, "path must end in"),
+        ({"on_refit": 3}, "on_refit must be a function"),
         ({"eigenvalues": (-1.0,), "dt": 0.1}, "eigenvalues, dt cannot change"),
         ({"neurons": 3}, "neurons"),
     ):

@@ -175,6 +175,11 @@ def test_learns_an_observer_that_fits_the_environment(tmp_path):
     assert env.reset(seed=0)[0].shape == (3,)
 
 
+def test_an_interval_that_is_not_the_environments():
+    with pytest.raises(ValueError, match=r"dt = 0\.5 s: CartPole-v1 shows a sample every 1 s; leave dt out"):
+        training.learn("CartPole-v1", measured=[0], hidden=[1], steps=60, dt=0.5)
+
+
 def test_what_is_wrong_is_said_before_anything_is_played(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "used").mkdir()
