@@ -84,8 +84,8 @@ def save(
     content = _whole(header, data)
     if len(content) > MOST_BYTES or _header_size(content) > MOST_HEADER or _is_deeper(described, DEEPEST):
         raise ValueError(
-            f"{path} would have {len(content)} bytes, {_header_size(content)} of them in its header; the limits: "
-            f"{MOST_BYTES} and {MOST_HEADER}, and {DEEPEST} levels of nested objects and lists"
+            f"{path} would have {len(content)} bytes, {_header_size(content)} of them in its header; the limits are "
+            f"{MOST_BYTES} and {MOST_HEADER}, and at most {DEEPEST} levels of nested objects and lists"
         )
     with replacing(path) as temporary:
         temporary.write_bytes(content)
