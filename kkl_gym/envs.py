@@ -25,7 +25,7 @@ from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, Components, System, reward_of
 from observers.checks import integer, mapping, real_array, shown
 
-SOON = 1000  # samples after which the step is compiled: the simulation is then long enough for it to pay
+SOON = 1000  # samples after which the step is compiled; in shorter simulations compiling costs more than it saves
 _KEYS = (("a", "d"), ("s", "w"))  # keyboard keys for the low and the high end of the first two inputs
 _INTEGER, _FLOAT32 = np.dtype(np.int64), np.dtype(np.float32)
 _ACTIONS = (_FLOAT32, np.dtype(np.float64))  # dtypes that a step takes without a conversion
@@ -53,7 +53,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     of shape (), is true if the state left its declared bounds.
 
     **Reward.** The system's ``reward(x, u)`` at the new state x. The default is 1 / (1 + 4 c) in (0, 1] with
-    c = mean(((x - target) / scale)^2): 1 at the system's target.
+    c = mean(((x - target) / scale)^2). It is 1 at the system's target.
 
     **Ends.** An episode is ``terminated`` where the system's ``terminated(x)`` is true, and where the state leaves its
     declared bounds (``info["escaped"]``). In the second case the last state and output inside the bounds are returned.
@@ -83,7 +83,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     render_mode : {None, "rgb_array", "human"}
         What :meth:`render` does: nothing, return an image, or draw in a window. "human" needs the extra ``human``. Its
         window shows the motion in real time, from :meth:`reset` until :meth:`close`. An observer around the
-        environment draws its estimate there, too.
+        environment draws its estimate in the same window.
 
     Raises
     ------
@@ -135,7 +135,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
 
         # Every step reads these; Python numbers are faster here than arrays.
         self._nu = self.system.nu
-        self._sample = self._samples = 0  # samples since the reset, and those of this system before it
+        self._sample = self._samples = 0  # samples in this episode, and in earlier ones of this system
         self._advance: Callable[..., Components]
         self._exchanged()
         self._bounds, self._u_max = self.system.bounds, self.system.u_max
@@ -148,8 +148,8 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
-        self.emitted = b""  # the last observation; an observer outside compares it with the one that it receives
-        self.drawn_by = 0  # number of the observer outside that draws the window; 0: the environment itself
+        self.emitted = b""  # the last observation; an observer wrapper compares it with the one that it receives
+        self.drawn_by = 0  # number of the observer wrapper that draws the window; 0: the environment draws it
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -216,7 +216,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         w, v = self._next_noise()
         x = self._advance(self._x, u, w, self.plant.dt)
         escaped = not self._inside(x)
-        if escaped:  # or the substeps erred: finer ones decide
+        if escaped:  # or the substeps were too coarse: check with finer ones
             x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
             escaped = not self._inside(x)
         if not escaped:
@@ -237,7 +237,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return self.draw()
 
     def draw(self, estimates: Collection[Sequence[float]] = ()) -> np.ndarray | None:
-        """Draw what :meth:`render` draws, and the estimates so far, in order of time, beside the states."""
+        """Draw the phase portrait, with the estimates so far, in order of time, beside the states."""
         if self.render_mode is None:
             return None
         if self._x is None:
@@ -253,7 +253,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return None
 
     def animate(self, estimates: Collection[Sequence[float]] = ()) -> None:
-        """Draw the window's next frame, if one is due at this sample; ``estimates`` are those of :meth:`draw`."""
+        """Draw the window's next frame, if one is due at this sample; ``estimates`` as for :meth:`draw`."""
         if self._sample % samples_a_frame(self.dt) == 0:
             self.draw(estimates)
 
@@ -283,7 +283,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     def _exchanged(self) -> None:
         self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
-        self._samples = -self._sample  # counts from here: a system that changes every episode is not worth compiling
+        self._samples = -self._sample  # restart the count: compiling does not pay if the system changes every episode
 
     def _input(self, action: np.ndarray) -> list[float]:
         if type(action) is not np.ndarray or action.dtype not in _ACTIONS:

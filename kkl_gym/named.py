@@ -52,7 +52,7 @@ def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str
             ask = "" if not entries else ": name one entry of it"
             raise ValueError(
                 f"{role} names {name!r}, but an observation of {source} is {known}{ask}; an index stands for its entry "
-                "(2 for obs[2]), and info[KEY] for what info holds"
+                "(2 for obs[2]), and info[KEY] for an entry of info"
             )
         found += [f"{function[1]}({entry})" for entry in entries] if function else entries
     return tuple(found)
@@ -71,7 +71,7 @@ def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]
 
 
 class Reader:
-    """Reads named signals from observations and ``info``. With ``missing`` they may be NaN. Shapes: ``low`` (n,)."""
+    """Reads named signals from observations and ``info``; with ``missing`` they may be NaN. Shapes: ``low`` (n,)."""
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str, missing: bool = False) -> None:
         there, self._source = observed(space), source
@@ -122,7 +122,7 @@ class Reader:
         if index is None and values.shape[-1] != 1:
             raise ValueError(f"{entry} of {self._source} holds {values.shape[-1]} numbers: name one, as in {entry}[0]")
         if (index or 0) >= values.shape[-1]:
-            raise ValueError(f"{entry}: info of {self._source} holds {values.shape[-1]} numbers there, from 0 on")
+            raise ValueError(f"{entry}: info of {self._source} holds {values.shape[-1]} numbers there, indexed from 0")
         return values[..., [index or 0]]
 
 
@@ -141,7 +141,7 @@ class InputReader:
         self._inputs, there = Inputs(space, source=source), acting(space)
         for name in names:
             if name not in there:
-                raise ValueError(f"inputs names {name!r}, but an action of {source} is {', '.join(there)}")
+                raise ValueError(f"inputs names {name!r}, but the inputs of {source} are {', '.join(there)}")
         self._take = np.array([there.index(name) for name in names], dtype=int)
 
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:

@@ -12,7 +12,7 @@ from observers.tracker import Tracker
 
 _LANES = 8  # rows that are stepped together
 MOST_OPERATIONS = 400  # longer expressions, such as a network as f, would take many seconds to compile
-MOST_ROWS = 32  # of a covariance: larger ones, of eight trackers at once, would exceed the stack of a thread
+MOST_ROWS = 32  # of a covariance; larger ones of eight trackers together would exceed a thread's stack
 
 
 class CompiledStep:
@@ -83,8 +83,8 @@ class CompiledStep:
 
 
 def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]:
-    """Ages, and each map's covariances there, (2, ages, nx^2)."""
-    errors = [each.error for each in maps if each.error is not None]  # maps that track have one
+    """Ages, and the covariances of the maps at these ages, (maps, ages, nx^2)."""
+    errors = [each.error for each in maps if each.error is not None]  # every map that tracks has covariances
     ages = np.unique([age for error in errors for age in error.ages])
     return ages, np.array([error(ages, ages.shape).reshape(len(ages), -1) for error in errors])
 

@@ -335,7 +335,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         z, x_hat, covariance, surer, acted = stack(size, 1), stack(nx, 1), doubles(P), doubles(quotient), stack(W, 1)
         for w in range(count):
             row, at = offset(doubles(rows), w), 0
-            acted[w] = 1.0 if size == nz else 0.0  # until an input acts, T_inv is that of free motion
+            acted[w] = 1.0 if size == nz else 0.0  # until an input acts, the map of free motion applies
             for i in range(nz, size):
                 acted[w] = acted[w] if row[i * W] == 0.0 else 1.0
             table = 0 if acted[w] else 1
@@ -349,7 +349,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 covariance[i * W + w] = lower + part * (covariances[table, upper, i] - lower)
         factorise(P, L, inverse)
         factorise(offset(rows, base + nx), L, own)
-        quotient[0] = own[0] / inverse[0]  # the root of that of the determinants
+        quotient[0] = own[0] / inverse[0]  # square root of the ratio of the determinants
         for i in range(1, nx):
             quotient[0] *= own[i] / inverse[i]
         for w in range(count):

@@ -34,7 +34,7 @@ class KKLObserver(RecordEstimates):
     ``reset(y_0, x_0)`` starts at z_0 = T(x_0) without transient. T also gives :attr:`mismatch`, the distance of z from
     T(x_hat).
 
-    If the artifact holds a motion, the observer tracks: a Kalman filter predicts the estimate by the system's
+    If the artifact holds a motion model, the observer tracks: a Kalman filter predicts the estimate by the system's
     equations, or by a learned flow, and corrects it by each sample (:class:`observers.tracker.Tracker`). T_inv's
     estimate replaces the tracker's soon after a reset if its covariance is smaller, and after a divergence.
 
@@ -53,19 +53,19 @@ class KKLObserver(RecordEstimates):
         Whether to test if the samples fit the estimates, see :attr:`score`.
     tracking : bool, optional
         Whether to track. False uses T_inv alone, without any model at run time. None tracks if the artifact holds a
-        motion.
+        motion model.
     compiled : bool, optional
         Whether Numba compiles the step (the extra ``fast``). None compiles if Numba is installed, True requires it, and
         False uses NumPy. The first process on a machine compiles for some seconds; later ones read the machine code
         from disk. Numba and NumPy agree to rounding.
     gate : float, optional
         Largest innovation, in its own standard deviations. Outputs beyond it are rejected: they count as missing, and
-        :attr:`rejected` counts them. The gate is open in the first window, half a second for the maps that ship. It
-        also opens for an output that was beyond it for a whole window, and after a divergence, until the output fits
-        again: so a lasting jump is accepted. A gate needs a map that tracks.
+        :attr:`rejected` counts them. The gate accepts all outputs in the first window, half a second for the
+        maps that ship. It also opens after a divergence, and for an output that was beyond it for a whole window, and
+        stays open until the output fits again: so a lasting jump is accepted. A gate needs a map that tracks.
     delay : int, default 0
-        Samples by which outputs arrive late. ``step(y, u)`` then takes the output of so many samples ago and the input
-        held since the last sample, and the motion predicts the estimate to now. A delay needs a map that tracks.
+        Samples by which outputs arrive late. ``step(y, u)`` takes the output of ``delay`` samples ago and the input
+        held since the last sample; the motion model then predicts the estimate to now. A delay needs a map that tracks.
 
     Raises
     ------
@@ -73,7 +73,7 @@ class KKLObserver(RecordEstimates):
         If ``compiled`` is True and Numba is not installed.
     ValueError
         If an argument has the wrong type, a noise level is negative or beyond 1e12, the measurement noise is beyond
-        the map's training, it differs between outputs but the map takes one level for all, or the artifact holds no
+        the map's range, it differs between outputs but the map takes one level for all, or the artifact holds no
         limits for a monitor.
     """
 
@@ -164,7 +164,7 @@ class KKLObserver(RecordEstimates):
     def replace(self, artifact: Artifact) -> None:
         """Use the maps of another artifact with the same filter from now on. The filter's state stays.
 
-        If the new map tracks and the old one did not, tracking starts at the current sample.
+        If the new map tracks and the old one did not, tracking starts at the current sample. A monitor restarts.
 
         Parameters
         ----------
@@ -175,7 +175,7 @@ class KKLObserver(RecordEstimates):
         ------
         ValueError
             If the artifact differs in more than its maps, the noise level is beyond its range, or it holds no limits
-            for the monitor, which restarts. The observer is then unchanged.
+            for the monitor. The observer is then unchanged.
         """
         check_replacement(self.artifact, artifact)
         how: dict[str, Any] = {**self._options, "gate": self._gate, "delay": self._delay}
@@ -217,7 +217,7 @@ class KKLObserver(RecordEstimates):
         ------
         ValueError
             If a shape is wrong, an entry is not a finite real number, or x0 is given and the artifact holds neither T
-            nor a motion. The observer is then unchanged.
+            nor a motion model. The observer is then unchanged.
         """
         y0 = real_array("y", y0).copy()  # the caller may reuse its array
         check_output(self.artifact, y0, y0.shape[:-1])
@@ -294,8 +294,8 @@ class KKLObserver(RecordEstimates):
         """Process the next sample.
 
         If outputs are missing, such as those of slower sensors, the observer uses predictions in their place: an
-        observer that tracks predicts by its motion, any other by h(T_inv(z)). If the artifact holds no h, the last
-        value of a missing output is held.
+        observer that tracks predicts by its motion model, any other by h(T_inv(z)). Without h, a missing output keeps
+        its last value.
 
         Parameters
         ----------
@@ -315,9 +315,9 @@ class KKLObserver(RecordEstimates):
         Raises
         ------
         ValueError
-            If a shape is wrong, an entry is not a finite real number (or NaN as described), an input is not zero that
-            the map does not take, ``dt`` does not suit the motion, or both ``dt`` and a delay are given. The observer
-            is then unchanged.
+            If a shape is wrong, an entry is not a finite real number (or NaN as described), an input that the map
+            does not take is not zero, ``dt`` does not suit the motion model, or ``dt`` and a delay are both given. The
+            observer is then unchanged.
         RuntimeError
             Before :meth:`reset`.
         """
@@ -363,7 +363,7 @@ class KKLObserver(RecordEstimates):
             self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows], dt)
 
     def _warn(self, text: str) -> None:
-        """Warn once of each kind of text, which its first words identify."""
+        """Warn once for each kind of message, which its first characters identify."""
         if text[:12] not in self._warned:
             self._warned = self._warned | {text[:12]}
             warnings.warn(text, stacklevel=5)
@@ -400,10 +400,10 @@ class KKLObserver(RecordEstimates):
     def covariance(self) -> np.ndarray:
         """Covariance of the error x - x_hat of the current estimate, shape (..., nx, nx).
 
-        It is calibrated on runs, by noise level and age: 90 % of their errors have (x - x_hat)^T P^-1 (x - x_hat) below
-        the 90 % quantile of the chi-square distribution with nx degrees of freedom. A tracker calibrates the covariance
-        of its Kalman filter. On another plant, under a faulty sensor or far outside the training, P is too small.
-        Raises RuntimeError before :meth:`reset`, and ArtifactError if the artifact holds no covariance.
+        It is calibrated on runs, by noise level and age, so that 90 % of errors have (x - x_hat)^T P^-1 (x - x_hat)
+        below the 90 % quantile of the chi-square distribution with nx degrees of freedom. For a tracker it is the
+        calibrated covariance of its Kalman filter. On another plant, under a faulty sensor or far outside the training,
+        P is too small. Raises RuntimeError before :meth:`reset`, and ArtifactError if the artifact holds no covariance.
         """
         return self.decode_covariance()
 
@@ -424,7 +424,7 @@ class KKLObserver(RecordEstimates):
         return self._state
 
     def _some(self, rows: np.ndarray | None) -> tuple[np.ndarray, tuple[int, ...]]:
-        """Some rows of the state, predicted to now if outputs are delayed, and the shape of their batch."""
+        """Some rows of the state, predicted to the present if outputs are delayed, and the shape of their batch."""
         state, batch = self._begun(), self._batch
         chosen: Any = slice(None)
         if rows is not None:

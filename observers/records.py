@@ -31,11 +31,11 @@ class RecordEstimates:
         y : array_like, shape (steps, ..., ny)
             Outputs; the first row is y_0. Missing outputs in later rows are NaN.
         u : array_like, shape (steps - 1, ..., nu), optional
-            The input held after each row but the last, by default zero. One row more is ignored.
+            The input held after each row but the last, by default zero. An additional last row is ignored.
         x0 : array_like, shape (..., nx), optional
             The state at y_0, if it is known, as for :meth:`reset`.
         t : array_like, shape (steps,), optional
-            Increasing times of the samples in seconds; by default the samples are at the map's interval.
+            Increasing times of the samples in seconds; by default one interval of the map apart.
 
         Returns
         -------
@@ -47,7 +47,7 @@ class RecordEstimates:
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Estimate the system's uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
 
-        Arguments and errors are those of :meth:`estimate`. Shapes: returns (steps, ..., number).
+        Arguments and errors are those of :meth:`estimate`. Shapes: returns (steps, ..., number of parameters).
         """
         return self._along(y, u, None, of=self._kkl.parameters_hat)
 
@@ -66,7 +66,7 @@ class RecordEstimates:
     ) -> np.ndarray:
         """The values of a function of the state's rows at each sample."""
         if self._delay:
-            raise ValueError("a record has no delay: shift its outputs to their times, and make an observer without")
+            raise ValueError("a record has no delay: shift its outputs by the delay, and use an observer without one")
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
             raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")

@@ -1,4 +1,4 @@
-"""Checks of all that an observer is given: arguments, other maps, samples, inputs, records and states."""
+"""Checks of all that is passed to an observer: arguments, replacement maps, samples, inputs, records and states."""
 
 import math
 from collections.abc import Callable
@@ -18,15 +18,15 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tr
     if not isinstance(artifact, Artifact):
         raise ValueError(f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names")
     if flag("monitor", monitor) and artifact.limits is None:
-        found = "them" if artifact.knows_output else "them, and the output h(x), which this artifact lacks as well"
+        found = "them" if artifact.knows_output else "them, and with the output h(x), which this one lacks as well"
         raise ValueError(
-            f"this artifact for {artifact.system!r} holds no limits to monitor by; training.calibrate(artifact, "
-            f"system) finds {found}, and returns an artifact that does"
+            f"this artifact for {artifact.system!r} holds no limits for a monitor; training.calibrate(artifact, "
+            f"system) returns an artifact with {found}"
         )
     if tracking is not None and flag("tracking", tracking):
         artifact.require_motion()
     elif tracking is not None and monitor and artifact.motion is not None:
-        raise ValueError("the limits of this artifact are those of the observer that tracks: leave tracking=False out")
+        raise ValueError("this artifact has monitor limits only for an observer that tracks: leave tracking=False out")
     if compiled is not None and flag("compiled", compiled) and not available():
         raise ImportError("compiled=True needs Numba: pip install kkl-gym[fast], or leave compiled out")
 
@@ -51,7 +51,7 @@ def check_delay(artifact: Artifact, tracking: bool | None, delay: Any) -> int:
 def _check_tracks(artifact: Artifact, tracking: bool | None) -> None:
     if tracking is not None and not tracking:
         raise ValueError(
-            "a gate and a delay need an observer that tracks: leave tracking=False, or a wrapper's estimate='z', out"
+            "a gate and a delay need an observer that tracks: leave out tracking=False, or a wrapper's estimate='z'"
         )
     artifact.require_motion()
 
@@ -59,7 +59,7 @@ def _check_tracks(artifact: Artifact, tracking: bool | None) -> None:
 def check_replacement(artifact: Artifact, other: Artifact) -> None:
     """Raise ArtifactError unless an artifact can replace another while the filter runs."""
     if not isinstance(other, Artifact):
-        raise ArtifactError(f"an observer is replaced by an observers.Artifact, got {shown(other)}")
+        raise ArtifactError(f"the replacement must be an observers.Artifact, got {shown(other)}")
     there = _serves(other)
     for what, here in _serves(artifact).items():
         if here != there[what]:
@@ -77,7 +77,7 @@ def check_replacement(artifact: Artifact, other: Artifact) -> None:
 
 
 def _serves(artifact: Artifact) -> dict[str, Any]:
-    """The purpose and the estimates of an artifact, by the words of messages."""
+    """Properties that a replacement must share, by their names in messages."""
     signals, environment = artifact.signals, artifact.environment
     return {
         "environment": environment,
@@ -93,13 +93,13 @@ def _serves(artifact: Artifact) -> dict[str, Any]:
 def check_output(
     artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], warn: Callable[[str], None] | None = None
 ) -> None:
-    """Check outputs (..., ny); at the first sample, without ``warn``, none may be missing."""
+    """Check outputs (..., ny). Without ``warn`` they are a first sample, in which none may be missing."""
     if y.shape != (*batch, artifact.ny):
         raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
     if all_finite(y):
         return
     if warn is None:
-        _check_finite("y", y, hint="; outputs may be missing later, but the first sample must be whole")
+        _check_finite("y", y, hint="; outputs may be missing later, but the first sample must be complete")
     elif not artifact.knows_output:
         warn(f"the map for {artifact.system!r} holds no output h(x): a missing output keeps its last value")
     _check_finite("y", np.where(np.isnan(y), 0.0, y), hint="; NaN marks a missing output")
@@ -108,7 +108,7 @@ def check_output(
 def held_input(
     artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...], warn: Callable[[str], None]
 ) -> np.ndarray:
-    """Return inputs (..., nu) as floats, zeros for None; warns of inputs far beyond the training."""
+    """Return inputs (..., nu) as floats, zeros for None; warn of inputs far beyond those in training."""
     nu = artifact.nu
     if u is None:
         return np.zeros((*batch, nu))
@@ -117,7 +117,7 @@ def held_input(
         raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
     if nu == 0 and u.any():
         raise ValueError(
-            f"this map for {artifact.system} knows no inputs, but u = {u}; take one that does, "
+            f"this map for {artifact.system} takes no inputs, but u = {u}; use one that does, "
             "or pass u=None to ignore the input"
         )
     if not all_finite(u, artifact.usual_input):  # one pass for both checks is faster
@@ -130,7 +130,7 @@ def held_input(
 
 
 def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """Return the filter's state (..., size) at the first sample (..., ny), from ``x0`` (..., nx) if it is known."""
+    """Return the filter's state (..., size) and age at the first sample (..., ny), from ``x0`` (..., nx) if given."""
     if x0 is None:
         return artifact.filter.start(y0), 0
     artifact.require_known_start()
@@ -138,7 +138,7 @@ def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tu
     if x0.shape != shape:
         raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")
     _check_finite("x0", x0, hint="; leave x0 out where it is unknown")
-    if artifact.forward is None:  # only the tracker starts there
+    if artifact.forward is None:  # only the tracker starts at x0
         return artifact.filter.start(y0), 0
     z0 = np.zeros((*shape[:-1], artifact.filter.size))
     z0[..., : artifact.forward.mlp.outputs] = artifact.forward(x0)

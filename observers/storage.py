@@ -84,7 +84,7 @@ def save(
     content = _whole(header, data)
     if len(content) > MOST_BYTES or _header_size(content) > MOST_HEADER or _is_deeper(described, DEEPEST):
         raise ValueError(
-            f"{path} would have {len(content)} bytes, {_header_size(content)} of them in its header; it may have "
+            f"{path} would have {len(content)} bytes, {_header_size(content)} of them in its header; the limits are "
             f"{MOST_BYTES} and {MOST_HEADER}, and at most {DEEPEST} levels of nested objects and lists"
         )
     with replacing(path) as temporary:
@@ -172,7 +172,7 @@ def _whole(header: Mapping[str, Any], data: bytes) -> bytes:
 
 
 def _is_deeper(value: Any, levels: int) -> bool:
-    """Whether objects and lists are nested on more than so many levels."""
+    """Whether objects and lists are nested more than ``levels`` deep."""
     inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else None
     return inner is not None and (levels == 0 or any(_is_deeper(one, levels - 1) for one in inner))
 

@@ -176,8 +176,8 @@ def test_what_is_said_of_tuned_kalman_filters():
         f"{ratios['ukf', 0.0]} times."
     ) in benchmark
     assert (
-        f"they leave {ratios['ekf', 0.5]} times the error of tuned extended filters, and {ratios['ukf', 0.5]} times "
-        "that of tuned unscented ones"
+        f"their errors are {ratios['ekf', 0.5]} times those of tuned extended filters, and "
+        f"{ratios['ukf', 0.5]} times those of tuned unscented ones"
     ) in faq
 
 

@@ -43,7 +43,7 @@ SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # shares of each colour mixed with the bac
 
 
 def theme_around() -> Theme:
-    """The theme of the enclosing :func:`style` block, which the background colour tells."""
+    """The theme of the enclosing :func:`style` block, recognised by its background colour."""
     import matplotlib
 
     return "dark" if matplotlib.rcParams["figure.facecolor"] == GROUNDS["dark"] else "light"
@@ -80,7 +80,7 @@ def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
 
 
 def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
-    """Write a looping GIF, whole or not at all; one small palette for all frames makes still parts cost nothing."""
+    """Write a looping GIF, whole or not at all; parts that stand still take no space, as frames share one palette."""
     from matplotlib.colors import to_rgb
     from PIL import Image
 

@@ -39,7 +39,7 @@ class ProgressBars(Progress):
 
     @contextmanager
     def phase(self, description: str, total: float = 1) -> Iterator[Callable[[float], None]]:
-        """Show a phase while the context lasts; the context's value reports how much is done."""
+        """Show a phase while the context lasts; it yields a function that reports how much is done."""
         task = self.add_task(description, total=total)
         try:
             yield lambda done: self.update(task, completed=done)
@@ -49,7 +49,7 @@ class ProgressBars(Progress):
         self.update(task, completed=total)
 
     def say(self, text: str) -> None:
-        """Print a line above the bars, and to the log."""
+        """Print a line above the bars, and write it to the log."""
         self.tell()
         self._write(text, printed=True)
 

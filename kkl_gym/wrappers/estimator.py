@@ -131,7 +131,7 @@ class KKLEstimator:
             return u
         if not self._ignore_input and u.any():
             raise ValueError(
-                f"the map {self.observer.artifact.system!r} in use knows no inputs, but the agent applied u = {u}; "
+                f"the map {self.observer.artifact.system!r} in use takes no inputs, but the agent applied u = {u}; "
                 "use the default map, keep the action at 0, or pass ignore_input=True"
             )
         return None

@@ -1,4 +1,4 @@
-"""A memory around any environment: filtered outputs and actions, beside the measured entries, without training."""
+"""Wrappers that add a memory, filtered outputs and actions, to observations of any environment, without training."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -65,7 +65,7 @@ class _Remembering:
         self._beside = [] if keys is None else [*self.outputs.unseen, *range(len(self.outputs.low), self.memory.size)]
         if keys is not None:
             if weights is not None or "memory" in keys:
-                raise ValueError(f"{source}: weights, and a key named memory, need measured=[0, 1], indices of entries")
+                raise ValueError(f"{source}: weights, or a key named memory, need indices of entries: measured=[0, 1]")
             low, high = low[self._beside], high[self._beside]
         with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
             flat = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
@@ -88,11 +88,11 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     linear, stable and fixed: filters of the outputs and inputs, the linear half of a KKL observer.
 
     The observation is [y, memory of y, memory of u], float32, where y are the measured entries. The memory of y has one
-    number for each entry and time constant: a first-order filter of the entry's changes, 0 where y rests. The memory of
-    u has a running mean for each input and time constant. The cosine and sine of an angle share one memory, of the
-    angle that it has turned. Once the memory has filled, its numbers are about as large as y, see
-    :class:`kkl_gym.memory.Memory`. At reset it assumes that y has rested and that no input has acted. From the first
-    step on, it assumes that y changed in the 64 steps before the reset as it has since. ``info`` is unchanged.
+    number for each entry and time constant: a first-order filter of its changes, 0 where y is constant. The memory of
+    u has a running mean for each input and time constant. The cosine and sine of an angle share one memory, that of
+    the unwrapped angle. Once the memory has filled, its numbers are about as large as y, see
+    :class:`kkl_gym.memory.Memory`. At reset it assumes that y was constant and that no input acted. From the first step
+    on, it assumes that y changed in the 64 steps before the reset at its mean rate since then. ``info`` is unchanged.
 
     A Dict stays a Dict with the same keys; the new key ``"memory"`` holds the memory, and the cosine and sine of
     angles. Images are not remembered.
@@ -112,10 +112,10 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Length of a turn, for all angles that are not pairs. None: 360 if the bounds are 360 or 720 apart, 2 pi if they
         are infinite or at most 4 pi apart. It is required for other bounds, and for bounds 1, 2 or 4 apart.
     missing : {"error", "hold"}
-        Treatment of NaN among the measured entries: an error, or the last value. The first sample must be complete.
+        On NaN among the measured entries, raise an error, or hold the last value. The first sample must be complete.
     weights : array_like, optional
-        Return value of :meth:`learn_weights`, for noisy outputs. The observation is then [y as expected in the next
-        step, predictions of later y], see :class:`kkl_gym.prediction.PredictiveMemory`.
+        Return value of :meth:`learn_weights`, for noisy outputs. The observation is then [prediction of y one step
+        ahead, predictions of later y], see :class:`kkl_gym.prediction.PredictiveMemory`.
     time_constants : sequence of float
         Time constants of the outputs' filters in steps, from 0.5 to 10,000, each at least 1.5 times the one before.
     input_time_constants : sequence of float
@@ -179,7 +179,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._of.show(obs, self._flat, shown), reward, terminated, truncated, info
 
     def learn_weights(self, steps: int = 4_000, *, seed: int = 0) -> list[list[float]]:
-        """Learn from random actions how the memory predicts later outputs.
+        """Fit weights, on random actions, by which the memory predicts later outputs.
 
         All environments of an agent need the same weights. This method resets the environment.
 
@@ -220,8 +220,8 @@ class KKLVectorMemory(VectorWrapper):
 
     It works around Gymnasium's Sync and Async vectors, and around environments that are natively vectors.
     ``info["final_obs"]`` holds the last observations with their memory; the rest of ``info`` is unchanged. In the mode
-    SAME_STEP, vectors return an episode's last observation after the next reset. If the environments reuse the array of
-    their observations, wrap each in :class:`KKLMemory` instead.
+    SAME_STEP, vectors return an episode's last observation after the next reset. If the environments overwrite it by
+    then, because they reuse one array, wrap each in :class:`KKLMemory` instead.
 
     Parameters
     ----------

@@ -312,7 +312,7 @@ def test_a_blind_map_under_action(saved):
     env = KKLVectorObservation(vector("van_der_pol", "NextStep"), path)
     env.reset(seed=0)
     env.step(np.zeros((N, 1)))
-    with pytest.raises(ValueError, match="knows no inputs"):
+    with pytest.raises(ValueError, match="takes no inputs"):
         env.step(np.ones((N, 1)))
     with pytest.raises(ValueError, match="reset after an error"):  # it has missed a sample
         env.step(np.zeros((N, 1)))

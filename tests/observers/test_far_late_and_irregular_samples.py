@@ -204,7 +204,7 @@ def test_wrappers_have_the_gate_and_the_delay_of_their_observers():
     envs.observer.gate = 5.0
     assert envs.reset(seed=0)[1]["rejected"].tolist() == [0, 0, 0]
     of_z = kkl_gym.KKLObservation(gym.make("KKLLorenz-v0"), estimate="z")
-    with pytest.raises(ValueError, match="leave tracking=False, or a wrapper's estimate='z', out"):
+    with pytest.raises(ValueError, match="leave out tracking=False, or a wrapper's estimate='z'"):
         of_z.observer.gate = 5.0
 
 
@@ -224,7 +224,7 @@ def test_what_is_wrong_is_named():
     for options in ({"gate": 5.0}, {"delay": 2}):
         with pytest.raises(ValueError, match="does not track"):
             KKLObserver(random_artifact(), **options)
-        with pytest.raises(ValueError, match="leave tracking=False, or"):
+        with pytest.raises(ValueError, match="leave out tracking=False, or"):
             KKLObserver(artifact, tracking=False, **options)
     observer, late = KKLObserver(artifact), KKLObserver(artifact, delay=2)
     for each in (observer, late):

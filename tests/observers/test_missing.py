@@ -89,12 +89,12 @@ def test_where_all_outputs_are_missing_the_sample_is(batch):
 def test_what_is_neither_there_nor_missing():
     observer, gap = KKLObserver(exact()), np.array([0.1, math.nan])
     for call in (observer.reset, lambda y: observer.estimate([y, [0.1, 0.2]])):
-        with pytest.raises(ValueError, match="the first sample must be whole"):
+        with pytest.raises(ValueError, match="the first sample must be complete"):
             call(gap)
     observer.reset(np.zeros((2, 2)))
     observer.step(np.ones((2, 2)))
     z = observer.z
-    with pytest.raises(ValueError, match="the first sample must be whole"):
+    with pytest.raises(ValueError, match="the first sample must be complete"):
         observer.restart(gap[None], np.array([True, False]))
     for wrong in ([math.inf, 0.0], [math.nan, -math.inf], [1e16, math.nan]):
         for call in (observer.reset, lambda y: observer.step([y, y]), lambda y: observer.estimate([[0.0, 0.0], y])):

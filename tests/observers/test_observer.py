@@ -159,9 +159,9 @@ def test_every_kind_of_real_array_is_taken(same, make_artifact):
 
 def test_a_map_without_inputs_refuses_them(make_artifact):
     observer, other = begun(make_artifact(inputs=False))
-    with pytest.raises(ValueError, match=r"van_der_pol knows no inputs, but u = \[0\.5\]"):
+    with pytest.raises(ValueError, match=r"van_der_pol takes no inputs, but u = \[0\.5\]"):
         observer.step([1.0], np.array([0.5]))
-    with pytest.raises(ValueError, match="knows no inputs"):
+    with pytest.raises(ValueError, match="takes no inputs"):
         observer.estimate(np.zeros((3, 1)), np.ones((2, 1)))
     with pytest.raises(ValueError, match="u must hold real numbers"):
         observer.step([1.0], ["a"])

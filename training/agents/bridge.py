@@ -14,10 +14,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 class SB3VecEnv(VecEnv):
     """A stable-baselines3 ``VecEnv`` around any Gymnasium ``VectorEnv`` that resets in the same step.
 
-    ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` may wrap it. When an episode ends, the row's info holds
-    ``terminal_observation`` (the one before the reset), ``TimeLimit.truncated`` and everything that the environment
-    reported for the last step. Other steps report only ``info_keys``, because a dictionary for each row and step costs
-    more than a batched simulation.
+    ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` may wrap it. A row is one environment of the vector. When its
+    episode ends, its info holds ``terminal_observation`` (the one before the reset), ``TimeLimit.truncated`` and all
+    that the environment reported for the last step. Other steps report only ``info_keys``, because a dictionary for
+    each row and step costs more than a batched simulation.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class SB3VecEnv(VecEnv):
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(
-                f"stable-baselines3 needs environments that reset in the same step, this one has {mode}: make it with "
+                f"stable-baselines3 needs environments that reset in the same step, got one with {mode}: make it with "
                 'autoreset_mode="SameStep" (vector_kwargs={"autoreset_mode": "SameStep"} for Sync and Async vectors)'
             )
         if 0 in (env.single_action_space.shape or ()):
@@ -53,7 +53,7 @@ class SB3VecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         if any(repr(other) != repr(options[0]) for other in options):
-            raise ValueError("a vector environment takes the same options for all rows: set_options(a dictionary)")
+            raise ValueError("a vector environment takes the same options for all rows: set_options(one dictionary)")
         obs, info = self.env.reset(seed=seeds, options=dict(options[0]) or None)
         self.reset_infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
         return deepcopy(obs)
@@ -105,7 +105,7 @@ class SB3VecEnv(VecEnv):
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **options: Any) -> list[Any]:
         """Call a method of every row's environment, in Sync and Async vectors only, and return the results."""
         if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError("methods of a vector environment's rows are called in all rows at once")
+            raise ValueError("a method of a vector environment's rows is called in all rows at once")
         return list(self._rows_of("call", method_name)(method_name, *args, **options))
 
     def _owner(self, name: str) -> Any:

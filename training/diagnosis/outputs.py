@@ -1,4 +1,4 @@
-"""Which states the outputs of a system determine: near each state by its equations, and globally by motions."""
+"""Which states the outputs of a system determine: near each state by the equations, globally by simulated motions."""
 
 import contextlib
 from collections.abc import Iterator
@@ -16,11 +16,11 @@ from training.sources.simulated import unknown_start
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
 MIN_STEPS = 10  # least number of samples of a motion
-# A direction is a problem or a note if more of its standard deviation at the start is left after all of y.
+# A direction is a problem or a note if a larger share of its initial standard deviation remains after all of y.
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in that direction
 VAGUE = 0.3  # larger errors without noise, in standard deviations of the state, are noted
-# A state has a symmetry if its error by the equations is at most the first, and by neighbours at least the second.
+# A state has a symmetry if its error by the equations is at most LOCALLY, and by neighbours at least GLOBALLY.
 LOCALLY, GLOBALLY = 0.1, 0.3
 
 
@@ -28,7 +28,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
     """The least error of each state at each level of noise, and the states that y does not determine."""
     names = subject.system.state_names
     errors, left = least_errors(subject)
-    weights = np.ones(errors.shape[1])  # the rest of a motion is like the second half of its beginning
+    weights = np.ones(errors.shape[1])  # steps left out count as much as the second half of the others
     late = weights[len(weights) // 2 :]
     late += max(0, round(subject.duration / subject.dt) + 1 - len(weights)) / len(late)
     least = np.average(errors, axis=1, weights=weights)
@@ -40,11 +40,11 @@ def observability(subject: Subject) -> Iterator[Finding]:
             continue
         exact = errors[0, :, i]
         first = int((exact <= max(DETERMINED, AS_GOOD * exact.min())).argmax())
-        shares = [f"{error(least[0, i])} without noise (seen {first * subject.dt:.3g} s after the start)"]
+        shares = [f"{error(least[0, i])} without noise (determined after {first * subject.dt:.3g} s)"]
         shares += [f"{error(one[i])} at noise {show_level(level)}" for level, one in zip(subject.noise, least[1:])]
         text = f"{name}: at best an error of {', '.join(shares)}, in its standard deviations"
         if least[0, i] > VAGUE:
-            yield Finding("observability", "note", text, f"let h measure more that depends on {name}")
+            yield Finding("observability", "note", text, f"let h measure another quantity that depends on {name}")
         else:
             yield Finding("observability", "ok", text)
 
@@ -97,7 +97,7 @@ def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], F
 
 
 def spectrum(subject: Subject) -> Iterator[Finding]:
-    """The eigenvalues that a training takes."""
+    """The eigenvalues of A that a training uses."""
     taken = eigenvalues(subject.system, subject.dt)
     text = f"{len(taken)} eigenvalues of A for each output, {taken[0]:.3g} to {taken[-1]:.3g} 1/s"
     yield Finding("spectrum", "ok", text)
@@ -112,8 +112,8 @@ def _symmetries(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Fi
         confused = (exact <= LOCALLY) & (of_records(records, measurement_noise=[]).errors[0].min(0) >= GLOBALLY)
         if confused.any() and not subject.policy:
             names = ", ".join(name for name, here in zip(system.state_names, confused) if here)
-            text = f"{names}: y determines them near each state, but distant states have nearly the same y, as by a "
-            advice = "let h measure what the symmetry changes, or estimate what it leaves as it is"
+            text = f"{names}: y determines them near each state, but distant states have nearly the same y, as under a "
+            advice = "let h measure what the symmetry changes, or estimate only what it leaves unchanged"
             found = Finding("observability", "problem", f"{text}symmetry", advice)
             return {tuple(np.flatnonzero(confused).tolist()): found}
     return {}

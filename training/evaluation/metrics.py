@@ -15,7 +15,7 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     x, x_hat : ndarray, shape (steps, n, nx)
         States and estimates.
     skip : int
-        Number of first steps left out.
+        Number of initial steps to leave out.
 
     Returns
     -------
@@ -46,7 +46,7 @@ def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     x, x_hat : ndarray, shape (steps, n, nx)
         States and estimates.
     skip : int
-        Number of first steps whose errors are left out.
+        Number of initial steps whose errors are left out.
 
     Returns
     -------

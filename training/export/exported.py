@@ -76,7 +76,7 @@ class Exported:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """Metadata of the exported file, in types that JSON has."""
+        """Metadata of the exported file, in types that JSON supports."""
         artifact = self.artifact
         metadata: dict[str, Any] = {"name": self.name, "artifact": self.source, "sha256": self.checksum}
         metadata |= {"system": artifact.system, "parameters": dict(artifact.parameters), "dt": artifact.filter.dt}
@@ -100,7 +100,7 @@ def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
 
 
 def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
-    """Scaling of the states; in scaled states the bounds, and the mean and covariance of starts."""
+    """Offset and scale of the states, and in scaled states their bounds and the mean and covariance of starts."""
     low, high, mean = ((x - motion.x_offset) / motion.x_scale for x in (motion.low, motion.high, motion.mean))
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}

@@ -12,7 +12,7 @@ from observers.expression import Expression
 from observers.network import MLP
 from training.maps.networks import from_mlp
 
-LEAST_PIVOT = 1e-30  # least variance of scaled states that a factorisation divides by
+LEAST_PIVOT = 1e-30  # lower bound of the pivots, variances of scaled states, that a factorisation divides by
 
 
 def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -68,7 +68,7 @@ class TorchExpression(Expression):
 
 
 def between(at: Tensor, points: Tensor, values: Tensor) -> Tensor:
-    """Interpolate values (k, m) at rising points (k,): (n, m) at ``at`` (n, 1), constant beyond the ends."""
+    """Interpolate values (k, m), given at rising points (k,), to ``at`` (n, 1): (n, m), constant beyond the ends."""
     if len(points) == 1:
         return values[..., 0, :]
     passed = ((at - points[:-1]) / (points[1:] - points[:-1])).clamp(0.0, 1.0)
@@ -76,15 +76,15 @@ def between(at: Tensor, points: Tensor, values: Tensor) -> Tensor:
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """A B^T of matrices (i, k, n) and (j, k, n): (i, j, n)."""
+    """Products A B^T (i, j, n) of n matrices A (i, k, n) and B (j, k, n)."""
     return (a[:, None] * b[None]).sum(2)
 
 
 def eliminated(P: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Factors L of covariances P = L L^T (m, m, n), and below them B L^-T of the matrices B = ``rows`` (k, m, n).
+    """Cholesky factors L of covariances P = L L^T (m, m, n), stacked on B L^-T with B = ``rows`` (k, m, n).
 
-    Returns also where P is positive definite, (n,). Elsewhere small pivots replace its own, so that gradients stay
-    finite. Above its diagonal L holds rounding errors.
+    Also returns a mask (n,) of the P that are positive definite. In the others LEAST_PIVOT replaces smaller pivots, so
+    that gradients stay finite. Entries of L above the diagonal are rounding errors.
     """
     rest, columns, pivots = torch.cat([P, *rows]), [], []
     for j in range(len(P)):

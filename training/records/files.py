@@ -18,7 +18,7 @@ from training.records.checks import Warn, check_motion, check_signals
 from training.records.episodes import is_dataset, read_dataset
 from training.records.record import ROLES, Record, Signals
 
-MISSING = ["na", "none", "NONE", "Null", "Nan", "Na"]  # missing cells, beside those that pandas recognises
+MISSING = ["na", "none", "NONE", "Null", "Nan", "Na"]  # missing cells, in addition to those that pandas recognises
 SEPARATORS = ",;\t"
 TIMES = ("t", "time")  # usual names of the column of time
 Columns = Mapping[str, Any]
@@ -47,7 +47,7 @@ def read_records(
     check_signals(records, system)
     check_motion(records, warn)
     if system is not None and system.nu and not records[0].signals.inputs:
-        warn(f"{records[0].name}: no column of inputs, which are taken for zero")
+        warn(f"{records[0].name}: no column of inputs; they are assumed to be zero")
     return records
 
 

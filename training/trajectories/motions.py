@@ -22,14 +22,14 @@ KINDS = ("zero", "steps", "zero", "sine")
 DRIVEN = ("steps", "sine", "pulses")
 CHUNK = 500  # number of trajectories simulated at once
 FIRST, FEWEST_INSIDE = 100, 0.05  # after so many trajectories, at least this share must have stayed within bounds
-# Times for which inputs lead starts out of X, in multiples of the pace.
+# Durations for which inputs drive starts out of X, in multiples of the system's pace.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 FAR = 0.6  # share of the trajectories that start in the larger box, if there is one
 INPUT_WEIGHT = 0.1  # a regulator's weight on inputs, relative to that on states, both scaled by typical sizes
 POLICY_KINDS = ("steps", "sine")  # signals of a policy's errors and of its exploration
 POLICY_ERROR = (0.02, 0.5)  # range of errors in the states that a policy sees, in multiples of the system's scale
 EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in multiples of input bounds
-# One trajectory in so many follows the policy exactly, the others have errors and exploration. An exact policy's input
+# One trajectory in so many follows the policy exactly; the others have errors and exploration. An exact policy's input
 # reveals the state, which an agent's input does not. Under the regulator on x_hat, at the default noise, the error of
 # cart-pole's angle is 3.4 % of X's half-width with 4 here, 3.2 % with 12, and 3.1 % with none; an exact EKF has 2.7 %.
 POLICYS_OWN = 12
@@ -37,7 +37,7 @@ POLICYS_OWN = 12
 
 @dataclass(frozen=True)
 class Pairs:
-    """States of motions and of a filter along them, at ages since its start, without measurement noise.
+    """States of motions and of a filter along them, some samples after its start, without measurement noise.
 
     Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
     """
@@ -51,7 +51,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Motions:
-    """How trajectories start, are driven and disturbed; ``levels`` of process noise replace random ones of a share."""
+    """How trajectories start, are driven and disturbed; ``levels`` of process noise replace random levels."""
 
     system: System
     dt: float
@@ -67,7 +67,7 @@ class Motions:
     lead_in_input: float = 0.0
 
     def with_inputs(self, nu: int) -> "Motions":
-        """The same motions, or free ones if an observer takes no input."""
+        """The same motions, or motions without input if an observer takes none."""
         return self if nu else replace(self, kinds=(), policy=None)
 
     def beside(
@@ -158,7 +158,7 @@ def _together(chunks: Iterator[Chunk]) -> Chunk:
 def filter_states(linear: LinearFilter, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
     """Filter states (m, n, size) at the distinct samples ``ages`` (m,), from a start at the first sample.
 
-    Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), held from the output of the same row on.
+    Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), each row held from the output of that row to the next.
     """
     z = linear.start(y[0])
     out, slots = np.empty((len(ages), *z.shape)), {int(age): i for i, age in enumerate(ages)}
@@ -237,7 +237,7 @@ def under_policy(
     u = np.zeros((steps, n, system.nu))
 
     def act(k: int, x: np.ndarray) -> np.ndarray:
-        seen = np.where(np.isfinite(x), x, system.X_centre) + error[k]  # after an escape any action serves
+        seen = np.where(np.isfinite(x), x, system.X_centre) + error[k]  # after an escape the action is irrelevant
         action = policy(seen)
         for row in np.flatnonzero(~np.isfinite(action).all(-1)):
             raise ValueError(f"the policy gives the action {action[row].tolist()} at x = {seen[row].tolist()}")
@@ -249,7 +249,7 @@ def under_policy(
 
 def recording_ages(steps: int, n: int) -> np.ndarray:
     """At most n ages to record at: half of them evenly spaced, half logarithmically, to resolve the transient."""
-    late = max(2, n - n // 2)  # the first and the last age at least
+    late = max(2, n - n // 2)  # at least the first and the last age
     ages = np.concatenate([np.geomspace(1, steps, n - late), np.linspace(0, steps, late)])
     return np.unique(ages.round()).astype(int)
 
@@ -270,7 +270,7 @@ def linear_quadratic(system: System) -> Controller:
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:
     """Return a policy that checks the shape of its actions; ValueError if those on some states are invalid."""
     if not system.nu:
-        raise ValueError(f"{system.name} has no inputs for the policy {name!r} to act by")
+        raise ValueError(f"{system.name} has no inputs, so that the policy {name!r} cannot act")
 
     def act(x: np.ndarray) -> np.ndarray:
         try:

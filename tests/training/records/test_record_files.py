@@ -190,7 +190,7 @@ def test_wrapped_angles_and_marks_of_missing_samples(tmp_path):
 
 def test_records_of_a_systems_signals(tmp_path):
     system, two = Oscillator(), np.stack([Y, Y], -1)
-    with pytest.warns(UserWarning, match=r"b.npz: no column of inputs, which are taken for zero"):
+    with pytest.warns(UserWarning, match=r"b.npz: no column of inputs; they are assumed to be zero"):
         read_records([npz(tmp_path / "b.npz")], system=system)
     with pytest.raises(ValueError, match=r"has 1 measured, but the columns are y1, y2; name others by --measured"):
         read_records([npz(tmp_path / "b.npz", y=two)], system=system)
