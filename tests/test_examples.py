@@ -53,7 +53,7 @@ def test_any_environment_under_noise(capsys):
 
 @pytest.mark.slow
 def test_any_environment_agent(capsys):
-    small = {"observer_steps": 400, "members": 1, "timesteps": 2048, "every": 1000, "batches": 40}
+    small = {"observer_steps": 400, "members": 1, "timesteps": 2048, "every": 1000, "batches": 200}
     found = example("any_environment_agent")(**small)
     assert list(found) == ["from random steps", "refitted", "on the truth first"]
     assert len(set(found.values())) == 3
