@@ -82,7 +82,7 @@ def test_what_is_no_data_set():
     with pytest.raises(ValueError, match="minari:none/none-v0 cannot be read"):
         read_records(["minari:none/none-v0"])
     folder = write_dataset(rollouts(), policy="random")
-    with pytest.raises(ValueError, match="called as in"):
+    with pytest.raises(ValueError, match="needs a name such as"):
         write_dataset(rollouts("no name"), policy="random")
     with pytest.raises(ValueError, match="no column of time"):
         read_records([folder], signals=Signals(time="t"))
