@@ -43,7 +43,7 @@ _TRIALS = 200  # states of each kind at which machine code is compared with Pyth
 _MAX_TRIAL_SUBSTEPS = 64  # trial states that need more are skipped, because Python is slow on them
 _LANES = 32  # rows that are stepped together; they fill a few of the processor's vector registers
 _KEPT = 64  # compiled kernels in the cache
-_kept: dict[Any, Any] = {}  # by program: its kernel, or the reason why it has none
+_kept: dict[Any, Any] = {}  # the kernel of each program, or the reason why it has none
 
 logger = logging.getLogger("kkl_gym")
 
@@ -294,7 +294,7 @@ def _assembled(motion: Motion, lines: list[str], jit: Callable[..., Any]) -> Any
 
 
 def _trial_states(system: System, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """States at which machine code is compared with Python, (400, nx), and also with NumPy, (600, nx)."""
+    """States at which machine code is compared: random ones (400, nx), and corners, integers and starts (600, nx)."""
     n, (low, high) = _TRIALS, np.array(system.bounds, dtype=float).T
     random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])
     ends = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])

@@ -77,7 +77,7 @@ def _elsewhere(name: str, *args: Any) -> Any:
 
 
 def _library(name: str, kind: str, args: tuple[Any, ...]) -> Any:
-    """The library, if one of the arguments is of this type of it; the library is never imported here."""
+    """The library if an argument has its type ``kind``, else None; the library is never imported here."""
     library = sys.modules.get(name)
     return library if library is not None and any(isinstance(arg, getattr(library, kind)) for arg in args) else None
 

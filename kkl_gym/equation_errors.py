@@ -110,7 +110,7 @@ def is_sequence(value: Any) -> bool:
 
 
 def is_of(library: str, kind: str, value: Any) -> bool:
-    """Whether a value is of this type of a library; the library is not imported for it."""
+    """Whether a value has a library's type ``kind``; the library is not imported for this check."""
     module = sys.modules.get(library)
     return module is not None and isinstance(value, getattr(module, kind))
 

@@ -12,10 +12,10 @@ from observers import LinearFilter
 from observers.checks import real_array, shown
 
 SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
-CLOSEST = 1.5  # ratio of neighbouring ones; the coordinates of closer ones would be rounding errors
+CLOSEST = 1.5  # least ratio of successive time constants; closer ones would give coordinates of rounding errors
 IMAGINED = 64  # steps before the first output in which the outputs are assumed to have changed
-SMALL = 200  # up to so many coordinates, one product advances a single row faster than several calls of NumPy
-FILLED = 20  # in longest time constants: after so many, only e^-20 of the past is left
+SMALL = 200  # coordinates up to which one matrix product advances one memory faster than several NumPy calls
+FILLED = 20  # in longest time constants: the age from which on the past before reset counts only e^-20
 TURN = 2 * math.pi
 
 
@@ -35,7 +35,7 @@ class Memory:
     of each faster one the part that the slower ones do not explain. These coordinates are uncorrelated and as large as
     y if y is an Ornstein-Uhlenbeck process with a correlation time from twice the shortest time constant to eight times
     the longest. In the long run they amplify white noise on y at most threefold. At first they rest on few samples and
-    amplify it more: with the default time constants 22-fold in the first step, and fourfold in the fifth.
+    amplify noise more: with the default time constants 22-fold in the first step, and fourfold in the fifth.
 
     If an angle is measured by its cosine and its sine, the memory filters the unwrapped angle itself. It assumes that
     the angle turns by less than half a turn from one sample to the next, and rests where cosine and sine are both 0.
@@ -71,7 +71,7 @@ class Memory:
         with np.errstate(under="ignore"):
             self._with_past = (1 - self.decay ** (ages + IMAGINED)) / (1 - self.decay ** np.maximum(ages, 1))
         self._y: np.ndarray | None = None  # (..., ny); w has the shape (m, ..., signals), v (k, ..., nu)
-        self._row: np.ndarray | None = None  # of a single small memory: [signals, w, v], which are views of it
+        self._row: np.ndarray | None = None  # a single small memory's [signals, w, v], then views of it
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
@@ -173,13 +173,11 @@ def turned(cosines: np.ndarray, sines: np.ndarray, before: np.ndarray | float) -
 
 
 def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Gram-Schmidt matrix from the slowest w on, for the covariance of w averaged over correlation times of y."""
+    """The matrix that orthonormalises w, slowest first, under its covariance averaged over correlation times of y."""
     covariance = np.zeros((len(decay), len(decay)))
     for correlation in np.geomspace(2 * time_constants[0], 8 * time_constants[-1], 6):
         forgotten = -math.expm1(-1 / correlation)  # the share of y, of variance 1, that decorrelates in a step
-        with_y = (
-            rise * forgotten / (1 - decay * (1 - forgotten))
-        )  # E[w y], and E[w (y_k+1 - y_k)] is -forgotten times it
+        with_y = rise * forgotten / (1 - decay * (1 - forgotten))  # E[w y]; E[w (y_k+1 - y_k)] is -forgotten times this
         crossed = np.outer(decay * with_y, rise)
         # From w_k+1 = decay w_k + rise (y_k+1 - y_k), where E[(y_k+1 - y_k)^2] = 2 forgotten:
         covariance += forgotten * (2 * np.outer(rise, rise) - crossed - crossed.T) / (1 - np.outer(decay, decay))

@@ -71,7 +71,7 @@ def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]
 
 
 class Reader:
-    """Reads named signals from observations and ``info``; with ``missing`` they may be NaN. Shapes: ``low`` (n,)."""
+    """Reads named signals from observations and ``info``; NaN is allowed with ``missing``. Shapes: ``low`` (n,)."""
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str, missing: bool = False) -> None:
         there, self._source = observed(space), source

@@ -14,7 +14,7 @@ from kkl_gym.system import Box, Components, System
 from kkl_gym.systems import get_system
 from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
-_MOST_POINTS = 1000  # of each kind, at which h is evaluated to bound the outputs
+_MOST_POINTS = 1000  # of each kind, at which h is evaluated to find the outputs' bounds
 NOISE_BLOCK = 256  # samples whose noise is drawn at once, because single draws cost more than the simulation
 
 
@@ -124,7 +124,7 @@ class OfPlant:
         raise NotImplementedError
 
     def _judged(self, x: Components, u: Components) -> tuple[Any, Any]:
-        """Rewards of intervals that ended at x under u, and whether episodes end there, of floats or arrays."""
+        """Rewards of intervals that ended at x under u, and whether episodes end at x; takes floats or arrays."""
         system = self.plant.system
         try:
             reward, ended = self._reward(x, u), system.terminated(x)
@@ -155,9 +155,9 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
 
 def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of h(x) over the declared bounds of the state; exact if h is monotone in each state."""
-    # h is evaluated at random states, and at the corners, the centres of faces and the centre, where it must not be
-    # NaN. For more than six states only some of these are taken, with the two corners towards which each output rises
-    # and falls from the centre.
+    # h is evaluated at random states, and on the grid of low, middle and high values, where it must not be NaN. With
+    # more than six states, only a part of this grid is taken. It includes, for each output, the two corners towards
+    # which the output rises and falls from the centre.
     low, high = np.array(system.bounds, dtype=float).T
     rng, nx = np.random.default_rng(0), system.nx
     if 3**nx <= _MOST_POINTS:

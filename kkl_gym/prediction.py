@@ -8,7 +8,7 @@ import numpy as np
 from kkl_gym.memory import Memory
 from observers.checks import real_array
 
-CHANCE = 3.0  # least variance of a direction to keep, in multiples of the variance that a fit to pure noise would have
+CHANCE = 3.0  # least variance of a combination to keep, in multiples of the variance that a fit to noise would have
 SAMPLES = 10  # least number of samples for each feature of the fit
 
 
@@ -25,7 +25,7 @@ class PredictiveMemory(Memory):
     ) -> None:
         super().__init__(ny, nu, angles, **time_constants)
         self._plain, self._others = self._others, np.arange(ny)
-        self._targets = np.r_[self._plain, ny : ny + len(angles)]  # among the signals
+        self._targets = np.r_[self._plain, ny : ny + len(angles)]  # indices of the predicted signals
         features = (ny + len(angles)) * (1 + len(self.decay)) + nu * len(self.input_decay) + 1
         self.weights = real_array("weights", weights) if len(weights) else np.zeros((features, len(self._targets)))
         if self.weights.ndim != 2 or len(self.weights) != features or self.weights.shape[1] < len(self._targets):
@@ -54,8 +54,8 @@ class PredictiveMemory(Memory):
     def fit(self, episodes: Sequence[np.ndarray]) -> np.ndarray:
         """Fit the weights by least squares. Shapes: each episode (samples, features).
 
-        From the predictions beyond the next step, the fit keeps the directions whose variance exceeds that of their
-        errors clearly, scaled to unit variance.
+        Of the predictions beyond the next step, the fit keeps the linear combinations whose variance is well above that
+        of their errors, and scales them to unit variance.
         """
         horizons = sorted({1, 2, *np.ceil(self.time_constants).astype(int).tolist()})  # in steps
         last = horizons[-1]

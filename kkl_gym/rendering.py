@@ -12,7 +12,7 @@ from observers.checks import shown
 
 ESTIMATE, TARGET = "C3", "C2"  # colours of matplotlib's cycle; states have the colour of text
 TRAIL = 1000  # samples that a phase portrait shows
-FRAMES = 100  # most frames a second in a video, about what players can show
+FRAMES = 100  # most frames a second in a video; players can hardly show more
 DRAWN = 50  # most frames a second in a window, which runs in real time
 ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 

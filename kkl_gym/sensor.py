@@ -42,7 +42,7 @@ class Sensor:
     drop_out : float or sequence of float, length ny
         Probability, below 1, with which a sample is lost, independently of others.
     every : int or sequence of int, length ny
-        Number of steps from one sample to the next; 1 has a sample at every step.
+        Number of steps from one sample to the next; 1 gives a sample at every step.
 
     Raises
     ------
@@ -99,7 +99,7 @@ class Sensor:
         return bool(np.any(self.coloured_noise) or np.any(self.drop_out))
 
     def columns(self, ny: int) -> dict[str, np.ndarray]:
-        """All parameters by name, one for each output, (ny, 1). Missing limits are infinite, time constants 1."""
+        """All parameters by name, (ny, 1) each. By default limits are infinite, and time constants are 1."""
         low, high = (-math.inf, math.inf) if self.saturation is None else self.saturation
         given = vars(self) | {"low": low, "high": high, "time_constant": self.time_constant or 1.0}
         del given["saturation"]
@@ -148,7 +148,7 @@ class Readings:
 
     @np.errstate(over="ignore", invalid="ignore")  # states that escaped may overflow
     def read(self, h: np.ndarray, v: np.ndarray, rows: np.ndarray | None = None, *, start: bool) -> np.ndarray:
-        """Samples of ``rows`` (m,) at an episode's start or at its next step: (ny, m), NaN where one is missing.
+        """Return the samples (ny, m) of ``rows`` (m,) at an episode's start or its next step, NaN where missing.
 
         Shapes: ``h`` (ny, m), ``v`` (ny, m) or, for a random sensor, (3 ny, m): white noise and the sensor's draws.
         """

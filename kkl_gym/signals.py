@@ -18,7 +18,7 @@ Entries = Sequence[int] | Sequence[str]
 Angles = Sequence[int | Sequence[int]] | Sequence[str | Sequence[str]]
 """Entries that are angles, and pairs of entries that are the cosine and the sine of an angle."""
 TURN = 2 * math.pi
-UNITS = 1.0, 2.0, 4.0  # widths of bounds from which the unit is not clear: turns, half turns or rad
+UNITS = 1.0, 2.0, 4.0  # widths of bounds that leave the unit unclear: turns, half turns or rad
 
 
 class Outputs:

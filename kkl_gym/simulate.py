@@ -1,4 +1,4 @@
-"""Simulation of sampling intervals by a sixth-order Runge–Kutta method, in 1, 2, 4, ... substeps of one length.
+"""Simulation of sampling intervals by a sixth-order Runge–Kutta method, in 1, 2, 4, ... substeps of equal length.
 
 The system's own ``rate(x)``, or else an estimate of the error, sets their number. Single states on Python floats
 (:func:`advance`) and batches on arrays (:func:`advance_batch`) agree to rounding, 1e-13 of the state in each step.
@@ -21,9 +21,9 @@ from observers.checks import check_dt
 RATE_STEP = 0.4
 # A millionth less, so that rates on both sides of a power of two, which differ only by rounding, get equal substeps.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
-# Largest estimate of a substep's error, in half-widths of X. The error itself is then a thousand times smaller. With
-# TOLERANCE, stiff systems and the shipped ones without their formulas keep the same 1e-5. ROUGH overrules a system's
-# formula where that fails, as at an ignition; it is a hundred times the largest estimate of the shipped systems.
+# Largest accepted estimate of a substep's error, in half-widths of X; the error itself is a thousand times smaller.
+# With TOLERANCE, stiff systems and the shipped ones without their rate formulas keep the same 1e-5. ROUGH overrules a
+# rate formula that fails, as at an ignition; it is a hundred times the largest estimate of the shipped systems.
 TOLERANCE, ROUGH = 3e-6, 0.1
 ATTEMPTS = 3  # with equal substeps; after these, or beyond MOST_EQUAL substeps, the step length follows the error
 MOST_EQUAL = 1 << 10
@@ -42,9 +42,9 @@ STAGES = (
     (9 / 44, -9 / 11, 63 / 44, 18 / 11, 0, -16 / 11),
 )
 WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
-# The error estimate is h times the difference of the two slopes halfway, of order h^5. That difference is zero where
-# the derivative depends only on time. So 1/256 of the fourth divided difference over the interval is added, which is
-# (1, 0, -9, -9, 16, 0, 1).
+# The error estimate is h times the difference between two stages' slopes at mid-step, of order h^5. This difference is
+# zero where the derivative depends only on time. So 1/256 of the fourth divided difference over the interval is added,
+# whose coefficients are (1, 0, -9, -9, 16, 0, 1).
 ERROR = (1 / 256, 0, -9 / 256, -9 / 256, 16 / 256 - 1, 1, 1 / 256)
 # Coefficients of the state, of a constant slope and of the slopes of the earlier stages.
 _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
@@ -165,7 +165,7 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
-    """The state after one interval, with substeps whose length follows the error; ``end`` if it leaves the bounds."""
+    """The state after one interval, with substeps whose length follows the error; ``end`` if x leaves the bounds."""
     # This serves motions that accelerate, as at an ignition. It also verifies an escape: equal substeps may have been
     # too long at its end and have left the bounds only by their error.
     if system.discrete:
@@ -215,7 +215,7 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
 
 def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
-    """The next states (nx, n) by equal substeps in each row, NaN if its error is too large, and whether any is NaN."""
+    """The next states (nx, n) by equal substeps, NaN in rows whose error is too large, and whether any is NaN."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need: Any = 1.0 if type(system).rate is System.rate else system.rate(x) * dt * PER_RATE
         if np.all(need <= 1):
@@ -239,7 +239,7 @@ def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, 
 
 
 def _powers(need: np.ndarray) -> np.ndarray:
-    """The least power of two from ``need`` (n,) on, or 0 beyond MOST_EQUAL; returns (n,)."""
+    """The least powers of two that are at least ``need`` (n,), or 0 where they exceed MOST_EQUAL; returns (n,)."""
     mantissa, exponent = np.frexp(np.where(need <= MOST_EQUAL, np.maximum(need, 1), 1))
     return np.where(need <= MOST_EQUAL, 1 << (exponent - (mantissa == 0.5)), 0)
 
@@ -259,7 +259,7 @@ def _substeps(
 def followed_rows(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, *, dt: float, end: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """``end``, (nx, n), in which :func:`followed` replaced those of ``rows`` (m,) that start within bounds."""
+    """Return ``end`` (nx, n), in which :func:`followed` has replaced the ``rows`` (m,) that start within bounds."""
     if len(rows):
         low, high = np.array(system.bounds, dtype=float).T[..., None]
         with np.errstate(all="ignore"):  # equations may use NumPy even for a single state

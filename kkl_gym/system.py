@@ -23,9 +23,9 @@ Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol fo
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 DT = 0.01  # s, the default where it suits a system's rate
-# Least and largest rate * dt for which DT suits, each with the rate * dt of the interval that replaces DT beyond it.
+# (limit, new) each: DT suits where rate * DT lies between both limits. Beyond one, rate * dt = new gives the default.
 SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)
-PROCESS_NOISE = 0.05  # default, in multiples of a system's scale in one second of its pace
+PROCESS_NOISE = 0.05  # default bound, in multiples of a system's scale per time unit (``pace``)
 NOISE_SHARE = 0.05  # default measurement noise as a share of an output's range
 # Attributes of a class with an empty body; Python 3.13 adds the last two.
 EMPTY = {"__module__", "__qualname__", "__doc__", "__firstlineno__", "__static_attributes__"}
@@ -204,7 +204,7 @@ class System:
     def step(self, x: Components, u: Components) -> Components:
         """The next state of a system in discrete time, one sampling interval after x under the held input u.
 
-        A system that defines it needs no f and g, must set ``dt``, and is not integrated. Process noise adds w dt to
+        A system that defines this needs no f and g, must set ``dt``, and is not integrated. Process noise adds w dt to
         the next state. f is then the mean derivative over the interval without input. Components are those of
         :meth:`f`.
         """
@@ -268,7 +268,7 @@ class System:
 
         The default differentiates f numerically, with each state in units of X's half-width, so that the rate does not
         depend on the user's units. An estimate of the error then sets the number of substeps. A formula that overrides
-        this method sets it instead: a substep then lasts at most 0.4 / rate. That helps where f jumps.
+        this method sets this number: a substep then lasts at most 0.4 / rate. That helps where f jumps.
         """
         return slope(self.f, x, self.X)
 
@@ -312,7 +312,7 @@ def nearness_of_rows(target: np.ndarray, weight: np.ndarray, x: np.ndarray, u: C
 
 
 def reward_of(system: System, *, rows: bool = False) -> Callable[[Any, Components], Any]:
-    """The reward function for one state or for a batch; the default reward reads the target only once, here."""
+    """The reward function for one state or for a batch; for the default, the target is read only once, here."""
     if type(system).reward is not System.reward:
         return system.reward
     goal = goal_of(system)
@@ -364,7 +364,7 @@ def rate_under(system: System, x: Components, u: Components) -> Any:
 
 def typical_rate(system: System, starts: np.ndarray) -> float:
     """Median rate of f over some starts. Shapes: ``starts`` (n, nx)."""
-    rate_at(system, starts.T)  # raises an EquationError if it fails
+    rate_at(system, starts.T)  # raises an EquationError if ``rate`` fails
     rate = float(np.median(np.broadcast_to(rate_under(system, starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:
         raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it with how fast f changes")

@@ -20,7 +20,7 @@ from observers.checks import bool_array, choice, integer, mapping, real_array, s
 
 Infos = dict[str, Any]
 Rows = np.ndarray | slice
-ALL = slice(None)  # rows: an index by it is a view
+ALL = slice(None)  # all rows; indexing by this slice gives a view
 ROWS_AT_ONCE = 64  # rows whose noise is drawn and transposed together; they fit the processor's cache
 MANY_ROWS = 128  # from this number on, compiling saves more seconds than it takes
 MOST_ENVS = 1_000_000  # each stores 256 samples of noise, about 10 kB
@@ -293,7 +293,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
         escaped = self._outside(x)
-        if escaped.any():  # or the substeps erred: finer ones decide
+        if escaped.any():  # or the substeps were too coarse: check with finer ones
             x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(escaped))
             escaped = self._outside(x)
         if escaped.any():  # these rows keep the last state and output inside the bounds
@@ -335,7 +335,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return w.T, v.T
 
     def _draw(self, rows: np.ndarray) -> None:
-        """Draw new blocks of noise for some rows: row by row, stored sample by sample, a few rows at a time."""
+        """Draw new blocks of noise for some rows, each from its own generator; blocks are stored sample by sample."""
         w, v = (np.empty((ROWS_AT_ONCE, *block.shape[:2])) for block in (self._w, self._v))
         for first in range(0, len(rows), ROWS_AT_ONCE):
             some = rows[first : first + ROWS_AT_ONCE]
@@ -378,7 +378,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
 
 def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any] | None, np.ndarray]:
-    """A copy of reset options, because some environments remove the mask from them, and the mask, (n,)."""
+    """Return the reset options and the mask (n,); options are copied, as some environments remove their mask."""
     given = dict(mapping("options", options))
     if given.get("reset_mask") is None:
         return None if options is None else given, np.ones(n, dtype=bool)

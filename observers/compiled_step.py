@@ -1,4 +1,4 @@
-"""The compiled step of a tracker, where Numba is installed: it orders the tracker's numbers for the kernel."""
+"""The compiled step of a tracker. It needs Numba, and arranges the tracker's arrays as the kernel's arguments."""
 
 import functools
 from typing import Any
@@ -12,7 +12,7 @@ from observers.tracker import Tracker
 
 _LANES = 8  # rows that are stepped together
 MOST_OPERATIONS = 400  # longer expressions, such as a network as f, would take many seconds to compile
-MOST_ROWS = 32  # of a covariance; larger ones of eight trackers together would exceed a thread's stack
+MOST_ROWS = 32  # in a covariance; eight larger covariances together would exceed a thread's stack
 
 
 class CompiledStep:
@@ -59,9 +59,9 @@ class CompiledStep:
         return functools.partial(kernel.steps(nx, ny, nu, W), tuple(addresses))
 
     def _at(self, linear: LinearFilter) -> tuple[Any, ...]:
-        """The kernel's arguments before rows and samples, at the sampling interval of a filter."""
+        """The kernel's arguments from ``flags`` to ``flow``, at the sampling interval of a filter."""
         samples, h, equations = linear.dt / self._linear.dt, 0.0, self._motion.equations
-        substeps = -round(samples)  # negative: steps of a flow
+        substeps = -round(samples)  # a negative number counts steps of a learned flow
         if equations is not None:
             substeps = equations.steps(samples)
             h = linear.dt / substeps
@@ -83,7 +83,7 @@ class CompiledStep:
 
 
 def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]:
-    """Ages, and the covariances of the maps at these ages, (maps, ages, nx^2)."""
+    """Ages, in seconds since reset, and the covariances of the maps at these ages, (maps, ages, nx^2)."""
     errors = [each.error for each in maps if each.error is not None]  # every map that tracks has covariances
     ages = np.unique([age for error in errors for age in error.ages])
     return ages, np.array([error(ages, ages.shape).reshape(len(ages), -1) for error in errors])

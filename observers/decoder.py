@@ -11,7 +11,7 @@ from observers.machine import available
 
 
 class Decoders:
-    """T_inv of driven and of free motion, or some of their outputs. Each row uses the map for its own motion."""
+    """T_inv for motions with and without input, or some of its outputs. Each row uses the map for its motion."""
 
     def __init__(self, artifact: Artifact, outputs: slice, **options: Any) -> None:
         free = artifact.free_inverse
@@ -19,7 +19,7 @@ class Decoders:
         self.free = None if free is None else Decoder(free, outputs, **options)
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
-        """Return the estimates, (..., nx), of filter states (..., size) at ages in seconds."""
+        """Return the estimates, (..., nx), of filter states (..., size) at ages, in seconds since reset."""
         return self._by_row(z, age, Decoder.__call__)
 
     def covariances(self, z: np.ndarray, age: Any) -> np.ndarray:

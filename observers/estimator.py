@@ -8,7 +8,7 @@ State = TypeVar("State")
 
 
 class Estimate(NamedTuple):
-    """Estimates (n, nx) at one time, their error covariances (n, nx, nx) and a monitor's scores (n,), each or None."""
+    """Estimates (n, nx) at one time, with their error covariances (n, nx, nx) and a monitor's scores (n,), if any."""
 
     x_hat: np.ndarray
     covariance: np.ndarray | None = None

@@ -1,4 +1,4 @@
-"""Calibrated error covariances, by age and level of measurement noise."""
+"""Calibrated error covariances, by age (time since reset) and level of measurement noise."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -34,7 +34,7 @@ class Factors:
     ages : ndarray, shape (m,)
         Seconds since reset, rising from 0.
     factors : ndarray, shape (2, k, m)
-        Positive factors without process noise and at its largest level in training; (1, k, m) serves every level.
+        Positive factors without process noise and at its largest level in training; (1, k, m) holds for all levels.
     """
 
     levels: np.ndarray

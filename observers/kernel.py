@@ -1,4 +1,4 @@
-"""The observer's step as machine code, for one row or many, along one sample or a record. It needs Numba.
+"""The observer's step as machine code, for a batch with one observer in each row. It needs Numba.
 
 One compilation serves all observers with equal numbers of states, outputs and inputs, and is stored on disk for later
 processes. A system's motion and nonlinear output are compiled separately, and the kernel calls them by their address.
@@ -39,21 +39,21 @@ def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any)
 
 @functools.cache
 def steps(nx: int, ny: int, nu: int, W: int) -> Any:
-    """The kernel for numbers of states, outputs and inputs, and for groups of W rows.
+    """Return the kernel for nx states, ny outputs and nu inputs; it steps W rows of the batch together.
 
-    Every entry of a matrix is a vector with a number for each of the W rows.
+    Each entry of a state vector or matrix holds W numbers, one for each of these rows. Matrices are stored flat.
     """
     kappa, points, wide = max(3.0 - nx, 0.0), 2 * nx + 1, (2 * nx + 1) * W
     far, other = math.sqrt(nx + kappa), 0.5 / (nx + kappa)
     middle, middle_squares = kappa / (nx + kappa), kappa / (nx + kappa) + 2.0
     square, cross, inputs, turns, inflation = nx * nx, nx * ny, max(nu, 1), RELINEARISATIONS, INFLATION
     of_states, of_outputs, of_innovations, of_network = (nx + nu) * points, ny * points, ny * ny, nx + nu
-    nis = nx + square  # its place in a row of the tracker
+    nis = nx + square  # index of the NIS in the tracker's part of a row
     of_row, rejections, trends = nis + 4 + 2 * ny, nis + 4, nis + 4 + ny
 
     @_inlined
     def factorise(P: Any, L: Any, inverse: Any) -> None:
-        """P = L L^T, and the inverse of L's diagonal; not finite if P is not positive definite."""
+        """Compute L with P = L L^T, and 1 / L's diagonal; both are not finite if P is not positive definite."""
         for i in range(nx):
             for j in range(i + 1):
                 total = P[i * nx + j]
@@ -67,7 +67,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_part
     def smoothed(P: Any, L: Any, inverse: Any, across: Any, V: Any, turned: bool, G: Any) -> None:
-        """G = across P^-1 V, or across^T P^-1 V."""
+        """Compute G = across P^-1 V, or across^T P^-1 V if ``turned``."""
         b = stack(nx, W)
         factorise(P, L, inverse)
         for k in range(ny):
@@ -89,7 +89,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def spread_out(x: Any, P: Any, L: Any, inverse: Any, at: Any) -> None:
-        """Sigma points (nx, points)."""
+        """Write the sigma points of mean x and covariance P to ``at``, (nx, points)."""
         factorise(P, L, inverse)
         for i in range(nx):
             for p in range(points):
@@ -101,7 +101,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def moments(at: Any, n: int, mean: Any, S: Any) -> None:
-        """Mean (n,) and covariance (n, n) of points (n, points); subtracts the mean from the points."""
+        """Compute the mean (n,) and covariance (n, n) of points (n, points), and subtract the mean from the points."""
         for i in range(n):
             total = 0.0
             for p in range(1, points):
@@ -117,7 +117,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def together(L: Any, at: Any, n: int, across: Any) -> None:
-        """Covariance (nx, n) of the sigma points of L with their images, given as differences (n, points)."""
+        """Compute the covariance (nx, n) of sigma points with their images, which ``at`` holds minus their mean."""
         for j in range(n):
             for i in range(nx):
                 total = 0.0
@@ -161,7 +161,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
-        """Mean and covariance one sample later, and the covariance with the earlier state."""
+        """Compute the state's mean and covariance one sample later, and its covariance with the earlier state."""
         states, flow, substeps, address, h, share = model
         inverse, at = stack(nx, W), stack(of_states, W)
         spread_out(x, P, L, inverse, at)
@@ -169,7 +169,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         for j in range(nu):
             for p in range(points):
                 at[(nx + j) * points + p] = u[j]
-        if substeps >= 0:
+        if substeps >= 0:  # a negative number counts steps of a learned flow
             call(address, doubles(at), doubles(at), substeps, h)
         for _ in range(-substeps):
             flow_step(doubles(at), flow, scratch)
@@ -180,7 +180,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def expect(x: Any, P: Any, h: Any, states: Any, L: Any, y: Any, S: Any, V: Any) -> None:
-        """Mean and covariance of the output, and its covariance with the state."""
+        """Compute the output's mean y, its covariance S, and its covariance V with the state."""
         address, C = h
         if address == 0:
             for k in range(ny):
@@ -211,7 +211,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
-        """Set outputs to NaN whose innovations are beyond the gate, unless the gate is open."""
+        """Set outputs with innovations beyond the gate to NaN, unless the gate is open."""
         for k in range(ny):
             innovation, count = y[k] - expected[k], now[rejections + k]
             far = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)
@@ -268,12 +268,12 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 start[i] = now[i]
             for i in range(square):
                 spread[i] = now[nx + i]
-            if turn:  # the sample corrects the start of the step too, about which the motion is linearised
+            if turn:  # correct the state before the step by the sample, too
                 smoothed(moved, L, inverse, across, V, False, G)
                 shift(start, 1.0, G, white)
                 add(spread, -1.0, G, G)
             predict(start, spread, u, model, scratch, L, again, again_moved, again_across)
-            if turn:  # linearise the motion about the smoothed start of the step
+            if turn:  # linearise the motion about this smoothed state
                 smoothed(spread, L, inverse, again_across, G, True, D)
                 shift(again, -1.0, D, white)
                 add(again_moved, 1.0, D, D)
@@ -312,7 +312,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         weight, each = count / float(ny), 1.0 / choose(count, 0.0, count, 1.0)
         average = now[nis] + share * weight * (squares * each - now[nis])
         square_average = now[nis + 1] + square_share * weight * (trend_gain * raised * each - now[nis + 1])
-        # Beyond the limit, successive innovations are correlated.
+        # Beyond the limit, successive innovations are correlated: the covariance is inflated.
         grown = choose(square_average, trend_limit, inflation, 1.0)
         now[nis] = choose(sound, 0.0, average, np.inf)
         now[nis + 1] = choose(some, 0.0, choose(square_average, trend_limit, 1.0, square_average), now[nis + 1])
@@ -328,14 +328,14 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     def supervise(
         rows: Any, count: int, sizes: Any, dt: float, window: float, limit: float, states: Any, maps: Any, scratch: Any
     ) -> None:
-        """Take T_inv's estimate if the tracker diverged, or if T_inv has the smaller covariance in the first window."""
+        """Reinitialise by T_inv after a divergence, and in the first window where T_inv's covariance is smaller."""
         (driven, free, ages, covariances), (nz, size) = maps, sizes
         base = size + ny + 1
         P, L, inverse, own, quotient = stack(square, W), stack(square, W), stack(nx, W), stack(nx, W), stack(1, W)
         z, x_hat, covariance, surer, acted = stack(size, 1), stack(nx, 1), doubles(P), doubles(quotient), stack(W, 1)
         for w in range(count):
             row, at = offset(doubles(rows), w), 0
-            acted[w] = 1.0 if size == nz else 0.0  # until an input acts, the map of free motion applies
+            acted[w] = 1.0 if size == nz else 0.0  # until an input acts, the map for motion without input applies
             for i in range(nz, size):
                 acted[w] = acted[w] if row[i * W] == 0.0 else 1.0
             table = 0 if acted[w] else 1
@@ -349,7 +349,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 covariance[i * W + w] = lower + part * (covariances[table, upper, i] - lower)
         factorise(P, L, inverse)
         factorise(offset(rows, base + nx), L, own)
-        quotient[0] = own[0] / inverse[0]  # square root of the ratio of the determinants
+        quotient[0] = own[0] / inverse[0]  # root of the determinant of T_inv's covariance over that of the tracker's
         for i in range(1, nx):
             quotient[0] *= own[i] / inverse[i]
         for w in range(count):
@@ -395,7 +395,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     ) -> None:  # fmt: skip
         """Advance rows of the state (n, width) by samples y (steps, n, ny) and inputs u (steps, n, nu).
 
-        A record (steps, n, width) stores the rows at each sample, (steps, n, nx) the estimates, (steps, n, 0) nothing.
+        ``record`` (steps, n, width) stores rows at each sample; with a width of nx estimates, with 0 nothing.
         """
         nz, widest, substeps = flags
         h, samples, dt, limit = numbers[:4]

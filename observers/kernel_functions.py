@@ -61,15 +61,15 @@ def _activate(h: Any, width: int, kind: int) -> None:
 
 @_part
 def evaluate(packed: Any, shape: Any, between: Any) -> Any:
-    """Evaluate a network for one sample, which is ``between``'s first row. Returns a pointer to its outputs.
+    """Evaluate a network for one sample, the first row of ``between``. Returns a pointer to the network's outputs.
 
-    ``shape`` holds its activation and widths. Shapes: ``between`` (2, largest width + UNROLLED).
+    ``shape`` holds the activation and the widths. Layers overwrite ``between``, (2, largest width + UNROLLED).
     """
     h, into, at = offset(between, 0), offset(between, between.shape[1]), 0
     for layer in range(1, len(shape) - 1):
         inputs, width = shape[layer], shape[layer + 1]
         for j in range(inputs, inputs + UNROLLED):
-            h[j] = _ZERO  # multiplies the padding
+            h[j] = _ZERO  # pads the inputs
         for j in range(width):
             into[j] = packed[at + j]
         at += width
@@ -123,9 +123,9 @@ def decode_one(z: Any, age: float, network: Any, out: Any) -> None:
 
 @functools.cache
 def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> Any:
-    """Compiled motion by equations: Runge-Kutta steps of length h for all sigma points of W rows, in place.
+    """Compile a motion by equations. It moves all sigma points of W rows by Runge-Kutta steps of length h, in place.
 
-    States and inputs are in one array (nx + nu, points, W).
+    One array (nx + nu, points, W) holds the states and inputs of all sigma points.
     """
     wide, field, inputs = (2 * nx + 1) * W, expression.python("field", nx, nu), [f"u{j}" for j in range(nu)]
     states = [f"x{i}" for i in range(nx)]
@@ -151,7 +151,7 @@ def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> 
 
 @functools.cache
 def output(expression: Expression, nx: int, W: int) -> Any:
-    """Compiled outputs (ny, points, W) of the sigma points (nx, points, W) of W rows."""
+    """Compile an output map: it writes outputs (ny, points, W) of the sigma points (nx, points, W) of W rows."""
     wide, ny = (2 * nx + 1) * W, len(expression.components)
     function = expression.python("function", nx, 0)
     given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))

@@ -46,8 +46,8 @@ class Pending:
 class KKL(Estimator[np.ndarray]):
     """The estimator inside :class:`observers.KKLObserver`, for n rows.
 
-    A row of the state holds z (size), the last output (ny), the age in samples, which is NaN before the first one, and
-    then the rows of the tracker and of the monitor.
+    A row of the state holds z (size), the last output (ny), the age, and then the rows of tracker and monitor.
+    The age is the number of samples since reset, NaN before the first one.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class KKL(Estimator[np.ndarray]):
         return state
 
     def take_over(self, other: "KKL", state: np.ndarray) -> np.ndarray:
-        """Return rows that continue those of another observer with the same filter; the tracker may start here."""
+        """Return rows that continue those of another observer with the same filter; a tracker that it lacked starts."""
         new = self.begin(state[:, other.y], state[:, other.z], state[:, other.age])
         if self.tracker is not None and other.tracker is not None:
             new[:, self.tracked] = self.tracker.take_over(state[:, other.tracked])
@@ -120,7 +120,7 @@ class KKL(Estimator[np.ndarray]):
         else:
             new = state.copy()
             self._machine(self._filter(dt), new, y[None], u[None])
-        if self.monitor is not None:  # rejected outputs count, too
+        if self.monitor is not None:  # outputs that the gate rejected count, too
             residual = self.artifact.residual(np.where(np.isnan(y), new[:, self.y], y), self.decode(new))
             new[:, self.watched] = self.monitor.update(new[:, self.watched], residual, ~np.isnan(y))
         return new
@@ -175,7 +175,7 @@ class KKL(Estimator[np.ndarray]):
         return Estimate(self.decode(state), covariance, score)
 
     def ahead(self, state: np.ndarray, u: np.ndarray, waiting: np.ndarray) -> np.ndarray:
-        """Return rows predicted under inputs (n, delay, nu); ``waiting`` (n,) counts the inputs of each row."""
+        """Return rows predicted ahead under inputs (n, delay, nu); ``waiting`` (n,) counts the inputs of each row."""
         for k in range(int(waiting.max(initial=0))):
             rows = waiting > k
             missing = np.full((int(rows.sum()), self.artifact.ny), np.nan)
@@ -219,7 +219,7 @@ class KKL(Estimator[np.ndarray]):
     def along(
         self, state: np.ndarray, y: np.ndarray, u: np.ndarray, of: Any, dts: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the values of a function of rows at each sample of a record that begins with ``state``.
+        """Return the values of ``of``, a function of rows, at each sample of a record that begins with ``state``.
 
         Shapes: ``y`` (steps, n, ny), ``u`` (steps - 1, n, nu), ``dts`` (steps - 1,); returns (steps, n, ...).
         """

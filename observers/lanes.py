@@ -1,4 +1,4 @@
-"""A Numba type for the numbers of several rows, so that code for one row steps several. It needs Numba."""
+"""A Numba type that holds one number for each of several rows, so that code for one row steps them together."""
 
 import math
 import operator
@@ -87,7 +87,7 @@ def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 @_intrinsic(prefer_literal=True)
 def stack(typing: Any, count: Any, rows: Any) -> Any:
-    """Memory for some doubles or lanes; the compiler may keep a constant number of them in registers."""
+    """Memory for ``count`` doubles, or vectors of ``rows`` doubles; a constant ``count`` allows registers instead."""
     kind = _Lanes(rows.literal_value) if rows.literal_value > 1 else types.float64
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -25,7 +25,7 @@ class Limits:
     mean : ndarray, shape (k, ny)
         Limits of the absolute running mean of the residual.
     low, high : ndarray, shape (k, ny)
-        Limits of the running mean square of the residual. ``low`` is 0 if there is no noise whose absence would show.
+        Limits of the running mean square of the residual. ``low`` is 0 at level 0, where there is no noise to miss.
     window : float
         Time constant of the running means, in seconds.
     warm_up : float

@@ -23,7 +23,7 @@ class Equations:
     field : Expression
         f(x) + g(x) u, or the next state in discrete time; nx components.
     substeps : int, default 1
-        Fourth-order Runge-Kutta steps in a sample, 0 for a system in discrete time. Beyond 1024 raises ArtifactError.
+        Fourth-order Runge-Kutta steps in a sample, 0 for a system in discrete time. More than 1024 raise ArtifactError.
     """
 
     field: Expression
@@ -50,7 +50,7 @@ class Equations:
         return x
 
     def steps(self, samples: float) -> int:
-        """Number of Runge-Kutta steps, or of steps in discrete time, in so many samples."""
+        """Number of Runge-Kutta steps, or of steps in discrete time, in ``samples`` intervals."""
         return round(samples) if not self.substeps else max(1, math.ceil(self.substeps * samples - 1e-9))
 
 
@@ -107,9 +107,9 @@ class Motion:
     low, high : ndarray, shape (nx,)
         Bounds of the states, to which estimates are limited.
     mean : ndarray, shape (nx,)
-        Mean of the starts of motions: the estimate before the first sample.
+        Mean of the motions' initial states: the estimate before the first sample.
     covariance : ndarray, shape (nx, nx)
-        Covariance of the starts of motions.
+        Covariance of the motions' initial states.
     error : ndarray, shape (nx,)
         Standard deviation of the motion's own error over a sample.
     process_noise : ndarray, shape (nx,)
@@ -119,8 +119,8 @@ class Motion:
     least_measurement_noise : ndarray, shape (ny,)
         Lower bounds of the assumed standard deviations of the measurement noise.
     window : float
-        Seconds over which innovations are averaged. T_inv's estimate may replace the tracker's for so long after a
-        start.
+        Seconds over which innovations are averaged. For this time after a reset, T_inv's estimate may replace the
+        tracker's.
     factors : Factors, optional
         Calibration factors of the filter's covariance.
     """
@@ -172,7 +172,7 @@ class Motion:
         return len(self.x_offset)
 
     def fits_inputs(self, nu: int) -> bool:
-        """Whether the motion takes so many inputs."""
+        """Whether the motion takes ``nu`` inputs."""
         if self.flow is not None:
             return len(self.flow.u_scale) == nu
         assert self.equations is not None
@@ -189,7 +189,7 @@ class Motion:
         return self.x_offset + self.x_scale * s
 
     def check_samples(self, samples: float) -> None:
-        """Raise ValueError if the motion cannot predict over so many samples."""
+        """Raise ValueError if the motion cannot predict over ``samples`` sampling intervals."""
         continuous = self.equations is not None and self.equations.substeps
         # A tolerance, because clocks jitter and floats resolve seconds since 1970 only to 2e-7 s.
         if not continuous and abs(samples - max(1, round(samples))) > 1e-3:
@@ -202,7 +202,7 @@ class Motion:
     def variances(
         self, measurement_noise: float | tuple[float, ...], process_noise: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the assumed variances at noise levels: Q's, (nx,), of scaled states, and R's, (ny,)."""
+        """Return the assumed variances at noise levels: the diagonals of Q (nx,), for scaled states, and R (ny,)."""
         level = max(process_noise, self.least_process_noise)
         return (
             (level * self.process_noise) ** 2 + self.error**2,

@@ -1,7 +1,7 @@
 """Files of arrays and JSON, which are written atomically and checked when they are read.
 
-Files have the safetensors format and contain no code. Their metadata holds a JSON object under ``KEY``, which names the
-kind of file, and the SHA-256 of the file without this entry under ``KEY-sha256``.
+Files have the safetensors format and contain no code. Their metadata has two entries: ``KEY``, which names
+the kind of file, holds a JSON object; ``KEY-sha256`` holds the SHA-256 of the file without this second entry.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype
 
 @contextmanager
 def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Add the name of the written file to errors without one, such as that of a full disk."""
+    """Add the name of the written file to errors that name no file, such as that of a full disk."""
     try:
         yield
     except OSError as problem:

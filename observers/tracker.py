@@ -11,21 +11,21 @@ from observers.decoder import Decoders
 from observers.motion import Motion
 from observers.unscented import add, factor, shift, solved, transformed, whitened
 
-# The limits are normal quantiles. A false alarm of the first loses a good estimate; one of the second only inflates a
-# covariance. Running means are more skewed than the chi-square distribution that the limits assume, so that white
-# innovations exceed the second limit about twenty times as often as its quantile implies.
+# Both limits are quantiles of the normal distribution. A false alarm of the first discards a good estimate; one of the
+# second only inflates a covariance. Running means are more skewed than the chi-square distribution that the limits
+# assume, so white innovations exceed the second limit about twenty times as often as its quantile implies.
 _DIVERGED = 6.0  # quantile of 1e-9, for the NIS
 _COLOURED = 4.265  # quantile of 1e-5, for the mean square of the innovations' running mean
 _TREND = 0.25  # time constant of the innovations' running mean, in windows
 _LONG = 4.0  # time constant of the mean of its square, in windows
-INFLATION = 10.0  # factor of the covariance if innovations are not white
+INFLATION = 10.0  # factor by which the covariance grows if innovations are not white
 RELINEARISATIONS = 2  # for each step in the first window; with 0, noise-free errors are 40 to 80 % larger
-KNOWN = 1e-3  # standard deviation of a known start, in scales of the states
+KNOWN = 1e-3  # assumed standard deviation of a known start, in units of the states' scales
 
 
 @dataclass(frozen=True)
 class Supervision:
-    """Shares and limits of a tracker's running statistics of innovations, for all noise levels."""
+    """Limits of the running statistics of innovations, and each new sample's share in them, for all noise levels."""
 
     window: int
     share: float
@@ -51,7 +51,7 @@ class Supervision:
 
     @property
     def trend_gain(self) -> float:
-        """Factor with which the square of a trend is 1 on average for white innovations."""
+        """Factor that scales the square of a trend to a mean of 1 for white innovations."""
         return (2 - self.trend_share) / self.trend_share
 
 
@@ -62,22 +62,22 @@ def _limit(freedom: float, quantile: float) -> float:
 
 
 class Tracker:
-    """An unscented Kalman filter on the system's equations, or on a learned flow, for a batch of rows.
+    """An unscented Kalman filter on the system's equations, or on a learned flow, with one estimate in each row.
 
-    It starts at the mean and covariance of the starts of motions, corrected by the first sample. Within the first
-    window each step is repeated twice, with the motion linearised about the start of the step as smoothed by the sample
-    (Kullberg, Skog and Hendeby, 2023).
+    It starts from the mean and covariance of the motions' initial states, corrected by the first sample. In the first
+    window, each step is repeated twice: the sample corrects the state before the step, too, and the motion is
+    linearised about this smoothed state (Kullberg, Skog and Hendeby, 2023).
 
     The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's in
     two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The
     filter has diverged if the mean square of its innovations over the window (NIS) exceeds its limit, or if its
-    covariance is no longer positive definite. T_inv's covariance is then that of an age of one window, because the
-    cause of the divergence may have disturbed z, too.
+    covariance is no longer positive definite. T_inv's covariance is then taken as one window after a reset, because
+    the cause of the divergence may have disturbed z, too.
 
-    Errors smaller than the noise still correlate the innovations. If the mean square of their running mean exceeds its
-    limit, the covariance is multiplied by ten.
+    Errors smaller than the noise still correlate the innovations. If the mean square of the innovations' running
+    mean exceeds its limit, the covariance is multiplied by ten.
 
-    A gate rejects an output whose innovation exceeds so many of its standard deviations; the output then counts as
+    A gate, in standard deviations of the innovation, rejects outputs with larger innovations; they then count as
     missing. The gate is open in the first window. It also opens for an output that it has rejected for a whole window,
     and after a divergence, until the output fits again. So a lasting jump is accepted.
 
@@ -110,7 +110,7 @@ class Tracker:
         self.width = self.trends + ny
 
     def covariance(self, rows: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """Calibrated error covariances of the estimates, (n, nx, nx), at ages (n,) in samples."""
+        """Return calibrated error covariances (n, nx, nx) of estimates ``age`` samples, (n,), after their reset."""
         factors = np.exp(np.interp(age * self._dt, self.motion.factors.ages, self._log_factors))
         return self._covariances(rows) * factors[:, None, None]
 
@@ -139,7 +139,7 @@ class Tracker:
     def advance(
         self, rows: np.ndarray, y: np.ndarray, u: np.ndarray, samples: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Predict over so many samples under inputs (n, nu), and correct by outputs (n, ny), NaN where missing.
+        """Predict ``samples`` sampling intervals under inputs (n, nu), and correct by outputs (n, ny), NaN if missing.
 
         Returns the rows, and the outputs (n, ny), in which predictions replace missing and rejected ones. Predictions
         are not finite if the covariance is not positive definite.
@@ -169,7 +169,7 @@ class Tracker:
         V, white = whitened(y - expected, S, cross, np.isnan(y))
         new = rows[:, self.nis + 2] < self.supervision.window
         for _ in range(RELINEARISATIONS if new.any() else 0):
-            # The sample corrects the start of the step by G white, too (Rauch, Tung and Striebel, 1965).
+            # The sample corrects the state before the step by G white, too (Rauch, Tung and Striebel, 1965).
             G = across @ solved(moved, V)
             spread = add(P, G, G, -1.0)
             around, curved, of_start = predict(shift(x, G, white), spread)
@@ -213,7 +213,7 @@ class Tracker:
         """Update the statistics of whitened innovations (n, ny), and inflate covariances if they are correlated."""
         watch, count = self.supervision, seen.sum(-1)
         (nis, trend_square, samples), trend = watched[:, :3].T, watched[:, -seen.shape[1] :]
-        weight = count / seen.shape[1]  # share of outputs measured: a mean of fewer counts less
+        weight = count / seen.shape[1]  # share of outputs measured; a mean over fewer weighs less
         per_output = 1 / np.maximum(count, 1)
         nis = nis + watch.share * weight * (per_output * (white**2).sum(-1) - nis)
         trend = trend + watch.trend_share * np.where(seen, white - trend, 0.0)
@@ -226,7 +226,7 @@ class Tracker:
         return P, np.column_stack([nis, trend_square, samples + (count > 0), watched[:, 3 : -seen.shape[1]], trend])
 
     def supervise(self, rows: np.ndarray, z: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """Return rows, (n, width), reinitialised from z, (n, size), where needed, at ages (n,) in samples."""
+        """Return rows (n, width), reinitialised from z (n, size) where needed; ``age`` (n,) counts samples."""
         watch, nis, seen = self.supervision, rows[:, self.nis], rows[:, self.nis + 2]
         lost = ~(nis <= watch.limit)
         where = np.flatnonzero(lost | (seen < watch.window))

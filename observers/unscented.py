@@ -49,7 +49,7 @@ def _scale(nx: int) -> float:
 def whitened(
     innovation: np.ndarray, S: np.ndarray, across: np.ndarray, missing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """V (n, nx, ny) and whitened innovations (n, ny); the corrected state is x + V white, with P - V V^T.
+    """V (n, nx, ny) and whitened innovations (n, ny); the corrected state is x + V white, its covariance P - V V^T.
 
     Shapes: ``innovation``, ``missing`` (n, ny), ``S`` (n, ny, ny), ``across`` (n, nx, ny).
     """

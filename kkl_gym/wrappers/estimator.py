@@ -17,7 +17,7 @@ from observers.names import resolve
 
 
 class Estimates:
-    """Any state estimator, as :class:`VectorEstimate` calls it; it makes no use of known starts."""
+    """Adapts any state estimator to the calls of :class:`VectorEstimate`; known starts are ignored."""
 
     def __init__(self, estimator: Estimator[Any], space: gym.spaces.Box) -> None:
         self._running, self.space = Running(estimator), space

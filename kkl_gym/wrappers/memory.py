@@ -1,4 +1,4 @@
-"""Wrappers that add a memory, filtered outputs and actions, to observations of any environment, without training."""
+"""Wrappers that add a memory of filtered outputs and actions to any environment's observations, without training."""
 
 import copy
 from collections.abc import Mapping, Sequence

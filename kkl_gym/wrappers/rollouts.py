@@ -1,4 +1,4 @@
-"""Observers that were learned from rollouts, inside the environment of these rollouts."""
+"""Observers learned from rollouts of an environment, and run inside the same environment."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -82,7 +82,7 @@ class NamedEstimator(KKLEstimator):
         return np.concatenate([y, super().shown(report)], axis=-1)
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
-        """The same for a single sample."""
+        """As :meth:`shown`, for a single sample."""
         return [*self._held.tolist(), *super().listed(report)]
 
 

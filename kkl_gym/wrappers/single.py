@@ -18,7 +18,7 @@ from observers import Artifact
 from observers.checks import choice, flag, integer, shown
 from observers.names import resolve
 
-_FEW = 8  # up to so many numbers, a comparison one by one is faster than np.clip
+_FEW = 8  # numbers up to which comparisons one by one are faster than np.clip
 _FLOAT32 = np.dtype(np.float32)
 
 
@@ -180,7 +180,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self.estimate = estimate
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # estimates
         self._rendering = env.render_mode is not None  # stored, because reading it passes through every wrapper
-        self._draws = 0  # number of this observer among those around the environment; the outermost draws
+        self._draws = 0  # position among the observers around the environment, from inside; the outermost draws
         if isinstance(base, KKLEnv):
             base.drawn_by += 1
             self._draws = base.drawn_by

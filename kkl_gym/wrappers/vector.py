@@ -28,7 +28,7 @@ Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]
 
 
 class VectorEstimate(VectorWrapper):
-    """Observations are the estimates of a batch of observers from ``info["y"]`` and ``info["u"]``.
+    """Replaces observations by the estimates of a batch of observers, which read ``info["y"]`` and ``info["u"]``.
 
     In every autoreset mode, ``info`` and ``info["final_info"]`` gain the observers' reports, with a row for each
     environment, and ``info["final_obs"]`` holds the last estimates.
@@ -146,7 +146,7 @@ class VectorEstimate(VectorWrapper):
             )
 
     def _check_untouched(self, obs: Any, *, at_reset: bool = False) -> None:
-        """Raise ValueError if a wrapper inside changes observations; Sync and Async vectors show it only at resets."""
+        """Raise ValueError if a wrapper inside changes observations; for Sync and Async vectors only at resets."""
         if self._inside is not None:
             check_untouched(obs, self._inside.emitted, self.env, self._inside)
         elif at_reset and not isinstance(self.env, _Telling):
