@@ -40,7 +40,7 @@ Advance = Callable[[Values, Values, Values, float], Values]
 
 MAX_OPERATIONS = 500  # longer programs, such as that of a network as f, would take many seconds to compile
 _TRIALS = 200  # states of each kind at which machine code is compared with Python
-_MAX_TRIAL_SUBSTEPS = 64  # trial states that need more are skipped, because Python is slow on them
+_MAX_TRIAL_SUBSTEPS = 64  # trial states that need more substeps are skipped, because Python is slow there
 _LANES = 32  # rows that are stepped together; they fill a few of the processor's vector registers
 _KEPT = 64  # compiled kernels in the cache
 _kept: dict[Any, Any] = {}  # the kernel of each program, or the reason why it has none

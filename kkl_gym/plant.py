@@ -14,7 +14,7 @@ from kkl_gym.system import Box, Components, System
 from kkl_gym.systems import get_system
 from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
-_MOST_POINTS = 1000  # of each kind, at which h is evaluated to find the outputs' bounds
+_MOST_POINTS = 1000  # points of each kind, on a grid and random, at which h is evaluated to bound the outputs
 NOISE_BLOCK = 256  # samples whose noise is drawn at once, because single draws cost more than the simulation
 
 

@@ -25,7 +25,7 @@ PER_RATE = (1.0 - 1e-6) / RATE_STEP
 # With TOLERANCE, stiff systems and the shipped ones without their rate formulas keep the same 1e-5. ROUGH overrules a
 # rate formula that fails, as at an ignition; it is a hundred times the largest estimate of the shipped systems.
 TOLERANCE, ROUGH = 3e-6, 0.1
-ATTEMPTS = 3  # with equal substeps; after these, or beyond MOST_EQUAL substeps, the step length follows the error
+ATTEMPTS = 3  # with equal substeps; after them, or beyond MOST_EQUAL substeps, the step length follows the error
 MOST_EQUAL = 1 << 10
 MAX_SUBSTEPS = 1 << 16
 REPORTED = 50  # intervals between two reports
@@ -247,7 +247,7 @@ def _powers(need: np.ndarray) -> np.ndarray:
 def _substeps(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: np.ndarray, n: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The states (nx, m) after n (m,) substeps of length h (m,), at least one, and each row's largest error."""
+    """The states (nx, m) after n (m,) >= 1 substeps of length h (m,), and each row's largest error."""
     out, error = _step_batch(system, x, u, w, h)
     for k in range(2, n.max(initial=1) + 1):
         rows = np.flatnonzero(n >= k)
@@ -301,7 +301,7 @@ def simulate(
     step: Step | None = None,
     report: Callable[[int], object] | None = None,
 ) -> np.ndarray:
-    """Trajectories (steps + 1, n, nx) from starts (n, nx), under ``u`` (steps, n, nu) or a policy, and ``w``."""
+    """Trajectories (steps + 1, n, nx) from starts (n, nx), under ``u`` (steps, n, nu) or a policy, and noise ``w``."""
     x0 = np.asarray(x0, dtype=float)
     if x0.ndim != 2 or x0.shape[1] != system.nx or not np.isfinite(x0).all():
         raise ValueError(f"x0 must be finite with shape (n, {system.nx}), got shape {x0.shape}")

@@ -204,7 +204,7 @@ class System:
     def step(self, x: Components, u: Components) -> Components:
         """The next state of a system in discrete time, one sampling interval after x under the held input u.
 
-        A system that defines this needs no f and g, must set ``dt``, and is not integrated. Process noise adds w dt to
+        A system with this method needs no f and g, must set ``dt``, and is not integrated. Process noise adds w dt to
         the next state. f is then the mean derivative over the interval without input. Components are those of
         :meth:`f`.
         """
@@ -297,7 +297,7 @@ def goal_of(system: System) -> list[tuple[float, float]]:
 
 
 def nearness(goal: Iterable[tuple[float, float]], x: Components, u: Components) -> Any:
-    """The default reward."""
+    """The default reward, as :meth:`System.reward` defines it."""
     cost = 0.0
     for xi, (target, weight) in zip(x, goal):
         cost = cost + weight * ((xi - target) * (xi - target))
@@ -331,7 +331,7 @@ def inner_state(system: System) -> tuple[float, ...]:
 
 
 def _starts(system: System) -> np.ndarray:
-    """The same thousand starts (1000, nx) at every call."""
+    """A thousand starts (1000, nx), the same at every call."""
     return system.draw_starts(np.random.default_rng(0), 1000)
 
 

@@ -22,7 +22,7 @@ Infos = dict[str, Any]
 Rows = np.ndarray | slice
 ALL = slice(None)  # all rows; indexing by this slice gives a view
 ROWS_AT_ONCE = 64  # rows whose noise is drawn and transposed together; they fit the processor's cache
-MANY_ROWS = 128  # from this number on, compiling saves more seconds than it takes
+MANY_ROWS = 128  # rows from which on compiling saves more seconds than it takes
 MOST_ENVS = 1_000_000  # each stores 256 samples of noise, about 10 kB
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.ma import MaskedArray, is_masked
 
-_FLOAT = np.dtype(float)  # a comparison by identity is fastest, and every step makes one
+_FLOAT = np.dtype(float)  # stored, so that every step can compare dtypes by identity, which is fastest
 LARGEST = 1e15  # largest output or input; beyond it float32 would overflow
 _NO_NUMBERS = (bool, np.timedelta64)  # Python converts the first to an integer, NumPy the second
 _TEXTS = (str, bytes, bytearray, memoryview)  # these are sequences, but not of numbers

@@ -11,7 +11,7 @@ from observers.factors import ErrorCovariance
 from observers.network import MLP
 
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
-_CONDITIONS = FEATURES[2:]  # each has a unit and a largest value
+_CONDITIONS = FEATURES[2:]  # the features that have a unit and a largest value
 
 
 @dataclass(frozen=True)

@@ -225,7 +225,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         """Whiten innovations: the corrected state is x + V white, with the covariance P - V V^T."""
         for k in range(ny):
             white[k] = y[k] - expected[k]
-        for k in range(ny):  # the expected value of a missing output may be undefined
+        for k in range(ny):  # drops missing outputs, whose expected values may be undefined
             seen, root = finite(y[k]), 1.0 / math.sqrt(S[k * ny + k] + r[k])
             white[k] = choose(seen, 0.0, white[k] * root, 0.0)
             for i in range(nx):
@@ -395,7 +395,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     ) -> None:  # fmt: skip
         """Advance rows of the state (n, width) by samples y (steps, n, ny) and inputs u (steps, n, nu).
 
-        ``record`` (steps, n, width) stores rows at each sample; with a width of nx estimates, with 0 nothing.
+        At each sample, ``record`` (steps, n, width) stores the row, (steps, n, nx) the estimate, (steps, n, 0) nothing.
         """
         nz, widest, substeps = flags
         h, samples, dt, limit = numbers[:4]

@@ -1,7 +1,7 @@
 """Files of arrays and JSON, which are written atomically and checked when they are read.
 
-Files have the safetensors format and contain no code. Their metadata has two entries: ``KEY``, which names
-the kind of file, holds a JSON object; ``KEY-sha256`` holds the SHA-256 of the file without this second entry.
+Files have the safetensors format and contain no code. Their metadata has two entries. ``KEY``, which names the kind of
+file, holds a JSON object. ``KEY-sha256`` holds the SHA-256 of the file without this second entry.
 """
 
 import hashlib

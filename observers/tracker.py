@@ -14,12 +14,12 @@ from observers.unscented import add, factor, shift, solved, transformed, whitene
 # Both limits are quantiles of the normal distribution. A false alarm of the first discards a good estimate; one of the
 # second only inflates a covariance. Running means are more skewed than the chi-square distribution that the limits
 # assume, so white innovations exceed the second limit about twenty times as often as its quantile implies.
-_DIVERGED = 6.0  # quantile of 1e-9, for the NIS
-_COLOURED = 4.265  # quantile of 1e-5, for the mean square of the innovations' running mean
+_DIVERGED = 6.0  # quantile with tail probability 1e-9, for the NIS
+_COLOURED = 4.265  # the same with 1e-5, for the mean square of the innovations' running mean
 _TREND = 0.25  # time constant of the innovations' running mean, in windows
-_LONG = 4.0  # time constant of the mean of its square, in windows
+_LONG = 4.0  # time constant of the mean of this running mean's square, in windows
 INFLATION = 10.0  # factor by which the covariance grows if innovations are not white
-RELINEARISATIONS = 2  # for each step in the first window; with 0, noise-free errors are 40 to 80 % larger
+RELINEARISATIONS = 2  # of each step in the first window; with 0, noise-free errors are 40 to 80 % larger
 KNOWN = 1e-3  # assumed standard deviation of a known start, in units of the states' scales
 
 
@@ -74,8 +74,8 @@ class Tracker:
     covariance is no longer positive definite. T_inv's covariance is then taken as one window after a reset, because
     the cause of the divergence may have disturbed z, too.
 
-    Errors smaller than the noise still correlate the innovations. If the mean square of the innovations' running
-    mean exceeds its limit, the covariance is multiplied by ten.
+    Estimation errors smaller than the noise still correlate the innovations. If the mean square of the innovations'
+    running mean exceeds its limit, the covariance is multiplied by ten.
 
     A gate, in standard deviations of the innovation, rejects outputs with larger innovations; they then count as
     missing. The gate is open in the first window. It also opens for an output that it has rejected for a whole window,
@@ -83,7 +83,7 @@ class Tracker:
 
     A row of the state, which the caller keeps, holds the estimate x (nx), its covariance P (nx^2), the NIS, the mean
     square of the innovations' running mean, the number of samples seen, the number of outputs rejected, the number of
-    successive samples beyond the gate (ny), and the running mean (ny).
+    successive samples beyond the gate (ny), and the running mean of the innovations (ny).
     """
 
     def __init__(
