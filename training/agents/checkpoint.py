@@ -42,7 +42,7 @@ class Checkpoint(BaseCallback):
         if not resume:
             path.unlink(missing_ok=True)
         self.saved = run.load_checkpoint(path, fingerprint=fingerprint) if path.exists() else None
-        self.weights = (self.saved or {}).get("weights")  # of z under noise
+        self.weights = (self.saved or {}).get("weights")  # weights of z under noise
 
     def restore(self, model: BaseAlgorithm, steps: int) -> None:
         """Restore the saved training, if there is one."""

@@ -21,8 +21,8 @@ def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
 class Cost(VectorWrapper):
     """Rewards with minus the cost, see :func:`paid`, if a system does not define its own reward.
 
-    Far from the target the environment's reward is flat, while c still has a slope for an agent to follow. To escape
-    is never worth it.
+    Far from the target the environment's reward is flat, while c still has a slope for an agent to follow. Escaping
+    never pays off.
     """
 
     def __init__(self, env: VectorEnv, task: Task) -> None:

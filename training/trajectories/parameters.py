@@ -48,7 +48,7 @@ def nominal_share(ranges: Ranges) -> float:
 def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False) -> System:
     """A system whose states are x, followed by some of its parameters with derivative zero.
 
-    An observer of such a system estimates parameters, and each of its motions has its own. In training, a share of the
+    An observer of such a system estimates parameters; each motion has its own values. In training, a share of the
     motions has the system's own parameters, which are the likeliest; the parameters of the others lie more often near
     the ends of their ranges, where errors are largest.
     """
