@@ -100,7 +100,7 @@ PROFILES: dict[str, Profile] = {
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
         # Real modes hardly separate the three parameters under noise; slow pairs at frequencies of y do: two of them
-        # reduce the best decoder's error from 2.3 to 1.9 % on plants 10 % off. More batches and trajectories add 3 %.
+        # reduce the best decoder's error from 2.3 to 1.9 % on plants 10 % off. More batches and motions gain 3 % more.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,

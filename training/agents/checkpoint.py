@@ -35,7 +35,7 @@ class Checkpoint(BaseCallback):
         super().__init__()
         self.path, self._fingerprint, self._curve_path = path, fingerprint, path.with_name(CURVE)
         self.resumed = self.restarts = 0
-        self.spent = 0  # random steps before the algorithm's first
+        self.spent = 0  # number of random steps before the algorithm's first step
         self.privileged = False  # whether the agent sees true hidden signals instead of estimates
         self.records: Callable[[], Sequence[Record]] = list  # the records to save
         self._curve, self._began = list[tuple[float, ...]](), time.process_time()

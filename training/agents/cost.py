@@ -11,7 +11,7 @@ MAX_COST = 10.0  # about three scales from the target in every state; larger cos
 
 
 def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
-    """Minus the cost c, limited to ``MAX_COST``, from the reward 1/(1 + 4c) averaged over an action's samples."""
+    """Return minus the cost c, at most ``MAX_COST``, from the mean reward 1/(1 + 4c) over an action's samples."""
     samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
     remaining = np.where(terminated, task.steps - np.ceil(age / task.repeat), 0.0)
     cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, MAX_COST)

@@ -39,8 +39,8 @@ from training.run import CHECKPOINT
 
 RECURRENT = "ppo_lstm"
 # Share of a training's steps, at its start, in which there are no estimates yet.
-PRIVILEGED = 0.9  # without noise: estimates are so accurate that the same policy suits them
-WANDERED = 0.1  # under noise: random actions
+PRIVILEGED = 0.9  # without noise: the agent sees true states; estimates are so accurate that its policy suits them too
+WANDERED = 0.1  # under noise: the agent only acts at random
 REHEARSAL = 0.05  # share of the steps, at the end, in which the agent neither explores nor learns
 FILE = "agent.safetensors"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings of the run

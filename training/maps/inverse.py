@@ -20,7 +20,7 @@ from training.maps.coordinates import (
 from training.maps.networks import Network, compiled, tensor
 from training.trajectories.motions import Pairs
 
-MEASUREMENT_NOISE_UNIT = 0.04  # unit in the noise feature log(1 + sigma_v / unit), over the usual level
+MEASUREMENT_NOISE_UNIT = 0.04  # unit in the noise feature log(1 + sigma_v / unit), over the system's usual noise
 AGE_UNIT = 5  # unit in the age feature log(1 + t / unit), in samples
 # With several outputs, the share of samples in which all outputs have the same fraction of their largest noise levels.
 ALIKE = 0.5

@@ -11,7 +11,7 @@ from observers.checks import shown
 from training.trajectories.motions import Controller
 
 # Share of the training motions with the system's own value of an uncertain parameter. With several parameters it is
-# raised to their number, as it is less likely that all have their own values. Chosen on the four systems that ship: at
+# raised to their number, as it is less likely that all have these values. Chosen on the four systems that ship: at
 # 0.6 and a width of 256, Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of a parameter's process noise, in place of 0
