@@ -20,12 +20,12 @@ from training.sources.simulated import SimulatedSource
 from training.trajectories.motions import filter_states
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # measurement noise, in multiples of the largest level in training
-AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # in multiples of the pace
-PER_AGE = 6  # samples of each run around each age; at one single age all motions may be in the same phase
-FEWEST = 50  # a covariance or a quantile needs at least so many errors
+AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # times since reset, in paces
+PER_AGE = 6  # samples of each run around each of these ages, as all motions may be in phase at a single sample
+FEWEST = 50  # least number of errors for a covariance or a quantile
 LEAST_VARIANCE = 1e-6  # added to each state's variance, as a fraction of the square of its range
-WINDOW, WARM_UP = 0.5, 5.0  # of the monitor, in multiples of the pace
-MARGIN = 1.05  # factor on the limits, as finitely many motions determine them
+WINDOW, WARM_UP = 0.5, 5.0  # the monitor's averaging window and its warm-up, in multiples of the pace
+MARGIN = 1.05  # factor on the limits, because only finitely many motions determine them
 
 
 def calibrate(
@@ -39,8 +39,8 @@ def calibrate(
     """Estimate the covariances of an observer's errors and the limits of its monitor.
 
     The observer follows motions that no training used, from their start and at several levels of measurement noise.
-    Its errors give the covariance of T_inv's errors, and a factor on the tracker's covariance, both by level and age.
-    Its residuals y - h(x_hat) give the limits of fault-free operation.
+    Its errors give two tables by noise level and age, the time since the start: the covariance of T_inv's error, and a
+    factor on the tracker's covariance. Its residuals y - h(x_hat) give the limits of fault-free operation.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def calibrate(
 
 
 class _Calibration:
-    """Tables of an observer's errors, which it makes on the same runs at each level of measurement noise."""
+    """Computes tables of an observer's errors, on the same runs at each level of measurement noise."""
 
     def __init__(self, artifact: Artifact, source: Source, runs: Runs, false_alarms: float) -> None:
         self.artifact, self.source, self.runs, self.false_alarms = artifact, source, runs, false_alarms
@@ -101,7 +101,7 @@ class _Calibration:
         monitored = artifact.knows_output and self.runs.sound
         if self.informed:
             artifact = self.with_covariances(artifact)
-            if motion is not None:  # the factors to find apply to the tracker's own covariance
+            if motion is not None:  # with factors of 1, the observer reports the tracker's own covariance
                 artifact = replace(artifact, motion=replace(motion, factors=Factors.ones()))
         if artifact.motion is None and not monitored:
             return artifact
@@ -117,7 +117,7 @@ class _Calibration:
         return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
 
     def groups(self) -> Iterator[tuple[int, dict[str, Any], np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield the index of a measurement noise level, both noise levels, and their runs' mask (n,), y and u."""
+        """Yield for each pair of noise levels the first's index, both levels, and mask (n,), y and u of the runs."""
         runs, rng = self.runs, np.random.default_rng(0)
         for i, level in enumerate(self.levels):
             y = runs.y + level * rng.standard_normal(runs.y.shape)
@@ -128,7 +128,7 @@ class _Calibration:
                 yield i, levels, rows, y[:, rows], runs.u[:, rows]
 
     def with_covariances(self, artifact: Artifact) -> Artifact:
-        """Add the covariance of T_inv's errors by level and age to each map."""
+        """Return the artifact with the covariance of T_inv's errors, by noise level and age, in each map."""
         seconds, x = self.ages * self.dt, self.runs.x[self.ages]
         errors, finite = np.empty((len(LEVELS), *x.shape)), np.isfinite(x).all(-1)
         for i, levels, rows, y, u in self.groups():
@@ -149,7 +149,7 @@ class _Calibration:
         return replace(artifact, inverse=with_table(artifact.inverse, finite), free_inverse=free)
 
     def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Squared Mahalanobis distances of errors (levels, ages, n); extremes of residuals (3, levels, n, ny)."""
+        """Run the observer; return squared distances (levels, ages, n), extremes of residuals (3, levels, n, ny)."""
         from scipy.signal import lfilter  # takes half a second to import
 
         runs, pace = self.runs, self.source.pace
@@ -173,7 +173,7 @@ class _Calibration:
         return distances, extremes
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
-        """``find`` of the values (ages, n, ...) around each knot, or around the nearest knot with enough values."""
+        """Apply ``find`` to the values (ages, n, ...) around each knot, or around the nearest with enough values."""
         finite = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
         cells = [np.isin(self.ages, span)[:, None] & finite for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
@@ -183,7 +183,7 @@ class _Calibration:
         return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
     def limits(self, extremes: np.ndarray) -> Limits:
-        """Limits, each of which a fault-free motion exceeds with the probability false_alarms / (6 ny)."""
+        """Return limits; a fault-free motion exceeds each of them with the probability false_alarms / (6 ny)."""
         share, sound = self.false_alarms / (6 * self.artifact.ny), self.noisy if self.noisy.any() else ~self.noisy
         largest, low, high = extremes[:, :, sound]
         mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))
@@ -194,7 +194,7 @@ class _Calibration:
 
 
 def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Ages in samples at which tables have entries, and for each of them the ages around it that contribute."""
+    """Return the knots, ages in samples at which tables have entries, and the ages that contribute to each knot."""
     last = max(1, min(4 * steps // 5, round(AGES[-1] * pace)))
     knots = np.array(sorted({k for k in (round(age * pace) for age in AGES) if k < last} | {last}))
     between = np.sqrt(knots[1:] * np.maximum(knots[:-1], 0.5))
@@ -205,10 +205,10 @@ def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
-    """Value (ny,) that a motion's extreme exceeds with probability ``share``; ``extremes`` are (n, ny).
+    """Value (ny,) that a motion's extreme exceeds with probability ``share``, from the ``extremes`` (n, ny) of motions.
 
-    A Gumbel distribution is fitted to the logarithms by the median and the 90 % quantile, so that a few lost motions do
-    not matter. The value is at most ten times the largest extreme, as some outputs stand still in most motions.
+    A Gumbel distribution is fitted to the logarithms by the median and the 90 % quantile, so that a few motions with
+    huge errors do not matter. The value is at most ten times the largest extreme, as some outputs rarely move.
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
     middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)
@@ -218,7 +218,7 @@ def rare(extremes: np.ndarray, share: float) -> np.ndarray:
 
 
 def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """e^T P^-1 e, (...,), which for Gaussian errors has a chi-square distribution with nx degrees of freedom."""
+    """Squared Mahalanobis distance e^T P^-1 e, (...,): chi-square with nx degrees of freedom for Gaussian errors."""
     scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # units may differ by orders of magnitude
     scaled = error / scale
     correlation = covariance / (scale[..., :, None] * scale[..., None, :])

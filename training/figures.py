@@ -80,7 +80,7 @@ def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
 
 
 def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
-    """Write a looping GIF, whole or not at all; parts that stand still take no space, as frames share one palette."""
+    """Write a looping GIF, whole or not at all; still parts take no space, as frames share one palette."""
     from matplotlib.colors import to_rgb
     from PIL import Image
 

@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from observers.storage import UNFINISHED, replacing
 
-CHECKPOINTS = "[!.]*.checkpoint.*"  # of a run or an agent; names of unfinished files begin with a dot
+CHECKPOINTS = "[!.]*.checkpoint.*"  # files of a run or an agent; unfinished ones begin with a dot
 ABANDONED = 3600.0  # seconds since the last write after which a temporary file counts as abandoned
 
 

@@ -30,7 +30,7 @@ def process_intensity(system: System, process_noise: float, dt: float) -> np.nda
 
 
 class Belief(NamedTuple):
-    """Means (n, nx), covariances (n, nx, nx), and a mask of the rows that have had a sample (n,)."""
+    """Means (n, nx), covariances (n, nx, nx), and a mask (n,) of the filters that have had a sample."""
 
     x: np.ndarray
     P: np.ndarray
@@ -57,18 +57,18 @@ class ExtendedKalmanFilter:
         self._aside = ASIDE * (high - low) / 2
 
     def start(self, n: int) -> Belief:
-        """Return n rows before their first sample."""
+        """Return the beliefs of n filters before their first sample."""
         x0, P0 = self._start
         return Belief(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), np.zeros(n, dtype=bool))
 
     def advance(self, state: Belief, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Belief:
-        """Predict over dt, by default the sampling interval, in rows that have had a sample; then correct."""
+        """Predict filters that have had a sample over dt, by default the sampling interval; then correct all."""
         x, P, begun = state
         if begun.any():
             held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
             moved, spread = self._predicted(x, P, held, self._dt if dt is None else dt)
             x, P = np.where(begun[:, None], moved, x), np.where(begun[:, None, None], spread, P)
-        begun = begun | np.isfinite(y).any(-1)  # a row begins with its first sample that is not missing
+        begun = begun | np.isfinite(y).any(-1)  # a filter begins with its first sample that is not missing
         return Belief(*self._corrected(x, P, np.where(begun[:, None], y, np.nan)), begun)
 
     def estimate(self, state: Belief) -> Estimate:

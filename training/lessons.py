@@ -1,4 +1,4 @@
-"""From a source of motions to an observer: the lessons on map and flow, and ``train``, which runs all lessons."""
+"""The lessons, or stages, of a training: map and flow are learned here, and ``train`` runs all lessons."""
 
 import dataclasses
 import platform
@@ -159,8 +159,8 @@ class Maps:
 def learn_map(source: Source, run: Run) -> Maps:
     """Learn T_inv along motions of a source, transients and all noise levels included.
 
-    With inputs there are two maps: one for driven motion, and one of z_y alone, used until an input acts. The pipeline
-    "spinn" follows the paper: it first learns T from motions and its equation, and then T_inv from z = T(x).
+    With inputs there are two maps: one for driven motion, and one that ignores u and serves until an input acts. The
+    pipeline "spinn" follows the paper: it learns first T from motions and its equation, then T_inv from z = T(x).
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def _pairs(source: Source, linear: LinearFilter, run: Run, free: bool = False) -
 def _sampler(
     source: Source, linear: LinearFilter, run: Run, pairs: Pairs, error: np.ndarray | None = None
 ) -> TrajectorySampler:
-    """Batches along motions; ``error`` is the covariance of an error of z, if it has one."""
+    """Make batches along motions; ``error`` is the covariance of the error of z, if z has one."""
     with run.progress.phase("preparing batches"):
         return TrajectorySampler(pairs, linear, run.config, device=run.device, error=error, **source.sampling(linear))
 
@@ -255,7 +255,7 @@ def _fitted(name: str, sampler: Sampler, run: Run, share: float, member: int = 0
 
 
 def learn_flow(source: Source, run: Run) -> Motion:
-    """Learn a tracker's motion over one sample: an affine fit, and a network for its residuals.
+    """Learn a flow, by which a tracker predicts the next sample: an affine fit, and a network for its residuals.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     Returns
     -------
     Motion
-        The motion model, with factors of one, which :func:`training.calibrate` replaces.
+        The motion model; its covariance factors are 1 until :func:`training.calibrate` replaces them.
 
     Raises
     ------
@@ -280,7 +280,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
     parts = {"x_offset": learned.x.mean(0), "x_scale": spread(learned.x)} | parts
-    offset, scale = parts["x_offset"], parts["x_scale"]  # a simulated source scales its process noise by its own
+    offset, scale = parts["x_offset"], parts["x_scale"]  # a source's own scale is the unit of its process noise
     u_scale = np.abs(learned.u).max(0, initial=0.0)
     u_scale = np.where(u_scale > 0, u_scale, 1.0)
     inputs = np.column_stack([(learned.x - offset) / scale, learned.u / u_scale])

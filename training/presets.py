@@ -65,7 +65,7 @@ def homogeneous(system: System) -> Controller:
 
 
 def _spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
-    """Rounded eigenvalues, as the shipped maps have them."""
+    """Evenly spaced eigenvalues, rounded as in the shipped maps."""
     return tuple(np.round(evenly_spaced(n, slowest, fastest), 6).tolist())
 
 
@@ -86,8 +86,8 @@ PROFILES: dict[str, Profile] = {
             "noise_free_share": 0.2,
             "high_noise_emphasis": 4.5,
         },
-        # More samples at high noise help, as noise hides mostly the phase. No input within its bound leads the
-        # oscillator out of X, so stronger inputs do.
+        # More samples at high noise help, as noise hides mostly the phase. Inputs within the bound cannot lead
+        # the oscillator out of X, so those that lead starts out of X are stronger.
         settings={"lead_in_input": 4.0, "noise_free_share": 0.05, "high_noise_emphasis": 4.0},
         # For use without a tracker: slow complex modes at frequencies of y average its noise.
         large_settings={
@@ -100,7 +100,7 @@ PROFILES: dict[str, Profile] = {
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
         # Real modes hardly separate the three parameters under noise; slow pairs at frequencies of y do: two of them
-        # reduce the best decoder's error on plants 10 % off from 2.3 to 1.9 %. More batches and trajectories add 3 %.
+        # reduce the best decoder's error from 2.3 to 1.9 % on plants 10 % off. More batches and motions gain 3 % more.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
@@ -126,7 +126,7 @@ def profile(system: System) -> Profile:
 
 
 def controller(system: System) -> Controller:
-    """The feedback to the system's target: its profile's, by default a saturated linear-quadratic regulator."""
+    """The feedback that drives a system to its target: the profile's, or else a saturated LQ regulator."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs to control it by")
     return profile(system).controller(system)
@@ -173,7 +173,7 @@ def preset(
     size : {"default", "large"}
         Size of an input-aware T_inv; "large" is for use without a tracker.
     changes : mapping of str to object, optional
-        Settings to replace; None keeps a setting. Eigenvalues that are not given follow from the others.
+        Settings to replace; None keeps a setting. Eigenvalues that are not given follow from the other settings.
 
     Returns
     -------
@@ -219,7 +219,7 @@ def preset(
 
 
 def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
-    """Real eigenvalues of A for an input-aware map: its profile's, or from the rate of f in X and from dt."""
+    """Real eigenvalues of A for an input-aware map: the profile's, or else from the rate of f in X and from dt."""
     chosen = profile(system).eigenvalues
     if chosen is not None:
         return chosen

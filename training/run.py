@@ -27,9 +27,9 @@ from training.progress import LOG, ProgressBars, progress_bars
 LOG_EVERY = 100  # batches
 CHECKPOINT_SECONDS = 20.0  # least time between two checkpoints
 CHECKPOINT = ".checkpoint.pt"  # suffix of checkpoint files
-WARM_UP = 0.01  # first part of a stage, in which the learning rate rises
+WARM_UP = 0.01  # share of a stage, at its start, in which the learning rate rises
 
-# Draws a batch with the given generator alone, so that a resumed run continues exactly as if it had not stopped.
+# A loss draws its batch from the given generator alone, so that a resumed run continues as if it had not stopped.
 Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
 
 
@@ -171,7 +171,7 @@ def optimise(
             raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {stage.step}")
         total.zero_()
         stage.history.append((stage.step, mean))
-        expected = round(stage.step / done)  # batches by the time the clock ends the stage
+        expected = round(stage.step / done)  # number of batches when the limit of CPU time ends the stage
         progress.update(task, completed=stage.step, total=expected, description=f"{stage.name} (error {mean:.3g})")
         if done >= 1 or time.monotonic() - saved_at > CHECKPOINT_SECONDS:
             state = {name: part.state_dict() for name, part in parts.items()} | {"generator": generator.get_state()}

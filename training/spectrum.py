@@ -15,7 +15,7 @@ from training.seeds import Stream, generator
 from training.trajectories.motions import filter_states, recording_ages
 
 FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode remembers only the last samples
-SMOOTH = 0.85  # least exponent p of a smooth T, where differences in z fall as distance^p between close states
+SMOOTH = 0.85  # least exponent p of a smooth T: between close states, differences in z fall as distance^p
 MOTIONS = 300  # number of simulated motions
 ASKING = 40  # number of motions whose states are compared with neighbours on the other motions
 SAMPLES = 160  # number of states along a motion
@@ -24,7 +24,7 @@ FEWEST_STATES = 1000  # least number of states for an exponent
 FOLLOWED = 300.0  # length of motions after the transient, in multiples of 1 / rate
 FINEST = 0.05  # least sampling interval, in multiples of 1 / rate; finer ones only cost time
 AT_REST = 1e-6  # a state that varies less, in half-widths of X, counts as constant
-SLOWEST, FASTEST = 1 / 6, 8.0  # slow ends of the first and of the last interval, in multiples of the rate
+SLOWEST, FASTEST = 1 / 6, 8.0  # slow end of the first and of the last interval of eigenvalues, over the rate
 STEP = 2**0.5  # ratio of the slow ends of consecutive intervals
 FORGOTTEN = 30.0  # a filter has forgotten its start after this multiple of 1 / |slow end|
 SPREAD = 4.0  # ratio of an interval's fast end to its slow end
@@ -44,7 +44,7 @@ class Spectrum:
         return np.array([*map(complex, self.eigenvalues), *above, *np.conj(above)])
 
     def filter(self, ny: int, dt: float, nu: int = 0) -> LinearFilter:
-        """The filter with these modes for each output: real ones, then a block [[a, w], [-w, a]] a pair; B = 1."""
+        """The filter with these modes for each output: real ones, then [[a, w], [-w, a]] for each pair; B = 1."""
         A = scipy.linalg.block_diag(*self.eigenvalues, *([[a, w], [-w, a]] for a, w in self.pairs))
         return LinearFilter(np.kron(np.eye(ny), A), np.kron(np.eye(ny), np.ones((len(A), 1))), dt, nu)
 
@@ -69,10 +69,10 @@ def check_continuous(system: System) -> None:
 
 
 def smoothness(system: System, spectra: Iterable[Spectrum], dt: float) -> Iterator[np.ndarray]:
-    """For each spectrum, exponents (ny * modes,) of differences in z between neighbouring states of different motions.
+    """Yield for each spectrum the exponents (ny * modes,) of z between neighbouring states on different motions.
 
     Motions without input are simulated once, half of them from X and half from 1.5 X, and all filters run along them.
-    Only states count at which at most a millionth of a filter's start is left; with too few of them exponents are NaN.
+    Only states count at which at most a millionth of a filter's start is left; exponents are NaN if these are too few.
     """
     check_continuous(system)
     rate = system.typical_rate
@@ -109,7 +109,7 @@ def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, settled: np.ndar
     z = z / np.where(z_scale > 0, z_scale, 1.0)
     distances, rows = scipy.spatial.cKDTree(x[:, ASKING:][others]).query(x[:, :ASKING][asking], k=[1, FAR])
     differences = z[:, ASKING:][others][rows] - z[:, :ASKING][asking][:, None]
-    # Relative to the distance of the far neighbour, so that a few isolated states do not outweigh the rest.
+    # Differences are over the distance of the far neighbour, so that a few isolated states do not outweigh the rest.
     reach = np.maximum(distances[:, 1:], np.finfo(float).tiny)
     closer = np.sqrt(((distances[:, :1] / reach) ** 2).mean(0))
     first, last = np.sqrt(((differences / reach[..., None]) ** 2).mean(0))

@@ -35,14 +35,14 @@ class Checkpoint(BaseCallback):
         super().__init__()
         self.path, self._fingerprint, self._curve_path = path, fingerprint, path.with_name(CURVE)
         self.resumed = self.restarts = 0
-        self.spent = 0  # random steps before the algorithm's first
+        self.spent = 0  # number of random steps before the algorithm's first step
         self.privileged = False  # whether the agent sees true hidden signals instead of estimates
         self.records: Callable[[], Sequence[Record]] = list  # the records to save
         self._curve, self._began = list[tuple[float, ...]](), time.process_time()
         if not resume:
             path.unlink(missing_ok=True)
         self.saved = run.load_checkpoint(path, fingerprint=fingerprint) if path.exists() else None
-        self.weights = (self.saved or {}).get("weights")  # of z under noise
+        self.weights = (self.saved or {}).get("weights")  # weights of z under noise
 
     def restore(self, model: BaseAlgorithm, steps: int) -> None:
         """Restore the saved training, if there is one."""

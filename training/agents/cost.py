@@ -11,7 +11,7 @@ MAX_COST = 10.0  # about three scales from the target in every state; larger cos
 
 
 def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
-    """Minus the cost c, limited to ``MAX_COST``, from the reward 1/(1 + 4c) averaged over an action's samples."""
+    """Return minus the cost c, at most ``MAX_COST``, from the mean reward 1/(1 + 4c) over an action's samples."""
     samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
     remaining = np.where(terminated, task.steps - np.ceil(age / task.repeat), 0.0)
     cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, MAX_COST)
@@ -21,8 +21,8 @@ def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
 class Cost(VectorWrapper):
     """Rewards with minus the cost, see :func:`paid`, if a system does not define its own reward.
 
-    Far from the target the environment's reward is flat, while c still has a slope for an agent to follow. To escape
-    is never worth it.
+    Far from the target the environment's reward is flat, while c still has a slope for an agent to follow. Escaping
+    never pays off.
     """
 
     def __init__(self, env: VectorEnv, task: Task) -> None:

@@ -26,7 +26,7 @@ def vector(
     *,
     each: Callable[[], gym.Env[Any, Any]] | None = None,
 ) -> VectorEnv:
-    """Make environments that reset in the same step; ``wrap`` goes inside the action repeat, ``each`` makes a row."""
+    """Make environments that reset in the same step; ``wrap`` goes inside the action repeat, ``each`` makes one."""
     if task.system is None:
         side_by_side = SyncVectorEnv([each or partial(single, task)] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
         return wrap(side_by_side)

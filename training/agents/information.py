@@ -69,7 +69,7 @@ class FeatureObservation(VectorWrapper):
 
 
 def make(task: Task, information: Information, num_envs: int, *, observer: str | None = None) -> VectorEnv:
-    """Make a task in which the agent sees ``information``; of systems in units of about one, taken from the target."""
+    """Make a task in which the agent sees ``information``; for systems relative to the target, in units of about 1."""
     choice("information", information, INFORMATION)
     if observer is not None and information not in OBSERVED:
         raise ValueError(f"an agent that sees {information!r} has no use for the observer {observer!r}")
@@ -100,7 +100,7 @@ def make(task: Task, information: Information, num_envs: int, *, observer: str |
 
 
 def weighted(task: Task, steps: int, *, seed: int) -> Task:
-    """Let z show what predicts the next outputs, by weights that are learned from random actions in a simulator."""
+    """Weight z so that it predicts the next outputs; the weights are learned from random actions in a simulator."""
     with closing(single(task)) as env:
         return replace(task, weights=KKLMemory(env, **_memory(task)).learn_weights(steps, seed=seed))
 
@@ -160,7 +160,7 @@ def output_deviation(system: System) -> Feature:
 
 
 def _modes(env: VectorEnv, artifact: Artifact, system: System | None) -> VectorEnv:
-    """Show z as the observer's network reads it, and the age: in systems relative to the target, else beside y."""
+    """Show z as the observer's network reads it, and the age; for systems relative to the target, else with y."""
     inverse, linear, inside = artifact.inverse, artifact.filter, env
     while not isinstance(inside, KKLVectorObservation):
         inside = inside.env  # type: ignore[attr-defined]

@@ -39,12 +39,12 @@ from training.run import CHECKPOINT
 
 RECURRENT = "ppo_lstm"
 # Share of a training's steps, at its start, in which there are no estimates yet.
-PRIVILEGED = 0.9  # without noise: estimates are so accurate that the same policy suits them
-WANDERED = 0.1  # under noise: random actions
-REHEARSAL = 0.05  # share of the last steps, in which the agent neither explores nor learns
+PRIVILEGED = 0.9  # without noise: the agent sees true states; estimates are so accurate that its policy suits them too
+WANDERED = 0.1  # under noise: the agent only acts at random
+REHEARSAL = 0.05  # share of the steps, at the end, in which the agent neither explores nor learns
 FILE = "agent.safetensors"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings of the run
-_OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # from these rl-zoo3 makes a system's task
+_OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes a system's task
 
 
 def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:
@@ -316,9 +316,9 @@ class _Until(BaseCallback):
         self._begun = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        collects = self.num_timesteps - self._begun  # as the time before
+        collects = self.num_timesteps - self._begun  # assumed to be as many as in the last rollout
         self._begun = self.num_timesteps
-        stopping = self.training_env.num_envs  # steps that it takes: a callback can stop nothing but a step
+        stopping = self.training_env.num_envs  # steps that stopping takes, as a callback can only stop a step
         self._over = self.num_timesteps >= min(self._steps, max(1, self._last - stopping - collects))
 
     def _on_step(self) -> bool:

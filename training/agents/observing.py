@@ -26,12 +26,12 @@ SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
 
 
 def hidden_entries(task: Task, size: int) -> tuple[int, ...]:
-    """Entries of an observation of some size that are hidden."""
+    """Indices of the hidden entries of an observation of a given size."""
     return tuple(i for i in range(size) if i not in task.measured) if task.hidden is None else task.hidden
 
 
 def estimated_entries(task: Task, size: int) -> tuple[int, ...]:
-    """Entries of an observation of some size that an observer estimates; under noise also the measured ones."""
+    """Indices of the entries that an observer estimates: the hidden ones, and under noise also the measured ones."""
     hidden = hidden_entries(task, size)
     return tuple(sorted({*hidden, *task.measured})) if task.measurement_noise else hidden
 

@@ -64,7 +64,7 @@ def lstm_in(weights: dict[str, torch.Tensor]) -> LSTM | None:
 
 def linear(start: float) -> Callable[[float], float]:
     """Return a linear schedule that ends at zero."""
-    return lambda remaining: start * max(remaining, 0.0)  # the last rollout exceeds the number of steps
+    return lambda remaining: start * max(remaining, 0.0)  # remaining is below 0 in the last rollout
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

@@ -46,7 +46,7 @@ class Task:
     def __post_init__(self) -> None:
         if not isinstance(self.env_id, str):
             raise ValueError(f"env_id must be a string, got {shown(self.env_id)}")
-        try:  # in the form that a file holds
+        try:  # in the form in which a file holds them
             object.__setattr__(self, "env_kwargs", json.loads(json.dumps(dict(self.env_kwargs))))
         except (TypeError, ValueError) as error:
             raise ValueError(f"env_kwargs must be JSON, got {shown(self.env_kwargs)}: {error}") from None
@@ -131,7 +131,7 @@ TASKS: dict[str, Task] = {
     "rossler": control_task("rossler", period=0.1, duration=30.0),
     "lorenz": control_task("lorenz", duration=5.0),  # the input is weak
 }
-PREFERRED = {"reverse_duffing": "sac"}  # the algorithm; all others have ppo
+PREFERRED = {"reverse_duffing": "sac"}  # preferred algorithm; for all other systems it is ppo
 
 # Positions are measured and velocities are hidden, as in rl-zoo3's tasks. ``hidden`` names the estimated entries, if
 # these are not all others: the double pendulum's constraint forces are left out.

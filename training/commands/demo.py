@@ -25,7 +25,7 @@ from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports
 SECONDS = 12.0  # length of animations for systems with a pace of 1 s, which are shown in real time
-FRAMES = 144  # largest number in an animation
+FRAMES = 144  # largest number of frames in an animation
 TRAIL = 0.35  # share of the samples drawn: older points would hide the new ones
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-RESOLUTION = 1e-3  # error of z as a network reads it, in standard deviations: it remains without noise
+RESOLUTION = 1e-3  # error with which a network reads z, in standard deviations; it remains even without noise
 
 Verdict = Literal["ok", "note", "problem"]
 

@@ -16,11 +16,11 @@ from training.sources.simulated import unknown_start
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
 MIN_STEPS = 10  # least number of samples of a motion
-# A direction is a problem or a note if a larger share of its initial standard deviation remains after all of y.
+# A direction is a problem or a note if more than this share of its initial standard deviation remains after all of y.
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in that direction
 VAGUE = 0.3  # larger errors without noise, in standard deviations of the state, are noted
-# A state has a symmetry if its error by the equations is at most LOCALLY, and by neighbours at least GLOBALLY.
+# A state has a symmetry if its error is at most LOCALLY by the equations, but at least GLOBALLY by neighbours in z.
 LOCALLY, GLOBALLY = 0.1, 0.3
 
 
@@ -28,7 +28,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
     """The least error of each state at each level of noise, and the states that y does not determine."""
     names = subject.system.state_names
     errors, left = least_errors(subject)
-    weights = np.ones(errors.shape[1])  # steps left out count as much as the second half of the others
+    weights = np.ones(errors.shape[1])  # steps beyond MAX_STEPS count as those of the second half
     late = weights[len(weights) // 2 :]
     late += max(0, round(subject.duration / subject.dt) + 1 - len(weights)) / len(late)
     least = np.average(errors, axis=1, weights=weights)

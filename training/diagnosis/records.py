@@ -26,14 +26,14 @@ STEPS = 10_000  # number of steps played in an environment by default
 MAX_QUERIES, MAX_OTHERS = 500, 40_000  # largest numbers of samples to predict, and of their possible neighbours
 QUERY_SHARE = 0.2  # share of the records with samples to predict; neighbours come from the others
 MIN_QUERIES = 50  # least number of samples to predict
-MIN_OTHERS = 5  # least number of possible neighbours, over that of coordinates of z
+MIN_OTHERS = 5  # least number of possible neighbours for each coordinate of z
 NOISE_SHARES = 0.01, 0.1  # default noise levels, in standard deviations of the output
-MIN_NEIGHBOURS = 32  # or twice as many as z has coordinates, so that they determine a plane
-ROUNDING = 1e-9  # relative rounding of z in a linear regression, as a ridge
+MIN_NEIGHBOURS = 32  # or twice the number of coordinates of z if this is larger, so that they determine a plane
+ROUNDING = 1e-9  # ridge of the linear regression on z, for the relative rounding of z
 # Largest error of a determined signal, and least error of an undetermined one, in its standard deviations.
 DETERMINED, UNDETERMINED = 0.05, 0.8
-AS_GOOD = 1.1  # a window with at most so many times the least error is as good as the best
-SEEN = 0.1  # a signal is known up to a constant if its changes have at most this fraction of its own error
+AS_GOOD = 1.1  # a window whose error is at most so many times the least counts as good as the best
+SEEN = 0.1  # a signal is known up to a constant if the error of its changes is at most this fraction of its own
 
 # Severity and advice, by the first word of a signal's verdict.
 VERDICTS: dict[str, tuple[Verdict, str]] = {
@@ -68,7 +68,7 @@ class Observability:
     dt : float
         Sampling interval in seconds.
     windows : tuple of int, length m
-        Numbers of past steps of which outputs and inputs are known; with 0, only the present output is.
+        Numbers of past steps of which outputs and inputs are known; with 0, only the present output is known.
     noise : tuple of (float or tuple of float), length k
         Levels of measurement noise; the first is 0.
     errors : ndarray, shape (k, m, nx)
@@ -190,8 +190,8 @@ def of_records(
 ) -> Observability:
     """Find which recorded states the recorded outputs and inputs determine.
 
-    For each window, the filter of a training on the records starts that many steps before a sample. The state z that it
-    then has is compared with z at similar samples in other records, with the noise that z has after such a window.
+    For each window, the filter that a training on these records would use starts that many steps before a sample. Its
+    state z at the sample is compared with similar z in other records, under the noise that z has after such a window.
     """
     integer("seed", seed, 0)
     check_signals(records)
@@ -242,7 +242,7 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
 
 
 def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Filter states (n, size) at evenly spread samples, ``steps`` after a start; states and their changes (n, 2 nx)."""
+    """States z (n, size) at evenly spread samples, ``steps`` after the filter's start; x and its changes (n, 2 nx)."""
     rows = windows.rows(steps)
     rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
     rows = evenly(rows, min(most, len(rows)))
@@ -253,7 +253,7 @@ def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.nd
 def compare(
     queries: Windows, others: Windows, window: int, *, noise: Sequence[Level], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Errors at each noise level (k, nx), the first being 0, and of changes at 0 (nx,); None with too few samples."""
+    """Errors (k, nx) at each noise level, first 0, and (nx,) of changes at level 0; None if samples are too few."""
     (z, x), (others_z, others_x) = _samples(queries, window, MAX_QUERIES), _samples(others, window, MAX_OTHERS)
     if len(z) < MIN_QUERIES or len(others_z) <= MIN_OTHERS * others_z.shape[1]:
         return None
@@ -273,10 +273,10 @@ def compare(
 def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.ndarray) -> np.ndarray:
     """Errors (nx,) of x given z, in standard deviations, from samples of both and from other samples near them.
 
-    Weights on the nearest others reproduce each sample's z, as a plane through them would. The same weights applied to
-    their x miss the sample's x by the part that z does not determine, of the sample and of the others, and by the
-    curvature of x, which falls with the square of the distance. The variance of the first part is the one sought, times
-    1 + the sum of squared weights, so squares are divided by that. One neighbour of weight 1 gives the Delta test.
+    Weights on the nearest others reproduce each sample's z, as a plane through them would. The same weights on their x
+    miss the sample's x for two reasons. First, z does not determine x, in the sample and in the others. This error has
+    the variance sought times 1 + the sum of squared weights, so squares are divided by this. Second, x is curved;
+    this error falls with the square of the distance. One neighbour of weight 1 gives the Delta test.
 
     Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
     """

@@ -20,7 +20,7 @@ COMPARED = 100  # the equations are evaluated at so many points of X, and at as 
 POINTS = 1000  # points of X at which outputs are evaluated
 MOTIONS = 100  # number of motions; where there are inputs, half of them are driven
 MANY = 0.5  # a larger share of motions that leave the bounds is a problem
-# Changes of y from sample to sample, in its standard deviations: a problem, a note, and the advised ones.
+# Changes of y from sample to sample, over its standard deviation: least for a problem, least for a note, advised.
 COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1
 STILL = 1e-9  # an output with a smaller range, over its size, does not move
 

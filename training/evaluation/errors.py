@@ -38,7 +38,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class UnseenTrajectories:
-    """Test trajectories ``x`` (steps + 1, n, nx) within the bounds; the mask ``inside`` is of all that were drawn."""
+    """Test trajectories ``x`` (steps + 1, n, nx) within the bounds; ``inside`` marks them among all that were drawn."""
 
     x: np.ndarray
     u: np.ndarray
@@ -264,7 +264,7 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Errors of estimated parameters after the transient, in percent of the plant's, or else of the last states."""
+    """Errors of parameters after the transient, in percent of the true values: the plant's, or else the last states."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
         raise ValueError(f"each of {trajectories.escaped} runs left bounds = {system.bounds}")

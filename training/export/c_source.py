@@ -119,7 +119,7 @@ def _map(exported: Exported, label: str, inverse: InverseMap) -> str:
 
 
 def template(name: str, words: Mapping[str, object], parts: Collection[str]) -> str:
-    """A file of the folder ``c`` with words replaced, without ranges "// if PART" to "// end PART" of other parts."""
+    """Fill in a file of the folder ``c``: replace words, drop ranges "// if PART" to "// end PART" of other parts."""
     text = files("training.export").joinpath("c", name).read_text(encoding="utf-8")
     ranges = re.compile(r"// if (\w+)\n(.*?)// end \1\n", re.DOTALL)
     while ranges.search(text):

@@ -100,7 +100,7 @@ def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
 
 
 def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
-    """Offset and scale of the states, and in scaled states their bounds and the mean and covariance of starts."""
+    """Offset and scale of the states; bounds, and mean and covariance of starts, in scaled states."""
     low, high, mean = ((x - motion.x_offset) / motion.x_scale for x in (motion.low, motion.high, motion.mean))
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}

@@ -210,7 +210,7 @@ class TorchMap(Module):
         return self.x_offset + self.x_scale * self.network(torch.cat(inputs, 1))
 
     def share(self, level: Tensor) -> Tensor:
-        """Levels (n, 1) over the largest in training, by the output where this ratio is greatest."""
+        """Noise levels over the largest in training, (n, 1): the greatest such ratio of all outputs."""
         return (level / self.measurement_noise_max).amax(1, keepdim=True)
 
     def covariance(self, _: Tensor, age: Tensor, level: Tensor) -> Tensor:

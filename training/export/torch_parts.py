@@ -12,7 +12,7 @@ from observers.expression import Expression
 from observers.network import MLP
 from training.maps.networks import from_mlp
 
-LEAST_PIVOT = 1e-30  # lower bound of the pivots, variances of scaled states, that a factorisation divides by
+LEAST_PIVOT = 1e-30  # lower bound of the pivots (variances of scaled states) by which a factorisation divides
 
 
 def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:

@@ -12,7 +12,7 @@ from training.trajectories.parameters import with_parameters
 
 RANK = 1e-7  # eigenvalues of the information below this share of the largest count as zero
 HARDLY = 1.0  # relative standard error from which a direction counts as unidentifiable
-PART = 0.05  # a parameter with a smaller component of a direction does not belong to it
+PART = 0.05  # a parameter whose component of a direction is smaller does not belong to the direction
 LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # exponents are rounded to fractions within this relative error
 MOST_SIGNS = 12  # states and parameters; with more, there are too many combinations of signs to test
 POINTS = 64  # states at which a symmetry is tested

@@ -17,7 +17,7 @@ CONVERGED = 1e-3  # a start has converged if its window's mean square falls by a
 FIRST_DAMPING = 1e-3
 BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # shares of windows to which starts are fitted first
 DRAWS, KEPT = 64, 4  # random starts for each window, and the number of best ones that are fitted
-SAMPLES_PER_STATE = 8  # in the shortest beginning, so that noise does not determine the start
+SAMPLES_PER_STATE = 8  # least number in the shortest beginning, so that noise does not determine the start
 MOST_ROWS = 60_000  # most motions in one simulation
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from training.identification.identifiability import PART, identifiable_directions
 from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped
 
-RESETTLING = 3  # steps of starts after a step of the parameters, in windows that then fit worse
+RESETTLING = 3  # steps that refit the starts of windows that fit worse after a step of the parameters
 NONLINEAR = 0.3  # largest rms error of linearised outputs, over the noise, for a change by one standard error
 ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
-SLOW, PATIENCE = 0.1, 3  # a smaller fall of the squares, over the noise's, is slow; three slow steps end the fit
+SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square by less is slow; three slow steps end the fit
 SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit
 EXACT = 1e-16  # a smaller mean square of residuals, over the outputs' variances, ends the fit
 ROUNDING = 1e-14  # lower bound of the noise, in an output's standard deviations
@@ -204,7 +204,7 @@ def _reduced(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normal equations S (p, p), s (p,) of the parameters, after elimination of the starts (Schur complement).
 
-    The third array, (n, nx, p + 1), gives the steps of starts: its last column minus the others times the parameters'.
+    From the third array, (n, nx, p + 1), follow the starts' steps: last column - others @ steps of the parameters.
     """
     D, cross = damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
     along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))
@@ -246,7 +246,7 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
 
 
 def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Curvature (n, p, p), derivatives of outputs with refitted starts, and of starts (n, nx, p), by parameters."""
+    """Curvature (n, p, p); derivatives by parameters of outputs with refitted starts, and of starts (n, nx, p)."""
     H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
     by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
     beyond = J[..., nx:] + np.einsum("knyx,nxp->knyp", J[..., :nx], by_parameters)

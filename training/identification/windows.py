@@ -13,7 +13,7 @@ from training.records import Record
 
 FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows; all lengths are fitted in turn
 MORE_NOISE = 1.5  # largest standard deviation of the first windows' residuals, over the noise level
-SMALL = 0.01  # or over the output's standard deviation
+SMALL = 0.01  # or, if this is larger, over the output's standard deviation
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
 GAIN = 0.7  # standard errors after a doubling of the length, over those before; larger ratios end the growth
 MORE_COST = 2.0  # largest mean square of the residuals after a doubling, over that before

@@ -9,9 +9,9 @@ import scipy
 from observers import LinearFilter
 from training.config import Scaling
 
-SMALLEST_MODE = 1e-7  # modes of z with smaller singular values, over the largest, hold rounding errors
+SMALLEST_MODE = 1e-7  # smallest singular value of z, over the largest; modes below it hold only rounding errors
 STILL = 1e-12  # a smaller standard deviation, over the component's size, is rounding error
-SETTLED = np.log(1e3)  # time constants after which a thousandth of a filter's start is left
+SETTLED = np.log(1e3)  # number of time constants after which a thousandth of a filter's start is left
 LEAST = 0.1  # added to the mean square of a scaled state, so that errors of small states do not dominate
 
 
@@ -19,7 +19,7 @@ LEAST = 0.1  # added to the mean square of a scaled state, so that errors of sma
 class Coordinates:
     """Coordinates of z in which the signal has unit covariance and stationary noise a diagonal one.
 
-    A network in float32 cannot read z itself: its components are nearly collinear, and their variances spread over ten
+    A network in float32 cannot read z itself: components of z are nearly collinear, and their variances spread over ten
     orders of magnitude.
 
     Shapes: ``offset`` (size,), ``whiten`` (modes, size), ``noise_gain`` (modes,).

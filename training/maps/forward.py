@@ -16,7 +16,7 @@ from training.maps.coordinates import StateScale, spread
 from training.maps.networks import Network, compiled, tensor
 
 SOLVED = 20_000  # number of pairs, and of points, in the least squares for the output layer
-RIDGE = 1e-5  # of these least squares, over the root mean square column norm of their matrix
+RIDGE = 1e-5  # ridge of these least squares, over the root mean square column norm of their matrix
 
 
 def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
@@ -91,7 +91,7 @@ class ForwardProblem(nn.Module):
         return data + self.config.physics_weight * physics, data.sqrt()
 
     def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """At x (n, nx): dT/dx f - A T - B h (n, nz), in units of z per second, and |f| (n,) of scaled states."""
+        """Return dT/dx f - A T - B h (n, nz) at x (n, nx), in units of z per second, and |f| (n,) of scaled states."""
         f, h = on_tensors(self.system.f, x) / self._x_scale, on_tensors(self.system.h, x)
         value, derivative = along(self.network, (x - self._x_offset) / self._x_scale, f)
         T, derivative = self._z_offset + self._z_scale * value, self._z_scale * derivative

@@ -20,7 +20,7 @@ from training.maps.coordinates import (
 from training.maps.networks import Network, compiled, tensor
 from training.trajectories.motions import Pairs
 
-MEASUREMENT_NOISE_UNIT = 0.04  # unit in the noise feature log(1 + sigma_v / unit), over the usual level
+MEASUREMENT_NOISE_UNIT = 0.04  # unit in the noise feature log(1 + sigma_v / unit), over the system's usual noise
 AGE_UNIT = 5  # unit in the age feature log(1 + t / unit), in samples
 # With several outputs, the share of samples in which all outputs have the same fraction of their largest noise levels.
 ALIKE = 0.5
@@ -29,7 +29,7 @@ PROCESS_NOISE_UNIT = 0.1  # unit in the process noise feature log(1 + level / un
 
 
 class Batch(NamedTuple):
-    """Samples to fit the inverse to, with the weight and the cell of each."""
+    """Samples to fit the inverse to, with the weight of each and its cell, a group of similar age and noise."""
 
     inputs: torch.Tensor
     x: torch.Tensor
@@ -169,7 +169,7 @@ class TrajectorySampler(Sampler):
         )
 
     def _draw_levels(self, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions of noise levels along their two decades, 0 to 1, and the levels, (ages, ny, rows) each."""
+        """Draw noise levels over two decades: their positions in this range, 0 to 1, and levels, (ages, ny, rows)."""
         shape = (self.AGES_PER_BATCH, len(self._level_max), self._per_age)
         quiet = self._config.noise_free_share
         position = (torch.rand(shape, generator=generator, device=generator.device) - quiet) / (1 - quiet)
@@ -194,7 +194,7 @@ class ForwardMapSampler(Sampler):
     Lipschitz constant (paper, lemma R-eta-bound). Gaussian noise with the covariance of that error, measured on the
     forward map's own data, is therefore added to z', and each coordinate is shrunk to its linear conditional mean.
 
-    Shapes: ``error`` (nz, nz), its covariance, ``points`` (n, nx).
+    Shapes: ``error``, the covariance of T's error, (nz, nz), ``points`` (n, nx).
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class InverseProblem(nn.Module):
         self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, relative to its cells' running errors; geometric mean of the running errors."""
+        """Return a batch's mean square error, over its cells' running errors, and these errors' geometric mean."""
         risk, error = self._risk(*self.sampler(generator))
         return {"loss": risk, "error": error}
 
@@ -249,7 +249,7 @@ class InverseProblem(nn.Module):
         """The loss of a batch, and the geometric mean of the cells' running errors."""
         apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
         square = weight * apart[:, :nx].mean(-1)
-        if self.sampler.parameters:  # they have cells of their own: they are hard also where states are easy
+        if self.sampler.parameters:  # parameters have cells of their own, as they are hard also where states are easy
             square = torch.cat([square, apart[:, nx:].mean(-1)])
             # All plants share these cells, or the map would return the system's own parameters for near plants.
             cell = torch.cat([cell, self.sampler.cells + cell // self.sampler.kinds_of_plant])

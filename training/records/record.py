@@ -91,7 +91,7 @@ class Record:
                     raise ValueError(f"{self.name}: column {name}, row {row + 1}: {why}")
 
     def part(self, rows: slice) -> "Record":
-        """At least two rows of the record; without states if no row has all of them."""
+        """Return some rows of the record, at least two; without states if no row has all of them."""
         u, x = (None if values is None else values[rows] for values in (self.u, self.x))
         if x is not None and np.isnan(x).any(-1).all():
             x = None
@@ -217,7 +217,7 @@ class Windows:
         return z
 
     def restarted(self, rows: np.ndarray, age: int) -> np.ndarray:
-        """The filter's states at ``rows`` if it had started ``age`` samples before, which follow by linearity."""
+        """The filter's states at ``rows`` if it had started ``age`` samples before them; they follow by linearity."""
         began = rows - age
         power = np.linalg.matrix_power(self.linear.transition, age)
         return np.asarray(self.z[rows] + (self.linear.start(self.y[began]) - self.z[began]) @ power.T)

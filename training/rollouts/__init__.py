@@ -41,7 +41,7 @@ def learn(
         observation, keys of a Dict, or ``info[key]``, see :func:`kkl_gym.named.resolved`.
     policy : str or callable
         "random", "wandering", "script.py:function", an agent as in "ppo:FILE.zip", or a function from observations to
-        actions. Estimates are accurate where it has been.
+        actions. Estimates are accurate only where the policy has been.
     episodes, steps : int, optional
         Length of the play, whichever is reached first; by default 100,000 steps.
     env_kwargs : mapping of str to object, optional
@@ -68,7 +68,7 @@ def learn(
     """
     from training.lessons import train  # torch takes seconds to import
 
-    # Invalid settings must raise before anything is played; the rollouts will determine the others.
+    # Invalid settings must raise before anything is played; the rollouts determine those that are not given.
     if not np.size(hidden):
         raise ValueError("name the hidden signals, which the observer is to estimate, as in hidden=[2]")
     settings = {"seed": seed} | settings

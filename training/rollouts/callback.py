@@ -27,7 +27,7 @@ from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # less than in a first training, as refits repeat
-LONGEST = 250  # steps of a piece; long episodes are cut, so that some pieces of each can be held out
+LONGEST = 250  # most steps in a piece; long episodes are cut, so that some pieces of each can be held out
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ Env = gym.Env[Any, Any]
 Policy = Callable[[Any], Any]  # from an observation to an action
 RANDOM = "random"
 WANDERING = "wandering"
-LONGEST_HOLD = 30  # steps; a wandering policy holds actions for mean times up to this one
+LONGEST_HOLD = 30  # longest mean time, in steps, for which a wandering policy holds an action
 
 
 def make(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Env:
@@ -169,7 +169,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step the environment; RuntimeError before a reset, which :meth:`rollouts` makes necessary, too."""
+        """Step the environment; RuntimeError before the first reset, or if none has followed :meth:`rollouts`."""
         if self._under_way is None:
             raise RuntimeError("reset the environment before its first step")
         made = copy.deepcopy(action)

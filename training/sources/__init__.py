@@ -20,7 +20,7 @@ class Runs:
     ``usual`` motions start in X; ``sound`` runs come from a plant that certainly has no faults.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
-    ``process_noise`` (n,), ``usual`` (n,): True from X, False from beyond.
+    ``process_noise`` (n,), ``usual`` (n,): True for starts in X, False beyond.
     """
 
     x: np.ndarray

@@ -21,19 +21,19 @@ from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
 FEW = 5  # with fewer records than this, none is held out whole
-STRETCHES, SAMPLES = 600, 2_000_000  # largest number of stretches for calibration, and of all their samples
+STRETCHES, SAMPLES = 600, 2_000_000  # largest number of stretches of records to calibrate on, and of all their samples
 STRETCH_MEMORIES = 2.0  # greatest length of a stretch, in settling times of the filter
-FEWEST = 50  # calibration needs at least so many samples at which a stretch may begin
+FEWEST = 50  # least number of samples at which a stretch for calibration may begin
 BEYOND = 0.5  # estimates may leave the range of the states by this fraction of it
 INCREMENTS = 400_000  # largest number of increments that a flow is learned from
 WINDOW = 10  # innovations are averaged over at least so many samples
-# The residual of y = C x is noise, unless it exceeds the first fraction of the output's standard deviation, or squares
-# of the states reduce it below the second fraction of itself.
+# The residual of y = C x counts as noise unless it exceeds UNEXPLAINED times the output's standard deviation, or a fit
+# with squares of the states reduces it below SQUARES times itself.
 UNEXPLAINED, SQUARES = 0.7, 0.8
 LITTLE = 0.1  # a smaller residual, over the output's standard deviation, always counts as noise
 ROUNDING, OUTLIER = 1e-6, 6.0  # in multiples of an output's size, and of the residual's standard deviation
 LEAST_NOISE = 1e-4  # least noise assumed, in standard deviations of the outputs: with R = 0 the gain would not fall
-MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: modes of each output, and their rates over the signals' rate
+MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: modes of each output, rates over the signals' rate
 RECORD_MEMORIES = 3.0  # so many settling times fit into a record, unless this needs modes faster than the signals
 # For rollouts, whose hidden signals an agent needs within a few steps: modes of each output, and their rates per step.
 # A few modes that lie far apart forget the start soon, and distinguish single steps.
@@ -207,7 +207,7 @@ class RecordedSource:
             "high": high + margin,
             "mean": x.mean(0),
             "covariance": np.atleast_2d(np.cov(x.T)) + np.diag(1e-6 * margin**2),
-            "process_noise": np.zeros(self.nx),  # the flow's error stands for all noise
+            "process_noise": np.zeros(self.nx),  # the flow's error covers all process noise
             "least_process_noise": 1.0,
             "least_measurement_noise": least,
             "window": max(WINDOW * self.dt, 0.5 * self.pace),
@@ -295,7 +295,7 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
 
 
 def signal_rate(records: Sequence[Record]) -> float:
-    """Rate of the signals in 1/s: rms of the derivative over standard deviation, the median of moving signals."""
+    """Rate of the signals in 1/s: rms of the derivative over standard deviation, median over moving signals."""
     rates = list[float]()
     for letter in "yx":
         signals = [(getattr(record, letter), record.t) for record in records if getattr(record, letter) is not None]
@@ -317,7 +317,7 @@ def recorded_errors(
     *,
     measurement_noise: float | tuple[float, ...] = 0.0,
 ) -> dict[str, float]:
-    """Errors of hidden signals (rms over standard deviation, or NaN) from ``after`` s on, or else once settled."""
+    """Errors of hidden signals (rms over standard deviation, or NaN) from ``after`` s on, by default once settled."""
     first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
     pairs, rng = [np.zeros((0, 2, artifact.nx))], np.random.default_rng(0)
     for record in pieces(records):
@@ -335,7 +335,7 @@ def recorded_errors(
 
 
 def linear_output(records: Sequence[Record], known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Fit C (ny, nx) of y = C x unless it is known; return it with standard deviations of the residual (ny,)."""
+    """Fit C (ny, nx) of y = C x unless it is known; return C and the residual's standard deviations (ny,)."""
     y, x = (np.concatenate([getattr(record, name) for record in records if record.x is not None]) for name in "yx")
     both = np.isfinite(np.column_stack([x, y])).all(-1)
     if not both.any():

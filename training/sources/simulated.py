@@ -21,14 +21,14 @@ from training.trajectories.parameters import blind, nominal_share, relative_rang
 
 LEAD_IN_SHARE = 0.4  # share of the free motions whose start inputs have led out of X
 BEYOND = 2.0  # a third of the calibration runs start in this multiple of X, and a flow is learned in it
-# In calibration, every other run is driven; with a policy, every other one sees the exact state without exploration.
+# In calibration, inputs drive every other run; a policy acts on exact states, without exploration, in every other run.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
 LEAST_PROCESS_NOISE = 0.005  # least level that filters assume, at pace 1: a tenth of the environments' default
 WINDOW, RUN = 0.5, 20.0  # lengths of a tracker's window and of a calibration run, in multiples of the pace
 SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sample
-INTEGRATION_ERROR = 2e-5  # a larger error of scaled states needs more steps; it lies below the noise assumed
-TOO_FAR_OFF = 0.01  # a larger error with SUBSTEPS steps, as jumps in f cause, makes a flow necessary
+INTEGRATION_ERROR = 2e-5  # a larger error of scaled states needs more steps; this limit is below the noise
+TOO_FAR_OFF = 0.01  # if SUBSTEPS steps have a larger error, as with jumps in f, a flow is learned
 INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
 DEVIATIONS = (1e-4, 0.3)  # log-uniform distances of increments from motions, in standard deviations of the states
 

@@ -56,7 +56,7 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Slopes at a state x without input: of f, or the step, by x (nx, nx) and by u (nx, nu), and of h by x (ny, nx)."""
+    """Jacobians at x without input: of f, or of the step, by x (nx, nx) and by u (nx, nu), and of h by x (ny, nx)."""
     low, high = system.box()
     nx, at, sizes = system.nx, np.array(x, dtype=float), high - low
 
@@ -82,7 +82,7 @@ def output_matrix(system: System) -> np.ndarray | None:
 
 
 def output_facts(system: System) -> dict[str, Any]:
-    """The artifact's argument for the output: C if h(x) = C x, else h as an expression, or ValueError."""
+    """The artifact's argument for the output: C if h(x) = C x, else h as an expression; ValueError without both."""
     C = output_matrix(system)
     return {"h": output_expression(system)} if C is None else {"C": C}
 

@@ -31,13 +31,13 @@ POLICY_ERROR = (0.02, 0.5)  # range of errors in the states that a policy sees, 
 EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in multiples of input bounds
 # One trajectory in so many follows the policy exactly; the others have errors and exploration. An exact policy's input
 # reveals the state, which an agent's input does not. Under the regulator on x_hat, at the default noise, the error of
-# cart-pole's angle is 3.4 % of X's half-width with 4 here, 3.2 % with 12, and 3.1 % with none; an exact EKF has 2.7 %.
+# cart-pole's angle is 3.4 % of X's half-width at the value 4, 3.2 % at 12, 3.1 % without any; an exact EKF has 2.7 %.
 POLICYS_OWN = 12
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """States of motions and of a filter along them, some samples after its start, without measurement noise.
+    """States of motions and of a filter along them, at some ages (samples since its start), without measurement noise.
 
     Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
     """
@@ -51,7 +51,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Motions:
-    """How trajectories start, are driven and disturbed; ``levels`` of process noise replace random levels."""
+    """How trajectories start, and which inputs and process noise act; ``levels`` of this noise replace random ones."""
 
     system: System
     dt: float
@@ -248,7 +248,7 @@ def under_policy(
 
 
 def recording_ages(steps: int, n: int) -> np.ndarray:
-    """At most n ages to record at: half of them evenly spaced, half logarithmically, to resolve the transient."""
+    """At most n ages, in samples, to record at: half evenly spaced, half logarithmically for the transient."""
     late = max(2, n - n // 2)  # at least the first and the last age
     ages = np.concatenate([np.geomspace(1, steps, n - late), np.linspace(0, steps, late)])
     return np.unique(ages.round()).astype(int)

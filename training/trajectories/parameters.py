@@ -11,7 +11,7 @@ from observers.checks import shown
 from training.trajectories.motions import Controller
 
 # Share of the training motions with the system's own value of an uncertain parameter. With several parameters it is
-# raised to their number, as it is less likely that all have their own values. Chosen on the four systems that ship: at
+# raised to their number, as it is less likely that all have these values. Chosen on the four systems that ship: at
 # 0.6 and a width of 256, Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of a parameter's process noise, in place of 0
@@ -48,7 +48,7 @@ def nominal_share(ranges: Ranges) -> float:
 def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False) -> System:
     """A system whose states are x, followed by some of its parameters with derivative zero.
 
-    An observer of such a system estimates parameters, and each of its motions has its own. In training, a share of the
+    An observer of such a system estimates parameters; each motion has its own values. In training, a share of the
     motions has the system's own parameters, which are the likeliest; the parameters of the others lie more often near
     the ends of their ranges, where errors are largest.
     """
