@@ -15,7 +15,7 @@ SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
 CLOSEST = 1.5  # least ratio of successive time constants; closer ones would give coordinates of rounding errors
 IMAGINED = 64  # steps before the first output in which the outputs are assumed to have changed
 SMALL = 200  # coordinates up to which one matrix product advances one memory faster than several NumPy calls
-FILLED = 20  # in longest time constants: the age from which on the past before reset counts only e^-20
+FILLED = 20  # after so many of the longest time constants, the past before the reset counts only e^-20
 TURN = 2 * math.pi
 
 

@@ -26,8 +26,9 @@ class CompiledStep:
         nx, ny, nu = self._sizes = artifact.nx, artifact.ny, artifact.nu
         self._motion, self._linear, self._h = motion, linear, artifact.h
         expressions = None if motion.equations is None else motion.equations.field, artifact.h
-        if max(nx, ny) > MOST_ROWS or any(each and each.operations > MOST_OPERATIONS for each in expressions):
-            raise ValueError("an expression takes too long to compile, or a covariance exceeds the stack")
+        most = max(each.operations if each else 0 for each in expressions)
+        if max(nx, ny) > MOST_ROWS or most > MOST_OPERATIONS:
+            raise ValueError(f"too much to compile: {nx} states, {ny} outputs, {most} operations in an expression")
         maps = decoders.driven, decoders.free or decoders.driven
         scaling, affine = np.zeros((3, nx + nu)), np.zeros((nx, 1))
         network = np.zeros(0, np.float32), np.zeros(1, int)

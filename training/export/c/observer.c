@@ -310,7 +310,7 @@ static void relinearise(NAME_observer *observer, prediction *p, const real y[NY]
 }
 
 /* What the innovations tell is forgotten. */
-static void watch_anew(NAME_observer *observer)
+static void restart_watch(NAME_observer *observer)
 {
     observer->nis = observer->trend_square = 1.0;
     memset(observer->trend, 0, sizeof observer->trend);
@@ -393,7 +393,7 @@ static void supervise(NAME_observer *observer)
         observer->x[i] = within((x_hat[i] - x_offset[i]) / x_scale[i], i);
     memcpy(observer->P, P, sizeof P);
     if (lost)
-        watch_anew(observer);
+        restart_watch(observer);
 }
 
 // end tracks
@@ -424,7 +424,7 @@ void NAME_reset(NAME_observer *observer, const real y[NY])
     memcpy(observer->x, start.x, sizeof start.x);
     memcpy(observer->P, start.P, sizeof start.P);
     take_in(observer, &start, y, 1);
-    watch_anew(observer);
+    restart_watch(observer);
     observer->seen = 0;
     supervise(observer);
 // end tracks
