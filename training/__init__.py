@@ -1,4 +1,4 @@
-"""Learning KKL observers offline: motions, maps, calibration, evaluation. Needs the extra ``train``."""
+"""Offline training, calibration and evaluation of KKL observers; needs the extra ``train``."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -1,4 +1,4 @@
-"""Calibration: error covariances and the limits of the monitor, from motions that no training used."""
+"""Calibration of an observer's error covariances and of its monitor's limits, on motions that no training used."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,11 +20,13 @@ from training.sources.simulated import SimulatedSource
 from training.trajectories.motions import filter_states
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # measurement noise, in multiples of the largest level in training
-AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)  # times since reset, in paces
-PER_AGE = 6  # samples of each run around each of these ages, as all motions may be in phase at a single sample
+# Times since reset, in units of the source's ``pace``.
+AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)
+# Each run gives several samples around each age, as all motions may be in phase at a single one.
+PER_AGE = 6
 FEWEST = 50  # least number of errors for a covariance or a quantile
-LEAST_VARIANCE = 1e-6  # added to each state's variance, as a fraction of the square of its range
-WINDOW, WARM_UP = 0.5, 5.0  # the monitor's averaging window and its warm-up, in multiples of the pace
+LEAST_VARIANCE = 1e-6  # added to each state's variance, as a fraction of its squared range
+WINDOW, WARM_UP = 0.5, 5.0  # the monitor's averaging window and its warm-up, in units of the pace
 MARGIN = 1.05  # factor on the limits, because only finitely many motions determine them
 
 
@@ -38,9 +40,9 @@ def calibrate(
 ) -> Artifact:
     """Estimate the covariances of an observer's errors and the limits of its monitor.
 
-    The observer follows motions that no training used, from their start and at several levels of measurement noise.
-    Its errors give two tables by noise level and age, the time since the start: the covariance of T_inv's error, and a
-    factor on the tracker's covariance. Its residuals y - h(x_hat) give the limits of fault-free operation.
+    The observer runs from a reset along motions that no training used, at several levels of measurement noise. Its
+    errors determine two tables by noise level and time since reset: the covariance of T_inv's error, and a factor on
+    the tracker's covariance. Its residuals y - h(x_hat) determine the monitor's limits, rarely exceeded without faults.
 
     Parameters
     ----------
@@ -49,10 +51,10 @@ def calibrate(
     source : Source or System
         The source or system that the observer was trained for.
     motion : Motion, optional
-        The motion model of its tracker; by default that of ``artifact``, if any.
+        The tracker's motion model; by default that of ``artifact``, if any.
     false_alarms : float, optional
-        Probability that a fault-free motion of twenty seconds, at the pace of the shipped systems, exceeds a limit; by
-        default the probability that was set for its training.
+        Probability that a fault-free motion exceeds a limit, over the length of the calibration motions (20 times
+        ``System.pace`` for a system); by default the probability in the settings of the observer's training.
     console : rich.console.Console or ProgressBars, optional
         Where progress is shown; by default nowhere.
 
@@ -64,8 +66,8 @@ def calibrate(
     Raises
     ------
     ValueError
-        If ``false_alarms`` is not between 0 and 1, most motions leave the system's bounds, or too few are held out;
-        :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
+        If ``false_alarms`` is not between 0 and 1, most motions leave the system's bounds, or too few motions are held
+        out; :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
     """
     if isinstance(source, System):
         artifact.check(source.name, source.parameters, dt=artifact.filter.dt, ny=source.ny, nu=source.nu)
@@ -76,7 +78,7 @@ def calibrate(
         raise ValueError(f"false_alarms must lie between 0 and 1, got {false_alarms!r}")
     sizes, expected = (source.nx, source.ny, source.nu), (artifact.nx, artifact.ny, artifact.nu)
     if sizes != expected:
-        raise ValueError(f"a source of {sizes} states, outputs and inputs does not fit an observer of {expected}")
+        raise ValueError(f"the source has (nx, ny, nu) = {sizes}, but the observer has {expected}")
     with progress_bars(console) as progress:
         with progress.phase("motions for calibration") as report:
             runs = source.runs(report=report)
@@ -84,7 +86,7 @@ def calibrate(
 
 
 class _Calibration:
-    """Computes tables of an observer's errors, on the same runs at each level of measurement noise."""
+    """Calibrates an observer on a set of runs, to whose outputs it adds each level of measurement noise in turn."""
 
     def __init__(self, artifact: Artifact, source: Source, runs: Runs, false_alarms: float) -> None:
         self.artifact, self.source, self.runs, self.false_alarms = artifact, source, runs, false_alarms
@@ -96,12 +98,12 @@ class _Calibration:
         self.levels = np.multiply.outer(LEVELS, largest)
 
     def calibrated(self, motion: Motion | None, progress: ProgressBars) -> Artifact:
-        """Return the artifact with all tables and the motion."""
+        """Return the artifact with covariances, a motion model and limits, as far as it can have each of these."""
         artifact = replace(self.artifact, motion=None, limits=None)
         monitored = artifact.knows_output and self.runs.sound
         if self.informed:
             artifact = self.with_covariances(artifact)
-            if motion is not None:  # with factors of 1, the observer reports the tracker's own covariance
+            if motion is not None:  # factors of 1 leave the tracker's covariance as it is
                 artifact = replace(artifact, motion=replace(motion, factors=Factors.ones()))
         if artifact.motion is None and not monitored:
             return artifact
@@ -117,7 +119,7 @@ class _Calibration:
         return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
 
     def groups(self) -> Iterator[tuple[int, dict[str, Any], np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield for each pair of noise levels the first's index, both levels, and mask (n,), y and u of the runs."""
+        """Yield (index of the measurement noise, both noise levels, mask (n,) of the runs with them, their y, u)."""
         runs, rng = self.runs, np.random.default_rng(0)
         for i, level in enumerate(self.levels):
             y = runs.y + level * rng.standard_normal(runs.y.shape)
@@ -128,7 +130,7 @@ class _Calibration:
                 yield i, levels, rows, y[:, rows], runs.u[:, rows]
 
     def with_covariances(self, artifact: Artifact) -> Artifact:
-        """Return the artifact with the covariance of T_inv's errors, by noise level and age, in each map."""
+        """Return the artifact with an error covariance, by noise level and age, in each of its inverse maps."""
         seconds, x = self.ages * self.dt, self.runs.x[self.ages]
         errors, finite = np.empty((len(LEVELS), *x.shape)), np.isfinite(x).all(-1)
         for i, levels, rows, y, u in self.groups():
@@ -144,17 +146,17 @@ class _Calibration:
             return replace(inverse, error_covariance=covariance)
 
         free = artifact.free_inverse
-        if free is not None:  # this map serves motions until an input has acted
+        if free is not None:  # the observer uses this map until an input acts
             free, finite = with_table(free, finite & ~moved), finite & moved
         return replace(artifact, inverse=with_table(artifact.inverse, finite), free_inverse=free)
 
     def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Run the observer; return squared distances (levels, ages, n), extremes of residuals (3, levels, n, ny)."""
+        """Run the observer; return its errors' squared distances (levels, ages, n) and its residuals' extremes."""
         from scipy.signal import lfilter  # takes half a second to import
 
         runs, pace = self.runs, self.source.pace
         distances = np.full((len(LEVELS), len(self.ages), runs.x.shape[1]), np.nan)
-        extremes = np.zeros((3, len(LEVELS), *runs.y.shape[1:]))
+        extremes = np.zeros((3, len(LEVELS), *runs.y.shape[1:]))  # largest |mean|, least and largest mean square
         share, first = -np.expm1(-self.dt / (WINDOW * pace)), 1 + round(WARM_UP * pace / self.dt)
         slots = {int(age): i for i, age in enumerate(self.ages)}
         for i, levels, rows, y, u in self.groups():
@@ -173,7 +175,7 @@ class _Calibration:
         return distances, extremes
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
-        """Apply ``find`` to the values (ages, n, ...) around each knot, or around the nearest with enough values."""
+        """Apply ``find`` to the values (ages, n, ...) around each knot, or around the nearest knot with enough."""
         finite = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
         cells = [np.isin(self.ages, span)[:, None] & finite for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
@@ -194,7 +196,7 @@ class _Calibration:
 
 
 def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the knots, ages in samples at which tables have entries, and the ages that contribute to each knot."""
+    """Return the knots (ages in samples at which tables have entries), and the ages that contribute to each knot."""
     last = max(1, min(4 * steps // 5, round(AGES[-1] * pace)))
     knots = np.array(sorted({k for k in (round(age * pace) for age in AGES) if k < last} | {last}))
     between = np.sqrt(knots[1:] * np.maximum(knots[:-1], 0.5))
@@ -205,10 +207,10 @@ def _knots(steps: int, pace: float) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def rare(extremes: np.ndarray, share: float) -> np.ndarray:
-    """Value (ny,) that a motion's extreme exceeds with probability ``share``, from the ``extremes`` (n, ny) of motions.
+    """Estimate the values (ny,) that ``extremes`` (n, ny) of motions exceed with probability ``share``.
 
-    A Gumbel distribution is fitted to the logarithms by the median and the 90 % quantile, so that a few motions with
-    huge errors do not matter. The value is at most ten times the largest extreme, as some outputs rarely move.
+    A Gumbel distribution is fitted to the logarithms by the median and the 90 % quantile, which a few huge extremes do
+    not change. The values are at most ten times the largest extreme, as the fit may exceed it far if y rarely moves.
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
     middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)
@@ -218,24 +220,24 @@ def rare(extremes: np.ndarray, share: float) -> np.ndarray:
 
 
 def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Squared Mahalanobis distance e^T P^-1 e, (...,): chi-square with nx degrees of freedom for Gaussian errors."""
-    scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # units may differ by orders of magnitude
+    """Return the squared Mahalanobis distances e^T P^-1 e (...,), which are chi-square for Gaussian errors."""
+    scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # the states' sizes may differ by orders of magnitude
     scaled = error / scale
     correlation = covariance / (scale[..., :, None] * scale[..., None, :])
     return np.asarray((scaled * np.linalg.solve(correlation, scaled[..., None])[..., 0]).sum(-1))
 
 
 def chi_square(shares: Any, degrees: int) -> np.ndarray:
-    """Quantiles of the chi-square distribution; scipy.stats, which has them too, takes longer to import."""
+    """Return quantiles of the chi-square distribution; scipy.stats has them too, but takes longer to import."""
     return np.asarray(2 * gammaincinv(degrees / 2, shares))
 
 
 def _covariance(error: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Mean outer product of errors (n, nx), scaled so that its 90 % region holds 90 % of them."""
+    """Return the mean outer product of errors (n, nx), scaled so that its 90 % region holds 90 % of the errors."""
     covariance = error.T @ error / len(error) + least
     return np.asarray(covariance * _excess(squared_distance(error, covariance), error.shape[1]))
 
 
 def _excess(distances: np.ndarray, degrees: int) -> float:
-    """The 90 % quantile of squared distances, divided by the 90 % quantile of the chi-square distribution."""
+    """Return the 90 % quantile of squared distances, divided by that of the chi-square distribution."""
     return float(np.quantile(distances, COVERAGE, method="weibull") / chi_square(COVERAGE, degrees))

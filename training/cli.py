@@ -1,7 +1,6 @@
-"""The command line, ``kkl-gym`` (or ``python -m training``): the table of commands, and error messages.
+"""The command line ``kkl-gym`` (or ``python -m training``): its table of commands and its error messages.
 
-This module imports nothing that is slow or may be missing. The module of a command is imported when the command is
-called.
+It imports nothing that is slow or may be missing: the module of a command is imported when the command is called.
 """
 
 import _thread
@@ -36,8 +35,8 @@ COMMANDS: Commands = {
 DESCRIPTION = """Learned KKL observers for Gymnasium environments.
 
 A first look: kkl-gym demo. An observer for your own system: kkl-gym diagnose script.py, kkl-gym train script.py.
-One for any environment: kkl-gym record ENV_ID, kkl-gym train NAME --data. kkl-gym COMMAND --help has the options,
-kkl-gym --version the version."""
+An observer for any environment: kkl-gym record ENV_ID, kkl-gym train NAME --data. kkl-gym COMMAND --help lists the
+options of a command, and kkl-gym --version prints the version."""
 
 # Hints after an interruption, by the first words of the command.
 AFTER_INTERRUPTION = dict.fromkeys(
@@ -47,7 +46,7 @@ WIDE = 140  # columns of output to a file or pipe; 80 would cut tables
 PROG = "kkl-gym"
 MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
-# The modules of each extra of the package.
+# The modules that each extra of the package installs.
 EXTRAS = {
     "train": {
         *["filelock", "joblib", "pandas", "pydantic", "pytorch_optimizer", "rich", "scipy", "sympy", "torch", "tyro"]
@@ -61,7 +60,7 @@ EXTRAS = {
 
 
 class _Notes(logging.Handler):
-    """Prints the library's log messages to the present stderr, which a progress bar may have redirected."""
+    """Prints the library's log messages to the current stderr, which a progress bar may have redirected."""
 
     def emit(self, record: logging.LogRecord) -> None:
         print(record.getMessage(), file=sys.stderr)
@@ -90,7 +89,7 @@ def main(
                 Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDE)
             )
         except BaseException as error:
-            if interrupted or isinstance(error, KeyboardInterrupt):  # modules may raise another error then
+            if interrupted or isinstance(error, KeyboardInterrupt):  # interrupted code may raise another error
                 hints = [hint for words, hint in after_interruption.items() if tuple(arguments[: len(words)]) == words]
                 _end(prog, "; ".join(["interrupted", *hints]), INTERRUPTED)
             if isinstance(error, ModuleNotFoundError):
@@ -107,7 +106,7 @@ def main(
 
 @contextmanager
 def _noticing_interruptions() -> Iterator[list[int]]:
-    """Yield a list that is empty until an interruption."""
+    """Yield a list that stays empty until the first interruption, and raise KeyboardInterrupt in the main thread."""
     noticed: list[int] = []
 
     def handler(number: int, frame: object) -> None:
@@ -115,7 +114,7 @@ def _noticing_interruptions() -> Iterator[list[int]]:
         raise KeyboardInterrupt
 
     def unraisable(failed: "sys.UnraisableHookArgs") -> None:
-        if isinstance(failed.exc_value, KeyboardInterrupt):  # it was lost in a callback, as in imports: repeat it
+        if isinstance(failed.exc_value, KeyboardInterrupt):  # Python has dropped it in a callback: repeat it
             threading.Timer(0.05, _thread.interrupt_main).start()
         else:
             hook(failed)
@@ -138,7 +137,7 @@ def read(arguments: list[str], *, prog: str = PROG, commands: Commands = COMMAND
 
     called = arguments[:1]
     if called and called[0] not in commands and not called[0].startswith("-"):
-        from observers.names import suggestion  # imports numpy, for which --help need not wait
+        from observers.names import suggestion  # imports numpy, which --help need not wait for
 
         _end(prog, f"unknown command {called[0]!r}{suggestion(called[0], commands)}: {', '.join(commands)}", MISUSED)
     if called and called[0].startswith("--tyro"):  # shell completion needs all commands
@@ -166,7 +165,7 @@ def _end(prog: str, message: str, code: int) -> NoReturn:
 
 
 def _without_box(text: str) -> str:
-    """Tyro's message on unreadable options, shortened to one line without frame, colours, title, help and reasons."""
+    """Shorten tyro's message on invalid options to one line, without its frame, colours, title, help and reasons."""
     parts: list[list[str]] = [[]]
     for line in text.splitlines()[1:]:  # the first line is the title
         content = re.sub(r"\x1b\[[0-9;]*m", "", line).strip(" │╰╯")
@@ -188,7 +187,7 @@ def load(module: str, name: str) -> Callable[..., Any]:
 
 @cache
 def _described(module: str, name: str) -> Callable[..., Any]:
-    """A substitute for a command that is not called, with the summary of its class; it does not import the module."""
+    """Make a substitute for a command that is not called: its summary is read from the source, without an import."""
     import ast  # not at the top, so that interruptions are handled before slow imports
     from importlib.util import find_spec
     from pathlib import Path
@@ -205,7 +204,7 @@ def _described(module: str, name: str) -> Callable[..., Any]:
 
 
 def _message(error: Exception) -> str:
-    """The message of an error; for a configuration, a line for each setting: ``name = value: requirement``."""
+    """Return an error's message; it has a line ``name = value: requirement`` for each invalid setting."""
     from pydantic import ValidationError
 
     if isinstance(error, OSError) and error.filename and error.strerror:

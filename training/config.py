@@ -20,7 +20,7 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
-# A number for all outputs, or one for each. Error messages show the tags.
+# One number for all outputs, or one for each output. Error messages show the tags, "all" and "each".
 EACH = Discriminator(lambda value: "each" if isinstance(value, list | tuple) else "all")
 Levels = Annotated[
     Annotated[Positive, Tag("all")] | Annotated[tuple[Positive, ...], Field(min_length=1), Tag("each")], EACH
@@ -34,9 +34,7 @@ Biases = Annotated[
     frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 )
 class Config:
-    """The settings of a training; together with the source they determine the artifact.
-
-    The defaults are those of the preset "fast" of input-aware maps. A source reads the settings of its motions.
+    """The settings of a training; by default those of the preset "fast" for input-aware maps.
 
     Raises
     ------
@@ -45,13 +43,13 @@ class Config:
     """
 
     pipeline: Pipeline
-    """How the observer is learned. input-aware: T_inv(z_y, z_u) is fitted along driven, noisy trajectories, transients
-    included, and T_inv(z_y) along free ones. spinn: as in the paper, first T by a physics-informed network, then T_inv
-    on z' = T(x'), without inputs."""
+    """How the observer is learned. input-aware: T_inv(z_y, z_u) is fitted along noisy trajectories with inputs, and
+    T_inv(z_y) along trajectories without, transients included. spinn: as in the paper, a physics-informed network
+    learns T, and T_inv is fitted on z' = T(x'), without inputs."""
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
     """Real eigenvalues of A, in 1/s; B is all ones for each output."""
     pairs: tuple[tuple[Annotated[float, Field(lt=0)], Positive], ...] = ()
-    """Complex pairs a +- iw of eigenvalues of A, as (a, w) in 1/s and rad/s. A pair averages noise at its frequency."""
+    """Complex pairs a +- iw of eigenvalues of A, as (a, w) in 1/s and rad/s; a pair averages noise at frequency w."""
     dt: Positive = 0.01
     """Sampling interval in seconds."""
     trajectories: Count = 500
@@ -67,9 +65,9 @@ class Config:
     activation: Literal["tanh", "silu"] = "tanh"
     """Activation of the hidden layers."""
     optimiser: Optimiser = "soap"
-    """Optimiser of all networks: adam, or soap, which needs a fraction of the batches."""
+    """Optimiser of all networks: adam, or soap, which needs far fewer batches."""
     batch: Annotated[int, Field(ge=64, multiple_of=32)] = 1024
-    """Samples in a batch. The forward map's batches have as many collocation points, too."""
+    """Samples in a batch. A batch for the forward map has as many collocation points in addition."""
     learning_rate: Positive = 5e-3
     """Highest learning rate; after a short warm-up it decays to zero along a cosine."""
     forward_steps: Annotated[int, Field(ge=0)] = 0
@@ -77,63 +75,63 @@ class Config:
     inverse_steps: Count = 1500
     """Batches for each inverse map."""
     collocation: Literal["motions", "box"] = "motions"
-    """Where the forward map's equation must hold and x' lies (spinn). box: uniform in X, as in the paper."""
+    """Points x' at which the forward map's equation must hold (spinn). box: uniform in X, as in the paper."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
     """Most trajectories start in this multiple of the training box X, the others in X (spinn)."""
     solved_output_layer: bool = True
     """Whether least squares determine the forward map's output layer after its training (spinn)."""
     transients: bool = True
-    """Whether T_inv is fitted at every age since reset and every level of noise (spinn); otherwise to T(x) alone."""
+    """Whether T_inv is fitted at all times since reset and all noise levels (spinn); otherwise to z' = T(x')."""
     scaling: Scaling = "relative"
     """How states are scaled. relative: by their standard deviation; errors of T_inv count relative to the state's size.
-    range: by half their range; all errors count alike. Input-aware maps are relative."""
+    range: by half their range; all errors count alike."""
     physics_weight: NotNegative = 0.1
     """Weight nu of the PDE residual in the forward map's risk (spinn)."""
     inputs: bool = True
-    """Whether the filter of an input-aware map takes in the system's inputs; if not, it learns free motions only."""
+    """Whether the filter of an input-aware map takes the system's inputs; if not, motions have no inputs."""
     policy: str | None = None
     """A policy for plants that random inputs drive out of their bounds (input-aware): "controller" for the system's own
-    (by default a linear-quadratic regulator at the target), or script.py:function or module:function, from states
-    (n, nx) to actions (n, nu) in [-1, 1]. It sees states with errors and explores, except in one trajectory in
-    twelve. With a policy there are no free motions."""
+    controller (by default a linear-quadratic regulator at the target), or a function from states (n, nx) to actions
+    (n, nu) in [-1, 1], as script.py:function or module:function. It sees states with errors and explores, except in one
+    trajectory in twelve. No motions without inputs are simulated then."""
     free_inverse: bool = True
     """Whether an input-aware map has a second inverse of z_y alone, used until an input acts; never with a policy."""
     lead_in_input: NotNegative = 0.0
-    """Inputs lead the starts of some free trajectories out of X: constant ones for 20 s, up to this multiple of their
-    bounds; 0: random ones for 10 s within their bounds."""
+    """Before some trajectories without inputs, inputs lead the start out of X: constant inputs, up to this multiple of
+    their bounds, for 20 times the system's pace; with 0, random inputs within their bounds for 10 times the pace."""
     process_noise_share: Share = 0.35
-    """Share of an input-aware map's trajectories with process noise, up to the system's; 0: T_inv takes no level."""
+    """Share of the trajectories that have process noise (input-aware); with 0, T_inv does not take its level."""
     measurement_noise_max: Levels = 1.0
-    """Largest standard deviation of the measurement noise that a map is trained for, for all outputs or for each."""
+    """Largest standard deviation of the measurement noise in training, one for all outputs or one for each."""
     noise_free_share: Share = 0.2
-    """Share of the samples without measurement noise, for maps that take its level."""
+    """Share of the samples without measurement noise, for maps that take the noise level."""
     high_noise_emphasis: Positive = 2.0
     """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
     measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
     windows: Count = 8000
-    """Number of filter starts for each age (recorded motions)."""
+    """Number of samples at each time since the filter's start (recorded motions)."""
     members: Count = 1
-    """Number of networks with different seeds, averaged into one wide network: they extrapolate differently."""
+    """Number of networks with different seeds, averaged into one wide network, as they extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()
-    """Measured signals with an arbitrary zero, such as encoder angles; T_inv uses their changes (recorded motions)."""
+    """Measured signals with an arbitrary zero, as of an encoder; T_inv uses only their changes (recorded motions)."""
     held_out: Annotated[float, Field(ge=0, lt=1)] = 0.2
-    """Share of the records that is held out for calibration and errors: whole records where there are five or more,
-    otherwise the end of each."""
+    """Share of the records that is held out to calibrate on and to measure errors: whole records if there are five or
+    more, otherwise the end of each record."""
     tracking: bool = True
-    """Whether a Kalman filter on the equations, or on a learned flow, tracks from T_inv's estimate (not with spinn)."""
+    """Whether a Kalman filter, initialised by T_inv, tracks by the equations or by a learned flow (not with spinn)."""
     flow_steps: Count = 5000
-    """Batches for a flow, which replaces equations that are unknown or that no expression can hold."""
+    """Batches for a flow, which replaces equations that are unknown or that an artifact cannot hold."""
     runs: Annotated[int, Field(ge=100)] = 400
-    """Simulated motions on which covariances and the monitor's limits are calibrated."""
+    """Number of simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability that a fault-free motion of twenty seconds, at the pace of the shipped systems, raises an alarm."""
+    """Probability that a fault-free motion as long as those of calibration (for a system 20 paces) raises an alarm."""
     truncation: Positive = 1e-6
-    """Largest remainder epsilon of the filter's start where the forward map's data begins (paper, sec. 5.2)."""
+    """The forward map's data begins once at most epsilon of the filter's start is left (spinn; paper, sec. 5.2)."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name, with their largest relative
     deviations; "all" stands for each that is not named. Some motions keep the system's own values."""
     bias: Biases = 0.0
-    """Largest constant bias of all outputs, or of each; biases become states (input-aware, no uncertain parameters)."""
+    """Largest constant bias of all outputs, or of each; T_inv estimates it (input-aware, no uncertain parameters)."""
     estimate_parameters: bool = False
     """Whether T_inv estimates the uncertain parameters, too."""
     cpu_seconds: Positive | None = None
@@ -146,7 +144,7 @@ class Config:
         if self.duration < self.dt:
             raise ValueError(f"duration = {self.duration} s is shorter than one sample, dt = {self.dt} s")
         if not self.eigenvalues and not self.pairs:
-            raise ValueError("A needs eigenvalues, or pairs of them")
+            raise ValueError("A needs eigenvalues: set eigenvalues or pairs")
         for modes in (self.eigenvalues, self.pairs):
             if len(set(modes)) < len(modes):
                 raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
@@ -172,7 +170,7 @@ class Config:
 
 
 def setting_types() -> dict[str, Any]:
-    """The type of each setting with its limits, by name."""
+    """Return each setting's type, which includes its limits, by name."""
     return {entry.name: entry.type for entry in dataclasses.fields(Config)}
 
 
@@ -190,7 +188,7 @@ def read_changes(path: Path) -> dict[str, Any]:
 
 def checked_changes(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Check the names of settings, and their JSON values against their types and limits."""
-    # A file of settings must not name code to run: --policy does.
+    # Only the option --policy may name code to run, not a file of settings.
     names = sorted(set(setting_types()) - {"pipeline", "policy"})
     for name in settings:
         if name not in names:
@@ -200,7 +198,7 @@ def checked_changes(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
-    """The configuration in the training metadata of an artifact, with some settings changed."""
+    """Return the configuration in an artifact's training metadata, with some settings changed."""
     settings = {name: training[name] for name in setting_types() if training.get(name) is not None}
     if not {"pipeline", "eigenvalues"} <= set(settings):
         raise ValueError("the observer holds no settings of its training, so it cannot be trained again")

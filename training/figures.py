@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 Theme = Literal["light", "dark"]
 RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"  # indices into the theme's colour cycle
-# All eight can be distinguished with each kind of colour blindness. They are like the colours of the same indices in
-# matplotlib's own cycle, which environments use when they render outside this style.
+# All eight colours can be distinguished with each kind of colour blindness. Each resembles the colour of the same index
+# in matplotlib's default cycle, in which environments render outside this style.
 CYCLES: dict[Theme, tuple[str, ...]] = {
     "light": ("#0072b2", "#e69f00", "#009e73", "#c2187a", "#56b4e9", "#7a4a1e", "#1a1a1a", "#9a9a9a"),
     "dark": ("#4aa3df", "#f0a83c", "#2fbf93", "#ff6db8", "#a6dcff", "#b98a5a", "#eceae4", "#8a909c"),
@@ -39,11 +39,11 @@ ALIKE: dict[str, Any] = {
     "lines.linewidth": 1.2,
     "lines.markersize": 4.0,
 }
-SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # shares of each colour mixed with the background, in animations
+SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # shares in which an animation's palette mixes each colour with the background
 
 
 def theme_around() -> Theme:
-    """The theme of the enclosing :func:`style` block, recognised by its background colour."""
+    """Return the theme of the enclosing :func:`style` block, recognised by its background colour."""
     import matplotlib
 
     return "dark" if matplotlib.rcParams["figure.facecolor"] == GROUNDS["dark"] else "light"
@@ -57,7 +57,7 @@ def style(theme: Theme | None = None) -> AbstractContextManager[None]:
 
 
 def looks(theme: Theme = "light") -> dict[Any, Any]:
-    """Matplotlib settings of this style; notebooks use ``plt.rcParams |= looks()``."""
+    """Return the matplotlib settings of this style; notebooks use ``plt.rcParams |= looks()``."""
     from cycler import cycler
 
     ink = CYCLES[theme][int(TRUTH[1])]
@@ -69,18 +69,18 @@ def looks(theme: Theme = "light") -> dict[Any, Any]:
 
 @contextmanager
 def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
-    """Make a figure in this style, and write it at the end of the ``with`` block."""
+    """Make a figure in this style, and write it whole or not at all at the end of the ``with`` block."""
     from matplotlib.figure import Figure
 
     with style():
         figure = Figure(figsize=(width, height))
         yield figure
-        with replacing(path) as temporary:  # whole or not at all
+        with replacing(path) as temporary:
             figure.savefig(temporary)
 
 
 def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
-    """Write a looping GIF, whole or not at all; still parts take no space, as frames share one palette."""
+    """Write a looping GIF, whole or not at all; parts that do not move take no space, as frames share one palette."""
     from matplotlib.colors import to_rgb
     from PIL import Image
 

@@ -31,7 +31,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def require_writable(folder: str | os.PathLike[str]) -> None:
-    """Raise OSError if files cannot be written to a folder: call it before long work."""
+    """Raise OSError if files cannot be written to a folder; commands call this before long work."""
     path = Path(folder)
     existing = next((one for one in (path, *path.parents) if one.exists()), path)
     try:
@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a training run's folder and write its configuration; a folder without checkpoints may serve any run."""
+    """Lock a run's folder and write its configuration; ValueError if checkpoints there cannot be resumed by the run."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)

@@ -18,14 +18,14 @@ NOISE_FLOOR = 0.002  # least measurement noise that a filter assumes, in multipl
 
 
 def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
-    """Covariance (ny, ny) of the measurement noise that a filter assumes, with ``NOISE_FLOOR`` as its floor."""
+    """Return the covariance (ny, ny) of the measurement noise that a filter assumes, which ``NOISE_FLOOR`` bounds."""
     least = NOISE_FLOOR * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
 
 
 def process_intensity(system: System, process_noise: float, dt: float) -> np.ndarray:
-    """Intensity (nx, nx) of the white noise that a filter assumes for the plant's process noise."""
+    """Return the intensity (nx, nx) of the white noise by which a filter models the plant's process noise."""
     return np.diag((process_noise * np.array(system.scale)) ** 2 / 3 * dt)
 
 
@@ -40,9 +40,9 @@ class Belief(NamedTuple):
 class ExtendedKalmanFilter:
     """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3), an :class:`observers.estimator.Estimator`.
 
-    The prediction is P = Phi P Phi^T + Q dt; central differences give Phi and the slope of h. A filter restarts where
-    its predicted mean leaves the system's bounds or its covariance is no longer finite. Outputs that are NaN, or
-    undefined at the mean, are skipped.
+    The prediction is P = Phi P Phi^T + Q dt; central differences give Phi and the Jacobian of h. A filter restarts when
+    its predicted mean leaves the system's bounds or its covariance is no longer finite. It skips outputs that are NaN,
+    or for which h is undefined at the mean.
 
     Shapes: ``Q`` (nx, nx), ``R`` (ny, ny) or (n, ny, ny), ``start`` (nx,) and (nx, nx).
     """
@@ -62,7 +62,7 @@ class ExtendedKalmanFilter:
         return Belief(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), np.zeros(n, dtype=bool))
 
     def advance(self, state: Belief, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Belief:
-        """Predict filters that have had a sample over dt, by default the sampling interval; then correct all."""
+        """Predict over dt (by default the sampling interval) where a filter has had a sample; then correct all."""
         x, P, begun = state
         if begun.any():
             held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
@@ -76,7 +76,7 @@ class ExtendedKalmanFilter:
         return Estimate(state.x.copy(), state.P.copy())
 
     def along(self, y: np.ndarray, u: np.ndarray, x: np.ndarray | None = None) -> Gaussian:
-        """Means (steps + 1, n, nx) and covariances along samples (steps + 1, n, ny) and inputs (steps, n, nu).
+        """Return means (steps + 1, n, nx) and covariances for samples (steps + 1, n, ny) and inputs (steps, n, nu).
 
         Given motions x (steps + 1, n, nx), the filter linearises about them. If it also assumes the plant's own noise,
         the covariances are the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
@@ -84,7 +84,7 @@ class ExtendedKalmanFilter:
         state, states = self.start(y.shape[1]), []
         for k in range(len(y)):
             state = state if x is None else state._replace(x=x[max(k - 1, 0)])
-            state = self.advance(state, y[k], u[k - 1])  # the first sample has no input
+            state = self.advance(state, y[k], u[k - 1])  # at k = 0 no filter predicts, and u is not used
             states.append(state)
         means, covariances, _ = zip(*states, strict=True)
         return np.array(means), np.array(covariances)
@@ -94,7 +94,7 @@ class ExtendedKalmanFilter:
 
     @np.errstate(over="ignore", invalid="ignore")  # diverged filters overflow, and restart
     def _predicted(self, x: np.ndarray, P: np.ndarray, u: np.ndarray, dt: float) -> Gaussian:
-        """Means and covariances after dt under held inputs (nu, n)."""
+        """Return means and covariances after dt under held inputs (nu, n)."""
         (n, nx), aside = x.shape, np.diag(self._aside)[..., None]
         starts = np.concatenate([x.T[:, None], x.T[:, None] + aside, x.T[:, None] - aside], 1)
         flat = starts.reshape(nx, -1)
@@ -104,7 +104,7 @@ class ExtendedKalmanFilter:
         return ends[:, 0].T, Phi @ P @ Phi.mT + self._Q * dt
 
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
-        """Means and covariances given the samples y (n, ny); filters out of bounds restart."""
+        """Return means and covariances given the samples y (n, ny); filters out of bounds restart first."""
         (x0, P0), inside = self._start, self._inside(x, P)
         x, P = np.where(inside[:, None], x, x0), np.where(inside[:, None, None], P, P0)
         aside, R = np.diag(self._aside), self._R

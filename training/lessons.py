@@ -1,4 +1,4 @@
-"""The lessons, or stages, of a training: map and flow are learned here, and ``train`` runs all lessons."""
+"""The lessons of a training: functions that learn the map and the flow, and ``train``, which runs all lessons."""
 
 import dataclasses
 import platform
@@ -28,10 +28,10 @@ from training.sources import OF_MEDIAN, Pairs, Source, TooFewRunsError
 from training.sources.simulated import SimulatedSource
 from training.spectrum import Spectrum, check_continuous
 
-# Hidden layers and training of the flow's network.
+# Size and training of the flow's network.
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
-LEAST = 0.01  # added to the mean square of a scaled increment, so that errors of tiny increments do not dominate
-LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, over the size of the increments
+LEAST = 0.01  # added to a scaled increment's mean square, by which the loss divides, so that tiny ones do not dominate
+LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, over the rms of the increments
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Result:
     artifact : Artifact
         The observer.
     losses : dict of str to list of (int, float)
-        For each stage that trained a network, numbers of batches and the errors after them.
+        For each stage that trained a network, pairs of a number of batches and the error after them.
     seconds : dict of str to float
         CPU seconds of each stage.
     """
@@ -65,8 +65,8 @@ def train(
     """Learn an observer: a filter, T_inv, a tracker's motion model, covariances and the limits of a monitor.
 
     The lessons, in order, are the map (:func:`training.learn_map`), the motion, and the calibration
-    (:func:`training.calibrate`). The motion consists of the system's equations, or of a learned flow if these are
-    unknown or no expression can hold them (:func:`training.learn_flow`). Each network has its own checkpoints.
+    (:func:`training.calibrate`). The motion model consists of the system's equations, or of a learned flow if the
+    equations are unknown or an artifact cannot hold them (:func:`training.learn_flow`). Each network has checkpoints.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def train(
     folder : Path, optional
         Folder for checkpoints and a log, created if missing; by default nothing is kept.
     resume : bool, default False
-        Whether to resume from checkpoints in ``folder``; if there are some without ``resume``, ValueError is raised.
+        Whether to resume from the checkpoints in ``folder``; if False, ``folder`` must not hold any.
     device : torch.device, optional
         Where networks are trained; by default on a GPU if there is one.
     console : rich.console.Console or ProgressBars, optional
@@ -91,8 +91,8 @@ def train(
     Raises
     ------
     ValueError
-        If ``folder`` holds checkpoints without ``resume`` or of another configuration, another process works in it,
-        motions leave the system's bounds, or ``config`` differs from the configuration of a source.
+        If ``folder`` holds checkpoints and ``resume`` is False, or checkpoints of another configuration; if another
+        process works in it, motions leave the system's bounds, or ``config`` differs from a source's configuration.
     FloatingPointError
         If the loss becomes NaN.
     """
@@ -132,7 +132,7 @@ def train(
 
 
 def _motion(source: Source, run: Run) -> Motion | None:
-    """The tracker's motion model: the source's equations, or else a flow; None where the observer cannot track."""
+    """Return the tracker's motion model, with the source's equations or else a flow; None if it cannot track."""
     try:
         parts = source.tracking()
     except ValueError as reason:
@@ -141,7 +141,7 @@ def _motion(source: Source, run: Run) -> Motion | None:
     try:
         equations = source.equations()
     except ValueError as error:
-        run.progress.say(f"the tracker moves by a learned flow: {error}")
+        run.progress.say(f"the tracker predicts by a learned flow: {error}")
         return learn_flow(source, run)
     return Motion(**parts, equations=equations)
 
@@ -159,8 +159,8 @@ class Maps:
 def learn_map(source: Source, run: Run) -> Maps:
     """Learn T_inv along motions of a source, transients and all noise levels included.
 
-    With inputs there are two maps: one for driven motion, and one that ignores u and serves until an input acts. The
-    pipeline "spinn" follows the paper: it learns first T from motions and its equation, then T_inv from z = T(x).
+    For a system with inputs these are two maps: one for driven motion, and one without u, used until an input acts. The
+    pipeline "spinn" follows the paper: it learns T from motions and T's equation, and then T_inv from z = T(x).
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def _pairs(source: Source, linear: LinearFilter, run: Run, free: bool = False) -
 def _sampler(
     source: Source, linear: LinearFilter, run: Run, pairs: Pairs, error: np.ndarray | None = None
 ) -> TrajectorySampler:
-    """Make batches along motions; ``error`` is the covariance of the error of z, if z has one."""
+    """Make a sampler of batches along motions; ``error`` is the covariance of z's error if z comes from a learned T."""
     with run.progress.phase("preparing batches"):
         return TrajectorySampler(pairs, linear, run.config, device=run.device, error=error, **source.sampling(linear))
 
@@ -255,7 +255,7 @@ def _fitted(name: str, sampler: Sampler, run: Run, share: float, member: int = 0
 
 
 def learn_flow(source: Source, run: Run) -> Motion:
-    """Learn a flow, by which a tracker predicts the next sample: an affine fit, and a network for its residuals.
+    """Learn a flow, by which a tracker predicts the next state: an affine fit, and a network for its residuals.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     Raises
     ------
     ValueError
-        If no two consecutive samples have all states, or an observer from this source cannot track.
+        If no two consecutive samples have all states, or observers that are learned from the source cannot track.
     FloatingPointError
         If the loss becomes NaN.
     """
@@ -280,7 +280,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
     parts = {"x_offset": learned.x.mean(0), "x_scale": spread(learned.x)} | parts
-    offset, scale = parts["x_offset"], parts["x_scale"]  # a source's own scale is the unit of its process noise
+    offset, scale = parts["x_offset"], parts["x_scale"]  # from the source, if it gives process noise in such units
     u_scale = np.abs(learned.u).max(0, initial=0.0)
     u_scale = np.where(u_scale > 0, u_scale, 1.0)
     inputs = np.column_stack([(learned.x - offset) / scale, learned.u / u_scale])

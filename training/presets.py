@@ -1,4 +1,4 @@
-"""Choices for each system: its profile, its controller, and the configurations behind the commands' options."""
+"""Choices for each system: its profile, its controller, and the configuration that the commands' options select."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from training.trajectories.motions import Controller, checked_policy, linear_qua
 
 Preset = Literal["fast", "paper"]
 Size = Literal["default", "large"]
-# For use without a tracker, T_inv needs more width, slow complex modes and longer training.
+# A T_inv for use without a tracker needs more neurons, more trajectories and longer training.
 LARGE: dict[str, Any] = {"width": 128, "trajectories": 4000, "inverse_steps": 18_000}
 PAPER: dict[str, Any] = {
     "width": 512, "depth": 4, "activation": "silu", "optimiser": "adam", "batch": 4096, "learning_rate": 1e-3
@@ -30,13 +30,13 @@ PAPER_SPINN: dict[str, Any] = {
     "collocation": "box", "scaling": "range", "solved_output_layer": False, "transients": False,
 }  # fmt: skip
 NOISE_RANGE = 2.0  # largest measurement noise in training, in multiples of the system's default
-# Replaces FASTEST_MODE in discrete time, where one step may change everything and the last samples matter most.
+# Replaces FASTEST_MODE in discrete time, where one step may change the whole state and the last samples matter most.
 FASTEST_OF_STEPS = 3.0
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Choices for one system; the defaults serve any system. docs/guides/own_system.md explains them by an example."""
+    """Choices for one system; the defaults suit any system. docs/guides/own_system.md explains them by an example."""
 
     eigenvalues: tuple[float, ...] | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -48,10 +48,10 @@ class Profile:
 
 
 def homogeneous(system: System) -> Controller:
-    """The feedback u = b x1 - 2 (x2 + cbrt(a x1)), cut at the input bound, for x1' = a x2^3, x2' = -b x1 + u.
+    """Return the feedback u = b x1 - 2 (x2 + cbrt(a x1)), saturated, for the system x1' = a x2^3, x2' = -b x1 + u.
 
-    A linear law does not exist, as the linearisation at the origin cannot be stabilised. The feedback cancels -b x1 and
-    makes x2 follow -cbrt(a x1), where x1' = -a^2 x1.
+    No linear feedback will do, as the linearisation at the origin cannot be stabilised. This one cancels -b x1 and
+    makes x2 follow -cbrt(a x1), for which x1' = -a^2 x1.
     """
     (u_max,) = system.u_max
     a, b = (system.parameters[name] for name in ("a", "b"))
@@ -65,7 +65,7 @@ def homogeneous(system: System) -> Controller:
 
 
 def _spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
-    """Evenly spaced eigenvalues, rounded as in the shipped maps."""
+    """Space eigenvalues evenly in the logarithm, and round them as the shipped maps have them."""
     return tuple(np.round(evenly_spaced(n, slowest, fastest), 6).tolist())
 
 
@@ -78,7 +78,7 @@ PROFILES: dict[str, Profile] = {
         fault_deadline=10.0,  # about a period at amplitude 1
     ),
     "van_der_pol": Profile(
-        # Fast modes follow the jumps of y, slow ones average its noise; errors of trained observers decided the range.
+        # Fast modes follow the jumps of y, and slow ones average its noise; this range gave the smallest errors.
         eigenvalues=_spaced(15, -0.4, -20.0),
         # Slower modes would have a rougher T; more modes average more of the noise.
         spinn_settings={
@@ -86,21 +86,21 @@ PROFILES: dict[str, Profile] = {
             "noise_free_share": 0.2,
             "high_noise_emphasis": 4.5,
         },
-        # More samples at high noise help, as noise hides mostly the phase. Inputs within the bound cannot lead
-        # the oscillator out of X, so those that lead starts out of X are stronger.
+        # High noise levels are drawn more often, as they make the phase hard to estimate. Inputs within the bound
+        # cannot lead the oscillator out of X, so that stronger ones lead starts out of it.
         settings={"lead_in_input": 4.0, "noise_free_share": 0.05, "high_noise_emphasis": 4.0},
-        # For use without a tracker: slow complex modes at frequencies of y average its noise.
+        # Without a tracker, slow complex modes at frequencies of y average the noise of y.
         large_settings={
             "pairs": ((-0.1, 0.718), (-0.1, 2.128), (-0.1, 0.6836), (-0.3, 0.718)),
             "inverse_steps": 32_000,
             "learning_rate": 2.5e-3,
         },
-        fault_deadline=8.9,  # a period
+        fault_deadline=8.9,  # a period of the limit cycle
     ),
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
-        # Real modes hardly separate the three parameters under noise; slow pairs at frequencies of y do: two of them
-        # reduce the best decoder's error from 2.3 to 1.9 % on plants 10 % off. More batches and motions gain 3 % more.
+        # Under noise, real modes hardly distinguish the three parameters, but slow pairs at frequencies of y do: on
+        # plants 10 % off, two pairs reduce the best decoder's error from 2.3 to 1.9 %. Longer training gains 3 % more.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
@@ -111,7 +111,7 @@ PROFILES: dict[str, Profile] = {
         fault_deadline=2.0,
     ),
     "lorenz": Profile(
-        eigenvalues=_spaced(13, -1.5, -25.0),  # its flow is faster than the others'
+        eigenvalues=_spaced(13, -1.5, -25.0),  # this system is faster than the others
         spinn_settings={"eigenvalues": _spaced(9, -9.0, -40.0)},
         settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
         large_settings={"inverse_steps": 24_000},
@@ -121,22 +121,22 @@ PROFILES: dict[str, Profile] = {
 
 
 def profile(system: System) -> Profile:
-    """The choices for a system."""
+    """Return the profile of a system, by default without any choices of its own."""
     return PROFILES.get(system.name, Profile())
 
 
 def controller(system: System) -> Controller:
-    """The feedback that drives a system to its target: the profile's, or else a saturated LQ regulator."""
+    """Return the feedback that drives a system to its target: the profile's, or else a saturated LQ regulator."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs to control it by")
     return profile(system).controller(system)
 
 
 def named_policy(system: System, name: str) -> Controller:
-    """Load and check a policy: a system's own controller, or a function of a script."""
+    """Load and check a policy: the system's controller, or a function of a script."""
     if ":" not in name and name != "controller":
         raise ValueError(
-            f"unknown policy {name!r}{suggestion(name, ['controller'])}: it is controller, or script.py:function"
+            f"unknown policy {name!r}{suggestion(name, ['controller'])}: give controller, or script.py:function"
         )
     try:
         policy = controller(system) if name == "controller" else load_function(name)
@@ -156,11 +156,11 @@ def preset(
     size: Size = "default",
     changes: Mapping[str, Any] | None = None,
 ) -> Config:
-    """Return the configuration behind ``--pipeline``, ``--preset`` and ``--size`` for a system.
+    """Return the configuration that ``--pipeline``, ``--preset`` and ``--size`` select for a system.
 
     Maps that ship were trained with "fast", which takes about half a minute of CPU time, ten minutes for the size
-    "large", and five for spinn. "paper" has the sizes of the paper's sec. 8; the paper does not state the batch (here
-    4,096), the spacing of the eigenvalues (here even) and the decay of the learning rate (here a cosine).
+    "large", and five for spinn. "paper" takes its sizes from the paper's sec. 8, which does not state the batch (here
+    4,096), the spacing of the eigenvalues (here even) or the decay of the learning rate (here a cosine).
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def preset(
     given = {key: value for key, value in (changes or {}).items() if value is not None}
     own, paper, uncertain = profile(system), name == "paper", given.get("uncertain")
     usual = zip(np.broadcast_to(system.measurement_noise, system.ny).tolist(), system.output_range, strict=True)
-    largest = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]  # a system may declare no noise
+    largest = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]  # declared noise may be 0
     chosen: dict[str, Any] = {
         "dt": system.dt,
         "duration": system.duration,
@@ -219,7 +219,7 @@ def preset(
 
 
 def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
-    """Real eigenvalues of A for an input-aware map: the profile's, or else from the rate of f in X and from dt."""
+    """Return real eigenvalues of A for an input-aware map: the profile's, or else from the system's rate and dt."""
     chosen = profile(system).eigenvalues
     if chosen is not None:
         return chosen

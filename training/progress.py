@@ -39,7 +39,7 @@ class ProgressBars(Progress):
 
     @contextmanager
     def phase(self, description: str, total: float = 1) -> Iterator[Callable[[float], None]]:
-        """Show a phase while the context lasts; it yields a function that reports how much is done."""
+        """Show a phase while the ``with`` block lasts; yield a function that reports how much is done."""
         task = self.add_task(description, total=total)
         try:
             yield lambda done: self.update(task, completed=done)
@@ -54,7 +54,7 @@ class ProgressBars(Progress):
         self._write(text, printed=True)
 
     def start(self) -> None:
-        """Begin to draw; a thread writes lines, so that phases that report nothing still appear."""
+        """Begin to draw; a thread writes lines, so that phases appear even if they report no progress."""
         super().start()
         threading.Thread(target=self._beat, daemon=True).start()
 
@@ -71,7 +71,7 @@ class ProgressBars(Progress):
             self._write(f"ended by {type(error).__name__}{': ' if str(error) else ''}{error}", printed=False)
 
     def tell(self) -> None:
-        """Write a line for each task that is due or has ended."""
+        """Write a line for each task that has ended, or whose next line is due."""
         with self._lock:
             for task in self.tasks:
                 passed = task.elapsed or 0.0

@@ -24,10 +24,10 @@ from training.config import Config, Optimiser
 from training.files import claimed_run
 from training.progress import LOG, ProgressBars, progress_bars
 
-LOG_EVERY = 100  # batches
+LOG_EVERY = 100  # batches between two entries of the error history
 CHECKPOINT_SECONDS = 20.0  # least time between two checkpoints
 CHECKPOINT = ".checkpoint.pt"  # suffix of checkpoint files
-WARM_UP = 0.01  # share of a stage, at its start, in which the learning rate rises
+WARM_UP = 0.01  # the learning rate rises over this share of a stage
 
 # A loss draws its batch from the given generator alone, so that a resumed run continues as if it had not stopped.
 Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
@@ -52,11 +52,11 @@ class Run:
     resume : bool
         Whether stages resume from their checkpoints.
     losses : dict of str to list of (int, float)
-        For each stage, numbers of batches and the errors after them.
+        For each stage, pairs of a number of batches and the error after them.
     seconds : dict of str to float
         CPU seconds of each stage.
     samples : dict of str to int
-        Number of distinct samples of the stages that count them.
+        Numbers of distinct samples, by name, from stages that count their samples.
     """
 
     config: Config
@@ -137,7 +137,7 @@ class Stage:
 def optimise(
     stage: Stage, module: nn.Module, loss: Loss, progress: Progress, *, resume: bool
 ) -> list[tuple[int, float]]:
-    """Minimise a loss over a module's parameters, with checkpoints; the same seed draws other batches on a GPU."""
+    """Minimise a loss over a module's parameters, with checkpoints; a GPU draws other batches than a CPU."""
     generator = torch.Generator(next(module.parameters()).device).manual_seed(stage.seed)
     optimiser = _optimiser(stage, module)
     parts: dict[str, Any] = {"module": module, "optimiser": optimiser}
@@ -168,10 +168,10 @@ def optimise(
             continue
         mean = float(total) / ((stage.step - 1) % LOG_EVERY + 1)
         if math.isnan(mean):
-            raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {stage.step}")
+            raise FloatingPointError(f"the error of stage {stage.name!r} is NaN at step {stage.step}")
         total.zero_()
         stage.history.append((stage.step, mean))
-        expected = round(stage.step / done)  # number of batches when the limit of CPU time ends the stage
+        expected = round(stage.step / done)  # total number of batches, as the limit of CPU time may end the stage
         progress.update(task, completed=stage.step, total=expected, description=f"{stage.name} (error {mean:.3g})")
         if done >= 1 or time.monotonic() - saved_at > CHECKPOINT_SECONDS:
             state = {name: part.state_dict() for name, part in parts.items()} | {"generator": generator.get_state()}
@@ -183,7 +183,7 @@ def optimise(
 
 def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
     if stage.optimiser == "adam":
-        on_gpu = next(module.parameters()).is_cuda  # there a fused step is one kernel
+        on_gpu = next(module.parameters()).is_cuda  # on a GPU a fused step is one kernel
         return torch.optim.Adam(module.parameters(), lr=stage.learning_rate, fused=on_gpu)
     from pytorch_optimizer import SOAP
 
@@ -192,7 +192,7 @@ def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
 
 def save_checkpoint(path: Path, state: Mapping[str, Any], *, fingerprint: str) -> None:
     """Write tensors and plain values in torch's own format, whole or not at all."""
-    content = io.BytesIO()  # writing to a file, torch would report a full disk as "unexpected pos"
+    content = io.BytesIO()  # if torch wrote to a file, it would report a full disk as "unexpected pos"
     torch.save({**state, "fingerprint": fingerprint}, content)
     with replacing(path) as temporary:
         temporary.write_bytes(content.getbuffer())

@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """First seed entry of each purpose. Published results depend on these numbers, which never change."""
+    """The first entry of a seed, by purpose. Published results depend on these numbers, which never change."""
 
     TRAINING = 1
     EVALUATION = 2
@@ -18,7 +18,7 @@ class Stream(IntEnum):
 
 
 def generator(stream: Stream, *seed: int) -> np.random.Generator:
-    """Make the generator of a stream for a seed, and for further entries that separate its parts."""
+    """Make a generator for a purpose and a seed; further entries give other generators for parts of the purpose."""
     for entry in seed:
         if not 0 <= entry < 2**32:
             raise ValueError(f"seed = {entry} must be a whole number from 0 to 2**32 - 1")

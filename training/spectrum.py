@@ -1,4 +1,4 @@
-"""The eigenvalues of A: the filter that they define, and whether T is smooth for them, before any training."""
+"""The eigenvalues of A: the filter that they define, and a test before any training of whether T is smooth for them."""
 
 import functools
 from collections.abc import Iterable, Iterator
@@ -39,23 +39,23 @@ class Spectrum:
 
     @property
     def poles(self) -> np.ndarray:
-        """All eigenvalues, complex, (modes,)."""
+        """All eigenvalues as complex numbers, (modes,)."""
         above = [complex(a, w) for a, w in self.pairs]
         return np.array([*map(complex, self.eigenvalues), *above, *np.conj(above)])
 
     def filter(self, ny: int, dt: float, nu: int = 0) -> LinearFilter:
-        """The filter with these modes for each output: real ones, then [[a, w], [-w, a]] for each pair; B = 1."""
+        """Make a filter with these modes for each output: real ones, then [[a, w], [-w, a]] for each pair; B = 1."""
         A = scipy.linalg.block_diag(*self.eigenvalues, *([[a, w], [-w, a]] for a, w in self.pairs))
         return LinearFilter(np.kron(np.eye(ny), A), np.kron(np.eye(ny), np.ones((len(A), 1))), dt, nu)
 
 
 def evenly_spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
-    """Space real eigenvalues evenly in the logarithm."""
+    """Space n real eigenvalues evenly in the logarithm."""
     return tuple((-np.geomspace(-slowest, -fastest, n)).tolist())
 
 
 def papers_spectrum(system: System) -> tuple[float, ...]:
-    """2 nx + 1 eigenvalues, evenly spaced in [-3, -1.5] (paper, sec. 8), over the system's pace."""
+    """Return 2 nx + 1 eigenvalues, evenly spaced in [-3, -1.5] (paper, sec. 8), divided by the system's pace."""
     return tuple((np.linspace(-1.5, -3.0, 2 * system.nx + 1) / system.pace).tolist())
 
 
@@ -69,10 +69,10 @@ def check_continuous(system: System) -> None:
 
 
 def smoothness(system: System, spectra: Iterable[Spectrum], dt: float) -> Iterator[np.ndarray]:
-    """Yield for each spectrum the exponents (ny * modes,) of z between neighbouring states on different motions.
+    """Yield for each spectrum the exponents (ny * modes,) of z between neighbouring states, as ``SMOOTH`` defines them.
 
     Motions without input are simulated once, half of them from X and half from 1.5 X, and all filters run along them.
-    Only states count at which at most a millionth of a filter's start is left; exponents are NaN if these are too few.
+    Only states count at which at most a millionth of a filter's start is left; exponents are NaN if too few states do.
     """
     check_continuous(system)
     rate = system.typical_rate
@@ -97,7 +97,7 @@ def smoothness(system: System, spectra: Iterable[Spectrum], dt: float) -> Iterat
 
 
 def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, settled: np.ndarray) -> np.ndarray:
-    """Exponents by which the z (ages, motions, size) of neighbouring settled states x (ages, motions, nx) differ."""
+    """Return the exponents of z (ages, motions, size) between neighbouring settled states x (ages, motions, nx)."""
     asking, others = settled[:, :ASKING], settled[:, ASKING:]  # neighbours must lie on different motions
     low, high = system.box()
     least = AT_REST * (high - low) / 2
@@ -109,7 +109,7 @@ def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, settled: np.ndar
     z = z / np.where(z_scale > 0, z_scale, 1.0)
     distances, rows = scipy.spatial.cKDTree(x[:, ASKING:][others]).query(x[:, :ASKING][asking], k=[1, FAR])
     differences = z[:, ASKING:][others][rows] - z[:, :ASKING][asking][:, None]
-    # Differences are over the distance of the far neighbour, so that a few isolated states do not outweigh the rest.
+    # Differences are divided by the distance of the far neighbour, lest a few isolated states outweigh the rest.
     reach = np.maximum(distances[:, 1:], np.finfo(float).tiny)
     closer = np.sqrt(((distances[:, :1] / reach) ** 2).mean(0))
     first, last = np.sqrt(((differences / reach[..., None]) ** 2).mean(0))
@@ -118,7 +118,7 @@ def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, settled: np.ndar
 
 
 def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spectrum]:
-    """Candidate spectra, slow ones first: 2 nx + 1 real eigenvalues for each output, evenly spaced logarithmically."""
+    """Return candidate spectra, slow ones first, each of 2 nx + 1 real eigenvalues evenly spaced in the logarithm."""
     rate = system.typical_rate
     fastest = min(FASTEST, FASTEST_MODE / (SPREAD * dt * rate))
     slowest = min(SLOWEST, fastest)

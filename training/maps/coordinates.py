@@ -9,10 +9,10 @@ import scipy
 from observers import LinearFilter
 from training.config import Scaling
 
-SMALLEST_MODE = 1e-7  # smallest singular value of z, over the largest; modes below it hold only rounding errors
+SMALLEST_MODE = 1e-7  # directions of z with smaller singular values, over the largest, hold only rounding errors
 STILL = 1e-12  # a smaller standard deviation, over the component's size, is rounding error
 SETTLED = np.log(1e3)  # number of time constants after which a thousandth of a filter's start is left
-LEAST = 0.1  # added to the mean square of a scaled state, so that errors of small states do not dominate
+LEAST = 0.1  # added to a scaled state's mean square, by which the loss divides, so that small states do not dominate
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Coordinates:
 
 
 def coordinates(z: np.ndarray, noise: np.ndarray, silent: np.ndarray | None = None) -> Coordinates:
-    """The coordinates for ``z`` (n, size) under ``noise`` (size, size), without the directions ``silent`` (size, k)."""
+    """Find coordinates from ``z`` (n, size) and the covariance ``noise``, without directions ``silent`` (size, k)."""
     if silent is not None and silent.size:
-        telling = np.eye(len(silent)) - silent @ np.linalg.pinv(silent)
-        rest = coordinates(z @ telling.T, telling @ noise @ telling.T)
-        return replace(rest, whiten=rest.whiten @ telling)
+        projection = np.eye(len(silent)) - silent @ np.linalg.pinv(silent)
+        rest = coordinates(z @ projection.T, projection @ noise @ projection.T)
+        return replace(rest, whiten=rest.whiten @ projection)
     offset, scale = z.mean(0), spread(z)
     _, singular, directions = np.linalg.svd((z - offset) / scale, full_matrices=False)
     keep = singular > SMALLEST_MODE * singular[0]
@@ -49,20 +49,21 @@ def coordinates(z: np.ndarray, noise: np.ndarray, silent: np.ndarray | None = No
 
 
 def spread(z: np.ndarray) -> np.ndarray:
-    """Standard deviations (size,) of a filter's states (n, size); 1 where a component does not move."""
+    """Return the standard deviations (size,) of samples (n, size), or 1 where a component does not move."""
     deviation = z.std(0)
     return np.where(deviation > STILL * np.abs(z).max(0), deviation, 1.0)
 
 
 def settling_time(linear: LinearFilter) -> float:
-    """Time in seconds after which a thousandth of the filter's start is left."""
+    """Return the time in seconds after which a thousandth of the filter's start is left."""
     return float(SETTLED / linear.slowest)
 
 
 def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
-    """Covariances (ages, ny, size, size) of z's error due to unit white noise on each output, by age in samples."""
+    """Return covariances (ages, ny, size, size) of z's error, by age in samples, under unit white noise on y_i."""
     phi, (early, late, equilibrium) = linear.transition, _columns(linear)
-    drive, after_first = phi @ late + early, phi @ equilibrium + early  # s_1 = after_first v_0
+    # For noise v_k, z_k = s_k + late v_k with s_1 = after_first v_0 and s_(k+1) = phi s_k + drive v_k.
+    drive, after_first = phi @ late + early, phi @ equilibrium + early
     covariance, at, out = after_first @ after_first.mT, 1, []
     for age in ages.astype(int):
         for _ in range(age - at):
@@ -73,26 +74,26 @@ def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
 
 
 def stationary_covariance(linear: LinearFilter) -> np.ndarray:
-    """Limit (ny, size, size) of :func:`noise_covariance` at large ages."""
+    """Return the limit (ny, size, size) of :func:`noise_covariance` at large ages."""
     phi, (early, late, _) = linear.transition, _columns(linear)
     drive = phi @ late + early
     return np.array([scipy.linalg.solve_discrete_lyapunov(phi, one) for one in drive @ drive.mT]) + late @ late.mT
 
 
 def _columns(linear: LinearFilter) -> list[np.ndarray]:
-    """Each output's columns of early_y, late_y and equilibrium, each (ny, size, 1)."""
+    """Return the columns of early_y, late_y and equilibrium by output, as three arrays (ny, size, 1)."""
     return [matrix.T[..., None] for matrix in (linear.early_y, linear.late_y, linear.equilibrium)]
 
 
 def root(covariance: np.ndarray) -> np.ndarray:
-    """Matrices R (..., size, size) with R R^T = covariance; eigenvalues that rounding made negative count as 0."""
+    """Return R (..., size, size) with R R^T = covariance; eigenvalues that rounding made negative count as 0."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
 
 @dataclass(frozen=True)
 class StateScale:
-    """Scaled states are (x - offset) / scale. Shapes: ``offset`` (nx,), ``scale`` (nx,)."""
+    """Scales states to (x - offset) / scale, (n,) each; weights of errors depend on the first ``nx`` states."""
 
     offset: np.ndarray
     scale: np.ndarray
@@ -101,7 +102,7 @@ class StateScale:
 
     @classmethod
     def of(cls, x: np.ndarray, scaling: Scaling, *, nx: int | None = None) -> Self:
-        """Make the scale of some states (..., nx)."""
+        """Determine offset and scale from states (..., nx)."""
         axes = tuple(range(x.ndim - 1))
         if scaling == "relative":
             offset, scale = x.mean(axes), x.std(axes)
@@ -116,7 +117,7 @@ class StateScale:
         return np.asarray((x - self.offset) / self.scale)
 
     def weight(self, x: np.ndarray) -> np.ndarray:
-        """Weights (...,) of the errors at states (..., nx)."""
+        """Return the weights (...,) of the square errors at states (..., nx)."""
         if not self.relative:
             return np.ones(x.shape[:-1])
         return np.asarray(1.0 / (((x / self.scale)[..., : self.nx] ** 2).mean(-1) + LEAST))

@@ -1,4 +1,4 @@
-"""The forward map T as a physics-informed network (paper, sec. 5): its equation, risk and output layer."""
+"""The forward map T as a physics-informed network (paper, sec. 5): its risk and its output layer."""
 
 import math
 from collections.abc import Callable
@@ -20,13 +20,13 @@ RIDGE = 1e-5  # ridge of these least squares, over the root mean square column n
 
 
 def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
-    """Evaluate a system's f or h, which work on components, on states (n, nx); returns (n, components)."""
+    """Evaluate a system's f or h, which are written for components, on states (n, nx); return (n, components)."""
     values = components(equations, x.unbind(-1))
     return torch.stack([(x.new_zeros(len(x)) + value).to(x.dtype) for value in values], -1)
 
 
 def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Values of a network at x and derivatives along f, by hand, as torch.compile lacks forward-mode derivatives."""
+    """Return a network's values at x and derivatives along f, without forward mode, which torch.compile lacks."""
     for layer in network:
         if isinstance(layer, nn.Linear):
             x, f = layer(x), f @ layer.weight.T
@@ -44,9 +44,9 @@ class ForwardProblem(nn.Module):
     """The physics-informed risk R_S1(theta) (paper, eq. emp-risk-theta) of a forward network.
 
     It is mean |z - T(x)|^2 over simulated pairs + nu * mean |dT/dx f(x) - A T(x) - B h(x)|^2 over collocation points.
-    Both terms measure each component of z in its standard deviation. Each component's residual is divided by the local
-    speed of the scaled motion plus the rate of its mode, so that fast regions do not dominate (the authors' released
-    code weights by the speed as well).
+    Both terms measure each component of z in units of its standard deviation. Each component's residual is divided by
+    the local speed of the scaled motion plus the rate of the component's mode, so that fast regions do not dominate
+    (the authors' released code weights by the speed as well).
 
     Shapes: ``pairs`` (n, nx) and (n, nz), ``points`` (m, nx).
     """
@@ -76,7 +76,7 @@ class ForwardProblem(nn.Module):
         self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """The risk on a batch of pairs and of as many collocation points."""
+        """Return the risk on a batch of pairs and as many collocation points."""
         shape, device = (self.config.batch,), self._x.device
         rows = torch.randint(len(self._x), shape, generator=generator, device=device)
         points = torch.randint(len(self._points), shape, generator=generator, device=device)
@@ -84,7 +84,7 @@ class ForwardProblem(nn.Module):
         return {"loss": risk, "error": error}
 
     def risk(self, x: torch.Tensor, z: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The risk, and the error of pairs alone."""
+        """Return the risk, and the root mean square error on the pairs alone."""
         data = ((self.network(x) - z) ** 2).mean()
         residual, speed = self.residual(points)
         physics = ((residual / self._z_scale / (speed[:, None] + self._rates)) ** 2).mean()
@@ -137,12 +137,12 @@ class ForwardProblem(nn.Module):
         self.network.to(device=device, dtype=torch.float32)
 
     def forward_map(self) -> ForwardMap:
-        """Return the learned map for NumPy."""
+        """Return the learned map as artifacts hold it."""
         return ForwardMap(self.network.export(), self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
 
 
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:
-    """First sample k* at which at most ``epsilon`` of the filter's start is left along every trajectory.
+    """Return the first sample k* at which at most ``epsilon`` of the filter's start is left along every trajectory.
 
     t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, which prints the logarithm's argument inverted).
     """
@@ -159,11 +159,11 @@ def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon
 
 
 def transients(T: np.ndarray, z0: np.ndarray, *, linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
-    """Filter states z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)) along trajectories, exact for an exact T (paper, sec. 3).
+    """Return z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)) along trajectories, which is exact for an exact T (paper, sec. 3).
 
     Shapes: ``T`` (m, n, nz), ``z0`` (n, nz), ``ages`` (m,); returns (m, n, nz).
     """
     poles, V = np.linalg.eig(linear.A)
-    left = np.exp(ages[:, None] * linear.dt * poles)  # remainder of each mode
+    left = np.exp(ages[:, None] * linear.dt * poles)  # remaining share of each mode
     start = np.linalg.solve(V, (z0 - T[0]).T).T
     return T + np.real((left[:, None] * start) @ V.T)

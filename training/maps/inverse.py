@@ -1,4 +1,4 @@
-"""The inverse T_inv: batches along motions or of T(x), and the loss of its network."""
+"""The inverse T_inv: batches along motions or of z = T(x), and the loss of the network."""
 
 import math
 from typing import Any, NamedTuple, Protocol
@@ -20,7 +20,7 @@ from training.maps.coordinates import (
 from training.maps.networks import Network, compiled, tensor
 from training.trajectories.motions import Pairs
 
-MEASUREMENT_NOISE_UNIT = 0.04  # unit in the noise feature log(1 + sigma_v / unit), over the system's usual noise
+MEASUREMENT_NOISE_UNIT = 0.04  # unit in the noise feature log(1 + sigma_v / unit), over the system's default noise
 AGE_UNIT = 5  # unit in the age feature log(1 + t / unit), in samples
 # With several outputs, the share of samples in which all outputs have the same fraction of their largest noise levels.
 ALIKE = 0.5
@@ -29,7 +29,7 @@ PROCESS_NOISE_UNIT = 0.1  # unit in the process noise feature log(1 + level / un
 
 
 class Batch(NamedTuple):
-    """Samples to fit the inverse to, with the weight of each and its cell, a group of similar age and noise."""
+    """Samples to which the inverse is fitted; ``cell`` numbers each sample's group of similar age and noise."""
 
     inputs: torch.Tensor
     x: torch.Tensor
@@ -54,20 +54,20 @@ class Sampler(Protocol):
 
 
 class TrajectorySampler(Sampler):
-    """Batches along trajectories, with all ages since reset and all noise levels up to ``measurement_noise_max``.
+    """Draws batches along trajectories, at all ages since reset and noise levels up to ``measurement_noise_max``.
 
     Noise is added to noise-free z; its covariance is that of the filter's response to measurement noise at each age. A
     network that fits such data in the mean square approximates the conditional mean of x.
 
-    The least errors differ by orders of magnitude between ages and noise levels. Samples therefore fall into ``cells``
-    of similar age and levels, and the loss divides a sample's error by its cell's recent error. Motions with the
-    system's own parameters, whose errors can be smaller, have cells of their own.
+    The least possible errors differ by orders of magnitude between ages and noise levels. Samples therefore fall into
+    ``cells`` of similar age and noise, and the loss divides a sample's square error by the recent mean of its cell.
+    Motions with the system's own parameters, whose errors can be smaller, have separate cells.
 
     Shapes: ``error`` (size, size), ``silent`` (size, k).
     """
 
     AGES_PER_BATCH = 32
-    LEVELS = 6  # cells of noise level, without the cell of no noise
+    LEVELS = 6  # cells by noise level, besides the one without noise
     AGE_CELLS = 8
     PROCESS_CELLS = 3  # no, weak and strong process noise
 
@@ -118,7 +118,7 @@ class TrajectorySampler(Sampler):
         self._x, self._weight = tensor(scale(data.x), device), tensor(scale.weight(data.x), device)
         self._gain, self._gains = tensor(gain, device), tensor(np.atleast_2d(gains)[:, None], device)
         self._level_max, self._level_unit = (tensor(values[:, None], device) for values in (largest, unit))
-        # Noise in units of stationary noise, so that its covariances are well conditioned.
+        # Noise is drawn in units of the stationary noise, so that its covariances are well conditioned.
         relative = whiten / np.where(gain > 0, gain, 1.0)[:, None]
         saturated = np.minimum(data.ages, int(np.ceil(2 * settling_time(linear) / linear.dt)))
         self._noise_root = tensor(root(relative @ noise_covariance(linear, saturated) @ relative.T), device)
@@ -133,7 +133,7 @@ class TrajectorySampler(Sampler):
             part = data.process_noise / process_noise_max
             self._process = tensor(np.log1p(part / PROCESS_NOISE_UNIT), device)
             trajectory_cell, self._trajectory_cells = (part > 0).astype(int) + (part > 0.5), self.PROCESS_CELLS
-        if data.nominal is not None:  # cells of motions with the system's own parameters
+        if data.nominal is not None:  # motions with the system's own parameters have separate cells
             trajectory_cell, self.kinds_of_plant = 2 * trajectory_cell + data.nominal, 2
             self._trajectory_cells *= 2
         self._trajectory_cell = torch.as_tensor(trajectory_cell, device=device)
@@ -169,7 +169,7 @@ class TrajectorySampler(Sampler):
         )
 
     def _draw_levels(self, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw noise levels over two decades: their positions in this range, 0 to 1, and levels, (ages, ny, rows)."""
+        """Draw noise levels over two decades; return positions in them, 0 to 1, and levels (ages, ny, rows)."""
         shape = (self.AGES_PER_BATCH, len(self._level_max), self._per_age)
         quiet = self._config.noise_free_share
         position = (torch.rand(shape, generator=generator, device=generator.device) - quiet) / (1 - quiet)
@@ -178,21 +178,21 @@ class TrajectorySampler(Sampler):
             position = torch.where(alike, position[:, :1], position)
         loud = position > 0
         position = position.clamp(min=0.0) ** (1 / self._config.high_noise_emphasis)
-        level = self._level_max * 100 ** (position - 1)  # over two decades
+        level = self._level_max * 100 ** (position - 1)
         return position, torch.where(loud, level, torch.zeros_like(level))
 
 
 def _float_or_tuple(values: np.ndarray) -> float | tuple[float, ...]:
-    """A number for one output or a tuple for several, as inverse maps hold them."""
+    """Return a number for one output or a tuple for several, as inverse maps hold them."""
     return tuple(values.tolist()) if len(values) > 1 else float(values[0])
 
 
 class ForwardMapSampler(Sampler):
-    """The paper's second data set S_2 (sec. 5.2): drawn points x' with z' = T(x'), without transients.
+    """Draws batches from the paper's second data set S_2 (sec. 5.2): points x' with z' = T(x'), without transients.
 
     The filter's z differs from T(x) by the error of T, which an inverse fitted to T(x') alone would magnify by its
-    Lipschitz constant (paper, lemma R-eta-bound). Gaussian noise with the covariance of that error, measured on the
-    forward map's own data, is therefore added to z', and each coordinate is shrunk to its linear conditional mean.
+    Lipschitz constant (paper, lemma R-eta-bound). Gaussian noise with the covariance of T's error, measured on the
+    training data of T, is therefore added to z', and each coordinate is shrunk to its linear conditional mean.
 
     Shapes: ``error``, the covariance of T's error, (nz, nz), ``points`` (n, nx).
     """
@@ -227,7 +227,7 @@ class ForwardMapSampler(Sampler):
 
 
 class InverseProblem(nn.Module):
-    """The inverse network, with a running mean square error for each cell."""
+    """Trains the inverse network, and keeps a running mean square error for each cell."""
 
     def __init__(self, network: Network, sampler: Sampler, device: torch.device) -> None:
         super().__init__()
@@ -239,19 +239,19 @@ class InverseProblem(nn.Module):
         self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Return a batch's mean square error, over its cells' running errors, and these errors' geometric mean."""
+        """Draw a batch; return its loss and the geometric mean of all cells' running errors, see :meth:`risk`."""
         risk, error = self._risk(*self.sampler(generator))
         return {"loss": risk, "error": error}
 
     def risk(
         self, inputs: torch.Tensor, x: torch.Tensor, weight: torch.Tensor, cell: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The loss of a batch, and the geometric mean of the cells' running errors."""
+        """Return the mean of square errors, each over its cell's running one, and the cells' geometric mean error."""
         apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
         square = weight * apart[:, :nx].mean(-1)
-        if self.sampler.parameters:  # parameters have cells of their own, as they are hard also where states are easy
+        if self.sampler.parameters:  # in separate cells, as parameters can be hard to estimate where states are not
             square = torch.cat([square, apart[:, nx:].mean(-1)])
-            # All plants share these cells, or the map would return the system's own parameters for near plants.
+            # All plants share these cells; otherwise the map would return the system's own parameters for near plants.
             cell = torch.cat([cell, self.sampler.cells + cell // self.sampler.kinds_of_plant])
         detached = square.detach()
         count = torch.zeros_like(self.error).index_add_(0, cell, torch.ones_like(detached))
@@ -259,6 +259,6 @@ class InverseProblem(nn.Module):
         keep = torch.where(count > 0, 0.99, 1.0)
         self.error.mul_(keep).add_((1 - keep) * mean)
         self.visited.logical_or_(count > 0)
-        # The mean leaves out cells that have had no data.
+        # The mean leaves out cells that have not had any data.
         error = (torch.where(self.visited, self.error.log(), 0.0).sum() / self.visited.sum()).exp().sqrt()
         return (square / self.error[cell]).mean(), error

@@ -31,11 +31,11 @@ class Network(nn.Sequential):
 
     @classmethod
     def of(cls, config: Config, inputs: int, outputs: int) -> Self:
-        """A network of the configured size."""
+        """Make a network of the configured size."""
         return cls(inputs, outputs, width=config.width, depth=config.depth, activation=config.activation)
 
     def linear_layers(self) -> list[nn.Linear]:
-        """The linear layers in order."""
+        """Return the linear layers in order."""
         return [layer for layer in self if isinstance(layer, nn.Linear)]
 
     def export(self) -> MLP:
@@ -49,7 +49,7 @@ class Network(nn.Sequential):
 
 
 def averaged(members: Sequence[MLP]) -> MLP:
-    """The mean of networks of one shape as one network, with their hidden layers side by side."""
+    """Return the mean of networks of one shape as one network, whose hidden layers hold theirs side by side."""
     first, *hidden, last = zip(*(member.weights for member in members), strict=True)
     *biases, offsets = zip(*(member.biases for member in members), strict=True)
     return MLP(
@@ -65,11 +65,11 @@ def compiled(function: Callable[..., Any], device: torch.device) -> Callable[...
         return function
     torch.set_float32_matmul_precision("high")
     run = torch.compile(function, mode="reduce-overhead")
-    return torch._dynamo.config.patch(suppress_errors=True)(run)  # unchanged if the compiler fails
+    return torch._dynamo.config.patch(suppress_errors=True)(run)  # runs uncompiled if the compiler fails
 
 
 def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
-    """A float32 tensor on ``device``."""
+    """Return a float32 tensor on ``device``."""
     return torch.as_tensor(np.ascontiguousarray(x, dtype=np.float32), device=device)
 
 

@@ -1,4 +1,4 @@
-"""Recorded data: files of samples and episodes, checks of them, and uniform grids."""
+"""Recorded data: reading files and episodes, checking them, and resampling to a uniform grid."""
 
 from training.records.checks import check_dt, check_signals
 from training.records.files import read_records

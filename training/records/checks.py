@@ -10,13 +10,13 @@ from training.records.record import LONGEST_GAP, ROLES, Record, median_step
 
 Warn = Callable[[str], object]
 
-OTHER_CLOCK = 30.0  # a sampling interval of more steps of a record suggests another unit of time
+OTHER_CLOCK = 30.0  # if dt is longer than so many steps of a record, its times are probably in another unit
 WHOLE_TURN = 0.9 * 2 * np.pi, 2 * np.pi + 0.1  # least and largest jump of a wrapped angle
-FAR_OFF = 10.0  # a value farther from all others than so many of their ranges may mark missing samples
+FAR_OFF = 10.0  # a value that is farther from all others, over their range, may mark missing samples
 
 
 def check_signals(records: Sequence[Record], system: System | None = None) -> None:
-    """Raise ValueError unless all records have the same columns, and their numbers fit the system."""
+    """Raise ValueError unless all records have the same columns, as many of each role as the system has signals."""
     if not records:
         raise ValueError("no records are given")
     first = records[0]
@@ -28,8 +28,8 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
     for role, count in zip(ROLES.values(), (system.ny, system.nu, system.nx)):
         if len(names[role]) != count and (names[role] or role == "measured"):
             raise ValueError(
-                f"{first.name}: {system.name} has {count} {role}, but the columns are "
-                f"{', '.join(names[role]) or 'none'}; name others by --{role}"
+                f"{first.name}: the {role} columns are {', '.join(names[role]) or 'none'}, but {system.name} has "
+                f"{count}; name others by --{role}"
             )
 
 
@@ -44,7 +44,7 @@ def check_alike(record: Record, names: Mapping[str, Sequence[str]], environment:
             "no known environment" if env is None else f"{env['id']} with arguments {env['kwargs']}"
             for env in (record.environment, environment)
         )
-        raise ValueError(f"{record.name} is of {here}, but {other} of {there}: one observer serves one of them")
+        raise ValueError(f"{record.name} is of {here}, but {other} of {there}: an observer serves one environment")
 
 
 def check_motion(records: Sequence[Record], warn: Warn) -> None:
@@ -64,8 +64,8 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
                 turns = np.flatnonzero((jumps > least) & (jumps < most))
                 if len(turns) and ends[1] - ends[0] < most:
                     wrapped.append(
-                        f"{record.name}: column {column}, row {turns[0] + 2}: a jump by a whole turn, as of an angle "
-                        f"that is wrapped; take cos({column}) and sin({column}), or unwrap it"
+                        f"{record.name}: column {column}, row {turns[0] + 2}: a jump by a whole turn, as of a wrapped "
+                        f"angle; take cos({column}) and sin({column}), or unwrap the angle"
                     )
                 for mark in ends:
                     rest = each[~np.isnan(each) & (each != mark)]
@@ -76,7 +76,7 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
                             f"{rest.min():.3g} to {rest.max():.3g}; if it marks missing samples, leave its cells empty"
                         )
             for texts in filter(None, (wrapped, marked)):
-                warn(texts[0] + (f" (and {len(texts) - 1} more like that)" if len(texts) > 1 else ""))
+                warn(texts[0] + (f" (and {len(texts) - 1} more of this kind)" if len(texts) > 1 else ""))
 
 
 def check_dt(records: Sequence[Record], dt: float) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
 PREFIX = "minari:"  # marks names of data sets among names of files
-KEY = "kkl_gym"  # key of the metadata that Minari does not define
+KEY = "kkl_gym"  # key of this package's entries in a data set's metadata
 METADATA = "data/metadata.json"  # path in the folder of a data set
 
 
@@ -88,7 +88,7 @@ class Rollouts:
 
 
 def is_dataset(name: str | Path) -> bool:
-    """Whether a name is that of a Minari data set: ``minari:ID``, or a folder that holds one."""
+    """Return whether a name is that of a Minari data set: ``minari:ID``, or a folder that holds a data set."""
     return str(name).startswith(PREFIX) or (Path(name) / METADATA).is_file()
 
 
@@ -99,7 +99,7 @@ def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
         folder = _folder(name.removeprefix(PREFIX)) if name.startswith(PREFIX) else Path(name)
         written = json.loads((folder / METADATA).read_text(encoding="utf-8"))
         if "observation_space" not in written or "action_space" not in written:
-            raise ValueError("its spaces are missing")  # Minari would make the environment, which runs its code
+            raise ValueError("its spaces are missing")  # to find them, Minari would run code of the environment
         dataset = minari.MinariDataset((folder / METADATA).parent)
         metadata, spec = dataset.storage.metadata, dataset.env_spec
         own = metadata.get(KEY, {})
@@ -160,7 +160,7 @@ def write_dataset(rollouts: Rollouts, *, policy: str) -> Path:
 
 
 def dataset_folder(name: str) -> Path:
-    """The folder for a new data set; an error if the name is invalid, taken, or cannot be written."""
+    """Return the folder for a new data set; raise an error if its name is invalid or taken, or it is not writable."""
     try:
         _minari().dataset.minari_dataset.parse_dataset_id(name)
     except (TypeError, ValueError):

@@ -79,7 +79,7 @@ def _record(path: Path, wanted: Signals, columns: Columns) -> Record:
         for signal in role:
             name, function = _column(signal, columns)
             column = _numbers(columns[name], name)
-            if held and len(column) == len(t) - 1 > 0:  # there is no input after the last sample
+            if held and len(column) == len(t) - 1 > 0:  # the last sample may lack an input
                 column = np.append(column, column[-1])
             if len(column) != len(t):
                 raise ValueError(
@@ -93,7 +93,7 @@ def _record(path: Path, wanted: Signals, columns: Columns) -> Record:
 
 
 def _named(wanted: Signals, columns: tuple[str, ...]) -> Signals:
-    """The wanted signals, or the usual columns for roles without names; ValueError if a column is missing."""
+    """Return the wanted signals, with the usual columns for roles without names; ValueError if a column is missing."""
     signals = replace(
         wanted,
         time=wanted.time or next((name for name in TIMES if name in columns), TIMES[0]),
@@ -112,13 +112,13 @@ def _named(wanted: Signals, columns: tuple[str, ...]) -> Signals:
 
 
 def _column(signal: str, columns: Iterable[str]) -> tuple[str, Callable[..., np.ndarray]]:
-    """The column of a signal, and the function to apply to it; a column may itself be named cos(...)."""
+    """Return a signal's column, and the function to apply to it; a column may itself be named cos(...)."""
     match = None if signal in columns else re.fullmatch(rf"({'|'.join(FUNCTIONS)})\((.+)\)", signal)
     return (signal, np.asarray) if match is None else (match[2].strip(), FUNCTIONS[match[1]])
 
 
 def _numbered(letter: str, columns: tuple[str, ...]) -> tuple[str, ...]:
-    """The column named by the letter alone, or the columns named by the letter and a number."""
+    """Return the column named by the letter alone, or the columns named by the letter and a number."""
     if letter in columns:
         return (letter,)
     numbered = [name for name in columns if re.fullmatch(rf"{letter}[0-9]+", name)]
@@ -126,7 +126,7 @@ def _numbered(letter: str, columns: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _seconds(values: Any, column: str) -> np.ndarray:
-    """Times in seconds; dates, or ISO 8601 texts of dates, count from the first."""
+    """Convert times to seconds; dates, or texts of dates in ISO 8601, count from the first one."""
     import pandas as pd
 
     values = pd.Series(values)
@@ -160,7 +160,7 @@ def _npz(path: Path) -> Columns:
     columns = dict[str, np.ndarray]()
     with file:
         for name in file.files:
-            with suppress(ValueError):  # pickled objects, which are not read
+            with suppress(ValueError):  # raised for pickled objects, which are not read
                 values = file[name]
                 if values.ndim == 2 and values.shape[1] > 1:
                     columns |= {f"{name}{i + 1}": column for i, column in enumerate(values.T)}

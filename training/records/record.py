@@ -12,9 +12,9 @@ from scipy.interpolate import PchipInterpolator
 from observers import LinearFilter
 from observers.checks import real_array
 
-ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # fields of Signals with the names of the columns
-MAX_SAMPLE = 1e100  # sums of squares stay finite up to this size
-LONGEST_GAP = 3.0  # samples at most so many steps apart are interpolated
+ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # fields of Record; fields of Signals that name their columns
+MAX_SAMPLE = 1e100  # largest valid sample, so that sums of squares stay finite
+LONGEST_GAP = 3.0  # longest gap, in steps, in which samples are interpolated
 ROUNDING = 1e-6  # tolerance of times, in steps
 
 
@@ -61,7 +61,7 @@ class Record:
             if values is not None or letter in "ty":
                 object.__setattr__(self, letter, real_array(f"{self.name}: {letter}", values))
         if np.ndim(self.t) != 1 or len(self.t) < 2:
-            raise ValueError(f"{self.name}: t must be two samples at least, got shape {np.shape(self.t)}")
+            raise ValueError(f"{self.name}: t must hold at least two samples, got shape {np.shape(self.t)}")
         names: dict[str, Any] = {"time": self.signals.time or "t"}
         columns = [("t", names["time"], self.t)]
         for letter, role in ROLES.items():
@@ -82,7 +82,7 @@ class Record:
             for wrong, why in (
                 (abs(column) > MAX_SAMPLE, "{0:g} is not a valid sample"),
                 (missing & missing.all(), "no row holds a number"),
-                (missing & (letter in "tu"), "a number is missing; only outputs and states may lack some"),
+                (missing & (letter in "tu"), "a number is missing; only outputs and states may lack samples"),
                 (back & (letter == "t"), "time must increase, but {0:g} comes after {1:g}"),
             ):
                 if wrong.any():
@@ -112,19 +112,19 @@ class Record:
 
 
 def median_step(*records: Record) -> float:
-    """Median time step in seconds of one record or several."""
+    """Return the median time step in seconds of one or more records."""
     return float(np.median(np.concatenate([np.diff(record.t) for record in records])))
 
 
 def sampling_interval(*records: Record) -> float:
-    """The median step in seconds, with as many digits as the times agree on, at least two."""
+    """Return the median step in seconds, rounded to the digits on which all steps agree, at least two."""
     uneven = max(map(jitter, records))
     digits = 12 if uneven < 1e-12 else int(np.clip(-np.log10(uneven), 2, 12))
     return float(f"{median_step(*records):.{digits}g}")
 
 
 def jitter(record: Record) -> float:
-    """Largest deviation of a time step from the median step, over the median step; gaps do not count."""
+    """Return the largest deviation of a time step from the median step, over the median step; gaps do not count."""
     steps = np.diff(record.t) / median_step(record)
     return float(np.max(abs(steps - np.maximum(steps.round(), 1.0))))
 
@@ -132,14 +132,14 @@ def jitter(record: Record) -> float:
 def resampled(record: Record, dt: float | None = None) -> Record:
     """Put a record on a uniform grid that begins with its first sample.
 
-    Outputs are interpolated linearly, as the filter assumes, so that a value needs only the next sample. States, which
-    no observer sees, follow a monotone cubic (PCHIP). Both are NaN between samples of their own column that are more
-    than 3 dt apart. Inputs, held between samples, are averaged over each interval of the grid. A record that already
-    has this grid changes only by rounding.
+    Outputs are interpolated linearly, as the filter assumes, so that a value depends on no sample after the next one.
+    States, which no observer sees, follow a monotone cubic (PCHIP). Each column is NaN between its samples that are
+    more than 3 dt apart. Inputs, held between samples, are averaged over each interval of the grid. A record that
+    already has this grid changes only by rounding.
     """
     dt = median_step(record) if dt is None else dt
     if not 0 < dt <= record.duration * (1 + ROUNDING):
-        raise ValueError(f"{record.name}: dt = {dt:g} s must be positive, and no more than its {record.duration:g} s")
+        raise ValueError(f"{record.name}: dt = {dt:g} s must lie between 0 and its duration, {record.duration:g} s")
     steps = int(np.floor(record.duration / dt + ROUNDING))
     t = np.minimum(record.t[0] + dt * np.arange(steps + 1), record.t[-1])
     signals, columns = record.signals, [] if record.x is None else list(record.x.T)
@@ -149,7 +149,7 @@ def resampled(record: Record, dt: float | None = None) -> Record:
 
 
 def _interpolated(record: Record, name: str, values: np.ndarray, t: np.ndarray, *, smooth: bool) -> np.ndarray:
-    """Interpolate a column at the times t of a grid; NaN in gaps."""
+    """Interpolate a column at the times t of a grid, with NaN in gaps."""
     there = ~np.isnan(values)
     at, values, dt = record.t[there], values[there], t[1] - t[0]
     close = np.zeros(len(t), dtype=bool)
@@ -166,7 +166,7 @@ def _interpolated(record: Record, name: str, values: np.ndarray, t: np.ndarray, 
 
 
 def _held(record: Record, t: np.ndarray, dt: float) -> np.ndarray | None:
-    """Means of held inputs over the intervals that begin at t; the last input is held beyond the end."""
+    """Return the means of held inputs over the intervals that begin at t; the last input is held beyond the end."""
     if record.u is None:
         return None
     ends = np.append(record.t, max(record.t[-1], t[-1]) + 2 * dt)
@@ -208,7 +208,7 @@ class Windows:
 
     @cached_property
     def z(self) -> np.ndarray:
-        """The filter's states."""
+        """States of a filter that starts with each piece."""
         z, first, linear = np.zeros((len(self.y), self.linear.size)), np.flatnonzero(self.before == 0), self.linear
         z[first] = linear.start(self.y[first])
         for k in range(1, self.before.max(initial=0) + 1):
@@ -217,7 +217,7 @@ class Windows:
         return z
 
     def restarted(self, rows: np.ndarray, age: int) -> np.ndarray:
-        """The filter's states at ``rows`` if it had started ``age`` samples before them; they follow by linearity."""
+        """Return, by linearity, the states at ``rows`` of filters that started ``age`` samples before each row."""
         began = rows - age
         power = np.linalg.matrix_power(self.linear.transition, age)
         return np.asarray(self.z[rows] + (self.linear.start(self.y[began]) - self.z[began]) @ power.T)

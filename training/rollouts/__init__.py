@@ -37,13 +37,13 @@ def learn(
     env_id : str
         Id of the environment, as for ``gym.make``.
     measured, hidden : sequence of str or int
-        Signals that the observer measures and that it estimates, at least one each: indices in the flattened
-        observation, keys of a Dict, or ``info[key]``, see :func:`kkl_gym.named.resolved`.
+        Signals that the observer measures, and signals that it estimates, at least one of each: indices in the
+        flattened observation, keys of a Dict, or ``info[key]``, see :func:`kkl_gym.named.resolved`.
     policy : str or callable
-        "random", "wandering", "script.py:function", an agent as in "ppo:FILE.zip", or a function from observations to
-        actions. Estimates are accurate only where the policy has been.
+        "random", "wandering" (random, but held for some steps), "script.py:function", an agent as in "ppo:FILE.zip",
+        or a function from observations to actions. Estimates are accurate only where the policy has been.
     episodes, steps : int, optional
-        Length of the play, whichever is reached first; by default 100,000 steps.
+        Episodes and steps to play, until either number is reached; by default 100,000 steps.
     env_kwargs : mapping of str to object, optional
         Arguments of the environment.
     seed : int
@@ -58,17 +58,17 @@ def learn(
     Returns
     -------
     Artifact
-        The observer. It tracks if each measured signal is a hidden one or a weighted sum of them.
+        The observer. It tracks if each measured signal is a hidden signal, or a weighted sum of hidden signals.
         ``training["held_out_errors"]`` are its errors on episodes that were held out.
 
     Raises
     ------
     ValueError
-        If an argument is invalid, or as :func:`training.train`.
+        If an argument is invalid, or for the reasons of :func:`training.train`.
     """
     from training.lessons import train  # torch takes seconds to import
 
-    # Invalid settings must raise before anything is played; the rollouts determine those that are not given.
+    # Config checks the settings before anything is played; -1 stands for eigenvalues that follow from the rollouts.
     if not np.size(hidden):
         raise ValueError("name the hidden signals, which the observer is to estimate, as in hidden=[2]")
     settings = {"seed": seed} | settings

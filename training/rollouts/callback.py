@@ -26,13 +26,13 @@ from training.records.checks import check_alike
 from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
-QUICK = {"members": 1, "inverse_steps": 1000}  # less than in a first training, as refits repeat
-LONGEST = 250  # most steps in a piece; long episodes are cut, so that some pieces of each can be held out
+QUICK = {"members": 1, "inverse_steps": 1000}  # a shorter training than the first, as there are many refits
+LONGEST = 250  # most steps in a piece; longer episodes are cut into pieces, so that parts of each can be held out
 
 
 @dataclass(frozen=True)
 class Refit:
-    """A refit: the observer in use after it, whether the new one was taken, and held-out errors before and after."""
+    """A refit: the observer in use after it, whether this is the new one, held-out errors, and the step."""
 
     artifact: Artifact
     taken: bool
@@ -51,9 +51,9 @@ class KKLTrainingCallback(BaseCallback):
 
     An observer is accurate where its rollouts have been, but an agent in training goes elsewhere. A refit learns T_inv,
     the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
-    replaces the old one unless its error on that share is larger. Filters and their states stay. A refit takes place
-    only where an algorithm begins to collect, so that no on-policy batch mixes two observers, and only after an episode
-    was as long as the filter's memory.
+    replaces the old one unless the new one's error on that share is larger. Filters and their states stay. A refit
+    takes place only when an algorithm begins to collect a rollout, so that no on-policy batch mixes two observers, and
+    only after an episode was as long as the filter's settling time.
 
     The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square over standard
     deviation), and ``kkl/error_before``, that of the observer before the refit.
@@ -63,10 +63,10 @@ class KKLTrainingCallback(BaseCallback):
     every : int, default 5000
         Steps of all environments together between refits.
     keep : int, default 100_000
-        Number of steps to keep; older ones are dropped.
+        Number of steps to keep; older steps are dropped.
     records : sequence of training.records.Record, optional
-        Earlier episodes, the oldest first, such as those that the observer was learned from. They count among the kept
-        steps; none of them is held out.
+        Earlier episodes, the oldest first, such as those that the observer was learned from. Their steps count among
+        the kept ones, but are never held out.
     rehearsal : int, default 0
         Further steps at the end of each call of ``learn``, in which the agent acts without exploration; a last refit
         follows.
@@ -121,7 +121,7 @@ class KKLTrainingCallback(BaseCallback):
             raise ValueError(f"on_refit must be a function of a Refit, got {shown(on_refit)}")
         if fixed := [name for name in OF_THE_FILTER if name in settings]:
             raise ValueError(f"{', '.join(fixed)} cannot change, as the filter stays: learn another observer instead")
-        Config("input-aware", eigenvalues=(-1.0,), **settings)  # raises here rather than at the first refit
+        Config("input-aware", eigenvalues=(-1.0,), **settings)  # invalid settings raise here, not at the first refit
         self._every, self._keep = integer("every", every, 1), integer("keep", keep, 1)
         self._before, self._rehearsal, self._outputs = tuple(records), integer("rehearsal", rehearsal, 0), outputs
         self._path, self._on_refit, self._settings = path, on_refit, settings
@@ -156,7 +156,7 @@ class KKLTrainingCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         for row in range(self.training_env.num_envs):
-            self._gathering.begin(row, {})  # an episode may be under way
+            self._gathering.begin(row, {})  # the next sample need not be an episode's first
 
     def _on_step(self) -> bool:
         self._add(self.locals["infos"], self.locals["dones"])
@@ -172,7 +172,7 @@ class KKLTrainingCallback(BaseCallback):
         env, scaling = self.training_env, self.model.get_vec_normalize_env()
         learns = scaling is not None and scaling.training
         if scaling is not None:
-            scaling.training = False  # keeps its scales
+            scaling.training = False  # the scales of observations must stay those of the training
         try:
             observations, state, dones = env.reset(), None, np.ones(env.num_envs, dtype=bool)
             self._add((), dones)
@@ -183,11 +183,11 @@ class KKLTrainingCallback(BaseCallback):
         finally:
             if scaling is not None:
                 scaling.training = learns
-        self.model.set_env(env)  # the next call of learn resets it
+        self.model.set_env(env)  # makes the next call of learn reset the environment
         self._refit_where_possible()
 
     def _add(self, infos: Sequence[dict[str, Any]], dones: Sequence[bool] | np.ndarray) -> None:
-        """Add a step of all environments; ``infos`` is empty after a reset of all."""
+        """Add a step of all environments, or their reset, for which ``infos`` is empty."""
         for row, done in enumerate(dones):
             if infos:
                 self._gathering.add(row, infos[row])
@@ -198,19 +198,19 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._gathering.steps + self._every
         kept, held_out = self._gathering.records()
         memory = settling_time(self.artifact.filter)
-        # Earlier records may be long enough alone, but only the agent's own pieces are held out.
+        # Earlier records may be long enough without the agent's episodes, but only pieces of these are held out.
         needed = (kept, held_out) if self._before and self._config.held_out else (kept,)
         if all(any(record.duration >= memory for record in records) for records in needed):
             self._refit(kept, held_out)
 
     def _refit(self, kept: list[Record], held_out: list[Record]) -> None:
         old = self.artifact
-        with torch.random.fork_rng():  # the agent's random numbers stay its own
+        with torch.random.fork_rng():  # a refit does not change the agent's random numbers
             new = train(RecordedSource(kept, self._config, old.system, held_out=held_out, C=old.C)).artifact
         if (old.motion is not None and new.motion is None) or (
             old.inverse.error_covariance is not None and new.inverse.error_covariance is None
         ):
-            warnings.warn("the observer in use stays: too little is held out to calibrate a new one", stacklevel=2)
+            warnings.warn("the observer in use stays: too few steps are held out to calibrate a new one", stacklevel=2)
             return
         before, after = (_rms(recorded_errors(each, held_out, measurement_noise=self._level)) for each in (old, new))
         taken = not after > before
@@ -229,7 +229,7 @@ class KKLTrainingCallback(BaseCallback):
 
 
 def _in_use(env: VecEnv) -> tuple[list[KKLObserver], Callable[[Artifact], object]]:
-    """The observers in use, and the function that replaces them; ValueError without any."""
+    """Return the observers in use and the function that replaces them; ValueError if there are no observers."""
     inside = getattr(env.unwrapped, "env", None)  # a vector environment of Gymnasium
     while isinstance(inside, gym.vector.VectorWrapper):
         if isinstance(inside, KKLVectorObservation):
@@ -244,7 +244,7 @@ def _in_use(env: VecEnv) -> tuple[list[KKLObserver], Callable[[Artifact], object
 
 
 def _rms(errors: Mapping[str, float]) -> float:
-    """Root mean square of the errors of all hidden signals that move, or NaN."""
+    """Return the root mean square of the errors of all hidden signals that move, or NaN."""
     known = [error for error in errors.values() if not math.isnan(error)]
     return float(np.sqrt(np.mean(np.square(known)))) if known else math.nan
 
@@ -271,7 +271,7 @@ class Gathering:
         self._signals = Signals("t", *(tuple(names[role]) for role in ROLES.values()))
         self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
         self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
-        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; open ones by environment
+        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; unfinished, by environment
         self._made = self.steps = 0
         check_dt(before, self._dt)
         for record in before:

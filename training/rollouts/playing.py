@@ -37,7 +37,7 @@ def make(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Env:
 
 
 def policy_of(policy: str | Policy, env: Env) -> Policy:
-    """Make a policy from its name: random actions, a function, or an agent of stable-baselines3 (``ppo:FILE.zip``)."""
+    """Make a policy from its name: random, wandering, a function, or an agent of stable-baselines3 (``ppo:A.zip``)."""
     if callable(policy):
         return policy
     if policy == RANDOM:
@@ -55,7 +55,7 @@ def policy_of(policy: str | Policy, env: Env) -> Policy:
 
 
 def _wandering(space: gym.Space[Any]) -> Iterator[Any]:
-    """Random actions, each held for a random number of steps; every hundred steps a new mean number is drawn."""
+    """Yield random actions, each held for a random number of steps, whose mean changes every hundred steps."""
     left, action = 0, None
     for call in itertools.count():
         if call % 100 == 0:
@@ -130,13 +130,13 @@ def roll_out(
             over, total = terminated or truncated, total + 1
         played += 1
         if played == 1:
-            recorder.rollouts().records()  # raises here rather than after hours of play
+            recorder.rollouts().records()  # invalid signals raise here, not after hours of play
         report(played if steps is None else total)
     return recorder.rollouts()
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Keeps the last episodes that were played in an environment, with ``keep`` steps or more."""
+    """Records the last episodes in an environment: as many as hold ``keep`` steps, by default all."""
 
     def __init__(
         self,
@@ -169,7 +169,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step the environment; RuntimeError before the first reset, or if none has followed :meth:`rollouts`."""
+        """Step the environment; RuntimeError before the first reset, or without a reset after :meth:`rollouts`."""
         if self._under_way is None:
             raise RuntimeError("reset the environment before its first step")
         made = copy.deepcopy(action)
@@ -182,7 +182,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         return observation, float(reward), terminated, truncated, info
 
     def rollouts(self, *, going_on: bool = False) -> Rollouts:
-        """Return the episodes, an unfinished one as far as it was played; it cannot continue unless ``going_on``."""
+        """Return the episodes, an unfinished one as far as it was played; it can continue only if ``going_on``."""
         self._under_way = self._under_way if going_on else None
         env, episodes = self.env, [self._episode(steps) for steps in self._played if steps.done]
         spaces = env.observation_space, env.action_space
@@ -201,7 +201,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
 @dataclass
 class _Steps:
-    """An episode's observations with entries of ``info``, and actions with rewards."""
+    """An episode: ``seen`` holds pairs of observation and entries of ``info``, ``done`` pairs of action and reward."""
 
     seen: list[Any]
     done: list[Any] = field(default_factory=list)
@@ -209,9 +209,9 @@ class _Steps:
 
 
 def _numbers(values: list[Any], key: str) -> np.ndarray:
-    """The entries of ``info`` under a key as an array; NaN at a reset that lacks the key."""
+    """Return the entries of ``info`` under a key as an array, with NaN at a reset that lacks the key."""
     if all(value is None for value in values):
-        raise ValueError(f"info has no {key!r}, at the reset or at a step")
+        raise ValueError(f"info has no {key!r}, neither at the reset nor at any step")
     if values[0] is None and len(values) > 1 and values[1] is not None:
         values = [np.full(np.shape(values[1]), np.nan), *values[1:]]
     try:
@@ -221,6 +221,6 @@ def _numbers(values: list[Any], key: str) -> np.ndarray:
 
 
 def _stacked(space: gym.Space[Any], values: Sequence[Any]) -> Any:
-    """Stack values of a space in arrays, with the structure of a Dict or Tuple."""
+    """Stack values of a space into arrays; those of a Dict or Tuple keep its structure."""
     empty: Any = create_empty_array(space, len(values), fn=np.zeros)
     return concatenate(space, values, empty)

@@ -1,4 +1,4 @@
-"""Sources of motions: equations, records, or rollouts of an environment; and the interface of all sources."""
+"""The interface of all sources of motions, which are simulated, recorded, or rollouts of an environment."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -15,9 +15,9 @@ OF_MEDIAN = 1.4826  # standard deviation of a normal distribution, over the medi
 
 @dataclass(frozen=True)
 class Runs:
-    """Whole motions to calibrate on, measured without noise, at one or two levels of process noise.
+    """Motions to calibrate on, without added measurement noise, at one or two levels of process noise.
 
-    ``usual`` motions start in X; ``sound`` runs come from a plant that certainly has no faults.
+    ``sound`` is True if the plant certainly had no faults.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
     ``process_noise`` (n,), ``usual`` (n,): True for starts in X, False beyond.
@@ -37,7 +37,7 @@ class TooFewRunsError(ValueError):
 
 @dataclass(frozen=True)
 class Increments:
-    """States (n, nx), inputs (n, nu), and changes of the states over one sample (n, nx)."""
+    """States (n, nx), inputs (n, nu), and changes of the states over one sampling interval (n, nx)."""
 
     x: np.ndarray
     u: np.ndarray
@@ -45,7 +45,7 @@ class Increments:
 
 
 class Source(Protocol):
-    """The interface through which lessons take motions: simulated, recorded, or rollouts of an environment.
+    """The interface by which lessons get motions: simulated, recorded, or rollouts of an environment.
 
     Motions for calibration are never those for training.
 
@@ -87,16 +87,16 @@ class Source(Protocol):
         """Return states of training motions and of a filter that runs along them; ``free`` motions have no input."""
 
     def runs(self, *, report: Report) -> Runs:
-        """Return motions for calibration; TooFewRunsError if too few are held out."""
+        """Return motions for calibration; raise TooFewRunsError if too few are held out."""
 
     def equations(self) -> Equations:
-        """Return the equations of motion; ValueError with the reason if a flow must replace them."""
+        """Return the equations of motion; raise ValueError with the reason if a flow must replace them."""
 
     def increments(self, *, report: Report) -> tuple[Increments, Increments]:
-        """Return changes of the state over one sample, for learning a flow and for measuring its error."""
+        """Return changes of the state over one sampling interval: for learning a flow, and for measuring its error."""
 
     def tracking(self) -> dict[str, Any]:
-        """Return arguments of :class:`observers.Motion`, except equations or flow; ValueError if it cannot track."""
+        """Return arguments of :class:`observers.Motion` but equations or flow; ValueError if tracking is impossible."""
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
         """Return errors on held-out motions, for the training metadata of the artifact."""

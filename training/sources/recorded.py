@@ -21,28 +21,28 @@ from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
 FEW = 5  # with fewer records than this, none is held out whole
-STRETCHES, SAMPLES = 600, 2_000_000  # largest number of stretches of records to calibrate on, and of all their samples
-STRETCH_MEMORIES = 2.0  # greatest length of a stretch, in settling times of the filter
+STRETCHES, SAMPLES = 600, 2_000_000  # most stretches of records to calibrate on, and most samples in all of them
+STRETCH_MEMORIES = 2.0  # greatest length of such a stretch, in settling times of the filter
 FEWEST = 50  # least number of samples at which a stretch for calibration may begin
 BEYOND = 0.5  # estimates may leave the range of the states by this fraction of it
 INCREMENTS = 400_000  # largest number of increments that a flow is learned from
-WINDOW = 10  # innovations are averaged over at least so many samples
+WINDOW = 10  # least number of samples over which a tracker averages innovations
 # The residual of y = C x counts as noise unless it exceeds UNEXPLAINED times the output's standard deviation, or a fit
-# with squares of the states reduces it below SQUARES times itself.
+# with products of states reduces it below SQUARES times itself.
 UNEXPLAINED, SQUARES = 0.7, 0.8
 LITTLE = 0.1  # a smaller residual, over the output's standard deviation, always counts as noise
-ROUNDING, OUTLIER = 1e-6, 6.0  # in multiples of an output's size, and of the residual's standard deviation
-LEAST_NOISE = 1e-4  # least noise assumed, in standard deviations of the outputs: with R = 0 the gain would not fall
-MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: modes of each output, rates over the signals' rate
-RECORD_MEMORIES = 3.0  # so many settling times fit into a record, unless this needs modes faster than the signals
-# For rollouts, whose hidden signals an agent needs within a few steps: modes of each output, and their rates per step.
-# A few modes that lie far apart forget the start soon, and distinguish single steps.
+ROUNDING, OUTLIER = 1e-6, 6.0  # limit of a rounding error, over an output's size, and of a residual, over its deviation
+LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
+MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: number of modes of each output, rates over the signals' rate
+RECORD_MEMORIES = 3.0  # least length of a record in settling times, unless that needs modes faster than the signals
+# For rollouts, whose hidden signals an agent needs within a few steps: number of modes of each output, and their rates
+# per step. A few modes that lie far apart forget the start soon, and distinguish single steps.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
-EPISODE_MEMORIES = 1.5  # so many settling times fit into an episode
+EPISODE_MEMORIES = 1.5  # least length of an episode in settling times
 RECORDED_NOISE = 0.1  # largest noise added to that of the records, in standard deviations of the output
 RECORDED: dict[str, Any] = {
     "samples": 60, "width": 96, "depth": 2, "learning_rate": 3e-3, "inverse_steps": 3000, "members": 3,
-    "noise_free_share": 0.5, "scaling": "range",  # errors count alike, whatever the size of the state
+    "noise_free_share": 0.5, "scaling": "range",
 }  # fmt: skip
 OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")  # settings that determine the filter
 
@@ -87,7 +87,7 @@ class RecordedSource:
         self.records, self.config, self.name, self.C, signals = records, config, name, C, records[0].signals
         if unknown := [name for name in config.arbitrary_zero if name not in signals.measured]:
             measured = ", ".join(signals.measured)
-            raise ValueError(f"arbitrary_zero names {', '.join(map(repr, unknown))}; measured are {measured}")
+            raise ValueError(f"arbitrary_zero names {', '.join(map(repr, unknown))}, but measured are {measured}")
         self.signals, self.nx, self.ny = signals, len(signals.hidden), len(signals.measured)
         self.nu, self.dt, self.process_noise = len(signals.inputs) * config.inputs, config.dt, 0.0
         self.linear = Spectrum(config.eigenvalues, config.pairs).filter(self.ny, config.dt, self.nu)
@@ -97,7 +97,7 @@ class RecordedSource:
         self.pace = 1 / signal_rate(self.kept)
 
     def identity(self) -> dict[str, Any]:
-        """The name, and a fingerprint of each file or data set."""
+        """Return the name, and a fingerprint of each file or data set."""
         each = dict[str, str]()
         for record in self.records:
             name = record.source or Path(record.name).name
@@ -106,37 +106,37 @@ class RecordedSource:
         return {"name": self.name, "records": records}
 
     def facts(self) -> dict[str, Any]:
-        """Arguments of :class:`observers.Artifact` that describe the records."""
+        """Return the arguments of :class:`observers.Artifact` that describe the records."""
         signals = {role: getattr(self.signals, role) for role in ROLES.values()} | ({} if self.nu else {"inputs": ()})
         facts = {"system": self.name, "parameters": {}, "measurement_noise": 0.0, "signals": signals}
         facts["environment"] = self.records[0].environment
         if self.nu:
             inputs = [np.abs(each.u[:-1]).max(0, initial=0.0) for each in self.records if each.u is not None]
             facts["u_max"] = tuple(np.max(inputs, 0).tolist())
-        with contextlib.suppress(ValueError):  # tracking() raises the same error
+        with contextlib.suppress(ValueError):  # tracking() reports this error
             facts["C"] = linear_output(self.kept, self.C)[0]
         return facts
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """Arguments of :class:`training.maps.inverse.TrajectorySampler` that depend on the records."""
+        """Return arguments of :class:`training.maps.inverse.TrajectorySampler` that depend on the records."""
         zero = [self.signals.measured.index(name) for name in self.config.arbitrary_zero]
         return {"measurement_noise": 0.0, "silent": linear.equilibrium[:, zero]}
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
-        """Recorded states, and the states of a filter that started some samples before."""
+        """Return recorded states, and the states of a filter that started some samples before each of them."""
         windows, n = Windows(self.kept, linear, self.nx), self.config.windows
         ages = recording_ages(math.ceil(settling_time(linear) / self.dt), self.config.samples)
         chosen = [evenly(windows.rows(age), n) for age in ages]
         if lacking := [age for age, rows in zip(ages, chosen) if not len(rows)]:
             raise ValueError(
-                f"no recorded state is {lacking[0] * self.dt:.3g} s after the start of its record, or of a gap; record "
-                "longer runs, or take faster eigenvalues"
+                f"no recorded state is {lacking[0] * self.dt:.3g} s after the start of its record, or after a gap; "
+                "record longer runs, or take faster eigenvalues"
             )
         zs = [windows.restarted(rows, age) for age, rows in zip(ages, chosen)]
         return Pairs(ages, windows.x[np.stack(chosen)], np.stack(zs), np.zeros(n))
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
-        """Stretches of the held-out records, whose first samples are spread evenly over them."""
+        """Return stretches of the held-out records, whose first samples are spread evenly over the records."""
         windows = Windows(self.held_out, self.linear, self.nx)
         first = windows.rows()
         first = first[windows.after[first] > 0]
@@ -159,7 +159,7 @@ class RecordedSource:
         raise ValueError("records have no equations")
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
-        """Changes of the state over one sample, in the training records and in the held-out ones."""
+        """Return changes of the state over one sampling interval, in the training records and in the held-out ones."""
         return self._increments
 
     @functools.cached_property
@@ -179,7 +179,7 @@ class RecordedSource:
         return both[0], both[1]
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
-        """Errors on the held-out records, relative to the signals' standard deviations."""
+        """Return errors on the held-out records, relative to the signals' standard deviations."""
         errors = recorded_errors(artifact, self.held_out)
         return {
             "records": self.identity()["records"],
@@ -188,7 +188,7 @@ class RecordedSource:
         }
 
     def tracking(self) -> dict[str, Any]:
-        """Arguments of :class:`observers.Motion`, except the flow; ValueError if it cannot track."""
+        """Return arguments of :class:`observers.Motion` but the flow; ValueError if tracking is impossible."""
         if self.config.arbitrary_zero:
             raise ValueError(
                 f"a tracker compares {', '.join(self.config.arbitrary_zero)} with its prediction, so the zero matters: "
@@ -197,7 +197,7 @@ class RecordedSource:
         if not self.held_out:
             raise ValueError("covariances are calibrated on held-out records: held_out must be positive, got 0")
         _, least = linear_output(self.kept, self.C)
-        _ = self._increments  # raises ValueError if the records hold none
+        _ = self._increments  # raises ValueError if the records hold no increments
         x = np.concatenate([record.x for record in self.kept if record.x is not None])
         x = x[np.isfinite(x).all(-1)]
         low, high = x.min(0), x.max(0)
@@ -275,12 +275,12 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
 
 
 def evenly(rows: np.ndarray, n: int) -> np.ndarray:
-    """Choose n of some rows, evenly spread; none if there are no rows."""
+    """Choose n rows, evenly spread, with repetitions if there are fewer; return no row if there are no rows."""
     return rows[np.linspace(0, len(rows) - 1, n if len(rows) else 0).round().astype(int)]
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:
-    """Hold out a share of the records: whole ones drawn by the seed, or the end of each if there are few."""
+    """Split records into training and held-out ones: by whole records that the seed draws, or by their ends if few."""
     if not share:
         return list(records), []
     if len(records) >= FEW:
@@ -295,7 +295,7 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
 
 
 def signal_rate(records: Sequence[Record]) -> float:
-    """Rate of the signals in 1/s: rms of the derivative over standard deviation, median over moving signals."""
+    """Return the signals' rate in 1/s: rms of the derivative over standard deviation, median of moving signals."""
     rates = list[float]()
     for letter in "yx":
         signals = [(getattr(record, letter), record.t) for record in records if getattr(record, letter) is not None]
@@ -306,7 +306,7 @@ def signal_rate(records: Sequence[Record]) -> float:
             rates += (change[size > 0] / size[size > 0]).tolist()
     moving = [rate for rate in rates if rate > 0]
     if not moving:
-        raise ValueError(f"{records[0].name}: no signal moves, nor in any other record: nothing can be learned from it")
+        raise ValueError(f"{records[0].name}: no signal moves, nor in any other record, so nothing can be learned")
     return float(np.median(moving))
 
 
@@ -317,7 +317,7 @@ def recorded_errors(
     *,
     measurement_noise: float | tuple[float, ...] = 0.0,
 ) -> dict[str, float]:
-    """Errors of hidden signals (rms over standard deviation, or NaN) from ``after`` s on, by default once settled."""
+    """Return hidden signals' errors (rms over standard deviation, or NaN) from ``after`` or the settling time on."""
     first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
     pairs, rng = [np.zeros((0, 2, artifact.nx))], np.random.default_rng(0)
     for record in pieces(records):
@@ -330,7 +330,7 @@ def recorded_errors(
     names = (artifact.signals or {})["hidden"]
     if not len(error):
         return dict.fromkeys(names, math.nan)
-    moves = np.ptp(x, 0) > 0  # a constant may have a standard deviation by rounding
+    moves = np.ptp(x, 0) > 0  # by rounding, a constant may have a positive standard deviation
     return dict(zip(names, (np.sqrt(np.mean(error**2, 0)) / np.where(moves, x.std(0), np.nan)).tolist()))
 
 
@@ -353,14 +353,14 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
     signals = records[0].signals
     if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
         raise ValueError(
-            f"{', '.join(other)} is not a weighted sum of {', '.join(signals.hidden)} without an offset, by which a "
-            "tracker predicts samples: add the measured signals, in the same units, to the hidden ones"
+            f"{', '.join(other)} is not a weighted sum of {', '.join(signals.hidden)} (without an offset), and a "
+            "tracker predicts only such sums: add the measured signals, in the same units, to the hidden ones"
         )
     return C, least
 
 
 def _fitted(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """C of a fit that leaves outliers out, and standard deviations (ny,) of the residual."""
+    """Fit C without outliers; return it, and the standard deviations (ny,) of the residual."""
     size = np.sqrt(np.mean(x**2, 0))
     size, scale = np.where(size > 0, size, 1.0), np.where(scale > 0, scale, 1.0)
     kept = np.ones(len(x), dtype=bool)
@@ -374,5 +374,5 @@ def _fitted(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray
 
 
 def _usual(apart: np.ndarray) -> np.ndarray:
-    """Standard deviations of noise (n, ny) from medians, on which outliers have no influence."""
+    """Estimate the standard deviations (ny,) of noise (n, ny) from medians, which outliers hardly change."""
     return np.asarray(OF_MEDIAN * np.median(np.abs(apart), axis=0))

@@ -19,18 +19,18 @@ from training.trajectories.equations import describe, digest, field_expression, 
 from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
-LEAD_IN_SHARE = 0.4  # share of the free motions whose start inputs have led out of X
-BEYOND = 2.0  # a third of the calibration runs start in this multiple of X, and a flow is learned in it
+LEAD_IN_SHARE = 0.4  # share of the motions without inputs whose starts come from a lead-in by inputs
+BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and some of a flow's training motions
 # In calibration, inputs drive every other run; a policy acts on exact states, without exploration, in every other run.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
-LEAST_PROCESS_NOISE = 0.005  # least level that filters assume, at pace 1: a tenth of the environments' default
-WINDOW, RUN = 0.5, 20.0  # lengths of a tracker's window and of a calibration run, in multiples of the pace
-SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sample
-INTEGRATION_ERROR = 2e-5  # a larger error of scaled states needs more steps; this limit is below the noise
-TOO_FAR_OFF = 0.01  # if SUBSTEPS steps have a larger error, as with jumps in f, a flow is learned
+LEAST_PROCESS_NOISE = 0.005  # least level that a tracker assumes, in states' scales per pace: a tenth of the default
+WINDOW, RUN = 0.5, 20.0  # lengths of a tracker's window and of a calibration run, in units of the pace
+SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
+INTEGRATION_ERROR = 2e-5  # largest error of these steps in standard deviations of the states, well below the noise
+TOO_FAR_OFF = 0.01  # if SUBSTEPS steps have a larger error, as where f jumps, a flow is learned
 INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
-DEVIATIONS = (1e-4, 0.3)  # log-uniform distances of increments from motions, in standard deviations of the states
+DEVIATIONS = (1e-4, 0.3)  # range of the distances of increments from motions, in standard deviations of the states
 
 
 class SimulatedSource:
@@ -72,7 +72,7 @@ class SimulatedSource:
         self.ages = recording_ages(self.steps, config.samples)
 
     def identity(self) -> dict[str, Any]:
-        """The system with its equations, and everything else on which motions depend."""
+        """Return the identity of the system with its equations, and everything else on which motions depend."""
         system = self.system
         noise = {"process_noise": float(system.process_noise), "scale": list(map(float, system.scale))}
         identity = describe(system) | noise
@@ -80,13 +80,13 @@ class SimulatedSource:
             identity["nominal_share"] = nominal_share(self.ranges)
         if self.policy:
             actions = self.policy(self.model.draw_starts(np.random.default_rng(0), 20))
-            identity["policy_actions"] = digest(np.round(actions, 6).tolist())  # the same on every machine
+            identity["policy_actions"] = digest(np.round(actions, 6).tolist())  # rounded, so that all machines agree
         return identity
 
     def facts(self) -> dict[str, Any]:
-        """Arguments of :class:`observers.Artifact` that describe the system."""
+        """Return the arguments of :class:`observers.Artifact` that describe the system."""
         system, output = self.model, dict[str, Any]()
-        with suppress(ValueError):  # tracking() raises the same error
+        with suppress(ValueError):  # tracking() reports this error
             output = output_facts(system)
         return {
             "system": self.name,
@@ -99,7 +99,7 @@ class SimulatedSource:
         }
 
     def sampling(self, linear: LinearFilter) -> dict[str, Any]:
-        """Arguments of :class:`training.maps.inverse.TrajectorySampler` that depend on the system."""
+        """Return arguments of :class:`training.maps.inverse.TrajectorySampler` that depend on the system."""
         return {
             "measurement_noise": self.model.measurement_noise,
             "process_noise_max": self.process_noise,
@@ -107,7 +107,7 @@ class SimulatedSource:
         }
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
-        """States of training motions and of a filter along them; inputs lead some starts of free motions out of X."""
+        """Return states of training motions and of a filter along them; without inputs, some start after a lead-in."""
         config, rng = self.config, generator(Stream.TRAINING, self.config.seed, *([1] if free else []))
         how: dict[str, Any] = {"kinds": DRIVEN if self.has_free_map else KINDS, "policy": self.policy}
         if free:
@@ -122,7 +122,7 @@ class SimulatedSource:
         return replace(pairs, x=pairs.x[..., : self.nx + len(self.estimated)], nominal=nominal)
 
     def runs(self, *, report: Report = lambda done: None) -> Runs:
-        """Motions without process noise and at the system's level; a third starts in 2X, the others in X."""
+        """Return motions, with process noise 0 or the system's; a third of them start in 2X, the others in X."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed), max(1, round(RUN * self.pace / self.dt))
         plant, n = with_parameters(self.model, self.ranges) if self.ranges else self.model, self.config.runs
         how: dict[str, Any] = SOUND | {"levels": (0.0, self.process_noise), "box_factor": BEYOND}
@@ -131,7 +131,7 @@ class SimulatedSource:
         return Runs(x[..., : self.nx], plant.output(x), u[..., : self.nu], noise, usual, sound=True)
 
     def equations(self) -> Equations:
-        """The system's equations as an expression, with as many Runge-Kutta steps as its motions need."""
+        """Return the system's equations as an expression, with as many Runge-Kutta steps as its motions need."""
         field = field_expression(self.model, inputs=bool(self.nu))
         if self.model.discrete:
             return Equations(field, 0)
@@ -152,7 +152,7 @@ class SimulatedSource:
         return equations
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
-        """Changes of the state over one sample, at states near motions."""
+        """Return changes of the state over one sampling interval, at states near motions."""
         rng = generator(Stream.CALIBRATION, self.config.seed, 5)
         along, u = self._states(300)
         rows = rng.integers(len(along), size=INCREMENTS)
@@ -168,11 +168,11 @@ class SimulatedSource:
         return Increments(*(each[held:] for each in both)), Increments(*(each[:held] for each in both))
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
-        """No errors, as ``kkl-gym evaluate`` measures them."""
+        """Return no errors: ``kkl-gym evaluate`` measures those of simulated systems."""
         return {}
 
     def tracking(self) -> dict[str, Any]:
-        """Arguments of :class:`observers.Motion`, except equations or flow; ValueError if it cannot track."""
+        """Return arguments of :class:`observers.Motion` but equations or flow; ValueError if tracking is impossible."""
         system = self.model
         if self.ranges:
             raise ValueError(f"a tracker needs the equations of one plant, not of a range of {', '.join(self.ranges)}")
@@ -198,12 +198,12 @@ class SimulatedSource:
 
     @functools.cached_property
     def _scale(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and standard deviation, (nx,) each, of the states along motions from X and 2X."""
+        """Return the mean and standard deviation, (nx,) each, of the states along motions from X and 2X."""
         along, _ = self._states(4)
         return along.mean(0), spread(along)
 
     def _states(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """States (n, nx) along short motions from X and 2X, and inputs (n, nu)."""
+        """Return states (n, nx) along short motions from X and 2X, and inputs (n, nu)."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed, 6), max(1, round(seconds * self.pace / self.dt))
         motions = Motions(self.model, self.dt, steps, KINDS, self.policy, box_factor=BEYOND).with_inputs(self.nu)
         x, u, *_ = motions.drawn(100, rng)
@@ -213,7 +213,7 @@ class SimulatedSource:
 
 
 def unknown_start(system: System) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (nx,) and covariance (nx, nx) of the starts of motions."""
+    """Return the mean (nx,) and covariance (nx, nx) of starts drawn in X."""
     low, high = system.box()
     if type(system).draw_starts is System.draw_starts:
         return (low + high) / 2, np.diag((high - low) ** 2 / 12)

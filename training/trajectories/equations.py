@@ -45,7 +45,7 @@ def describe(system: System) -> dict[str, Any]:
 
 
 def digest(values: Sequence[Any]) -> str:
-    """Hash of numbers in lists."""
+    """Return a hash of numbers in nested lists."""
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
 
 
@@ -56,7 +56,7 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobians at x without input: of f, or of the step, by x (nx, nx) and by u (nx, nu), and of h by x (ny, nx)."""
+    """Return Jacobians at x and u = 0: A (nx, nx) and B (nx, nu) of f + g u, or of the step, and C (ny, nx) of h."""
     low, high = system.box()
     nx, at, sizes = system.nx, np.array(x, dtype=float), high - low
 
@@ -74,7 +74,7 @@ def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, n
 
 
 def output_matrix(system: System) -> np.ndarray | None:
-    """C (ny, nx) if the output is h(x) = C x, else None."""
+    """Return C (ny, nx) if the output is h(x) = C x, else None."""
     x = system.draw_starts(np.random.default_rng(0), 100)
     with np.errstate(all="ignore"):  # ratios and logarithms may be undefined at 0 and 1
         C, y = system.output(np.eye(system.nx)).T, system.output(x)
@@ -82,7 +82,7 @@ def output_matrix(system: System) -> np.ndarray | None:
 
 
 def output_facts(system: System) -> dict[str, Any]:
-    """The artifact's argument for the output: C if h(x) = C x, else h as an expression; ValueError without both."""
+    """Return the artifact's argument for the output: C if h(x) = C x, else h as an expression (or raise ValueError)."""
     C = output_matrix(system)
     return {"h": output_expression(system)} if C is None else {"C": C}
 
@@ -130,7 +130,7 @@ def _expression(
             expected = evaluated(states, acting)
         rounding = EXPRESSION_ROUNDING * np.nanmax(np.abs(expected), axis=0)
         if not np.isclose(expression(states, acting), expected, rtol=1e-9, atol=rounding, equal_nan=True).all():
-            raise ValueError("it differs between symbols and arrays; write it with kkl_gym.elementary alone")
+            raise ValueError("its values for symbols and arrays differ; use only the functions of kkl_gym.elementary")
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"an observer of {system.name!r} cannot hold {what} as an expression: {error}") from error
     return expression

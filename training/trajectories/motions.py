@@ -29,15 +29,15 @@ INPUT_WEIGHT = 0.1  # a regulator's weight on inputs, relative to that on states
 POLICY_KINDS = ("steps", "sine")  # signals of a policy's errors and of its exploration
 POLICY_ERROR = (0.02, 0.5)  # range of errors in the states that a policy sees, in multiples of the system's scale
 EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in multiples of input bounds
-# One trajectory in so many follows the policy exactly; the others have errors and exploration. An exact policy's input
-# reveals the state, which an agent's input does not. Under the regulator on x_hat, at the default noise, the error of
-# cart-pole's angle is 3.4 % of X's half-width at the value 4, 3.2 % at 12, 3.1 % without any; an exact EKF has 2.7 %.
+# One trajectory in so many follows the policy exactly; the others have errors and exploration. The exact policy's input
+# reveals the state, but an agent's input does not. Under the regulator on x_hat, at the default noise, the error of
+# cart-pole's angle is 3.4 % of X's half-width with one in 4, 3.2 % with one in 12, 3.1 % without any; an EKF has 2.7 %.
 POLICYS_OWN = 12
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """States of motions and of a filter along them, at some ages (samples since its start), without measurement noise.
+    """States of motions and of a filter that runs along them without measurement noise, at ages since its start.
 
     Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
     """
@@ -51,7 +51,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Motions:
-    """How trajectories start, and which inputs and process noise act; ``levels`` of this noise replace random ones."""
+    """How trajectories start, and which inputs and process noise act on them, at ``levels`` or random levels."""
 
     system: System
     dt: float
@@ -67,7 +67,7 @@ class Motions:
     lead_in_input: float = 0.0
 
     def with_inputs(self, nu: int) -> "Motions":
-        """The same motions, or motions without input if an observer takes none."""
+        """Return the same motions if an observer takes inputs, else motions without inputs."""
         return self if nu else replace(self, kinds=(), policy=None)
 
     def beside(
@@ -90,7 +90,7 @@ class Motions:
         return _together(self.chunks(n, rng, report))
 
     def chunks(self, n: int, rng: np.random.Generator, report: Report = lambda done: None) -> Iterator[Chunk]:
-        """Simulate in chunks; trajectories that leave the system's bounds are replaced by new ones driven alike.
+        """Simulate in chunks; one with the same kind of input replaces a trajectory that leaves the system's bounds.
 
         Yields ``x`` (steps + 1, m, nx), ``u`` (steps, m, nu), the levels of process noise (m,), and a mask of the
         trajectories that start in X (m,), with m up to CHUNK.
@@ -133,7 +133,7 @@ class Motions:
         return np.asarray(self.system.process_noise * np.where(some, np.sqrt(rng.random(n)), 0.0))
 
     def _starts(self, rows: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Starts (n, nx), some in a larger box or led out of X by inputs, and a mask of those drawn in X."""
+        """Return starts (n, nx), some in a larger box or led out of X by inputs, and a mask of those drawn in X."""
         system, share = self.system, self.lead_in_share
         x0, near = system.draw_starts(rng, len(rows)), np.ones(len(rows), dtype=bool)
         if self.box_factor > 1:
@@ -156,9 +156,9 @@ def _together(chunks: Iterator[Chunk]) -> Chunk:
 
 
 def filter_states(linear: LinearFilter, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
-    """Filter states (m, n, size) at the distinct samples ``ages`` (m,), from a start at the first sample.
+    """Return the states (m, n, size), at distinct ages (m,) in samples, of a filter that starts at the first sample.
 
-    Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), each row held from the output of that row to the next.
+    Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), where u[k] is held from y[k] to y[k + 1].
     """
     z = linear.start(y[0])
     out, slots = np.empty((len(ages), *z.shape)), {int(age): i for i, age in enumerate(ages)}
@@ -223,8 +223,8 @@ def under_policy(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories under a policy with errors in the state that it sees and with exploration.
 
-    The exact policy's input would reveal the state to an observer, which filters that input. So each trajectory has its
-    own error in the state that the policy sees, and a signal added to its actions; those in the mask ``own`` have none.
+    The exact policy's input would reveal the state to an observer, which filters that input. So each trajectory has an
+    error in the state that the policy sees, and a signal added to its actions; those in the mask ``own`` have neither.
 
     Shapes: ``x0`` (n, nx), ``own`` (n,), ``w`` (steps, n, nx); returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
     """
@@ -248,14 +248,14 @@ def under_policy(
 
 
 def recording_ages(steps: int, n: int) -> np.ndarray:
-    """At most n ages, in samples, to record at: half evenly spaced, half logarithmically for the transient."""
-    late = max(2, n - n // 2)  # at least the first and the last age
+    """Return at most n ages, in samples, at which to record: half spaced evenly, half logarithmically (transients)."""
+    late = max(2, n - n // 2)  # number of evenly spaced ages, among them the first and the last
     ages = np.concatenate([np.geomspace(1, steps, n - late), np.linspace(0, steps, late)])
     return np.unique(ages.round()).astype(int)
 
 
 def linear_quadratic(system: System) -> Controller:
-    """Saturated linear-quadratic regulator at the target; its weights are 1/scale^2 and INPUT_WEIGHT/u_max^2."""
+    """Return a saturated LQ regulator at the target, with weights 1/scale^2 (Q) and INPUT_WEIGHT/u_max^2 (R)."""
     target, u_max = np.array(system.target), np.array(system.u_max)
     A, B, _ = linearised(system, system.target)
     Q, R = np.diag(1.0 / np.square(system.scale)), np.diag(INPUT_WEIGHT / u_max**2)
@@ -268,7 +268,7 @@ def linear_quadratic(system: System) -> Controller:
 
 
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:
-    """Return a policy that checks the shape of its actions; ValueError if those on some states are invalid."""
+    """Return a policy that checks the shape of its actions; ValueError if its actions at drawn states are invalid."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs, so that the policy {name!r} cannot act")
 

@@ -11,18 +11,18 @@ from observers.checks import shown
 from training.trajectories.motions import Controller
 
 # Share of the training motions with the system's own value of an uncertain parameter. With several parameters it is
-# raised to their number, as it is less likely that all have these values. Chosen on the four systems that ship: at
-# 0.6 and a width of 256, Lorenz's map no longer distinguished its own plant from the others.
+# raised to their number, as it is less likely that all have these values. It was chosen on the four systems that ship:
+# with 0.6 and a width of 256, Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
-STILL = 1e-12  # scale of a parameter's process noise, in place of 0
+STILL = 1e-12  # scale of an additional state: hardly any process noise acts on it, and 0 would be invalid
 EVERY = "all"  # stands for every parameter that is not named
-ROOM = 1e6  # bounds of a parameter, in widths of its range from the middle
+ROOM = 1e6  # distance of a parameter's bounds from the middle of its range, in widths of the range
 
 Ranges = Mapping[str, tuple[float, float]]
 
 
 def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Ranges around the values of a system's parameters, with half-widths relative to these values."""
+    """Return ranges around the values of a system's parameters, with half-widths relative to these values."""
     known = system.parameters
     if half_widths and not known:
         raise ValueError(f"{system.name} has no parameters that could be uncertain")
@@ -41,12 +41,12 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
 
 
 def nominal_share(ranges: Ranges) -> float:
-    """Share of the training motions that have the system's own parameters."""
+    """Return the share of the training motions that have the system's own parameters."""
     return NOMINAL_SHARE ** len(ranges)
 
 
 def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False) -> System:
-    """A system whose states are x, followed by some of its parameters with derivative zero.
+    """Return a system whose states are x, followed by some of its parameters with derivative zero.
 
     An observer of such a system estimates parameters; each motion has its own values. In training, a share of the
     motions has the system's own parameters, which are the likeliest; the parameters of the others lie more often near
@@ -68,10 +68,10 @@ def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False
 
 
 def with_bias(system: System, half_widths: float | Sequence[float]) -> System:
-    """A system whose states are x, followed by a constant bias, up to its half-width, of each output that has one."""
+    """Return a system whose states are x, followed by the constant biases of outputs with a positive half-width."""
     given = np.atleast_1d(np.asarray(half_widths, dtype=float))
     if len(given) not in (1, system.ny):
-        raise ValueError(f"bias must be one number, or one of each of {system.ny} outputs, got {half_widths}")
+        raise ValueError(f"bias must be one number, or one for each of {system.ny} outputs, got {half_widths}")
     widths = np.broadcast_to(given, (system.ny,)).tolist()
     biased = [i for i, width in enumerate(widths) if width]
     ranges = {f"y{i + 1}_bias": (-widths[i], widths[i]) for i in biased}
@@ -96,7 +96,7 @@ def _with_constants(
     *,
     in_training: bool = False,
 ) -> System:
-    """A system with additional constant states, the equations of ``model(x)`` and the outputs ``outputs(x)``."""
+    """Return a system with additional constant states, the equations of ``model(x)`` and outputs ``outputs(x)``."""
     nx, limits = system.nx, [(float(low), float(high)) for low, high in ranges.values()]
     low, high = np.transpose(limits)
     middle, room = (low + high) / 2, ROOM * (high - low)
@@ -120,7 +120,7 @@ def _with_constants(
             x = super().draw_starts(rng, n)  # the factor does not widen the ranges of parameters
             x[:, :nx] = system.draw_starts(rng, n, factor)
             if in_training:
-                along = (2 * x[:, nx:] - low - high) / (high - low)  # -1 to 1
+                along = (2 * x[:, nx:] - low - high) / (high - low)  # from -1 to 1
                 x[:, nx:] = (low + high + np.sin(along * np.pi / 2) * (high - low)) / 2
                 x[rng.random(n) < nominal_share(ranges), nx:] = [*own.values()]
             return x
@@ -154,5 +154,5 @@ def _with_constants(
 
 
 def blind(policy: Controller, nx: int) -> Controller:
-    """A policy for a system with additional states that sees only the first nx states."""
+    """Return the policy for a system with additional states, of which it sees only the first nx."""
     return lambda x: policy(x[:, :nx])

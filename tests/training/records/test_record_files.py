@@ -95,7 +95,7 @@ BAD_CSV = {
     "no rows": ([], "column time has no rows"),
     "a bad date": (["2024-05-01,1,2,a", "noon,2,2,a"], "column time, row 2: 'noon' is not a date in ISO 8601"),
     "a date is missing": (["2024-05-01,1,2,a", ",2,2,a"], "column time, row 2: a number is missing"),
-    "one row": (["0,1,2,a"], "t must be two samples at least"),
+    "one row": (["0,1,2,a"], "t must hold at least two samples"),
     "rounding moves": ([f"{k},0.1,2,a" for k in range(99)], "column theta: 0.1 in all rows"),
     "decimal comma": (['0,"1",2,a', '1,"2,5",2,a'], "theta, row 2: '2,5' is not a number; write decimals with a point"),
     "hidden never moves": (["0,3,2,a", "1,4,2,a"], r"column cos\(alpha\): -0.416147 in all rows"),
@@ -192,7 +192,7 @@ def test_records_of_a_systems_signals(tmp_path):
     system, two = Oscillator(), np.stack([Y, Y], -1)
     with pytest.warns(UserWarning, match=r"b.npz: no column of inputs; they are assumed to be zero"):
         read_records([npz(tmp_path / "b.npz")], system=system)
-    with pytest.raises(ValueError, match=r"has 1 measured, but the columns are y1, y2; name others by --measured"):
+    with pytest.raises(ValueError, match=r"the measured columns are y1, y2, but \w+ has 1; name others by --measured"):
         read_records([npz(tmp_path / "b.npz", y=two)], system=system)
 
 

@@ -55,7 +55,7 @@ def test_a_start_that_is_known(path):
 
 def test_a_refit_without_enough_held_out_is_left_out(path):
     model = agent(path, 1, 220)
-    with pytest.warns(UserWarning, match="the observer in use stays: too little is held out"):
+    with pytest.warns(UserWarning, match="the observer in use stays: too few steps are held out"):
         model.learn(440, KKLTrainingCallback(220))
 
 

@@ -39,7 +39,7 @@ def tracking(tmp_path_factory):
     """An observer that tracks, as read from a file."""
     path = tmp_path_factory.mktemp("spring") / "spring.safetensors"
     result, said = trained([both(seed) for seed in range(10)], measurement_noise_max=2 * NOISE)
-    assert "the tracker moves by a learned flow: records have no equations" in said
+    assert "the tracker predicts by a learned flow: records have no equations" in said
     assert "does not track" not in said
     assert list(result.losses) == ["inverse", "flow"]
     result.artifact.save(path)
@@ -136,7 +136,7 @@ def test_estimates_do_not_hang_on_an_arbitrary_zero():
     here, there = (KKLObserver(result.artifact).estimate(new.y + offset, new.u) for offset in (0.0, 100.0))
     np.testing.assert_allclose(here, there, atol=1e-3 * new.x.std())
     assert here[-1] != pytest.approx(here[-50])  # it does move
-    with pytest.raises(ValueError, match=r"arbitrary_zero names 'angle'; measured are position"):
+    with pytest.raises(ValueError, match=r"arbitrary_zero names 'angle', but measured are position"):
         trained(records, arbitrary_zero=("angle",))
 
 
