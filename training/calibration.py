@@ -42,7 +42,7 @@ def calibrate(
 
     The observer runs from a reset along motions that no training used, at several levels of measurement noise. Its
     errors determine two tables by noise level and time since reset: the covariance of T_inv's error, and a factor on
-    the tracker's covariance. Its residuals y - h(x_hat) determine the monitor's limits, rarely exceeded without faults.
+    the tracker's covariance. Its residuals y - h(x_hat) determine the limits beyond which the monitor assumes a fault.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def rare(extremes: np.ndarray, share: float) -> np.ndarray:
     """Estimate the values (ny,) that ``extremes`` (n, ny) of motions exceed with probability ``share``.
 
     A Gumbel distribution is fitted to the logarithms by the median and the 90 % quantile, which a few huge extremes do
-    not change. The values are at most ten times the largest extreme, as the fit may exceed it far if y rarely moves.
+    not change. The values are at most ten times the largest extreme: if y rarely moves, the fit may lie far above it.
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
     middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)

@@ -106,7 +106,7 @@ def main(
 
 @contextmanager
 def _noticing_interruptions() -> Iterator[list[int]]:
-    """Yield a list that stays empty until the first interruption, and raise KeyboardInterrupt in the main thread."""
+    """Yield a list that stays empty until the first interruption, which also raises KeyboardInterrupt."""
     noticed: list[int] = []
 
     def handler(number: int, frame: object) -> None:
@@ -114,7 +114,7 @@ def _noticing_interruptions() -> Iterator[list[int]]:
         raise KeyboardInterrupt
 
     def unraisable(failed: "sys.UnraisableHookArgs") -> None:
-        if isinstance(failed.exc_value, KeyboardInterrupt):  # Python has dropped it in a callback: repeat it
+        if isinstance(failed.exc_value, KeyboardInterrupt):  # an interruption in a callback is lost: repeat it
             threading.Timer(0.05, _thread.interrupt_main).start()
         else:
             hook(failed)
@@ -139,7 +139,8 @@ def read(arguments: list[str], *, prog: str = PROG, commands: Commands = COMMAND
     if called and called[0] not in commands and not called[0].startswith("-"):
         from observers.names import suggestion  # imports numpy, which --help need not wait for
 
-        _end(prog, f"unknown command {called[0]!r}{suggestion(called[0], commands)}: {', '.join(commands)}", MISUSED)
+        close = suggestion(called[0], commands)
+        _end(prog, f"unknown command {called[0]!r}{close}; there are {', '.join(commands)}", MISUSED)
     if called and called[0].startswith("--tyro"):  # shell completion needs all commands
         called = list(commands)
     classes = {name: (load if name in called else _described)(*behind) for name, behind in commands.items()}

@@ -93,18 +93,18 @@ class Config:
     """A policy for plants that random inputs drive out of their bounds (input-aware): "controller" for the system's own
     controller (by default a linear-quadratic regulator at the target), or a function from states (n, nx) to actions
     (n, nu) in [-1, 1], as script.py:function or module:function. It sees states with errors and explores, except in one
-    trajectory in twelve. No motions without inputs are simulated then."""
+    trajectory in twelve. With a policy, no motions without inputs are simulated."""
     free_inverse: bool = True
     """Whether an input-aware map has a second inverse of z_y alone, used until an input acts; never with a policy."""
     lead_in_input: NotNegative = 0.0
     """Before some trajectories without inputs, inputs lead the start out of X: constant inputs, up to this multiple of
     their bounds, for 20 times the system's pace; with 0, random inputs within their bounds for 10 times the pace."""
     process_noise_share: Share = 0.35
-    """Share of the trajectories that have process noise (input-aware); with 0, T_inv does not take its level."""
+    """Share of trajectories with process noise (input-aware); with 0, the noise level is not an input of T_inv."""
     measurement_noise_max: Levels = 1.0
     """Largest standard deviation of the measurement noise in training, one for all outputs or one for each."""
     noise_free_share: Share = 0.2
-    """Share of the samples without measurement noise, for maps that take the noise level."""
+    """Share of the samples without measurement noise, for maps that have the noise level as an input."""
     high_noise_emphasis: Positive = 2.0
     """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
     measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
@@ -124,14 +124,14 @@ class Config:
     runs: Annotated[int, Field(ge=100)] = 400
     """Number of simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability that a fault-free motion as long as those of calibration (for a system 20 paces) raises an alarm."""
+    """Probability that a fault-free motion as long as in calibration (a system's 20 paces) raises an alarm."""
     truncation: Positive = 1e-6
-    """The forward map's data begins once at most epsilon of the filter's start is left (spinn; paper, sec. 5.2)."""
+    """epsilon: the forward map's data begins when this share of the filter's start is left (spinn; paper, sec. 5.2)."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name, with their largest relative
     deviations; "all" stands for each that is not named. Some motions keep the system's own values."""
     bias: Biases = 0.0
-    """Largest constant bias of all outputs, or of each; T_inv estimates it (input-aware, no uncertain parameters)."""
+    """Largest constant bias of all outputs, or of each; T_inv estimates biases (input-aware, without ``uncertain``)."""
     estimate_parameters: bool = False
     """Whether T_inv estimates the uncertain parameters, too."""
     cpu_seconds: Positive | None = None

@@ -23,9 +23,9 @@ CYCLES: dict[Theme, tuple[str, ...]] = {
     "light": ("#0072b2", "#e69f00", "#009e73", "#c2187a", "#56b4e9", "#7a4a1e", "#1a1a1a", "#9a9a9a"),
     "dark": ("#4aa3df", "#f0a83c", "#2fbf93", "#ff6db8", "#a6dcff", "#b98a5a", "#eceae4", "#8a909c"),
 }
-GROUNDS: dict[Theme, str] = {"light": "#ffffff", "dark": "#1e2129"}  # the backgrounds of the site
-RULES: dict[Theme, str] = {"light": "#e4e4e4", "dark": "#363b47"}
-ALIKE: dict[str, Any] = {
+GROUNDS: dict[Theme, str] = {"light": "#ffffff", "dark": "#1e2129"}  # backgrounds, those of the site
+RULES: dict[Theme, str] = {"light": "#e4e4e4", "dark": "#363b47"}  # grid lines and frames of legends
+ALIKE: dict[str, Any] = {  # settings of both themes
     "axes.axisbelow": True,
     "axes.grid": True,
     "axes.spines.right": False,
@@ -80,7 +80,7 @@ def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
 
 
 def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
-    """Write a looping GIF, whole or not at all; parts that do not move take no space, as frames share one palette."""
+    """Write a looping GIF, whole or not at all; its frames share one palette, so that unchanged parts take no space."""
     from matplotlib.colors import to_rgb
     from PIL import Image
 

@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a run's folder and write its configuration; ValueError if checkpoints there cannot be resumed by the run."""
+    """Lock a run's folder and write its configuration; ValueError if checkpoints there must not be resumed."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)
@@ -107,4 +107,4 @@ def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
         raise ValueError(f"{path} is damaged; remove it if nothing in its folder is worth keeping: {error}") from None
     if changed:
         differences = "; ".join(f"{name} = {there.get(name)} there, {here.get(name)} here" for name in changed)
-        raise ValueError(f"{path.parent} holds {what}: {differences}. Take another --out, or remove it")
+        raise ValueError(f"{path.parent} holds {what}: {differences}. Take another --out, or remove the folder")

@@ -18,7 +18,7 @@ NOISE_FLOOR = 0.002  # least measurement noise that a filter assumes, in multipl
 
 
 def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
-    """Return the covariance (ny, ny) of the measurement noise that a filter assumes, which ``NOISE_FLOOR`` bounds."""
+    """Return the covariance (ny, ny) of the measurement noise that a filter assumes, at least ``NOISE_FLOOR``."""
     least = NOISE_FLOOR * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)

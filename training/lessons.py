@@ -64,7 +64,7 @@ def train(
 ) -> Result:
     """Learn an observer: a filter, T_inv, a tracker's motion model, covariances and the limits of a monitor.
 
-    The lessons, in order, are the map (:func:`training.learn_map`), the motion, and the calibration
+    The lessons, in order, are the map (:func:`training.learn_map`), the motion model, and the calibration
     (:func:`training.calibrate`). The motion model consists of the system's equations, or of a learned flow if the
     equations are unknown or an artifact cannot hold them (:func:`training.learn_flow`). Each network has checkpoints.
 
@@ -132,7 +132,7 @@ def train(
 
 
 def _motion(source: Source, run: Run) -> Motion | None:
-    """Return the tracker's motion model, with the source's equations or else a flow; None if it cannot track."""
+    """Return the tracker's motion model, by the source's equations or else a flow; None if tracking is impossible."""
     try:
         parts = source.tracking()
     except ValueError as reason:
@@ -159,7 +159,7 @@ class Maps:
 def learn_map(source: Source, run: Run) -> Maps:
     """Learn T_inv along motions of a source, transients and all noise levels included.
 
-    For a system with inputs these are two maps: one for driven motion, and one without u, used until an input acts. The
+    A simulated system with inputs has two maps: one for driven motion, and one without u, used until an input acts. The
     pipeline "spinn" follows the paper: it learns T from motions and T's equation, and then T_inv from z = T(x).
 
     Parameters
@@ -204,7 +204,7 @@ def _papers_maps(source: Source, linear: LinearFilter, run: Run) -> Maps:
         raise ValueError("the pipeline 'spinn' needs the equations of a system; train with 'input-aware'")
     check_continuous(source.system)
     config, system, ages, progress = run.config, source.system, source.ages, run.progress
-    settled = ages >= truncation_step(  # from here on the filter's start no longer matters
+    settled = ages >= truncation_step(  # mask of the ages at which the filter's start no longer matters
         system, linear, steps=source.steps, epsilon=config.truncation, box_factor=config.box_factor
     )
     pairs, rng = _pairs(source, linear, run), generator(Stream.TRAINING, config.seed, 3)
@@ -218,7 +218,7 @@ def _papers_maps(source: Source, linear: LinearFilter, run: Run) -> Maps:
         with run.timed("forward"), progress.phase("solving for T's output layer", linear.size) as report:
             problem.solve_output_layer(rng, report)
     T = problem.forward_map()
-    with progress.phase("T along the motions"):
+    with progress.phase("evaluating T along the motions"):
         z = transients(np.stack([T(each) for each in pairs.x]), pairs.z[0], linear=linear, ages=ages)
     error = (pairs.z - z)[settled].reshape(-1, linear.size)
     covariance = error.T @ error / len(error)
@@ -231,7 +231,7 @@ def _papers_maps(source: Source, linear: LinearFilter, run: Run) -> Maps:
 
 
 def _pairs(source: Source, linear: LinearFilter, run: Run, free: bool = False) -> Pairs:
-    name = f"motions of {source.name}{', free' if free else ''}"
+    name = f"motions of {source.name}{' without inputs' if free else ''}"
     with run.timed("motions"), run.progress.phase(name, run.config.trajectories) as report:
         return source.pairs(linear, free=free, report=report)
 
@@ -280,7 +280,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
     parts = {"x_offset": learned.x.mean(0), "x_scale": spread(learned.x)} | parts
-    offset, scale = parts["x_offset"], parts["x_scale"]  # from the source, if it gives process noise in such units
+    offset, scale = parts["x_offset"], parts["x_scale"]  # the source's scale, if any, is its process noise's unit
     u_scale = np.abs(learned.u).max(0, initial=0.0)
     u_scale = np.where(u_scale > 0, u_scale, 1.0)
     inputs = np.column_stack([(learned.x - offset) / scale, learned.u / u_scale])

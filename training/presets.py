@@ -50,8 +50,8 @@ class Profile:
 def homogeneous(system: System) -> Controller:
     """Return the feedback u = b x1 - 2 (x2 + cbrt(a x1)), saturated, for the system x1' = a x2^3, x2' = -b x1 + u.
 
-    No linear feedback will do, as the linearisation at the origin cannot be stabilised. This one cancels -b x1 and
-    makes x2 follow -cbrt(a x1), for which x1' = -a^2 x1.
+    There is no linear-quadratic regulator, as the linearisation at the origin cannot be stabilised. This feedback
+    cancels -b x1 and makes x2 follow -cbrt(a x1), for which x1' = -a^2 x1.
     """
     (u_max,) = system.u_max
     a, b = (system.parameters[name] for name in ("a", "b"))
@@ -99,8 +99,8 @@ PROFILES: dict[str, Profile] = {
     ),
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
-        # Under noise, real modes hardly distinguish the three parameters, but slow pairs at frequencies of y do: on
-        # plants 10 % off, two pairs reduce the best decoder's error from 2.3 to 1.9 %. Longer training gains 3 % more.
+        # Under noise, real modes hardly distinguish the three parameters, but slow pairs at frequencies of y do: two
+        # pairs reduce the best decoder's error from 2.3 to 1.9 % (parameters 10 % off); longer training gains 3 % more.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
@@ -121,7 +121,7 @@ PROFILES: dict[str, Profile] = {
 
 
 def profile(system: System) -> Profile:
-    """Return the profile of a system, by default without any choices of its own."""
+    """Return the system's entry in ``PROFILES``, or else the default profile."""
     return PROFILES.get(system.name, Profile())
 
 
@@ -191,7 +191,7 @@ def preset(
     given = {key: value for key, value in (changes or {}).items() if value is not None}
     own, paper, uncertain = profile(system), name == "paper", given.get("uncertain")
     usual = zip(np.broadcast_to(system.measurement_noise, system.ny).tolist(), system.output_range, strict=True)
-    largest = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]  # declared noise may be 0
+    largest = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]  # the system's noise may be 0
     chosen: dict[str, Any] = {
         "dt": system.dt,
         "duration": system.duration,

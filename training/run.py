@@ -220,7 +220,7 @@ def restoring(path: Path) -> Iterator[None]:
     """Turn errors in restoring a checkpoint into a ValueError that names the file."""
     try:
         yield
-    except Exception as error:  # pickle, zip and torch raise many kinds
+    except Exception as error:  # pickle, zip and torch raise many kinds of errors
         line = (str(error) if not isinstance(error, KeyError) else f"it lacks {error}").partition("\n")[0]
         raise ValueError(
             f"the checkpoint {path} is damaged or of another version; remove it to train that stage again: {line}"

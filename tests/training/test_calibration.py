@@ -180,7 +180,7 @@ def test_a_system_is_a_source_too_if_the_observer_says_how_it_was_trained():
         calibrate(dataclasses.replace(artifact, training={}), Slow())
     with pytest.raises(ValueError, match=r"false_alarms must lie between 0 and 1, got 0\.0"):
         calibrate(artifact, Slow(), false_alarms=0.0)
-    with pytest.raises(ValueError, match=r"source of \(2, 1, 1\) states, .* does not fit .* \(2, 1, 0\)"):
+    with pytest.raises(ValueError, match=r"source has .* = \(2, 1, 1\), but the observer has \(2, 1, 0\)"):
         calibrate(artifact, SimulatedSource(Slow(), settings_of(plain_observer().training)))
     with pytest.raises(ArtifactError, match="system"):
         calibrate(artifact, type("Steep", (Slow,), {"name": "steep"})())

@@ -35,7 +35,7 @@ class Coordinates:
 
 
 def coordinates(z: np.ndarray, noise: np.ndarray, silent: np.ndarray | None = None) -> Coordinates:
-    """Find coordinates from ``z`` (n, size) and the covariance ``noise``, without directions ``silent`` (size, k)."""
+    """Find coordinates for ``z`` (n, size) and noise of covariance ``noise`` that ignore directions ``silent``."""
     if silent is not None and silent.size:
         projection = np.eye(len(silent)) - silent @ np.linalg.pinv(silent)
         rest = coordinates(z @ projection.T, projection @ noise @ projection.T)
@@ -60,7 +60,7 @@ def settling_time(linear: LinearFilter) -> float:
 
 
 def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
-    """Return covariances (ages, ny, size, size) of z's error, by age in samples, under unit white noise on y_i."""
+    """Return covariances (ages, ny, size, size) of z's error by age (samples), for unit white noise on each output."""
     phi, (early, late, equilibrium) = linear.transition, _columns(linear)
     # For noise v_k, z_k = s_k + late v_k with s_1 = after_first v_0 and s_(k+1) = phi s_k + drive v_k.
     drive, after_first = phi @ late + early, phi @ equilibrium + early

@@ -26,7 +26,7 @@ def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -
 
 
 def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return a network's values at x and derivatives along f, without forward mode, which torch.compile lacks."""
+    """Return a network's values at x and derivatives along f, by hand, as torch.compile lacks forward-mode autodiff."""
     for layer in network:
         if isinstance(layer, nn.Linear):
             x, f = layer(x), f @ layer.weight.T
@@ -102,8 +102,8 @@ class ForwardProblem(nn.Module):
         """Minimise the risk over the output layer, given the features phi that the other layers have learned.
 
         In the coordinates of A's eigenvectors, dT/dx f = A T + B h is one linear equation for each component of T: with
-        T_i = w . phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point. Pairs add
-        T_i = z_i. A QR factorisation with a small ridge solves the least squares in float64, on more samples than a
+        T_i = w . phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point. Each pair adds
+        w . phi = z_i. A QR factorisation with a small ridge solves the least squares in float64, on more samples than a
         batch has.
         """
         *hidden, last = self.network.to(device="cpu", dtype=torch.float64)

@@ -56,8 +56,8 @@ class Sampler(Protocol):
 class TrajectorySampler(Sampler):
     """Draws batches along trajectories, at all ages since reset and noise levels up to ``measurement_noise_max``.
 
-    Noise is added to noise-free z; its covariance is that of the filter's response to measurement noise at each age. A
-    network that fits such data in the mean square approximates the conditional mean of x.
+    Noise is added to noise-free z, with the covariance of the filter's response to measurement noise at each age. A
+    network that fits these data in the mean square approximates the conditional mean of x.
 
     The least possible errors differ by orders of magnitude between ages and noise levels. Samples therefore fall into
     ``cells`` of similar age and noise, and the loss divides a sample's square error by the recent mean of its cell.
@@ -169,7 +169,7 @@ class TrajectorySampler(Sampler):
         )
 
     def _draw_levels(self, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw noise levels over two decades; return positions in them, 0 to 1, and levels (ages, ny, rows)."""
+        """Draw noise levels (ages, ny, rows) over two decades; return their positions there, 0 to 1, and the levels."""
         shape = (self.AGES_PER_BATCH, len(self._level_max), self._per_age)
         quiet = self._config.noise_free_share
         position = (torch.rand(shape, generator=generator, device=generator.device) - quiet) / (1 - quiet)
@@ -246,12 +246,12 @@ class InverseProblem(nn.Module):
     def risk(
         self, inputs: torch.Tensor, x: torch.Tensor, weight: torch.Tensor, cell: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the mean of square errors, each over its cell's running one, and the cells' geometric mean error."""
+        """Return the loss (square errors divided by their cells' running means) and the cells' geometric mean error."""
         apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
         square = weight * apart[:, :nx].mean(-1)
         if self.sampler.parameters:  # in separate cells, as parameters can be hard to estimate where states are not
             square = torch.cat([square, apart[:, nx:].mean(-1)])
-            # All plants share these cells; otherwise the map would return the system's own parameters for near plants.
+            # All plants share these cells; otherwise the map would return the system's own parameters for similar ones.
             cell = torch.cat([cell, self.sampler.cells + cell // self.sampler.kinds_of_plant])
         detached = square.detach()
         count = torch.zeros_like(self.error).index_add_(0, cell, torch.ones_like(detached))

@@ -49,7 +49,7 @@ class Network(nn.Sequential):
 
 
 def averaged(members: Sequence[MLP]) -> MLP:
-    """Return the mean of networks of one shape as one network, whose hidden layers hold theirs side by side."""
+    """Return the mean of networks of one shape as one network, with all their hidden neurons side by side."""
     first, *hidden, last = zip(*(member.weights for member in members), strict=True)
     *biases, offsets = zip(*(member.biases for member in members), strict=True)
     return MLP(

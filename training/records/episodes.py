@@ -160,7 +160,7 @@ def write_dataset(rollouts: Rollouts, *, policy: str) -> Path:
 
 
 def dataset_folder(name: str) -> Path:
-    """Return the folder for a new data set; raise an error if its name is invalid or taken, or it is not writable."""
+    """Return a new data set's folder; raise an error if the name is invalid or taken, or the folder is unwritable."""
     try:
         _minari().dataset.minari_dataset.parse_dataset_id(name)
     except (TypeError, ValueError):

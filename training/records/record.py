@@ -12,7 +12,7 @@ from scipy.interpolate import PchipInterpolator
 from observers import LinearFilter
 from observers.checks import real_array
 
-ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # fields of Record; fields of Signals that name their columns
+ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # field of Record: field of Signals that names its columns
 MAX_SAMPLE = 1e100  # largest valid sample, so that sums of squares stay finite
 LONGEST_GAP = 3.0  # longest gap, in steps, in which samples are interpolated
 ROUNDING = 1e-6  # tolerance of times, in steps
@@ -20,7 +20,7 @@ ROUNDING = 1e-6  # tolerance of times, in steps
 
 @dataclass(frozen=True)
 class Signals:
-    """The names of a record's columns by role; an empty role stands for the usual names.
+    """The names of a record's columns by role; an empty role stands for the usual names, such as y1, y2.
 
     A measured, input or hidden signal is the name of a column, or ``cos(column)`` or ``sin(column)`` of an angle in
     rad.
@@ -203,12 +203,12 @@ class Windows:
         self.u, self.x = np.concatenate([np.zeros((0, nu)), *u]), np.concatenate([np.zeros((0, nx)), *x])
 
     def rows(self, age: int = 0) -> np.ndarray:
-        """Indices of samples with a known state and at least ``age`` samples before them."""
+        """Return the indices of samples with a known state and at least ``age`` samples before them."""
         return np.flatnonzero((self.before >= age) & ~np.isnan(self.x).any(-1))
 
     @cached_property
     def z(self) -> np.ndarray:
-        """States of a filter that starts with each piece."""
+        """States of a filter that starts at the first sample of each piece."""
         z, first, linear = np.zeros((len(self.y), self.linear.size)), np.flatnonzero(self.before == 0), self.linear
         z[first] = linear.start(self.y[first])
         for k in range(1, self.before.max(initial=0) + 1):

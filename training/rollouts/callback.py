@@ -42,7 +42,7 @@ class Refit:
 
     def __str__(self) -> str:
         """Format the errors on one line."""
-        errors = f"error {self.error:.3g} after {self.before:.3g}" if self.taken else f"error still {self.error:.3g}"
+        errors = f"error {self.error:.3g}, before {self.before:.3g}" if self.taken else f"error still {self.error:.3g}"
         return f"refitted the observer at step {self.steps}: {errors}"
 
 
@@ -51,7 +51,7 @@ class KKLTrainingCallback(BaseCallback):
 
     An observer is accurate where its rollouts have been, but an agent in training goes elsewhere. A refit learns T_inv,
     the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
-    replaces the old one unless the new one's error on that share is larger. Filters and their states stay. A refit
+    replaces the old one unless the new one's error on that share is larger. Filters keep their states. A refit
     takes place only when an algorithm begins to collect a rollout, so that no on-policy batch mixes two observers, and
     only after an episode was as long as the filter's settling time.
 
@@ -251,7 +251,7 @@ def _rms(errors: Mapping[str, float]) -> float:
 
 @dataclass
 class _Piece:
-    """Samples of one environment since its reset, or since it was cut."""
+    """Samples of one environment since a reset, or since its episode was cut."""
 
     name: str
     held_out: bool
@@ -271,7 +271,7 @@ class Gathering:
         self._signals = Signals("t", *(tuple(names[role]) for role in ROLES.values()))
         self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
         self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
-        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; unfinished, by environment
+        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; open ones by environment
         self._made = self.steps = 0
         check_dt(before, self._dt)
         for record in before:

@@ -31,9 +31,9 @@ WINDOW = 10  # least number of samples over which a tracker averages innovations
 # with products of states reduces it below SQUARES times itself.
 UNEXPLAINED, SQUARES = 0.7, 0.8
 LITTLE = 0.1  # a smaller residual, over the output's standard deviation, always counts as noise
-ROUNDING, OUTLIER = 1e-6, 6.0  # limit of a rounding error, over an output's size, and of a residual, over its deviation
+ROUNDING, OUTLIER = 1e-6, 6.0  # largest rounding error, over an output's size; least outlier, in standard deviations
 LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
-MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: number of modes of each output, rates over the signals' rate
+MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: number of modes of each output, their rates over the signals'
 RECORD_MEMORIES = 3.0  # least length of a record in settling times, unless that needs modes faster than the signals
 # For rollouts, whose hidden signals an agent needs within a few steps: number of modes of each output, and their rates
 # per step. A few modes that lie far apart forget the start soon, and distinguish single steps.
@@ -142,8 +142,8 @@ class RecordedSource:
         first = first[windows.after[first] > 0]
         if len(first) < FEWEST:
             raise TooFewRunsError(
-                f"the held-out records have {len(first)} samples with states to begin at, too few to calibrate on "
-                f"({FEWEST}): record more, or hold more out (--set held_out=0.3)"
+                f"the held-out records have {len(first)} samples at which a motion for calibration may begin, fewer "
+                f"than {FEWEST}: record more, or hold more out (--set held_out=0.3)"
             )
         longest = int(windows.after[first].max())
         steps = max(2, min(round(STRETCH_MEMORIES * settling_time(self.linear) / self.dt), longest))
@@ -280,7 +280,7 @@ def evenly(rows: np.ndarray, n: int) -> np.ndarray:
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:
-    """Split records into training and held-out ones: by whole records that the seed draws, or by their ends if few."""
+    """Return kept and held-out records: the seed draws whole ones to hold out, or if they are few, all ends are."""
     if not share:
         return list(records), []
     if len(records) >= FEW:
@@ -317,7 +317,7 @@ def recorded_errors(
     *,
     measurement_noise: float | tuple[float, ...] = 0.0,
 ) -> dict[str, float]:
-    """Return hidden signals' errors (rms over standard deviation, or NaN) from ``after`` or the settling time on."""
+    """Return errors of hidden signals (rms over standard deviation, or NaN) after ``after`` s or the settling time."""
     first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
     pairs, rng = [np.zeros((0, 2, artifact.nx))], np.random.default_rng(0)
     for record in pieces(records):
@@ -335,7 +335,7 @@ def recorded_errors(
 
 
 def linear_output(records: Sequence[Record], known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Fit C (ny, nx) of y = C x unless it is known; return C and the residual's standard deviations (ny,)."""
+    """Fit C (ny, nx) of y = C x unless it is known; return C and the noise levels (ny,) that the residual suggests."""
     y, x = (np.concatenate([getattr(record, name) for record in records if record.x is not None]) for name in "yx")
     both = np.isfinite(np.column_stack([x, y])).all(-1)
     if not both.any():

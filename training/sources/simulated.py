@@ -19,12 +19,12 @@ from training.trajectories.equations import describe, digest, field_expression, 
 from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
-LEAD_IN_SHARE = 0.4  # share of the motions without inputs whose starts come from a lead-in by inputs
+LEAD_IN_SHARE = 0.4  # share of the motions without inputs before which inputs have led the start out of X
 BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and some of a flow's training motions
 # In calibration, inputs drive every other run; a policy acts on exact states, without exploration, in every other run.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
-LEAST_PROCESS_NOISE = 0.005  # least level that a tracker assumes, in states' scales per pace: a tenth of the default
+LEAST_PROCESS_NOISE = 0.005  # least level that a tracker assumes, in ``scale`` per pace: a tenth of the default
 WINDOW, RUN = 0.5, 20.0  # lengths of a tracker's window and of a calibration run, in units of the pace
 SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
 INTEGRATION_ERROR = 2e-5  # largest error of these steps in standard deviations of the states, well below the noise
@@ -107,7 +107,7 @@ class SimulatedSource:
         }
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
-        """Return states of training motions and of a filter along them; without inputs, some start after a lead-in."""
+        """Return states of motions and of a filter along them; inputs first lead some ``free`` motions out of X."""
         config, rng = self.config, generator(Stream.TRAINING, self.config.seed, *([1] if free else []))
         how: dict[str, Any] = {"kinds": DRIVEN if self.has_free_map else KINDS, "policy": self.policy}
         if free:

@@ -15,11 +15,11 @@ from training.trajectories.equations import linearised
 
 Controller = Callable[[np.ndarray], np.ndarray]
 """Maps states (n, nx) to actions (n, nu) in [-1, 1]."""
-Report = Callable[[float], object]
+Report = Callable[[float], object]  # called with the amount of work that is done
 Chunk = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
-KINDS = ("zero", "steps", "zero", "sine")
-DRIVEN = ("steps", "sine", "pulses")
+KINDS = ("zero", "steps", "zero", "sine")  # signals that the inputs of successive trajectories follow
+DRIVEN = ("steps", "sine", "pulses")  # such signals if no trajectory shall be without inputs
 CHUNK = 500  # number of trajectories simulated at once
 FIRST, FEWEST_INSIDE = 100, 0.05  # after so many trajectories, at least this share must have stayed within bounds
 # Durations for which inputs drive starts out of X, in multiples of the system's pace.
@@ -37,9 +37,9 @@ POLICYS_OWN = 12
 
 @dataclass(frozen=True)
 class Pairs:
-    """States of motions and of a filter that runs along them without measurement noise, at ages since its start.
+    """States x (m, n, nx) of motions with process noise (n,), and z (m, n, size) of a filter that runs along them.
 
-    Shapes: ``ages`` (m,) in samples, ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
+    ``ages`` (m,) are in samples since the filter's start; ``nominal`` (n,) marks motions with the system's parameters.
     """
 
     ages: np.ndarray
@@ -51,7 +51,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Motions:
-    """How trajectories start, and which inputs and process noise act on them, at ``levels`` or random levels."""
+    """How trajectories start, and which inputs and process noise (of ``levels``, or of random levels) act on them."""
 
     system: System
     dt: float
@@ -90,7 +90,7 @@ class Motions:
         return _together(self.chunks(n, rng, report))
 
     def chunks(self, n: int, rng: np.random.Generator, report: Report = lambda done: None) -> Iterator[Chunk]:
-        """Simulate in chunks; one with the same kind of input replaces a trajectory that leaves the system's bounds.
+        """Simulate in chunks; trajectories with inputs of the same kind replace those that leave the system's bounds.
 
         Yields ``x`` (steps + 1, m, nx), ``u`` (steps, m, nu), the levels of process noise (m,), and a mask of the
         trajectories that start in X (m,), with m up to CHUNK.

@@ -154,5 +154,5 @@ def _with_constants(
 
 
 def blind(policy: Controller, nx: int) -> Controller:
-    """Return the policy for a system with additional states, of which it sees only the first nx."""
+    """Return a policy for a system with additional states, which passes on only the first nx to ``policy``."""
     return lambda x: policy(x[:, :nx])

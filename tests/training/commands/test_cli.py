@@ -105,7 +105,7 @@ def test_a_script_with_one_system_needs_no_class(tmp_path):
         ("train lorenz --set width",
          "Error parsing --set: 'width' is no setting: write NAME=VALUE, as in width=64"),
         ("evaluate lorenz --trajectorys 3", "Unrecognized options: --trajectorys, 3; did you mean --trajectories?"),
-        ("trian lorenz", f"unknown command 'trian', did you mean 'train'?: {', '.join(COMMANDS)}"),
+        ("trian lorenz", f"unknown command 'trian', did you mean 'train'?; there are {', '.join(COMMANDS)}"),
         ("agent", "Expected one of {train, evaluate, export, import}."),
     ],
 )  # fmt: skip

@@ -158,7 +158,7 @@ def test_records_that_nothing_is_learned_from(drift):
     with pytest.raises(ValueError, match=r"goal\[0\], goal\[1\] never changes: leave it out"):
         recorded_preset(played(make(drift), measured=["place", "goal"]).records())
     other = dataclasses.replace(records[0], environment={"id": "Drift-v0", "kwargs": {"text": False}})
-    with pytest.raises(ValueError, match=r"with arguments {'text': False}, but .* with arguments {}: one observer"):
+    with pytest.raises(ValueError, match=r"with arguments {'text': False}, but .* with arguments {}: an observer"):
         check_signals([records[0], other])
 
 

@@ -103,7 +103,7 @@ def test_without_enough_that_is_held_out_there_are_no_covariances(tmp_path):
     records = [both(seed, n=300) for seed in range(3)]
     for share, reason in (
         (0.0, "held_out must be positive, got 0"),
-        (0.03, "the held-out records have 24 samples with"),
+        (0.03, "the held-out records have 24 samples"),
     ):
         result, said = trained(records, held_out=share, inverse_steps=20, flow_steps=20)
         assert "does not track: " in said
