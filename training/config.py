@@ -124,7 +124,7 @@ class Config:
     runs: Annotated[int, Field(ge=100)] = 400
     """Number of simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability that a fault-free motion as long as in calibration (a system's 20 paces) raises an alarm."""
+    """Probability of an alarm in a fault-free motion as long as those of calibration (systems: 20 times the pace)."""
     truncation: Positive = 1e-6
     """epsilon: the forward map's data begins when this share of the filter's start is left (spinn; paper, sec. 5.2)."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)

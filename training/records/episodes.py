@@ -29,7 +29,7 @@ METADATA = "data/metadata.json"  # path in the folder of a data set
 
 @dataclass(frozen=True)
 class Episode:
-    """The n steps from a reset to the end. Shapes: ``rewards`` (n,), ``infos`` (n + 1, ...)."""
+    """The n steps from a reset to the end of an episode. Shapes: ``rewards`` (n,), each of ``infos`` (n + 1, ...)."""
 
     observations: Any
     actions: Any

@@ -10,9 +10,9 @@ from kkl_gym.system import Box, Components, System
 from observers.checks import shown
 from training.trajectories.motions import Controller
 
-# Share of the training motions with the system's own value of an uncertain parameter. With several parameters it is
-# raised to their number, as it is less likely that all have these values. It was chosen on the four systems that ship:
-# with 0.6 and a width of 256, Lorenz's map no longer distinguished its own plant from the others.
+# Share of the training motions with the system's own value of an uncertain parameter. With k parameters it is raised to
+# the power k, as it is less likely that all have these values. It was chosen on the four systems that ship: with 0.6
+# and a width of 256, Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of an additional state: hardly any process noise acts on it, and 0 would be invalid
 EVERY = "all"  # stands for every parameter that is not named
