@@ -50,7 +50,7 @@ OBSERVER_STEPS = 40_000  # steps from which an observer, or the weights of z und
 TRUTH = 0.15  # share of the time, at the start, in which agents on x_hat see the true state
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and the agent sees only estimates
 OF_STATE = ("masked", "parameters")  # agents on the full state do not depend on the sensors of the other kinds
-STEPS = 100_000  # at which returns are compared too
+STEPS = 200_000  # at which returns are compared too
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return")
 
 
@@ -299,12 +299,11 @@ def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
 def _by_kind(values: "pd.Series", cells: Callable[[dict[str, np.ndarray]], dict[str, str]]) -> list[str]:
     """A table with a row for each environment and kind, and a column for each kind of information."""
     shown = [name for name in get_args(Shown) if name in values.index.unique("shown")]
+    groups = {key: of.to_numpy() for key, of in values.groupby(["environment", "kind", "shown"])}
     lines = list[list[str]]()
     for env_id, kind in values.index.droplevel(["shown", "seed"]).unique():
-        of_state = kind if kind in OF_STATE else "masked"
-        keys = {name: (env_id, of_state if name == "state" else kind, name) for name in shown}
-        row = {name: values.loc[key].to_numpy() for name, key in keys.items() if key in values.index.droplevel("seed")}
-        text = cells(row)
+        keys = {name: (env_id, "masked" if name == "state" and kind not in OF_STATE else kind, name) for name in shown}
+        text = cells({name: groups[key] for name, key in keys.items() if key in groups})
         lines.append([f"`{env_id}`, {kind}", *(text.get(name, "–") for name in shown)])
     return files.table(["", *shown], lines)
 
