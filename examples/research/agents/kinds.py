@@ -31,12 +31,27 @@ if TYPE_CHECKING:
     from kkl_gym.wrappers.vector import VectorEnv
 
 Shown = Literal["state", "y", "stacked", "traces", "z", "x_hat", "lru"]
-ALGORITHMS = {"CartPole-v1": "ppo"}  # all others: sac
+# The same settings of PPO for all environments and information sets. Agents on the full state and on traces chose them.
+PPO: dict[str, Any] = {
+    "policy": "MlpPolicy",
+    "normalize": True,
+    "n_envs": 16,
+    "n_steps": 256,
+    "batch_size": 256,
+    "n_epochs": 10,
+    "gamma": 0.98,
+    "gae_lambda": 0.95,
+    "policy_kwargs": {"net_arch": [64, 64]},
+}
+LEARNING_RATE = 0.001  # at the start; it falls linearly to zero
 FRAMES = 32  # length of the linear recurrent unit's history
-EVALUATIONS, EPISODES, LAST_EPISODES = 15, 20, 100
-OBSERVER_STEPS = 40_000  # random steps from which an observer, or the weights of z under noise, are learned
+EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100
+OBSERVER_STEPS = 40_000  # steps from which an observer, or the weights of z under noise, are learned
+TRUTH = 0.15  # share of the time, at the start, in which agents on x_hat see the true state
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and the agent sees only estimates
-COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return", "observer_seconds")
+OF_STATE = ("masked", "parameters")  # agents on the full state do not depend on the sensors of the other kinds
+STEPS = 200_000  # at which returns are compared too
+COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return")
 
 
 @dataclass(frozen=True)
@@ -86,11 +101,13 @@ class TimedAgent(Job):
         return tuple(place for place in range(self._ny, size) if place - self._ny not in known)
 
     def make(self, rows: int, observer: Path | None = None) -> "VectorEnv":
-        """Make environments with the agent's information."""
+        """Make environments with the agent's information; without an observer, the truth replaces x_hat."""
         task = self.task
-        if self.shown == "state":
-            with closing(single(task)) as one:
-                return make(replace(task, measured=self._states(flatdim(one.observation_space))), "y", rows)
+        if self.shown in ("state", "x_hat") and observer is None:
+            env = vector(task, rows)
+            y = () if self.shown == "state" or self.kind in FAULTY else task.measured
+            entries = [*y, *self._states(flatdim(env.single_observation_space), self._known)]
+            return FeatureObservation(env, lambda at: at["obs"][:, entries], len(entries))
         if self.shown == "lru":
             return make(replace(task, frames=FRAMES), "stacked", rows)
         if self.shown != "x_hat":
@@ -105,105 +122,108 @@ class TimedAgent(Job):
         first = self._ny if self.kind in FAULTY else 0
         return FeatureObservation(env, lambda at: at["obs"][:, first:], flatdim(env.single_observation_space) - first)
 
-    def learn_observer(self) -> Path:
-        """Learn an observer from random steps in a simulator. Returns its file."""
+    @property
+    def _known(self) -> Sequence[int]:
+        """Entries of the state that agents on x_hat read from y."""
+        return MEASURED[self.env_id] if self.shown == "x_hat" and self.kind not in FAULTY else ()
+
+    def learn_observer(self, act: Callable[[np.ndarray], Any]) -> Path:
+        """Learn an observer in a simulator: from random steps, and from as many of an agent that sees the truth."""
         from training.agents.observing import learn_observer
         from training.rollouts.playing import WANDERING, policy_of, roll_out
 
         with single(self.task) as env:
             env.get_wrapper_attr("exact")()
-            known = () if self.kind in FAULTY else MEASURED[self.env_id]
-            hidden = [str(place) for place in self._states(flatdim(env.observation_space), known)]
-            outputs = [str(place) for place in range(self._ny)]
-            policy = policy_of(WANDERING, env)
-            rollouts = roll_out(env, policy, measured=outputs, hidden=hidden, steps=OBSERVER_STEPS, seed=self.seed)
+            places = self._states(flatdim(env.observation_space), self._known)
+            seen = [*(() if self.kind in FAULTY else self.task.measured), *places]
+            signals: Any = {"measured": [str(i) for i in self.task.measured], "hidden": [str(i) for i in places]}
+            records = [
+                record
+                for policy in (policy_of(WANDERING, env), lambda obs: act(obs[None, seen])[0])
+                for record in roll_out(env, policy, **signals, steps=OBSERVER_STEPS // 2, seed=self.seed).records()
+            ]
         task, tracking = replace(self.task, measurement_noise=self._noise), self.kind in FAULTY
         quiet = ProgressBars(None)
-        return learn_observer(task, rollouts.records(), self.folder, seed=self.seed, progress=quiet, tracking=tracking)
+        return learn_observer(task, records, self.folder, seed=self.seed, progress=quiet, tracking=tracking)
 
     def work(self) -> None:
-        """Train for the CPU time; the time of evaluations does not count."""
+        """Learn the observer and the agent within the CPU time. Evaluations do not count."""
         from examples.research.agents.recurrent import LinearRecurrence
-        from training.agents.learning import Learner, hyperparameters
+        from training.agents.learning import Learner
 
-        began = time.process_time()
-        task, observer = self.task, self.learn_observer() if self.shown == "x_hat" else None
-        spent = time.process_time() - began
-        algorithm = ALGORITHMS.get(self.env_id, "sac")
-        settings = hyperparameters(algorithm, Task(self.env_id, tuple(MEASURED[self.env_id])))
-        if algorithm == "sac":
-            settings["buffer_size"] = 100_000  # more than the number of steps
-        budget = _budget(self.seconds, lambda seconds: evaluate(seconds))
-        for name, value in settings.items():
-            if str(value).startswith("lin_"):
-                settings[name] = _falling(float(value.removeprefix("lin_")), budget)
+        clock, observer, curve = _Clock(), None, list[tuple[Any, ...]]()
+        # Steps from which the observer or the weights of z are learned count too.
+        steps = OBSERVER_STEPS if self.shown == "x_hat" or self.task.weights is not None else 0
+        settings = PPO | {"learning_rate": lambda _: LEARNING_RATE * max(0.0, 1.0 - clock.seconds / self.seconds)}
         if self.shown == "lru":
             extractor = {"features_extractor_class": LinearRecurrence, "features_extractor_kwargs": {"frames": FRAMES}}
-            settings["policy_kwargs"] |= extractor
-        rows, curve = settings.get("n_envs", 1), list[tuple[Any, ...]]()
-        with (
-            closing(Learner(algorithm, settings, self.seed, task, self.make(rows, observer), ())) as learner,
-            closing(self.make(EPISODES, observer)) as few,
-            closing(self.make(LAST_EPISODES, observer)) as many,
-        ):
+            settings["policy_kwargs"] = {**PPO["policy_kwargs"], **extractor}
+        with closing(Learner("ppo", settings, self.seed, self.task, self.make(PPO["n_envs"]), ())) as learner:
             model: Any = learner.model
-            model.get_env().seed(agent_training_seed(self.seed, 0, rows))
+            model.get_env().seed(agent_training_seed(self.seed, 0, PPO["n_envs"]))
+            if self.shown == "x_hat":
+                learner.learn(10**9, [_budget(clock, TRUTH * self.seconds)])
+                observer = self.learn_observer(policy_of(model, deterministic=False))
+                learner.move(self.make(PPO["n_envs"], observer), 1)
+            with closing(self.make(EPISODES, observer)) as few, closing(self.make(LAST_EPISODES, observer)) as many:
 
-            def evaluate(seconds: float) -> None:
-                env = few if seconds < self.seconds else many
-                value = play(env, policy_of(model), seed=AGENT_EVALUATION_SEED).returns.mean()
-                at = (model.num_timesteps, round(seconds, 2), round(float(value), 3), round(spent, 1))
-                curve.append((self.env_id, self.kind, self.shown, self.seed, *at))
+                def evaluate(seconds: float) -> None:
+                    env = few if seconds < self.seconds else many
+                    value = play(env, policy_of(model), seed=AGENT_EVALUATION_SEED).returns.mean()
+                    at = (model.num_timesteps + steps, round(seconds, 2), round(float(value), 3))
+                    curve.append((self.env_id, self.kind, self.shown, self.seed, *at))
 
-            learner.learn(10**9, [budget])
+                learner.learn(10**9, [_budget(clock, self.seconds, evaluate)])
         lines = [",".join(map(str, row)) for row in [COLUMNS, *curve]]
         files.write(self.folder / self.result, "\n".join(lines) + "\n")
 
 
-def _falling(start: float, budget: Any) -> Callable[[float], float]:
-    """A schedule that falls to zero over the CPU time instead of steps."""
-    return lambda progress: start * float(budget.remaining())
-
-
-def policy_of(model: Any) -> Callable[[np.ndarray], Any]:
-    """The deterministic policy of a model, for use during its training."""
-    scaling = model.get_vec_normalize_env()
+def policy_of(model: Any, *, deterministic: bool = True) -> Callable[[np.ndarray], Any]:
+    """The policy of a model, for use during its training."""
 
     def act(obs: np.ndarray) -> Any:
-        return model.predict(obs if scaling is None else scaling.normalize_obs(obs), deterministic=True)[0]
+        return model.predict(model.get_vec_normalize_env().normalize_obs(obs), deterministic=deterministic)[0]
 
     return act
 
 
-def _budget(seconds: float, evaluate: Callable[[float], None]) -> Any:
-    """A callback that evaluates at equal intervals of CPU time, and stops at the last; evaluations do not count."""
+class _Clock:
+    """CPU seconds of this process since the clock was made, without those of evaluations."""
+
+    def __init__(self) -> None:
+        self._began = time.process_time()
+
+    @property
+    def seconds(self) -> float:
+        return time.process_time() - self._began
+
+    def without(self, work: Callable[[], None]) -> None:
+        """Run an evaluation."""
+        seconds = self.seconds
+        work()
+        self._began = time.process_time() - seconds
+
+
+def _budget(clock: _Clock, until: float, evaluate: Callable[[float], None] | None = None) -> Any:
+    """A callback that stops a training at a time of the clock; it evaluates at equal intervals, and at the end."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Budget(BaseCallback):
-        began = time.process_time()
-        evaluations = 0
-
-        def remaining(self) -> float:
-            return max(0.0, 1.0 - (time.process_time() - self.began) / seconds)
-
-        def _on_training_start(self) -> None:
-            self.began = time.process_time()
+        due = 0.0
 
         def _on_step(self) -> bool:
-            now = time.process_time()
-            spent = now - self.began
-            if spent >= seconds * ((self.evaluations + 1) / EVALUATIONS):
-                self.evaluations += 1
-                evaluate(spent)
-                self.began += time.process_time() - now
-            return spent < seconds
+            seconds = clock.seconds
+            if evaluate and seconds >= self.due:
+                clock.without(lambda: evaluate(seconds))
+                self.due = min(until, seconds + until / EVALUATIONS)
+            return seconds < until
 
     return Budget()
 
 
 @dataclass(frozen=True)
 class Kinds:
-    """Compare agents in five kinds of partial observability, each trained for the same CPU time on one core.
+    """Compare agents in five kinds of partial observability, at the same CPU time on one core.
 
     Writes OUT/kinds.csv (returns along CPU seconds and steps) and OUT/table.md. The jobs are ordered by seed. After an
     interruption, the same command continues.
@@ -217,8 +237,8 @@ class Kinds:
     """Information that agents see; lru is a linear recurrent unit over 32 frames."""
     seeds: int = 5
     """Number of agents of each kind."""
-    seconds: float = 150.0
-    """CPU seconds of a training."""
+    seconds: float = 60.0
+    """CPU seconds of an agent, including its observer."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     out: Path = Path("runs/agents/kinds")
     """Folder of results."""
@@ -236,8 +256,7 @@ class Kinds:
             for kind in self.kinds
             for env_id in self.environments
             for shown in self.information
-            # Agents on the full state do not depend on the sensor.
-            if shown != "state" or kind in ("masked", "parameters")
+            if shown != "state" or kind in OF_STATE
         ]
         agents = [
             TimedAgent(env_id, kind, shown, seed, self.seconds, self.out / "jobs" / env_id / kind / shown / str(seed))
@@ -258,43 +277,54 @@ class Kinds:
 
 
 def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
-    """Interquartile means of the last returns, with bootstrap intervals for three or more seeds."""
-    last = rows.groupby(["environment", "kind", "shown", "seed"], sort=False).last().reset_index()
-    shown = [name for name in get_args(Shown) if name in set(last.shown)]
-    lines, steps = list[list[str]](), list[list[str]]()
-    for (env_id, kind), group in last.groupby(["environment", "kind"], sort=False):
-        label, values, reached = f"`{env_id}`, {kind}", list[str](), list[str]()
-        for name in shown:
-            of_state = name == "state" and kind not in ("masked", "parameters")
-            own = last[(last.environment == env_id) & (last.kind == "masked")] if of_state else group
-            own = own[own.shown == name]
-            values.append(_cell(own["return"].to_numpy()))
-            reached.append(f"{own.steps.mean() / 1000:.0f}" if len(own) else "–")
-        lines.append([label, *values])
-        steps.append([label, *reached])
-    observers = rows[rows.shown == "x_hat"].observer_seconds
-    fit = "" if observers.empty else f" Observers took {observers.mean():.0f} CPU seconds more."
+    """Interquartile means of returns at the end and at equal steps, with bootstrap intervals over seeds."""
+    agents = rows.groupby(["environment", "kind", "shown", "seed"], sort=False)
+    last = agents.last()
+    seconds = f"{rows.seconds.max():.0f} CPU seconds"
     partial = f" Partial: {missing} agents are missing." if missing else ""
-    return [
+    lines = [
         "# Kinds of partial observability",
         "",
-        f"Returns after {rows.seconds.max():.0f} CPU seconds: interquartile means over seeds, [95 % interval], "
-        f"number of seeds.{fit}{partial}",
+        "Returns: interquartile means over seeds, [95 % interval], number of seeds. Bold: the best agent without the "
+        f"full state, and those above the lower end of its interval.{partial}",
         "",
-        *files.table(["", *shown], lines),
-        "",
-        "Thousands of steps in that time:",
-        "",
-        *files.table(["", *shown], steps),
     ]
+    equal = agents.apply(lambda curve: np.interp(STEPS, curve.steps, curve["return"]))
+    for title, values in ((f"After {seconds}:", last["return"]), (f"After {STEPS:,} steps:", equal)):
+        lines += [title, "", *_by_kind(values, _returns), ""]
+    lines += [f"Thousands of steps in {seconds}:", "", *_by_kind(last.steps, _thousands)]
+    return lines
 
 
-def _cell(values: np.ndarray) -> str:
-    if not len(values):
-        return "–"
-    ends = ""
-    if len(values) > 2:
-        drawn = np.random.default_rng(0).choice(values, (2000, len(values)))
-        low, high = np.percentile(middle(drawn), [2.5, 97.5])
-        ends = f" [{low:.4g}, {high:.4g}]"
-    return f"{float(middle(values)):.4g}{ends}, {len(values)}"
+def _by_kind(values: "pd.Series", cells: Callable[[dict[str, np.ndarray]], dict[str, str]]) -> list[str]:
+    """A table with a row for each environment and kind, and a column for each kind of information."""
+    shown = [name for name in get_args(Shown) if name in values.index.unique("shown")]
+    groups = {key: of.to_numpy() for key, of in values.groupby(["environment", "kind", "shown"])}
+    lines = list[list[str]]()
+    for env_id, kind in values.index.droplevel(["shown", "seed"]).unique():
+        keys = {name: (env_id, "masked" if name == "state" and kind not in OF_STATE else kind, name) for name in shown}
+        text = cells({name: groups[key] for name, key in keys.items() if key in groups})
+        lines.append([f"`{env_id}`, {kind}", *(text.get(name, "–") for name in shown)])
+    return files.table(["", *shown], lines)
+
+
+def _returns(row: dict[str, np.ndarray]) -> dict[str, str]:
+    drawn = np.random.default_rng(0)
+    means = {name: float(middle(values)) for name, values in row.items()}
+    ends = {
+        name: np.percentile(middle(drawn.choice(values, (2000, len(values)))), [2.5, 97.5])
+        for name, values in row.items()
+    }
+    best = max((name for name in means if name != "state"), key=means.__getitem__, default=None)
+    text = dict[str, str]()
+    for name, values in row.items():
+        mean = f"{means[name]:.4g}"
+        if best and name != "state" and means[name] >= ends[best][0]:
+            mean = f"**{mean}**"
+        interval = f" [{ends[name][0]:.4g}, {ends[name][1]:.4g}]" if len(values) > 2 else ""
+        text[name] = f"{mean}{interval}, {len(values)}"
+    return text
+
+
+def _thousands(row: dict[str, np.ndarray]) -> dict[str, str]:
+    return {name: f"{steps.mean() / 1000:.0f}" for name, steps in row.items()}
