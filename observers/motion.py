@@ -78,7 +78,7 @@ class Flow:
     def __post_init__(self) -> None:
         nx = self.mlp.outputs
         if self.u_scale.ndim != 1 or self.mlp.inputs != nx + len(self.u_scale):
-            raise ArtifactError(f"a flow of {nx} states and {len(self.u_scale)} inputs needs as many network inputs")
+            raise ArtifactError(f"a flow's network must have {nx + len(self.u_scale)} inputs, got {self.mlp.inputs}")
         check_shapes(self, {"linear": (nx, 1 + self.mlp.inputs), "gain": (nx,)})
         if not (self.u_scale > 0).all():
             raise ArtifactError(f"u_scale of a flow must be positive, got {self.u_scale}")
@@ -107,13 +107,13 @@ class Motion:
     low, high : ndarray, shape (nx,)
         Bounds of the states, to which estimates are limited.
     mean : ndarray, shape (nx,)
-        Mean of the motions' initial states: the estimate before the first sample.
+        Mean of the initial states in training: the estimate before the first sample.
     covariance : ndarray, shape (nx, nx)
-        Covariance of the motions' initial states.
+        Covariance of the initial states in training.
     error : ndarray, shape (nx,)
-        Standard deviation of the motion's own error over a sample.
+        Standard deviation of the model's error over one sample.
     process_noise : ndarray, shape (nx,)
-        Standard deviation that process noise of level 1 adds in a sample.
+        Standard deviation that process noise of level 1 adds over one sample.
     least_process_noise : float
         Lower bound of the assumed level of process noise: with Q = 0 the gain would vanish.
     least_measurement_noise : ndarray, shape (ny,)
@@ -122,7 +122,7 @@ class Motion:
         Seconds over which innovations are averaged. For this time after a reset, T_inv's estimate may replace the
         tracker's.
     factors : Factors, optional
-        Calibration factors of the filter's covariance.
+        Calibration factors of the Kalman filter's covariance.
     """
 
     x_offset: np.ndarray
@@ -195,8 +195,8 @@ class Motion:
         if not continuous and abs(samples - max(1, round(samples))) > 1e-3:
             what = "a learned flow" if self.flow is not None else "a motion in discrete time"
             raise ValueError(
-                f"{what} predicts over whole samples, got a dt of {samples:g} samples; pass a whole multiple of the "
-                "sampling interval, or tracking=False"
+                f"{what} predicts over whole sampling intervals, got a dt of {samples:g} intervals; pass a whole "
+                "multiple of the interval, or tracking=False"
             )
 
     def variances(

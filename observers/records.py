@@ -64,9 +64,9 @@ class RecordEstimates:
     def _along(
         self, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, *, of: Any, t: np.ndarray | None = None
     ) -> np.ndarray:
-        """The values of a function of the state's rows at each sample."""
+        """Return the values of ``of``, a function of the state's rows, at each sample."""
         if self._delay:
-            raise ValueError("a record has no delay: shift its outputs by the delay, and use an observer without one")
+            raise ValueError("a record needs an observer without a delay: shift its outputs by the delay instead")
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
             raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
