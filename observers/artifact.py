@@ -71,7 +71,7 @@ class Artifact:
         (y), "inputs" (u) and "hidden" (x).
     environment : mapping of str to object, optional
         For an observer that was learned from rollouts of an environment: the "id" of that environment and its arguments
-        "kwargs". The observer fits only that environment. Without this entry, an observer from records fits none.
+        "kwargs". The observer fits only that environment. An observer from other records fits no environment.
     """
 
     filter: LinearFilter

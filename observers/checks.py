@@ -61,7 +61,7 @@ def noise_level(name: str, level: Any) -> float:
         raise ValueError(f"{name} must be a finite number, not negative, got {shown(level)}")
     level = float(level)
     if level > _LARGEST_LEVEL:
-        raise ValueError(f"{name} must be at most {_LARGEST_LEVEL:g}, got {level!r}: use larger units for the outputs")
+        raise ValueError(f"{name} must be at most {_LARGEST_LEVEL:g}, got {level!r}: use larger units")
     return level
 
 

@@ -24,8 +24,8 @@ def _check_grid(levels: np.ndarray, ages: np.ndarray) -> tuple[int, int]:
 class Factors:
     """Calibration factors of a filter's covariance P. Raises ArtifactError if they are invalid.
 
-    With P times its factor, 90 % of errors have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of a chi-square
-    distribution with nx degrees of freedom. Between levels and ages factors are interpolated, beyond them constant.
+    After P is multiplied by its factor, 90 % of errors have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of
+    chi-square with nx degrees of freedom. Between levels and ages, factors are interpolated; beyond, they are constant.
 
     Parameters
     ----------

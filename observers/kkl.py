@@ -91,7 +91,7 @@ class KKL(Estimator[np.ndarray]):
         return state
 
     def take_over(self, other: "KKL", state: np.ndarray) -> np.ndarray:
-        """Return rows that continue those of ``other``, with the same filter; a tracker that ``other`` lacks starts."""
+        """Return rows that continue those of ``other`` with the same filter; a tracker starts if ``other`` has none."""
         new = self.begin(state[:, other.y], state[:, other.z], state[:, other.age])
         if self.tracker is not None and other.tracker is not None:
             new[:, self.tracked] = self.tracker.take_over(state[:, other.tracked])

@@ -23,9 +23,9 @@ class Limits:
         Standard deviations of the measurement noise, one for all outputs or one for each, rising from 0. With one for
         each, all outputs in a row have the same share of their largest level. Limits are interpolated between levels.
     mean : ndarray, shape (k, ny)
-        Limits of the absolute running mean of the residual.
+        Limits of the absolute value of the residual's running mean.
     low, high : ndarray, shape (k, ny)
-        Limits of the running mean square of the residual. ``low`` is 0 at level 0, where sound sensors have no noise.
+        Limits of the residual's running mean square. ``low`` is 0 at level 0, where sound sensors have no noise.
     window : float
         Time constant of the running means, in seconds.
     warm_up : float
@@ -52,7 +52,7 @@ class Limits:
         if len(shape) != 2 or not shape[0] or not shape == self.low.shape == self.high.shape:
             raise ValueError(f"limits must have shape (levels, ny), got {shape}, {self.low.shape}, {self.high.shape}")
         if self.levels.shape not in (shape[:1], shape):
-            raise ValueError(f"levels must have shape {shape[:1]} or {shape} as the limits, got {self.levels.shape}")
+            raise ValueError(f"levels must have shape {shape[:1]} or {shape}, as the limits, got {self.levels.shape}")
         if self.levels[0].any() or not (np.diff(self.levels, axis=0) > 0).all():
             raise ValueError(f"levels must rise from 0, got {self.levels}")
         if not ((self.mean > 0) & (self.low >= 0) & (self.high > self.low)).all():
@@ -75,8 +75,8 @@ class Limits:
         Some outputs may be noisier than others, relative to the largest levels. Their noise reaches the estimate, and
         so every residual: all outputs then have the upper limits at the relative level of the noisiest output.
 
-        Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each, interpolated as
-        variances. Raises ValueError if a level is not a number, negative or beyond the last one.
+        Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each. Mean squares
+        and squared means are linear in the squared level. Raises ValueError if a level is invalid or beyond the last.
         """
         ny = self.mean.shape[1]
         level = noise_levels("the noise level", level, ny)

@@ -1,4 +1,4 @@
-"""The motion of a state over one sample: by the system's equations, or by a learned flow."""
+"""Models of a state's motion over a sampling interval: a system's equations, or a learned flow."""
 
 import math
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ class Equations:
     field : Expression
         f(x) + g(x) u, or the next state in discrete time; nx components.
     substeps : int, default 1
-        Fourth-order Runge-Kutta steps in a sample, 0 for a system in discrete time. More than 1024 raise ArtifactError.
+        Fourth-order Runge-Kutta steps in an interval, at most 1024 (else ArtifactError). 0: a system in discrete time.
     """
 
     field: Expression
@@ -34,7 +34,7 @@ class Equations:
             raise ArtifactError(f"substeps must be an integer from 0 to {_MAX_SUBSTEPS}, got {self.substeps!r}")
 
     def __call__(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
-        """Return the states ``samples`` times dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        """Return the states samples * dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         f, substeps = self.field, self.steps(samples)
         if not self.substeps:
             for _ in range(substeps):
@@ -50,7 +50,7 @@ class Equations:
         return x
 
     def steps(self, samples: float) -> int:
-        """Number of Runge-Kutta steps, or of steps in discrete time, in ``samples`` intervals."""
+        """Return the number of Runge-Kutta steps, or of steps in discrete time, in ``samples`` sampling intervals."""
         return round(samples) if not self.substeps else max(1, math.ceil(self.substeps * samples - 1e-9))
 
 
@@ -91,10 +91,10 @@ class Flow:
 
 @dataclass(frozen=True)
 class Motion:
-    """The model of a tracker: the motion of states, its uncertainty and its calibration.
+    """The model by which a tracker predicts: the motion of the states, its uncertainty and its calibration.
 
-    Scaled states are s = (x - x_offset) / x_scale. Standard deviations of states are in scaled units, those of outputs
-    in the outputs' units. Raises ArtifactError if the parts do not fit each other.
+    Scaled states are s = (x - x_offset) / x_scale. Standard deviations of states refer to scaled states, and standard
+    deviations of outputs are in the outputs' units. Raises ArtifactError if the parts do not fit each other.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ class Motion:
         return self.equations.field.inputs <= nu
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
-        """Return the states ``samples`` times dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        """Return the states samples * dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         if self.equations is not None:
             return self.equations(x, u, dt, samples)
         assert self.flow is not None

@@ -27,8 +27,8 @@ class KKLObserver(RecordEstimates):
     """z' = A z + B y, x_hat = T_inv(z): a causal state estimate from sampled outputs (Niazi et al., 2025).
 
     ``x_hat_0 = reset(y_0)``, then ``x_hat_k+1 = step(y_k+1, u_k)`` with u_k the input held over [t_k, t_k+1].
-    All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx). A step is :meth:`advance`, the
-    linear filter, followed by :meth:`decode`, the network; :meth:`restart` restarts some rows of a batch.
+    All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx). A step is :meth:`advance`,
+    which takes the sample, and then :meth:`decode`, which returns the estimate; :meth:`restart` restarts some rows.
 
     After a reset the filter has a transient. If the state x_0 is known and the artifact holds the forward map T,
     ``reset(y_0, x_0)`` starts at z_0 = T(x_0) without transient. T also gives :attr:`mismatch`, the distance of z from

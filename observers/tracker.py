@@ -13,7 +13,7 @@ from observers.unscented import add, factor, shift, solved, transformed, whitene
 
 # The two limits of Supervision follow from these quantiles of the normal distribution. A NIS beyond its limit discards
 # the estimate; a trend beyond its limit only inflates the covariance. Running means are more skewed than the chi-square
-# distribution that the limits assume: white innovations exceed the trend's limit with probability 2e-4, not 1e-5.
+# distribution that the limits assume: white innovations exceed the trend's limit with probability 2e-4 (not 1e-5).
 _DIVERGED = 6.0  # for the NIS, with tail probability 1e-9
 _COLOURED = 4.265  # for the mean square of the trend, with tail probability 1e-5
 _TREND = 0.25  # time constant of the trend, the innovations' running mean, in windows
@@ -65,8 +65,8 @@ class Tracker:
     """An unscented Kalman filter on the system's equations, or on a learned flow, with one estimate in each row.
 
     It starts from the mean and covariance of the initial states in training, corrected by the first sample. In the
-    first window, each step is repeated twice: the sample corrects the state before the step, too, and the motion is
-    linearised about this smoothed state (Kullberg, Skog and Hendeby, 2023).
+    first window after a reset, each step is repeated twice: the sample corrects the state before the step, too, and the
+    motion is linearised about this smoothed state (Kullberg, Skog and Hendeby, 2023).
 
     The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's in
     two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The

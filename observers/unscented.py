@@ -1,7 +1,7 @@
 """Unscented transforms: batches of Gaussians through nonlinear functions, by sigma points.
 
 The points are the mean, and the mean +- sqrt(nx + kappa) times each column of the covariance's Cholesky factor (Wan and
-van der Merwe, 2000, with alpha = 1, beta = 2). A nonlinear output gets new points from the predicted covariance.
+van der Merwe, 2000, with alpha = 1, beta = 2). A nonlinear output uses new points, from the predicted covariance.
 """
 
 import math
@@ -42,7 +42,7 @@ def transformed(
 
 
 def _scale(nx: int) -> float:
-    """Return nx + kappa, where kappa is 3 - nx, or 0 if that is negative."""
+    """Return nx + kappa, with kappa = max(3 - nx, 0)."""
     return max(float(nx), 3.0)
 
 
@@ -51,7 +51,7 @@ def whitened(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return V (n, nx, ny) and whitened innovations ``white`` (n, ny): the corrections are x + V white and P - V V^T.
 
-    Shapes: ``innovation``, ``missing`` (n, ny), ``S`` (n, ny, ny), ``across`` (n, nx, ny).
+    ``S`` (n, ny, ny) is the covariance of innovations (n, ny), and ``across`` (n, nx, ny) that of states and outputs.
     """
     if missing.any():
         innovation = np.where(missing, 0.0, innovation)

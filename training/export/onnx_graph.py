@@ -63,7 +63,7 @@ def onnx_model(exported: Exported) -> Any:
 
 
 class _Step(TorchObserver):
-    """A step that also returns the covariances of the estimates, if T_inv has one."""
+    """A step that also returns the covariances of the estimates, if T_inv has a covariance."""
 
     def forward(  # type: ignore[override]
         self, state: Tensor, y: Tensor, u: Tensor | None, measurement_noise: Tensor | None, process_noise: Tensor | None

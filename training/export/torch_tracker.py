@@ -19,7 +19,7 @@ Tracked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 The trend is the running mean of the innovations.
 """
 Prediction = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Means (nx, n), covariances (nx, nx, n), their covariances with the last states (nx, nx, n), validity (n,)."""
+"""Means (nx, n), covariances (nx, nx, n), covariances with the last states (nx, nx, n), whether they are valid (n,)."""
 
 
 class TorchTracker(Module):
@@ -57,7 +57,7 @@ class TorchTracker(Module):
         return factor * (self._unpacked(state)[1] * self.units).flatten(0, 1).T
 
     def states(self, s: Tensor) -> Tensor:
-        """Convert scaled states (nx, n) to their units."""
+        """Return the states (nx, n) in their own units, from scaled states."""
         return s * self.x_scale + self.x_offset
 
     def advance(
@@ -138,7 +138,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return V and white, for the corrected mean + V white and P - V V^T; expected outputs; validity of V (n,)."""
+        """Return V and white, for the corrected mean + V white and P - V V^T; expected outputs; whether V is valid."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)
@@ -178,7 +178,7 @@ class TorchTracker(Module):
         return (moved - self.x_offset) / self.x_scale
 
     def _output(self, s: Tensor, _: Tensor) -> Tensor:
-        """Return the outputs of scaled states (nx, n); where h is undefined, the states are limited to their bounds."""
+        """Return the outputs of scaled states (nx, n), or of the states limited to their bounds if h is undefined."""
         assert self.h is not None
         y, near = (self.h(self.states(each)) for each in (s, self._within(s)))
         return torch.where(y.isfinite(), y, near)
