@@ -55,7 +55,7 @@ class Exported:
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """Levels of measurement noise: one for each output if T_inv takes them, else one for all outputs."""
+        """Levels of measurement noise: one for each output if T_inv takes several, else one for all outputs."""
         if self.artifact.inverse.noise_gain.ndim == 2:
             return tuple(np.broadcast_to(self.measurement_noise, self.artifact.ny).tolist())
         return (float(np.max(self.measurement_noise)),)

@@ -38,7 +38,7 @@ typedef PRECISION NAME_real;
 typedef struct {
     double z[COUNT_Z]; /* the filter's state */
     NAME_real y[MACRO_NY]; /* the last sample */
-    unsigned long age; /* samples since reset, counted until estimates no longer depend on them */
+    unsigned long age; /* samples since reset, counted up to the largest age that T_inv distinguishes */
 // if tracks
     double x[MACRO_NX], P[MACRO_NX][MACRO_NX]; /* the estimate and its covariance, in scaled states */
     double nis; /* running mean square of the whitened innovations */
