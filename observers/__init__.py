@@ -1,4 +1,4 @@
-"""Learned KKL observers at run time. They need only NumPy; Numba, if installed, compiles their steps."""
+"""Learned KKL observers. Running one needs only NumPy and safetensors; Numba, if installed, compiles its steps."""
 
 from observers.artifact import Artifact
 from observers.checks import ArtifactError

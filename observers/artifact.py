@@ -1,4 +1,4 @@
-"""One file that holds a whole observer: filter, maps, scaling, and the system for which they were made."""
+"""The artifact: a whole observer in one file, with its filter, its maps, and the system for which it was trained."""
 
 import functools
 import math
@@ -19,59 +19,59 @@ from observers.motion import Motion
 from observers.network import MLP
 
 FORMAT = 1
-FAR = 10.0  # observers warn of inputs beyond this multiple of the largest in training
+FAR = 10.0  # observers warn of inputs beyond this multiple of the largest input in training
 USUAL_NOISE = 0.5  # default standard deviation of the measurement noise
 _KEY = "kkl-gym"
 
 
 @dataclass(frozen=True)
 class Artifact:
-    """An observer as its file stores it. Raises ArtifactError if its parts do not fit each other.
+    """An observer as its file stores it. Raises ArtifactError if its parts are incompatible.
 
     Parameters
     ----------
     filter : LinearFilter
-        The filter with A, B, dt and the number of inputs.
+        The linear filter, with A, B, dt and the number of inputs.
     inverse : InverseMap
-        T_inv.
+        T_inv, the map from the filter's state z to the state x.
     system : str
         Name of the system.
     parameters : mapping of str to float
         The system's physical parameters.
     forward : ForwardMap, optional
-        T, if it was learned.
+        T, the map from x to z, if it was learned.
     C : ndarray, shape (ny, nx), optional
         Matrix of a linear output h(x) = C x. Predictions of missing outputs and the monitor need C or h.
     h : Expression, optional
-        An output h(x) that is not linear.
+        A nonlinear output h(x).
     limits : Limits, optional
         Limits of the residual y - h(x_hat) in normal operation, if they were calibrated.
     free_inverse : InverseMap, optional
-        T_inv of z_y only, in use until an input acts. Motions without input visit far fewer states than driven ones, so
-        that a map for them alone is more accurate.
+        A map from z_y alone to x, which replaces T_inv until the first nonzero input. Motion without input visits far
+        fewer states than driven motion, so a map for these states alone is more accurate.
     motion : Motion, optional
-        The system's motion, by its equations or by a learned flow. An observer with a motion tracks: a Kalman filter
-        on the motion carries the estimate, and T_inv initialises it.
+        Model of the system's motion: its equations or a learned flow. An observer with this model tracks: a Kalman
+        filter predicts by the model and corrects by each sample, and T_inv initialises the filter.
     measurement_noise : float or tuple of float, length ny, default 0.5
-        Default standard deviation of the noise on each sample, one for all outputs or one for each. Observers limit it
-        to the largest in the maps' training.
+        Default standard deviation of the noise on each sample, one for all outputs or one for each. The artifact limits
+        it to the largest value in the maps' training.
     u_max : tuple of float, length nu, optional
-        Largest absolute values of the inputs in training. Observers warn once of inputs beyond ten times these.
+        Largest absolute value of each input in training. Observers warn once of inputs beyond ten times this value.
     parameter_ranges : mapping of str to (float, float), optional
         (low, high) of each uncertain parameter: the observer was trained for systems with any parameters within these
         ranges.
     estimated_parameters : tuple of str, optional
-        The uncertain parameters that the maps estimate. They are the last outputs of T_inv, in this order.
+        The uncertain parameters that T_inv estimates. They are its last outputs, in this order.
     training : mapping, optional
-        Record of the training: method, preset, configuration, seed, measures.
+        Record of the training: its settings, seed and results.
     versions : mapping of str to str, optional
-        Versions of the libraries in the training.
+        Versions of the libraries that the training used.
     signals : mapping of str to sequence of str, optional
         For an observer that was learned from recorded states, without equations: the names of the columns "measured"
         (y), "inputs" (u) and "hidden" (x).
     environment : mapping of str to object, optional
         For an observer that was learned from rollouts of an environment: the "id" of that environment and its arguments
-        "kwargs". It fits only that environment. An observer with signals but without this entry fits none.
+        "kwargs". The observer fits only that environment. An observer from other records fits no environment.
     """
 
     filter: LinearFilter
@@ -105,12 +105,12 @@ class Artifact:
         self._check_ranges()
         if self.inverse.whiten.shape[1] != self.filter.size or ("z_u" in self.inverse.features) != (self.filter.nu > 0):
             raise ArtifactError(
-                f"features {self.inverse.features} over {self.inverse.whiten.shape[1]} values do not fit "
-                f"a filter of {self.filter.size} values and {self.filter.nu} inputs"
+                f"T_inv takes {self.inverse.features} and {self.inverse.whiten.shape[1]} values of z, but the filter "
+                f"has {self.filter.size} values of z and {self.filter.nu} inputs"
             )
         gain = self.inverse.noise_gain
         if gain.ndim == 2 and len(gain) != self.ny:
-            raise ArtifactError(f"a noise_gain of {len(gain)} outputs does not fit {self.ny}")
+            raise ArtifactError(f"noise_gain must have one row for each of {self.ny} outputs, got {len(gain)} rows")
         usual = noise_levels("measurement_noise", self.measurement_noise, self.ny)
         object.__setattr__(self, "measurement_noise", self.inverse.within(usual))
         if self.u_max is not None and (len(self.u_max) != self.nu or not all(is_finite(each) for each in self.u_max)):
@@ -120,18 +120,18 @@ class Artifact:
             self._check_free(free)
         for error in (self.inverse.error_covariance, None if free is None else free.error_covariance):
             if error is not None and error.nx != self.nx:
-                raise ArtifactError(f"a covariance of {error.nx} states does not fit {self.nx} states")
+                raise ArtifactError(f"error_covariance must have the observer's {self.nx} states, got {error.nx}")
         if self.forward is not None and (self.forward.mlp.inputs, self.forward.mlp.outputs) != (self.nx, nz):
             raise ArtifactError(
-                f"a forward map of {self.forward.mlp.inputs} states to {self.forward.mlp.outputs} values "
-                f"does not fit {self.nx} states and {nz} values"
+                f"T must map {self.nx} states to nz = {nz} values, got a map of {self.forward.mlp.inputs} states to "
+                f"{self.forward.mlp.outputs} values"
             )
         if self.C is not None and self.C.shape != (self.ny, self.nx):
             raise ArtifactError(f"C must have shape {(self.ny, self.nx)}, got {self.C.shape}")
         if self.h is not None and (self.C is not None or len(self.h.components) != self.ny or self.h.states > self.nx):
             raise ArtifactError(
-                f"an output h of {len(self.h.components)} components and {self.h.states} states does not fit {self.ny} "
-                f"outputs and {self.nx} states, or there is a C beside it"
+                f"h must have {self.ny} components and at most {self.nx} states, and C must be None; got "
+                f"{len(self.h.components)} components, {self.h.states} states and C = {shown(self.C)}"
             )
         if self.motion is not None:
             self._check_motion(self.motion)
@@ -140,79 +140,77 @@ class Artifact:
         if self.environment is not None:
             self._check_environment(self.environment)
         if self.limits is not None and (not self.knows_output or self.limits.mean.shape[1] != self.ny):
-            raise ArtifactError(f"limits of {self.limits.mean.shape[1]} residuals need a C or h with as many outputs")
+            raise ArtifactError(f"limits need C or h, and must have {self.ny} outputs, got {self.limits.mean.shape[1]}")
 
     def require_system(self) -> None:
-        """Raise ArtifactError if the observer was learned from recorded states and so has no system."""
+        """Raise ArtifactError if the observer was learned from recorded states, without equations of a system."""
         if self.signals is not None:
-            names = {role: ", ".join(of) for role, of in self.signals.items()}
-            given = " and ".join(of for of in (names["measured"], names["inputs"]) if of)
-            fits = "fits no environment" if self.environment is None else f"fits {self.environment['id']} alone"
+            names = {role: ", ".join(columns) for role, columns in self.signals.items()}
+            given = " and ".join(columns for columns in (names["measured"], names["inputs"]) if columns)
+            fits = "fits no environment" if self.environment is None else f"fits only {self.environment['id']}"
             raise ArtifactError(
-                f"the observer {self.system!r} was learned from recorded states: {names['hidden']} from {given}, every "
-                f"{self.filter.dt:g} s. It has no equations, and {fits}; observers.load(path) runs it on samples"
+                f"the observer {self.system!r} was learned from recorded states: it estimates {names['hidden']} from "
+                f"{given}, sampled every {self.filter.dt:g} s. It has no equations, and {fits}; observers.load(path) "
+                "runs it on samples"
             )
 
     def _check_free(self, free: InverseMap) -> None:
         nz = len(self.filter.A)
         if "z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu:
-            raise ArtifactError(f"a map of free motion must take z_y, {nz} values, and needs one with inputs beside it")
+            raise ArtifactError(f"free_inverse must take z_y alone, {nz} values, and the filter must have inputs")
         own = _conditions(self.inverse)
         if differing := [name for name, value in _conditions(free).items() if value != own[name]]:
-            raise ArtifactError(f"the maps of free and of driven motion differ in {', '.join(differing)}")
+            raise ArtifactError(f"inverse and free_inverse must agree, but differ in {', '.join(differing)}")
 
     def _check_motion(self, motion: Motion) -> None:
-        sizes, expected = (motion.nx, len(motion.least_measurement_noise)), (self.nx, self.ny)
-        if sizes != expected or not motion.fits_inputs(self.nu):
+        sizes, ny = (motion.nx, len(motion.least_measurement_noise)), self.ny
+        if sizes != (self.nx, ny) or not motion.fits_inputs(self.nu):
             raise ArtifactError(
-                f"a motion of {sizes} states and outputs, or its inputs, does not fit an observer of {expected} states "
-                f"and outputs and {self.nu} inputs"
+                f"a motion of {sizes[0]} states and {sizes[1]} outputs does not fit an observer of {self.nx} states "
+                f"and {ny} outputs, or the motion's inputs do not fit the observer's {self.nu} inputs"
             )
         if self.inverse.error_covariance is None or not self.knows_output:
-            raise ArtifactError("a motion needs T_inv's covariance and the output h(x) beside it")
+            raise ArtifactError("an artifact with a motion needs T_inv's covariance and the output h(x), too")
         if self.parameter_ranges:
-            raise ArtifactError(f"a motion has fixed parameters, not ranges of {', '.join(self.parameter_ranges)}")
+            raise ArtifactError(f"a motion needs fixed parameters, not ranges of {', '.join(self.parameter_ranges)}")
 
     def _check_signals(self, signals: Mapping[str, Sequence[str]]) -> None:
         counts = {"measured": self.ny, "inputs": self.nu, "hidden": self.nx}
         if not isinstance(signals, Mapping) or set(signals) != set(counts):
-            raise ArtifactError(f"signals must name {', '.join(counts)}, got {shown(signals)}")
+            raise ArtifactError(f"signals must have the keys {', '.join(counts)}, got {shown(signals)}")
         for role, count in counts.items():
             names = signals[role]
             of_names = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
             if not of_names or len(names) != count:
-                raise ArtifactError(f"the signals {role} must be {count} names, got {shown(names)}")
+                raise ArtifactError(f"signals[{role!r}] must be a list of {count} names, got {shown(names)}")
 
     def _check_environment(self, environment: Mapping[str, Any]) -> None:
         whole = isinstance(environment, Mapping) and set(environment) == {"id", "kwargs"}
         if not whole or not isinstance(environment["id"], str) or not isinstance(environment["kwargs"], Mapping):
-            raise ArtifactError(f"environment must be an id and kwargs, got {shown(environment)}")
+            raise ArtifactError(f"environment must hold a string 'id' and a dict 'kwargs', got {shown(environment)}")
         if self.signals is None:
-            raise ArtifactError(f"an observer for the environment {environment['id']} must name its signals")
+            raise ArtifactError(f"an artifact for the environment {environment['id']} needs signals, too")
 
     def _check_ranges(self) -> None:
-        """Raise an error unless uncertain parameters lie in their ranges, and the maps estimate at least one state."""
+        """Raise ArtifactError unless parameters lie in their ranges, estimated ones have ranges, and nx is positive."""
         for name, ends in self.parameter_ranges.items():
             if not isinstance(ends, list | tuple) or len(ends) != 2 or not all(map(is_finite, ends)):
                 raise ArtifactError(f"the range of the parameter {name} must be two finite numbers, got {shown(ends)}")
             if name not in self.parameters or not ends[0] <= self.parameters[name] <= ends[1]:
                 raise ArtifactError(
-                    f"the range {shown(tuple(ends))} of {name} must hold its value; parameters: {dict(self.parameters)}"
+                    f"the range {shown(tuple(ends))} must contain the parameter {name}, got {dict(self.parameters)}"
                 )
-        tuples = {name: tuple(ends) for name, ends in self.parameter_ranges.items()}  # JSON has lists
+        tuples = {name: tuple(ends) for name, ends in self.parameter_ranges.items()}  # files hold them as lists
         object.__setattr__(self, "parameter_ranges", tuples)
         if not {*self.estimated_parameters} <= {*self.parameter_ranges}:
             raise ArtifactError(
-                f"estimated_parameters = {self.estimated_parameters} must be among those with a range, "
+                f"estimated_parameters = {self.estimated_parameters} must be among the parameters with a range, "
                 f"{tuple(self.parameter_ranges)}"
             )
         if self.nx < 1:
-            raise ArtifactError(
-                f"a map of {self.inverse.mlp.outputs} outputs has no room for a state beside "
-                f"{len(self.estimated_parameters)} parameters"
-            )
+            raise ArtifactError(f"T_inv must estimate states, not only {len(self.estimated_parameters)} parameters")
 
-    @functools.cached_property  # every step reads it
+    @functools.cached_property
     def nx(self) -> int:
         """Number of estimated states."""
         return len(self.inverse.x_offset) - len(self.estimated_parameters)
@@ -229,7 +227,7 @@ class Artifact:
 
     @functools.cached_property
     def usual_input(self) -> float:
-        """Absolute value up to which no input is far beyond its range in training."""
+        """Ten times the smallest entry of ``u_max``, at most LARGEST; inputs up to this value need no further check."""
         return min([LARGEST, *(FAR * each for each in self.u_max or ())])
 
     @property
@@ -238,7 +236,7 @@ class Artifact:
         return self.C is not None or self.h is not None
 
     def output(self, x: np.ndarray) -> np.ndarray:
-        """Return h(x); NaN or infinite where h is not defined. Shapes: ``x`` (..., nx); returns (..., ny).
+        """Return h(x); NaN or infinite where h is undefined. Shapes: ``x`` (..., nx); returns (..., ny).
 
         Raises ArtifactError if the artifact holds no h.
         """
@@ -249,51 +247,51 @@ class Artifact:
         return self.h(x)
 
     def residual(self, y: np.ndarray, x_hat: np.ndarray) -> np.ndarray:
-        """Return y - h(x_hat), and 0 where h is not defined. Shapes and error as in :meth:`output`."""
-        apart = y - self.output(x_hat)
-        return apart if self.C is not None else np.where(np.isfinite(apart), apart, 0.0)
+        """Return y - h(x_hat), and 0 where h is undefined. Shapes and errors are those of :meth:`output`."""
+        residual = y - self.output(x_hat)
+        return residual if self.C is not None else np.where(np.isfinite(residual), residual, 0.0)
 
     def require_forward(self) -> ForwardMap:
         """Return T, or raise ArtifactError if the artifact has no T."""
         return self.forward or self._lacks(
-            "holds no forward map T; take one of the pipeline spinn, which does: for the package's systems those named "
-            "SYSTEM-spinn ship, others are made by kkl-gym train SYSTEM --pipeline spinn"
+            "holds no forward map T; the shipped maps SYSTEM-spinn hold one, and so do maps that kkl-gym train SYSTEM "
+            "--pipeline spinn makes"
         )
 
     def require_known_start(self) -> None:
         """Raise ArtifactError unless an observer can start at a known state, which needs T or a motion."""
         if self.motion is None and self.forward is None:
             self._lacks(
-                "cannot start at a known state: it holds neither a motion nor T; kkl-gym train makes one that tracks, "
-                "and kkl-gym train SYSTEM --pipeline spinn one with T"
+                "cannot start at a known state: it holds neither a motion nor T; kkl-gym train SYSTEM makes a map with "
+                "a motion, and kkl-gym train SYSTEM --pipeline spinn a map with T"
             )
 
     def require_covariance(self) -> None:
         """Raise ArtifactError unless T_inv has a covariance."""
         if self.inverse.error_covariance is None:
-            self._lacks("holds no covariance; kkl-gym train makes one that does")
+            self._lacks("holds no covariance; kkl-gym train makes a map that does")
 
     def require_motion(self) -> Motion:
         """Return the motion by which the observer tracks, or raise ArtifactError if it has no motion."""
-        return self.motion or self._lacks("does not track; kkl-gym train makes one that does")
+        return self.motion or self._lacks("cannot track: it holds no motion; kkl-gym train makes a map that does")
 
     def _lacks(self, text: str) -> NoReturn:
         raise ArtifactError(f"this map for {self.system!r} {text}")
 
     @property
     def process_noise_max(self) -> float | None:
-        """The highest level of process noise in training; None if the map does not take the level."""
+        """The highest level of process noise in training; None if T_inv does not take the level as an input."""
         return self.inverse.process_noise_max if "process_noise" in self.inverse.features else None
 
     def check(self, system: str, parameters: Mapping[str, float], *, dt: float, ny: int, nu: int) -> None:
-        """Raise an ArtifactError that names both values unless the observer was made for this system.
+        """Raise ArtifactError unless the observer was made for this system; the message names the values that differ.
 
         Parameters
         ----------
         system : str
             Name of the system.
         parameters : mapping of str to float
-            Its physical parameters; one with a range may have any value within.
+            The system's physical parameters; a parameter with a range may have any value within the range.
         dt : float
             Sampling interval in seconds.
         ny, nu : int
@@ -303,8 +301,8 @@ class Artifact:
         def differ(what: str, here: Any, there: Any) -> None:
             raise ArtifactError(
                 f"the observer was made for {what} {here!r}, but the environment has {there!r}; change the "
-                "environment, train an observer for it (kkl-gym train) and pass its path, or, for a plant that differs "
-                "on purpose, exchange env.unwrapped.system once the observer is around it"
+                "environment, or train an observer for it (kkl-gym train) and pass its path; for a plant that differs "
+                "on purpose, wrap the environment first, and then set env.unwrapped.system"
             )
 
         self.require_system()
@@ -338,7 +336,7 @@ class Artifact:
         OSError
             If the file cannot be written.
         TypeError, ValueError
-            If JSON cannot represent ``training``, ``versions`` or a number.
+            If JSON cannot represent a value, or the file would be too large.
         """
         tensors: dict[str, np.ndarray] = {}
         described = {"format": FORMAT, **_put(tensors, "", self)}
@@ -380,7 +378,7 @@ class Artifact:
 
 
 def _conditions(inverse: InverseMap) -> dict[str, Any]:
-    """The properties in which two maps of one artifact must agree."""
+    """Return the properties in which the two inverse maps of an artifact must agree."""
     process_noise = inverse.process_noise_unit, inverse.process_noise_max
     return {
         "number of outputs": inverse.mlp.outputs,
@@ -391,7 +389,7 @@ def _conditions(inverse: InverseMap) -> dict[str, Any]:
 
 
 def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, Any]:
-    """Add the arrays of a part under names that begin with ``prefix``; returns its other fields, as nested dicts."""
+    """Add a part's arrays to ``tensors``, under names with a prefix, and return its other fields as nested dicts."""
     described: dict[str, Any] = {}
     for entry in fields(part):
         name, value = entry.name, getattr(part, entry.name)
@@ -413,7 +411,7 @@ def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, An
 
 
 def _get(kind: Any, tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> Any:
-    """Rebuild a part that :func:`_put` took apart; raises KeyError if an array or a field is missing."""
+    """Return the part that :func:`_put` stored, or raise KeyError if an array or a field is missing."""
     left = dict(described)
     values: dict[str, Any] = {}
     for entry in fields(kind):
@@ -429,7 +427,7 @@ def _get(kind: Any, tensors: Mapping[str, np.ndarray], prefix: str, described: M
         elif name in left:
             value = left.pop(name)
             values[name] = tuple(value) if isinstance(value, list) else value
-        elif entry.default not in (None, math.inf):  # _put does not write these
+        elif entry.default not in (None, math.inf):  # _put leaves out None and infinity
             raise KeyError(f"{prefix}{name}")
     if left:
         raise ArtifactError(f"unknown metadata keys: {', '.join(f'{prefix}{name}' for name in sorted(left))}")

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.ma import MaskedArray, is_masked
 
-_FLOAT = np.dtype(float)  # stored, so that every step can compare dtypes by identity, which is fastest
-LARGEST = 1e15  # largest output or input; beyond it float32 would overflow
-_NO_NUMBERS = (bool, np.timedelta64)  # Python converts the first to an integer, NumPy the second
-_TEXTS = (str, bytes, bytearray, memoryview)  # these are sequences, but not of numbers
-_LARGEST_LEVEL = 1e12  # largest noise level; outputs under it stay far within LARGEST and float32
+_FLOAT = np.dtype(float)  # arrays of float64 share this object, and `is` is the fastest comparison
+LARGEST = 1e15  # largest absolute value of an output or input; larger values could overflow in float32
+_NO_NUMBERS = (bool, np.timedelta64)  # types that count as integers in Python and NumPy, but are no numbers
+_TEXTS = (str, bytes, bytearray, memoryview)  # sequences that are not lists of numbers
+_LARGEST_LEVEL = 1e12  # largest noise level; with this noise, outputs stay far below LARGEST
 
 
 class ArtifactError(ValueError):
@@ -20,17 +20,17 @@ class ArtifactError(ValueError):
 
 
 def check_shapes(owner: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raise ArtifactError unless the arrays of a map have these shapes."""
+    """Raise ArtifactError unless the arrays of ``owner``, by their names in ``shapes``, have these shapes."""
     for name, shape in shapes.items():
         if (given := getattr(owner, name).shape) != shape:
-            raise ArtifactError(f"{name} does not fit the network: it must have shape {shape}, got {given}")
+            raise ArtifactError(f"{name} does not fit the other parts: it must have shape {shape}, got {given}")
 
 
 def shown(value: object) -> str:
-    """The text of a value for error messages: one line, shortened if it is long."""
+    """Return the text of a value for error messages: one line, shortened if it is long."""
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # repr fails, as for integers of more than 4,300 digits
+    except Exception:  # such as that of repr for integers of more than 4,300 digits
         return f"a {type(value).__name__}"
     return text if len(text) <= 200 else f"{text[:150]} … {text[-40:]}"
 
@@ -47,10 +47,10 @@ def all_finite(values: np.ndarray, largest: float = LARGEST) -> bool:
     """Whether outputs or inputs are finite and at most ``largest`` in absolute value."""
     if values.ndim == 1:  # fast path for one sample
         for value in values.tolist():  # noqa: SIM110 - a generator is slower
-            if not -largest <= value <= largest:  # false for NaN too
+            if not -largest <= value <= largest:  # NaN fails the comparison
                 return False
         return True
-    if np.vdot(values, values) <= largest**2:  # a fast sufficient test; false for NaN
+    if np.vdot(values, values) <= largest**2:  # a fast, sufficient test, which NaN fails
         return True
     return bool((np.abs(values) <= largest).all())
 
@@ -61,7 +61,7 @@ def noise_level(name: str, level: Any) -> float:
         raise ValueError(f"{name} must be a finite number, not negative, got {shown(level)}")
     level = float(level)
     if level > _LARGEST_LEVEL:
-        raise ValueError(f"{name} must not be beyond {_LARGEST_LEVEL:g}, got {level!r}: take larger units")
+        raise ValueError(f"{name} must be at most {_LARGEST_LEVEL:g}, got {level!r}: use larger units")
     return level
 
 
@@ -94,7 +94,7 @@ def integer(name: str, value: Any, least: int, most: int | None = None) -> int:
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return a bool, or raise ValueError; a text such as "no" would count as true."""
+    """Return a bool, or raise ValueError: Python would take a text such as "no" as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {shown(value)}")
     return bool(value)
@@ -133,7 +133,7 @@ def real_array(name: str, values: Any) -> np.ndarray:
             if array.dtype.kind in "fiu":
                 with np.errstate(over="ignore"):  # callers reject infinite values
                     return array.astype(float)
-    except Exception as error:  # ragged lists, and any exception from __array__ of other objects
+    except Exception as error:  # for ragged lists, and for objects whose __array__ fails
         raise ValueError(f"{name} must hold real numbers in the shape of an array, got {shown(values)}") from error
     raise ValueError(f"{name} must hold real numbers, got {shown(values)}")
 
@@ -156,7 +156,7 @@ def bool_array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array of bools, or raise ValueError."""
     try:
         array = values if type(values) is np.ndarray else np.asarray(values)
-    except Exception as error:  # as in real_array
+    except Exception as error:  # for the same values as in real_array
         raise ValueError(f"{name} must be boolean with shape {shape}, got {shown(values)}") from error
     if array.dtype.kind != "b" or array.shape != shape or (isinstance(values, MaskedArray) and is_masked(values)):
         raise ValueError(f"{name} must be boolean with shape {shape}, nothing masked, got {shown(values)}")

@@ -1,4 +1,4 @@
-"""The compiled step of a tracker. It needs Numba, and arranges the tracker's arrays as the kernel's arguments."""
+"""The compiled step of an observer that tracks. It needs Numba, and passes the observer's arrays to the kernel."""
 
 import functools
 from typing import Any
@@ -10,9 +10,9 @@ from observers.decoder import Decoder, Decoders
 from observers.filter import LinearFilter
 from observers.tracker import Tracker
 
-_LANES = 8  # rows that are stepped together
-MOST_OPERATIONS = 400  # longer expressions, such as a network as f, would take many seconds to compile
-MOST_ROWS = 32  # in a covariance; eight larger covariances together would exceed a thread's stack
+_LANES = 8  # rows of the batch that the kernel steps together
+MOST_OPERATIONS = 400  # of an expression; longer ones, such as a network as f, take many seconds to compile
+MOST_ROWS = 32  # of a covariance; eight larger ones, one for each lane, would exceed a thread's stack
 
 
 class CompiledStep:
@@ -28,7 +28,7 @@ class CompiledStep:
         expressions = None if motion.equations is None else motion.equations.field, artifact.h
         most = max(each.operations if each else 0 for each in expressions)
         if max(nx, ny) > MOST_ROWS or most > MOST_OPERATIONS:
-            raise ValueError(f"too much to compile: {nx} states, {ny} outputs, {most} operations in an expression")
+            raise ValueError(f"too large to compile: {nx} states, {ny} outputs, {most} operations in an expression")
         maps = decoders.driven, decoders.free or decoders.driven
         scaling, affine = np.zeros((3, nx + nu)), np.zeros((nx, 1))
         network = np.zeros(0, np.float32), np.zeros(1, int)
@@ -48,7 +48,7 @@ class CompiledStep:
         self._code = functools.cache(self._compiled)
 
     def _compiled(self, W: int) -> Any:
-        """The kernel for groups of W rows, with the addresses of the compiled motion and output."""
+        """Return the kernel for groups of W rows, which already has the addresses of the compiled motion and output."""
         from observers import kernel, kernel_functions
 
         (nx, ny, nu), equations, addresses = self._sizes, self._motion.equations, [0, 0]
@@ -60,7 +60,7 @@ class CompiledStep:
         return functools.partial(kernel.steps(nx, ny, nu, W), tuple(addresses))
 
     def _at(self, linear: LinearFilter) -> tuple[Any, ...]:
-        """The kernel's arguments from ``flags`` to ``flow``, at the sampling interval of a filter."""
+        """Return the kernel's arguments from ``flags`` to ``flow``, for the sampling interval of a filter."""
         samples, h, equations = linear.dt / self._linear.dt, 0.0, self._motion.equations
         substeps = -round(samples)  # a negative number counts steps of a learned flow
         if equations is not None:
@@ -71,10 +71,10 @@ class CompiledStep:
     def __call__(
         self, linear: LinearFilter, rows: np.ndarray, y: np.ndarray, u: np.ndarray, record: Any = None
     ) -> None:
-        """Advance rows by samples and inputs, at the interval of a filter.
+        """Advance rows of the state in place by samples and inputs, at the sampling interval of ``linear``.
 
-        A record stores the rows or the estimates at each sample. Shapes: ``rows`` (n, width), ``y`` (steps, n, ny),
-        ``u`` (steps, n, nu), ``record`` (steps, n, width) or (steps, n, nx).
+        ``record``, if given, receives the rows, (steps, n, width), or the estimates, (steps, n, nx), at each sample.
+        Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu).
         """
         # Numba would compile again for arrays that are read-only or not contiguous.
         y, u = (each if each.flags.carray else np.array(each, order="C") for each in (y, u))
@@ -84,14 +84,14 @@ class CompiledStep:
 
 
 def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]:
-    """Ages, in seconds since reset, and the covariances of the maps at these ages, (maps, ages, nx^2)."""
-    errors = [each.error for each in maps if each.error is not None]  # every map that tracks has covariances
+    """Return ages in seconds since reset, and the covariances of both maps at these ages, (maps, ages, nx^2)."""
+    errors = [each.error for each in maps if each.error is not None]  # both have one if the observer tracks
     ages = np.unique([age for error in errors for age in error.ages])
     return ages, np.array([error(ages, ages.shape).reshape(len(ages), -1) for error in errors])
 
 
 def _of_filter(linear: LinearFilter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gains of z, outputs and inputs on z, and the few entries of the transition off its diagonal."""
+    """Return gains from z, outputs and inputs to the next z, and places and values of the off-diagonal gains from z."""
     diagonal = linear.transition.diagonal()
     places = np.array(np.nonzero(linear.transition - np.diag(diagonal)))
     return np.vstack([diagonal, linear.drive]), places, linear.transition[*places]

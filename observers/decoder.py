@@ -11,7 +11,7 @@ from observers.machine import available
 
 
 class Decoders:
-    """T_inv for motions with and without input, or some of its outputs. Each row uses the map for its motion."""
+    """T_inv, or some of its outputs. Rows without input since reset use the artifact's ``free_inverse``, if any."""
 
     def __init__(self, artifact: Artifact, outputs: slice, **options: Any) -> None:
         free = artifact.free_inverse
@@ -19,7 +19,7 @@ class Decoders:
         self.free = None if free is None else Decoder(free, outputs, **options)
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
-        """Return the estimates, (..., nx), of filter states (..., size) at ages, in seconds since reset."""
+        """Return the estimates (..., nx) from filter states (..., size) and ages in seconds since reset."""
         return self._by_row(z, age, Decoder.__call__)
 
     def covariances(self, z: np.ndarray, age: Any) -> np.ndarray:
@@ -30,7 +30,7 @@ class Decoders:
         driven, free = self.driven, self.free
         if free is None:
             return np.asarray(of(driven, z, age))
-        nz = free.size  # z_u follows z_y, and is exactly 0 until an input acts
+        nz = free.size  # z is [z_y, z_u], and z_u is exactly 0 until the first nonzero input
         moved = z[..., nz:].any(-1)
         if moved.all() or not moved.any():
             return np.asarray(of(driven, z, age) if moved.all() else of(free, z[..., :nz], age))
@@ -42,7 +42,7 @@ class Decoders:
 
 
 class Decoder:
-    """T_inv at given noise levels: maps z, (..., size), and the age in seconds to x_hat, (..., nx)."""
+    """T_inv at given noise levels: a map from z, (..., size), and the age in seconds to x_hat, (..., nx)."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Decoder:
         self._offset = -inverse.z_offset @ self._whiten
         self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
         self._needs_age = inverse.features[-1] == "age"
-        self._machine = compiled is not False  # if Numba is installed
+        self._machine = compiled is not False
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Return the estimate."""
@@ -90,9 +90,9 @@ class Decoder:
 
     @functools.cached_property
     def network(self) -> tuple[np.ndarray, ...]:
-        """The network in the form of :func:`observers.kernel_functions.decode`.
+        """The network in the form that :func:`observers.kernel_functions.decode` takes.
 
-        Whitening of z and the first layer are one matrix product, in double precision. In float32 the differences of
+        One matrix product in double precision whitens z and applies the first layer. In float32 the differences of
         nearly equal filter states would lose their digits.
         """
         inverse, modes = self._inverse, len(self._offset)

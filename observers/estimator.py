@@ -42,12 +42,12 @@ class Running:
         self.state: Any = None
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Start at first samples (n, ny). Returns the estimates (n, nx)."""
+        """Start at first samples (n, ny), and return the estimates (n, nx)."""
         self.state = self.estimator.advance(self.estimator.start(len(y0)), y0)
         return self.decode()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
-        """Restart rows (n,) at their first samples (number of True in rows, ny)."""
+        """Restart those rows where ``rows`` (n,) is True, at first samples (number of True, ny)."""
         begun, state = self.estimator.advance(self.estimator.start(len(y0)), y0), []
         for before, after in zip(self.state, begun, strict=True):
             state.append(before.copy())
@@ -55,7 +55,7 @@ class Running:
         self.state = type(self.state)(*state)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
-        """Process samples (n, ny) after inputs (n, nu), in all rows or some."""
+        """Process samples (n, ny) after inputs (n, nu), in all rows or where ``rows`` (n,) is True."""
         state = self.estimator.advance(self.state, y, u)
         if rows is not None:
             for before, after in zip(self.state, state, strict=True):
@@ -68,11 +68,11 @@ class Running:
         return self.decode()
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the estimates (n, nx) of all rows or some."""
+        """Return the estimates of all rows, (n, nx), or of those where ``rows`` (n,) is True."""
         x_hat = self.estimator.estimate(self.state).x_hat
         return x_hat if rows is None else x_hat[rows]
 
     def along(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Return estimates (steps, n, nx) along records y (steps, n, ny) and inputs u (steps - 1, n, nu)."""
+        """Return estimates (steps, n, nx) along records of outputs (steps, n, ny) and inputs (steps - 1, n, nu)."""
         first = self.reset(y[0])
         return np.array([first, *(self.step(y[k], None if u is None else u[k - 1]) for k in range(1, len(y)))])

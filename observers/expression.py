@@ -11,13 +11,13 @@ import numpy as np
 from observers.checks import is_finite
 
 MOST_LEVELS = 24  # levels of nested expressions
-MOST_PARTS = 2000  # numbers, states and functions in all components together
-_POWERS = 8  # integer exponents up to this become products
-_MOST_NESTED = 16  # nested operators in one source line
+MOST_PARTS = 2000  # numbers, states, inputs and functions in all components together
+_POWERS = 8  # integer exponents up to this value compile to products
+_MOST_NESTED = 16  # arguments of one function beyond which the source combines them in halves
 
 
 class _Rule(NamedTuple):
-    """The function behind a name: Python source for NumPy and Numba, and the types of its arguments and result."""
+    """A function that expressions can name: its Python source, and the types of its arguments and its result."""
 
     source: str
     takes: tuple[bool, ...]  # whether each argument is a condition
@@ -91,13 +91,13 @@ class Expression:
         return {"components": self.components}  # compiled source cannot be pickled
 
     def python(self, name: str, nx: int, nu: int) -> str:
-        """Python source of a function of nx states and nu inputs, one argument each; it returns the components."""
+        """Return the source of a Python function that takes nx states and nu inputs and returns the components."""
         given = ", ".join([*(f"x{i}" for i in range(nx)), *(f"u{j}" for j in range(nu))])
         return f"def {name}({given}):\n    return ({''.join(_source(part) + ', ' for part in self.components)})"
 
     @property
     def operations(self) -> int:
-        """Number of operations, counted by the arguments of all functions."""
+        """Number of operations: the total number of arguments of all functions."""
         named = [part for each in self.components for part in _parts(each) if isinstance(part, tuple)]
         return sum(len(part) - 1 for part in named if part[0] not in ("x", "u"))
 
@@ -112,7 +112,7 @@ class Expression:
         return self._count("u")
 
     def _count(self, letter: str) -> int:
-        """The largest index of a letter plus one."""
+        """Return one plus the largest index of the states, for the letter "x", or of the inputs, for "u"."""
         parts = (part for each in self.components for part in _parts(each))
         return max((int(part[1]) + 1 for part in parts if isinstance(part, tuple) and part[0] == letter), default=0)
 
@@ -134,7 +134,7 @@ def _checked(part: Any, condition: bool, levels: int, left: list[int]) -> Any:
     rule = _RULES.get(name)
     if rule is None or rule.gives != condition:
         known = [known for known in _RULES if _RULES[known].gives == condition]
-        raise ValueError(f"{reprlib.repr(name)} is unknown where one of these is expected: {' '.join(known)}")
+        raise ValueError(f"{reprlib.repr(name)} must be one of these functions: {' '.join(known)}")
     if len(arguments) < len(rule.takes) or (len(arguments) > len(rule.takes) and not rule.more):
         raise ValueError(f"{name} takes {len(rule.takes)} arguments, got {len(arguments)}")
     kinds = (*rule.takes, *rule.takes[-1:] * (len(arguments) - len(rule.takes)))
@@ -157,7 +157,7 @@ def _source(part: Any) -> str:
 
 
 def _joined(source: str, sources: list[str], arity: int) -> str:
-    """Apply a function of ``arity`` arguments to more of them, by halves, because Python limits nesting."""
+    """Return source that applies a function of ``arity`` arguments to more; halving limits how deep it is nested."""
     if len(sources) > _MOST_NESTED:
         half = len(sources) // 2
         sources = [_joined(source, sources[:half], arity), _joined(source, sources[half:], arity)]
@@ -165,7 +165,7 @@ def _joined(source: str, sources: list[str], arity: int) -> str:
 
 
 def _parts(part: Any) -> Iterator[Any]:
-    """A part of an expression and all within it."""
+    """Yield a part of an expression, and all parts inside it."""
     yield part
     if isinstance(part, tuple) and part[0] not in ("x", "u"):
         for each in part[1:]:

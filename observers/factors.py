@@ -7,12 +7,12 @@ import numpy as np
 
 from observers.checks import ArtifactError, shown
 
-COVERAGE = 0.9  # the share of errors that the calibrated regions hold
+COVERAGE = 0.9  # share of errors inside the calibrated regions
 _MAX_FACTOR = 1e12
 
 
 def _check_grid(levels: np.ndarray, ages: np.ndarray) -> tuple[int, int]:
-    """Return the numbers of levels and ages; ArtifactError unless both rise from 0."""
+    """Return the numbers of levels and ages, or raise ArtifactError unless both rise from 0."""
     for name, values in (("levels", levels), ("ages", ages)):
         rising = values.ndim == 1 and len(values) and values[0] == 0 and (np.diff(values) > 0).all()
         if not rising or not np.isfinite(values).all():
@@ -24,8 +24,8 @@ def _check_grid(levels: np.ndarray, ages: np.ndarray) -> tuple[int, int]:
 class Factors:
     """Calibration factors of a filter's covariance P. Raises ArtifactError if they are invalid.
 
-    With them, 90 % of the errors have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of the chi-square
-    distribution with nx degrees of freedom. Factors are interpolated between levels and ages, and constant beyond.
+    After P is multiplied by its factor, 90 % of errors have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of
+    chi-square with nx degrees of freedom. Between levels and ages, factors are interpolated; beyond, they are constant.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Factors:
     ages : ndarray, shape (m,)
         Seconds since reset, rising from 0.
     factors : ndarray, shape (2, k, m)
-        Positive factors without process noise and at its largest level in training; (1, k, m) holds for all levels.
+        Positive factors: [0] without process noise, [1] at its largest level in training; (1, k, m) holds for both.
     """
 
     levels: np.ndarray
@@ -50,11 +50,11 @@ class Factors:
 
     @classmethod
     def ones(cls) -> Self:
-        """Factors of 1, for use before calibration."""
+        """Return factors of 1, for use before calibration."""
         return cls(np.zeros(1), np.zeros(1), np.ones((1, 1, 1)))
 
     def at_levels(self, measurement_noise: float, process_noise: float) -> np.ndarray:
-        """Return the factors, (m,), at levels in multiples of the largest in training."""
+        """Return the factors (m,) at noise levels, which are in multiples of the largest levels in training."""
         share = min(process_noise, 1.0)
         table = (1.0 - share) * self.factors[0] + share * self.factors[-1]
         return interpolated(measurement_noise, self.levels, table)
@@ -64,7 +64,7 @@ class Factors:
 class ErrorCovariance:
     """The covariance of x - T_inv(z), by level of measurement noise and age since reset.
 
-    It is calibrated as in :class:`Factors`. Raises ArtifactError if it is invalid.
+    It is calibrated like the covariance in :class:`Factors`. Raises ArtifactError if it is invalid.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class ErrorCovariance:
         return self.covariance.shape[-1]
 
     def at_level(self, level: float) -> Self:
-        """Return the covariances at one level, in multiples of the largest in training."""
+        """Return the covariances at one noise level, which is in multiples of the largest level in training."""
         return type(self)(np.zeros(1), self.ages, interpolated(level, self.levels, self.covariance)[None])
 
     def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
@@ -110,7 +110,7 @@ def interpolated(at: np.ndarray | float, points: np.ndarray, values: np.ndarray)
 
 
 def check_positive_definite(covariance: np.ndarray) -> None:
-    """Raise ArtifactError unless covariances (..., n, n) are positive definite, in any units of the states."""
+    """Raise ArtifactError unless covariances (..., n, n) are positive definite; units of the states do not matter."""
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     if (variances > 0).all():
         scale = np.sqrt(variances)

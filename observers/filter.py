@@ -8,16 +8,17 @@ import numpy as np
 from observers.checks import check_dt, integer, real_array
 
 MOST_INPUTS = 64  # each input adds nz values to the filter's state
-MOST_VALUES = 1024  # in the state, and in the output; more would cost much memory and a slow decomposition of A
+MOST_VALUES = 1024  # largest nz (1 + nu), and largest ny; more would need much memory and time
 
 
 class LinearFilter:
     """z_y' = A z_y + B y and, for each known input, z_u' = A z_u + B 1 u, at the sampling interval ``dt``.
 
-    The integration takes the output as linear between samples, a first-order hold. This is causal, because z_k+1 is
-    computed when y_k+1 is known; a zero-order hold would delay the output by half a sample. The input is constant
-    between samples. A filter of output and input is the functional KKL observer (Buisson-Fenet et al., TMLR 2023). For
-    u = 0 it is the paper's filter (sec. 3, eq. kkl_observer). Raises ValueError if A, B, dt or nu is invalid.
+    Here 1 is a vector of ones. The integration takes the output as linear between samples, a first-order hold. This is
+    causal, because z_k+1 is computed when y_k+1 is known; a zero-order hold would delay the output by half a sample.
+    The input is constant between samples. A filter of output and input is the functional KKL observer (Buisson-Fenet
+    et al., TMLR 2023). For u = 0 it is the filter of Niazi et al. (2025, eq. 7). Raises ValueError if A, B, dt or nu is
+    invalid.
 
     The filter's state is ``z = [z_y, z_u of the first input, ...]``, of size ``nz * (1 + nu)``, and
     z_k+1 = transition z_k + early_y y_k + late_y y_k+1 + held_u u_k.
@@ -27,11 +28,11 @@ class LinearFilter:
     A : ndarray, shape (nz, nz)
         State matrix in 1/s, Hurwitz and diagonalisable. The filter's state may have at most 1024 values.
     B : ndarray, shape (nz, ny)
-        Input matrix of the outputs, 1 to 1024 of them.
+        Matrix from y to z_y'; there may be 1 to 1024 outputs.
     dt : float
         Sampling interval in seconds.
     nu : int, default 0
-        Number of known inputs to filter, 0 to 64. 0 is the paper's observer.
+        Number of known inputs to filter, 0 to 64. The observer of Niazi et al. has none.
 
     Attributes
     ----------
@@ -57,8 +58,8 @@ class LinearFilter:
         nz, ny = B.shape
         if not (1 <= nz * (1 + nu) <= MOST_VALUES and 1 <= ny <= MOST_VALUES):
             raise ValueError(
-                f"a filter has 1 to {MOST_VALUES} values, nz (1 + nu), and as many outputs at most; "
-                f"got nz = {nz}, nu = {nu} and {ny} outputs"
+                f"the filter's size nz (1 + nu) and ny must be from 1 to {MOST_VALUES}, "
+                f"got nz = {nz}, nu = {nu} and ny = {ny}"
             )
         poles, V = np.linalg.eig(A)
         if not (poles.real < 0).all():
@@ -79,7 +80,7 @@ class LinearFilter:
         with np.errstate(all="ignore"):
             s = poles * dt
             hold = np.expm1(s) / poles  # integral of e^{poles (dt - t)} over [0, dt]
-            late = (np.expm1(s) - s) / (poles * s)  # ... of e^{poles (dt - t)} t / dt
+            late = (np.expm1(s) - s) / (poles * s)  # integral of e^{poles (dt - t)} t / dt over [0, dt]
             transition, early, late, hold = (
                 np.real((self._V * values) @ self._V_inverse) for values in (np.exp(s), hold - late, late, hold)
             )
@@ -90,8 +91,8 @@ class LinearFilter:
         self._update = np.vstack([self.transition.T, self.drive])
         if not (np.isfinite(self._update).all() and np.isfinite(self.equilibrium).all()):
             raise ValueError(
-                f"dt = {dt!r}, B of up to {abs(self.B).max():g} and the eigenvalues of A, {poles}, lead beyond the "
-                "range of floats"
+                f"the filter's matrices are beyond the range of floats for dt = {dt!r}, entries of B up to "
+                f"{abs(self.B).max():g} and eigenvalues {poles} of A"
             )
 
     def _on_z_y(self, matrix: np.ndarray) -> np.ndarray:

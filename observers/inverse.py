@@ -46,21 +46,22 @@ class ForwardMap:
 
 @dataclass(frozen=True)
 class InverseMap:
-    """T_inv: from the filter's state, the noise levels and the age to the state estimate.
+    """T_inv: the map from the filter's state, the noise levels and the age to the state estimate.
 
     The network's inputs follow ``features``, in which "z_y" comes first and the others are optional:
 
-    - ``z_y``, ``z_u``: together ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2. Each mode has
-      unit variance over noise-free training data, so the division shrinks a noisy mode to its conditional mean;
-    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), one for each output that has its own level;
+    - ``z_y``, ``z_u``: together the modes ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2, with
+      sigma_v the standard deviation of the measurement noise. Each mode has unit variance over noise-free training
+      data, so the division shrinks a noisy mode to its conditional mean;
+    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), one value for each sigma_v;
     - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), with the level in multiples of the
       system's scale per second, as in environments;
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
     The output is x_offset + x_scale * mlp(inputs). Raises ArtifactError if the parts do not fit each other.
 
-    A map for several outputs may take a level for each. ``noise_gain`` then has a row for each output, and the squares
-    of its rows add up. ``measurement_noise_unit`` and ``measurement_noise_max`` are then tuples.
+    A map for several outputs may take a sigma_v for each. ``noise_gain`` then has a row for each output, the squares
+    (sigma_v * noise_gain)^2 are summed over outputs, and the unit and the largest value of sigma_v are tuples.
 
     Parameters
     ----------
@@ -73,13 +74,13 @@ class InverseMap:
     whiten : ndarray, shape (modes, size)
         Matrix from the filter's state to the modes, which are the network's first inputs.
     noise_gain : ndarray, shape (modes,) or (ny, modes)
-        Standard deviation of each mode per unit of sigma_v, of all outputs or of each output.
+        Standard deviation of each mode per unit of sigma_v, for all outputs together or for each output.
     x_offset, x_scale : ndarray, shape (nx,)
         Scaling of the estimate.
     measurement_noise_unit : float or tuple of float, length ny, default 1
         Unit of sigma_v. If ``noise_gain`` has a row for each output, a number becomes a tuple.
     measurement_noise_max : float or tuple of float, length ny, default inf
-        The largest sigma_v in training, in the same form. A map without the feature takes any level.
+        The largest sigma_v in training, in the same form. A map without the feature takes any sigma_v.
     process_noise_unit : float, default 1
         Unit of the process noise level.
     process_noise_max : float, default inf
@@ -87,7 +88,7 @@ class InverseMap:
     age_unit : float, default 1
         Unit of the age in seconds.
     age_max : float, default 0
-        Age in seconds beyond which estimates no longer depend on it.
+        Age in seconds beyond which estimates no longer depend on the age.
     error_covariance : ErrorCovariance, optional
         The covariance of the estimation error, if it was calibrated.
     """
@@ -109,7 +110,7 @@ class InverseMap:
 
     def __post_init__(self) -> None:
         if self.features != ("z_y", *(name for name in FEATURES[1:] if name in self.features)):
-            raise ArtifactError(f"inverse features must be z_y and then some of {FEATURES[1:]}, got {self.features}")
+            raise ArtifactError(f"features must be z_y, then any of {FEATURES[1:]} in this order, got {self.features}")
         if self.whiten.ndim != 2:
             raise ArtifactError(f"whiten must have shape (modes, size), got {self.whiten.shape}")
         modes, size = self.whiten.shape
@@ -122,7 +123,7 @@ class InverseMap:
             for end in self._each(f"{name}_max"):
                 if name in self.features and (not is_finite(end) or end <= 0):
                     raise ArtifactError(
-                        f"{name}_max must be a positive, finite number for a map that takes it, got {end!r}"
+                        f"{name}_max must be a positive, finite number for a map that takes {name}, got {end!r}"
                     )
                 if end != math.inf and (not is_finite(end) or end < 0):
                     raise ArtifactError(f"{name}_max must be a number, not negative, got {end!r}")
@@ -131,15 +132,16 @@ class InverseMap:
             conditions += outputs - 1
         if self.mlp.inputs != modes + conditions:
             raise ArtifactError(
-                f"a network of {self.mlp.inputs} inputs does not fit {modes} modes and {conditions} conditions"
+                f"T_inv's network must have {modes} inputs for modes and {conditions} for noise levels and age, "
+                f"got {self.mlp.inputs} inputs"
             )
         nx = self.mlp.outputs
         check_shapes(self, {"z_offset": (size,), "x_offset": (nx,), "x_scale": (nx,)})
         if self.error_covariance is not None and "measurement_noise" not in self.features:
-            raise ArtifactError("a covariance by level of noise needs a map that depends on the level")
+            raise ArtifactError("error_covariance needs a map with the feature measurement_noise")
 
     def _each(self, name: str) -> tuple[Any, ...]:
-        """A unit or largest value: one for each output if noise_gain has rows, else a single one."""
+        """Return a unit or largest value as a tuple: an entry for each row of noise_gain, or a single entry."""
         value = getattr(self, name)
         if self.noise_gain.ndim != 2 or not name.startswith("measurement_noise"):
             return (value,)
@@ -151,7 +153,7 @@ class InverseMap:
         return value
 
     def part(self, outputs: slice) -> "InverseMap":
-        """Return the map with some of its outputs and without covariance; the map itself if all are selected."""
+        """Return a map to some of the outputs, without covariance, or this map if all outputs are selected."""
         if range(self.mlp.outputs)[outputs] == range(self.mlp.outputs):
             return self
         x_offset, x_scale = self.x_offset[outputs], self.x_scale[outputs]
@@ -165,7 +167,7 @@ class InverseMap:
         if isinstance(measurement_noise, tuple) and self.noise_gain.ndim == 1 and self.noise_gain.any():
             raise ValueError(
                 f"this map takes one level of measurement noise for all outputs, got {measurement_noise}: pass one "
-                "number, or train again, which makes a map with a level for each"
+                "number, or train again, which makes a map with a level for each output"
             )
         if "measurement_noise" not in self.features:
             return measurement_noise
@@ -173,12 +175,12 @@ class InverseMap:
         return levels if isinstance(levels, float) else levels[0] if len({*levels}) == 1 else tuple(levels)
 
     def gain(self, measurement_noise: float | tuple[float, ...]) -> np.ndarray:
-        """Factors of the whitened modes, (modes,), at these standard deviations of the noise."""
+        """Return the factors (modes,) that shrink the modes at these standard deviations of the measurement noise."""
         sigma = np.reshape(measurement_noise, (-1, 1))
         return 1.0 / (1.0 + ((sigma * np.atleast_2d(self.noise_gain)) ** 2).sum(0))
 
     def shares(self, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0) -> tuple[float, float]:
-        """Return both noise levels in multiples of the largest in training; that of the noisiest output counts."""
+        """Return both noise levels in multiples of the largest in training; of several outputs the noisiest counts."""
         largest = np.max(np.divide(measurement_noise, self.measurement_noise_max))
         return float(largest), process_noise / self.process_noise_max
 
@@ -192,7 +194,7 @@ class InverseMap:
         return features
 
     def age_feature(self, age: Any) -> Any:
-        """The network's input for a time since reset in seconds, or for an array of times."""
+        """Return the network's input for the time since reset in seconds, a number or an array."""
         if isinstance(age, float):  # fast path for one sample
             return math.log1p(min(age, self.age_max) / self.age_unit)
         return np.log1p(np.minimum(age, self.age_max) / self.age_unit)

@@ -53,7 +53,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def factorise(P: Any, L: Any, inverse: Any) -> None:
-        """Compute L with P = L L^T, and 1 / L's diagonal; both are not finite if P is not positive definite."""
+        """Compute L with P = L L^T, and the reciprocals of its diagonal; L is not finite if P has no such factor."""
         for i in range(nx):
             for j in range(i + 1):
                 total = P[i * nx + j]
@@ -117,7 +117,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def together(L: Any, at: Any, n: int, across: Any) -> None:
-        """Compute the covariance (nx, n) of sigma points with their images, which ``at`` holds minus their mean."""
+        """Compute the covariance (nx, n) of sigma points and images; ``at`` holds the images minus their mean."""
         for j in range(n):
             for i in range(nx):
                 total = 0.0
@@ -127,7 +127,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_part
     def flow_step(at: Any, flow: Any, scratch: Any) -> None:
-        """One step of a learned flow for all sigma points, in place."""
+        """Move all sigma points in place by one step of a learned flow."""
         scaling, linear, packed, shape = flow
         q, given = stack(of_network, 1), offset(scratch, 0)
         for p in range(wide):
@@ -143,13 +143,13 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def clipped(states: Any, s: Any, i: int) -> Any:
-        """A state limited to its bounds."""
+        """Return a state limited to its bounds."""
         s = choose(states[0, i], s, states[0, i], s)
         return choose(s, states[1, i], states[1, i], s)
 
     @_inlined
     def finite(value: Any) -> Any:
-        """1 if a number is finite, else 0."""
+        """Return 1 if a number is finite, else 0."""
         return choose(value, -np.inf, choose(np.inf, value, 1.0, 0.0), 0.0)
 
     @_inlined
@@ -161,7 +161,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
-        """Compute the state's mean and covariance one sample later, and its covariance with the earlier state."""
+        """Compute the state's mean and covariance at the next sample, and its covariance with the present state."""
         states, flow, substeps, address, h, share = model
         inverse, at = stack(nx, W), stack(of_states, W)
         spread_out(x, P, L, inverse, at)
@@ -169,7 +169,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         for j in range(nu):
             for p in range(points):
                 at[(nx + j) * points + p] = u[j]
-        if substeps >= 0:  # a negative number counts steps of a learned flow
+        if substeps >= 0:  # negative numbers count the steps of a learned flow
             call(address, doubles(at), doubles(at), substeps, h)
         for _ in range(-substeps):
             flow_step(doubles(at), flow, scratch)
@@ -211,7 +211,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
-        """Set outputs with innovations beyond the gate to NaN, unless the gate is open."""
+        """Set outputs whose innovations are beyond the gate to NaN, unless the gate is open."""
         for k in range(ny):
             innovation, count = y[k] - expected[k], now[rejections + k]
             far = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)
@@ -349,7 +349,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 covariance[i * W + w] = lower + part * (covariances[table, upper, i] - lower)
         factorise(P, L, inverse)
         factorise(offset(rows, base + nx), L, own)
-        quotient[0] = own[0] / inverse[0]  # root of the determinant of T_inv's covariance over that of the tracker's
+        quotient[0] = own[0] / inverse[0]  # sqrt(det of T_inv's covariance / det of the tracker's covariance)
         for i in range(1, nx):
             quotient[0] *= own[i] / inverse[i]
         for w in range(count):

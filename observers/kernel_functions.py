@@ -69,7 +69,7 @@ def evaluate(packed: Any, shape: Any, between: Any) -> Any:
     for layer in range(1, len(shape) - 1):
         inputs, width = shape[layer], shape[layer + 1]
         for j in range(inputs, inputs + UNROLLED):
-            h[j] = _ZERO  # pads the inputs
+            h[j] = _ZERO  # zeros pad the inputs to a multiple of UNROLLED
         for j in range(width):
             into[j] = packed[at + j]
         at += width
@@ -88,7 +88,7 @@ def evaluate(packed: Any, shape: Any, between: Any) -> Any:
 
 @_part
 def decode(z: Any, age: float, network: Any, between: Any, out: Any) -> None:
-    """T_inv of one sample: the first layer takes z and age in double precision, the others are float32."""
+    """Evaluate T_inv for one sample. The first layer takes z and age in double precision, the others are float32."""
     first, units, ages, packed, shape = network
     size, width = first.shape[0] - 2, first.shape[1]
     sums = stack(width, 1)
@@ -114,7 +114,7 @@ def decode(z: Any, age: float, network: Any, between: Any, out: Any) -> None:
 
 @_kernel
 def decode_one(z: Any, age: float, network: Any, out: Any) -> None:
-    """T_inv of one sample."""
+    """Evaluate T_inv for one sample; Python calls this function."""
     widest = network[0].shape[1]
     for width in network[4][1:]:
         widest = max(widest, width)
@@ -123,7 +123,7 @@ def decode_one(z: Any, age: float, network: Any, out: Any) -> None:
 
 @functools.cache
 def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> Any:
-    """Compile a motion by equations. It moves all sigma points of W rows by Runge-Kutta steps of length h, in place.
+    """Compile equations to a function that moves all sigma points of W rows in place, by Runge-Kutta or discrete steps.
 
     One array (nx + nu, points, W) holds the states and inputs of all sigma points.
     """
@@ -151,7 +151,7 @@ def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> 
 
 @functools.cache
 def output(expression: Expression, nx: int, W: int) -> Any:
-    """Compile an output map: it writes outputs (ny, points, W) of the sigma points (nx, points, W) of W rows."""
+    """Compile h(x) to a function that writes the outputs (ny, points, W) of sigma points (nx, points, W) of W rows."""
     wide, ny = (2 * nx + 1) * W, len(expression.components)
     function = expression.python("function", nx, 0)
     given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))

@@ -21,19 +21,19 @@ _CHUNK = 8192  # rows of a record that are decoded together; more would exceed t
 
 @dataclass(frozen=True)
 class Pending:
-    """Inputs whose outputs have not arrived yet, (n, delay, nu), and their number, (n,). Instances are immutable."""
+    """Inputs (n, delay, nu) whose outputs have not arrived yet, and their number (n,). Instances are immutable."""
 
     inputs: np.ndarray
     count: np.ndarray
 
     def restarted(self, rows: np.ndarray) -> "Pending":
-        """Return a copy without the inputs of some rows."""
+        """Return a copy without inputs where ``rows`` (n,) is True."""
         return Pending(self.inputs, np.where(rows, 0, self.count))
 
     def after(self, u: np.ndarray, rows: np.ndarray) -> tuple["Pending", np.ndarray, np.ndarray]:
-        """Append the next sample's inputs, (n, nu), in some rows.
+        """Append the next sample's inputs (n, nu) where ``rows`` (n,) is True.
 
-        Returns the new object, the inputs that led to the outputs that arrive now, (n, nu), and a mask of rows, (n,).
+        Returns the new object, the oldest inputs (n, nu), and a mask (n,) of the rows where their outputs arrive now.
         """
         delay = self.inputs.shape[1]
         due, first = rows & (self.count == delay), self.inputs[:, 0]
@@ -46,8 +46,8 @@ class Pending:
 class KKL(Estimator[np.ndarray]):
     """The estimator inside :class:`observers.KKLObserver`, for n rows.
 
-    A row of the state holds z (size), the last output (ny), the age, and then the rows of tracker and monitor.
-    The age is the number of samples since reset, NaN before the first one.
+    A row of the state holds z (size), the last output (ny), the age, and then the values of tracker and monitor.
+    The age is the number of samples since reset, NaN before the first sample.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class KKL(Estimator[np.ndarray]):
         return np.full((n, self.width), np.nan)
 
     def begin(self, y: np.ndarray, z: np.ndarray, age: Any, x0: np.ndarray | None = None) -> np.ndarray:
-        """Return rows at first samples (n, ny) and filter states (n, size), or at known states ``x0`` (n, nx)."""
+        """Return rows that start at samples (n, ny), filter states (n, size) and, if given, known states (n, nx)."""
         state = np.empty((len(y), self.width))
         state[:, self.z], state[:, self.y], state[:, self.age] = z, y, age
         if self.tracker is not None:
@@ -91,7 +91,7 @@ class KKL(Estimator[np.ndarray]):
         return state
 
     def take_over(self, other: "KKL", state: np.ndarray) -> np.ndarray:
-        """Return rows that continue those of another observer with the same filter; a tracker that it lacked starts."""
+        """Return rows that continue those of ``other`` with the same filter; a tracker starts if ``other`` has none."""
         new = self.begin(state[:, other.y], state[:, other.z], state[:, other.age])
         if self.tracker is not None and other.tracker is not None:
             new[:, self.tracked] = self.tracker.take_over(state[:, other.tracked])
@@ -103,7 +103,7 @@ class KKL(Estimator[np.ndarray]):
         """Return rows after samples and inputs; see :class:`Estimator`."""
         u = np.zeros((len(y), self.artifact.nu)) if u is None else u
         shapes = (len(y), self.width), (len(y), self.artifact.ny), (len(y), self.artifact.nu)
-        if (state.shape, y.shape, u.shape) != shapes:  # machine code would read beyond the arrays
+        if (state.shape, y.shape, u.shape) != shapes:  # machine code would read beyond smaller arrays
             raise ValueError(f"state, y and u must have shapes {shapes}, got {state.shape}, {y.shape} and {u.shape}")
         begun = ~np.isnan(state[:, self.age])
         if begun.all():
@@ -114,19 +114,19 @@ class KKL(Estimator[np.ndarray]):
         return state
 
     def step(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
-        """Return started rows after samples (n, ny) and inputs (n, nu)."""
+        """Return rows after samples (n, ny) and inputs (n, nu); all rows must have started."""
         if self._machine is None:
             new = self._stepped(state, y, u, dt)
         else:
             new = state.copy()
             self._machine(self._filter(dt), new, y[None], u[None])
-        if self.monitor is not None:  # outputs that the gate rejected count, too
+        if self.monitor is not None:  # the residuals of outputs that the gate rejected count, too
             residual = self.artifact.residual(np.where(np.isnan(y), new[:, self.y], y), self.decode(new))
             new[:, self.watched] = self.monitor.update(new[:, self.watched], residual, ~np.isnan(y))
         return new
 
     def _filter(self, dt: float | None) -> LinearFilter:
-        """The linear filter at a sampling interval, by default that of the artifact."""
+        """Return the linear filter at a sampling interval, by default the artifact's."""
         linear = self.artifact.filter
         if dt is None or dt == linear.dt:
             return linear
@@ -138,7 +138,7 @@ class KKL(Estimator[np.ndarray]):
         return linear.at(dt)
 
     def _stepped(self, state: np.ndarray, y: np.ndarray, u: np.ndarray, dt: float | None) -> np.ndarray:
-        """The step in NumPy, without the monitor."""
+        """Return rows after a step in NumPy; the monitor's values stay unchanged."""
         z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
         linear, tracker, gaps = self._filter(dt), self.tracker, np.isnan(y)
         samples = linear.dt / self.artifact.filter.dt
@@ -159,7 +159,7 @@ class KKL(Estimator[np.ndarray]):
     def _predicted(
         self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, state: np.ndarray, linear: LinearFilter
     ) -> np.ndarray:
-        """Samples with gaps filled by h(T_inv(z)): first for the last z, then for the z that follows from it."""
+        """Return samples whose gaps hold h(T_inv(z)), first of the last z, then of the next z that results from it."""
         z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
         following, age = z, age * self.artifact.filter.dt
         for ahead in (0.0, linear.dt):
@@ -245,9 +245,9 @@ class KKL(Estimator[np.ndarray]):
 
     @functools.cached_property
     def _machine(self) -> CompiledStep | None:
-        """The compiled step of a tracker; None without Numba, with ``compiled=False``, or where it would be too large.
+        """The compiled step; None without a tracker or Numba, with ``compiled=False``, or if it would be too large.
 
-        The linear filter by itself is a matrix product, which is as fast in NumPy.
+        Without a tracker the step is a matrix product, which is as fast in NumPy.
         """
         if self._choice is False or self.tracker is None or not available():
             return None
@@ -261,5 +261,5 @@ class KKL(Estimator[np.ndarray]):
 
 
 def _filled(y: np.ndarray, gaps: np.ndarray, predicted: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Samples with gaps filled by predicted outputs, or by the last outputs if the predictions are undefined."""
+    """Return samples with gaps filled by predicted outputs, or by the last outputs where predictions are undefined."""
     return np.where(gaps, np.where(np.isfinite(predicted), predicted, before), y)

@@ -1,4 +1,4 @@
-"""A Numba type that holds one number for each of several rows, so that code for one row steps them together."""
+"""A Numba type that holds one number for each of several rows, so that code for one row steps several rows."""
 
 import math
 import operator
@@ -70,13 +70,13 @@ def _define() -> None:
 
 
 def _common(*kinds: Any) -> Any:
-    """The type of a result: lanes if an argument has lanes, else double."""
+    """Return the type of a result: lanes if an argument has lanes, else double."""
     return next((kind for kind in kinds if isinstance(kind, _Lanes)), types.float64)
 
 
 @_intrinsic
 def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    """``yes`` where a > b, else ``no``, also where a or b is NaN."""
+    """Return ``yes`` where a > b, else ``no``, also where a or b is NaN."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">", *arguments[:2]), *arguments[2:])
@@ -87,7 +87,7 @@ def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 @_intrinsic(prefer_literal=True)
 def stack(typing: Any, count: Any, rows: Any) -> Any:
-    """Memory for ``count`` doubles, or vectors of ``rows`` doubles; a constant ``count`` allows registers instead."""
+    """Return stack memory, or registers if ``count`` is a constant, for ``count`` vectors of ``rows`` doubles."""
     kind = _Lanes(rows.literal_value) if rows.literal_value > 1 else types.float64
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -100,7 +100,7 @@ def stack(typing: Any, count: Any, rows: Any) -> Any:
 
 @_intrinsic
 def offset(typing: Any, memory: Any, count: Any) -> Any:
-    """A pointer to entry ``count`` of an array or of other memory. A slice would count references, which is slow."""
+    """Return a pointer to entry ``count`` of an array or of other memory; slices would count references, slowly."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         start = arguments[0]
@@ -113,7 +113,7 @@ def offset(typing: Any, memory: Any, count: Any) -> Any:
 
 @_intrinsic
 def doubles(typing: Any, memory: Any) -> Any:
-    """The same memory as doubles: first those of the first lanes, then those of the second, and so on."""
+    """Return the memory of vectors as doubles: all lanes of the first vector, then all of the second, and so on."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.bitcast(arguments[0], ir.DoubleType().as_pointer())

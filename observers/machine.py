@@ -30,7 +30,7 @@ def kernel(**options: Any) -> Callable[[_F], _F]:
 
         named = _named(function, options)
         made: Any = numba.njit(named, **options)
-        with suppress(RuntimeError):  # no folder can be written
+        with suppress(RuntimeError):  # Numba raises it if no folder for the cache can be written
             made._cache = _forgiving()(named)
         return made
 
@@ -43,7 +43,7 @@ def pointer(function: Callable[..., Any], signature: Any, **options: Any) -> Any
 
     named = _named(function, options)
     made: Any = CFunc(named, (signature.args, signature.return_type), locals={}, options=options)
-    with suppress(RuntimeError):  # no folder can be written
+    with suppress(RuntimeError):  # Numba raises it if no folder for the cache can be written
         made._cache = _forgiving()(named)
     made.compile()
     return made
@@ -51,16 +51,16 @@ def pointer(function: Callable[..., Any], signature: Any, **options: Any) -> Any
 
 @cache
 def _announce() -> None:
-    logger.info("Numba compiles, which takes some seconds; later processes read the machine code from disk")
+    logger.info("Numba is compiling, which takes some seconds; later processes read the machine code from disk")
 
 
 @cache
 def _forgiving() -> Any:
-    """Numba's cache, but a file that cannot be read or written causes a compilation instead of an error."""
+    """Return a subclass of Numba's cache that compiles again if it cannot read a file, and ignores failed writes."""
     from numba.core.caching import FunctionCache
 
     class Forgiving(FunctionCache):
-        def _index_key(self, sig: Any, codegen: Any) -> Any:  # by name, which contains a hash
+        def _index_key(self, sig: Any, codegen: Any) -> Any:  # the name contains a hash of the content
             return sig, codegen.magic_tuple(), self._py_func.__qualname__
 
         def load_overload(self, *arguments: Any) -> Any:
@@ -87,13 +87,13 @@ def part(**options: Any) -> Callable[[_F], _F]:
     A compiled function would differ between processes, and kernels that call it would not be found on disk.
     """
 
-    def known(function: _F) -> _F:
+    def registered(function: _F) -> _F:
         from numba.extending import register_jitable
 
         made: _F = register_jitable(**options)(_named(function, options))
         return made
 
-    return known
+    return registered
 
 
 def _named(function: _F, options: dict[str, Any]) -> _F:

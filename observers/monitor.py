@@ -20,20 +20,20 @@ class Limits:
     Parameters
     ----------
     levels : ndarray, shape (k,) or (k, ny)
-        Standard deviations of the measurement noise, one for all outputs or one for each, rising from 0. Limits are
-        interpolated between them. In each row, all outputs have the same share of their largest level.
+        Standard deviations of the measurement noise, one for all outputs or one for each, rising from 0. With one for
+        each, all outputs in a row have the same share of their largest level. Limits are interpolated between levels.
     mean : ndarray, shape (k, ny)
-        Limits of the absolute running mean of the residual.
+        Limits of the absolute value of the residual's running mean.
     low, high : ndarray, shape (k, ny)
-        Limits of the running mean square of the residual. ``low`` is 0 at level 0, where there is no noise to miss.
+        Limits of the residual's running mean square. ``low`` is 0 at level 0, where sound sensors have no noise.
     window : float
         Time constant of the running means, in seconds.
     warm_up : float
-        Seconds after reset in which the observer still converges; residuals do not count then.
+        Seconds after reset in which the observer still converges and the score is 0.
     false_alarms : float
         Probability of an alarm in a run without faults, within (0, 1).
     duration : float
-        Duration of such a run in seconds.
+        Duration of a run in seconds.
     """
 
     levels: np.ndarray
@@ -50,13 +50,13 @@ class Limits:
             object.__setattr__(self, name, real_array(f"the limits' {name}", getattr(self, name)))
         shape = self.mean.shape
         if len(shape) != 2 or not shape[0] or not shape == self.low.shape == self.high.shape:
-            raise ValueError(f"limits must be (levels, ny), got {shape}, {self.low.shape}, {self.high.shape}")
+            raise ValueError(f"limits must have shape (levels, ny), got {shape}, {self.low.shape}, {self.high.shape}")
         if self.levels.shape not in (shape[:1], shape):
-            raise ValueError(f"levels must have shape {shape[:1]} or {shape} as the limits, got {self.levels.shape}")
+            raise ValueError(f"levels must have shape {shape[:1]} or {shape}, as the limits, got {self.levels.shape}")
         if self.levels[0].any() or not (np.diff(self.levels, axis=0) > 0).all():
             raise ValueError(f"levels must rise from 0, got {self.levels}")
         if not ((self.mean > 0) & (self.low >= 0) & (self.high > self.low)).all():
-            raise ValueError("limits must be positive, the low ones below the high ones")
+            raise ValueError("mean and high must be positive, and low from 0 to below high")
         if not all((limit <= _LARGEST).all() for limit in (self.levels, self.mean, self.high)):
             raise ValueError(f"limits and their levels must be finite, and not beyond {_LARGEST:g}")
         for name in ("window", "warm_up", "false_alarms", "duration"):
@@ -72,11 +72,11 @@ class Limits:
     def at(self, level: float | tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the limits at a noise level.
 
-        If some outputs are noisier than others, relative to the largest levels, their noise reaches the estimate and so
-        every residual. All outputs then have the upper limits at the relative level of the noisiest output.
+        Some outputs may be noisier than others, relative to the largest levels. Their noise reaches the estimate, and
+        so every residual: all outputs then have the upper limits at the relative level of the noisiest output.
 
-        Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each, interpolated as
-        variances. Raises ValueError if a level is not a number, negative or beyond the last one.
+        Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each. Mean squares
+        and squared means are linear in the squared level. Raises ValueError if a level is invalid or beyond the last.
         """
         ny = self.mean.shape[1]
         level = noise_levels("the noise level", level, ny)
@@ -97,7 +97,7 @@ class Limits:
 class Monitor:
     """Running mean and mean square of the residual, compared with their limits.
 
-    A biased sensor shifts the mean, a frozen or dead one has too little noise, and filter states far outside the
+    A biased sensor shifts the mean, a frozen or dead sensor has too little noise, and filter states far outside the
     training make the residual large.
 
     Parameters
@@ -122,7 +122,7 @@ class Monitor:
         self._limits = limits.at(level)
         self._share = -np.expm1(-dt / limits.window)
         self._silent = np.round(limits.warm_up / dt)
-        self._sound = np.maximum(np.square(level), self._limits[1])  # start of the running mean square
+        self._sound = np.maximum(np.square(level), self._limits[1])  # initial value of the running mean square
 
     @property
     def width(self) -> int:
@@ -142,7 +142,7 @@ class Monitor:
         return np.concatenate([mean, square, samples + seen.any(-1, keepdims=True)], axis=-1)
 
     def score(self, rows: np.ndarray) -> np.ndarray:
-        """Return the scores (n,): above 1 a limit is exceeded, and 0 during the warm-up."""
+        """Return the scores (n,): above 1 if a limit is exceeded, and 0 during the warm-up."""
         (mean, square, samples), (most, low, high) = self._parts(rows), self._limits
         worst = np.maximum(np.abs(mean) / most, square / high)
         worst = np.maximum(worst, low / np.maximum(square, 1e-300))

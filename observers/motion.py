@@ -1,4 +1,4 @@
-"""The motion of a state over one sample: by the system's equations, or by a learned flow."""
+"""Models of a state's motion over a sampling interval: a system's equations, or a learned flow."""
 
 import math
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ class Equations:
     field : Expression
         f(x) + g(x) u, or the next state in discrete time; nx components.
     substeps : int, default 1
-        Fourth-order Runge-Kutta steps in a sample, 0 for a system in discrete time. More than 1024 raise ArtifactError.
+        Fourth-order Runge-Kutta steps in an interval, at most 1024 (else ArtifactError). 0: a system in discrete time.
     """
 
     field: Expression
@@ -34,7 +34,7 @@ class Equations:
             raise ArtifactError(f"substeps must be an integer from 0 to {_MAX_SUBSTEPS}, got {self.substeps!r}")
 
     def __call__(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
-        """Return the states ``samples`` times dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        """Return the states samples * dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         f, substeps = self.field, self.steps(samples)
         if not self.substeps:
             for _ in range(substeps):
@@ -50,7 +50,7 @@ class Equations:
         return x
 
     def steps(self, samples: float) -> int:
-        """Number of Runge-Kutta steps, or of steps in discrete time, in ``samples`` intervals."""
+        """Return the number of Runge-Kutta steps, or of steps in discrete time, in ``samples`` sampling intervals."""
         return round(samples) if not self.substeps else max(1, math.ceil(self.substeps * samples - 1e-9))
 
 
@@ -78,7 +78,7 @@ class Flow:
     def __post_init__(self) -> None:
         nx = self.mlp.outputs
         if self.u_scale.ndim != 1 or self.mlp.inputs != nx + len(self.u_scale):
-            raise ArtifactError(f"a flow of {nx} states and {len(self.u_scale)} inputs needs as many network inputs")
+            raise ArtifactError(f"a flow's network must have {nx + len(self.u_scale)} inputs, got {self.mlp.inputs}")
         check_shapes(self, {"linear": (nx, 1 + self.mlp.inputs), "gain": (nx,)})
         if not (self.u_scale > 0).all():
             raise ArtifactError(f"u_scale of a flow must be positive, got {self.u_scale}")
@@ -91,10 +91,10 @@ class Flow:
 
 @dataclass(frozen=True)
 class Motion:
-    """The model of a tracker: the motion of states, its uncertainty and its calibration.
+    """The model by which a tracker predicts: the motion of the states, its uncertainty and its calibration.
 
-    Scaled states are s = (x - x_offset) / x_scale. Standard deviations of states are in scaled units, those of outputs
-    in the outputs' units. Raises ArtifactError if the parts do not fit each other.
+    Scaled states are s = (x - x_offset) / x_scale. Standard deviations of states refer to scaled states, and standard
+    deviations of outputs are in the outputs' units. Raises ArtifactError if the parts do not fit each other.
 
     Parameters
     ----------
@@ -107,13 +107,13 @@ class Motion:
     low, high : ndarray, shape (nx,)
         Bounds of the states, to which estimates are limited.
     mean : ndarray, shape (nx,)
-        Mean of the motions' initial states: the estimate before the first sample.
+        Mean of the initial states in training: the estimate before the first sample.
     covariance : ndarray, shape (nx, nx)
-        Covariance of the motions' initial states.
+        Covariance of the initial states in training.
     error : ndarray, shape (nx,)
-        Standard deviation of the motion's own error over a sample.
+        Standard deviation of the model's error over one sample.
     process_noise : ndarray, shape (nx,)
-        Standard deviation that process noise of level 1 adds in a sample.
+        Standard deviation that process noise of level 1 adds over one sample.
     least_process_noise : float
         Lower bound of the assumed level of process noise: with Q = 0 the gain would vanish.
     least_measurement_noise : ndarray, shape (ny,)
@@ -122,7 +122,7 @@ class Motion:
         Seconds over which innovations are averaged. For this time after a reset, T_inv's estimate may replace the
         tracker's.
     factors : Factors, optional
-        Calibration factors of the filter's covariance.
+        Calibration factors of the Kalman filter's covariance.
     """
 
     x_offset: np.ndarray
@@ -179,7 +179,7 @@ class Motion:
         return self.equations.field.inputs <= nu
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
-        """Return the states ``samples`` times dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        """Return the states samples * dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         if self.equations is not None:
             return self.equations(x, u, dt, samples)
         assert self.flow is not None
@@ -195,8 +195,8 @@ class Motion:
         if not continuous and abs(samples - max(1, round(samples))) > 1e-3:
             what = "a learned flow" if self.flow is not None else "a motion in discrete time"
             raise ValueError(
-                f"{what} predicts over whole samples, got a dt of {samples:g} samples; pass a whole multiple of the "
-                "sampling interval, or tracking=False"
+                f"{what} predicts over whole sampling intervals, got a dt of {samples:g} intervals; pass a whole "
+                "multiple of the interval, or tracking=False"
             )
 
     def variances(

@@ -39,7 +39,7 @@ def load(
     Raises
     ------
     ArtifactError, ImportError, ValueError
-        If there is no such name or file, or the file is damaged or of another kind. Also as :class:`KKLObserver`.
+        If there is no such name or file, the file is damaged or of another kind, or :class:`KKLObserver` raises one.
     """
     return KKLObserver(
         Artifact.read(resolve(name_or_path)),
@@ -65,7 +65,7 @@ def shipped() -> tuple[str, ...]:
 
 
 def resolve(name_or_path: str | os.PathLike[str]) -> Path:
-    """Return the file of a name."""
+    """Return the path of an observer's file, given this path or the name of a shipped map."""
     text = os.fspath(name_or_path) if isinstance(name_or_path, str | os.PathLike) else None
     if not isinstance(text, str):
         raise ArtifactError(f"an observer is a shipped name or a path, got {shown(name_or_path)}")
@@ -73,7 +73,7 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
         return Path(text)
     names = shipped()
     if ":" in text or text.endswith(".py"):
-        raise ArtifactError(f"{text} names a system; name its observer's file, such as runs/NAME/NAME.safetensors")
+        raise ArtifactError(f"{text} names a system; pass its observer's file, such as runs/NAME/NAME.safetensors")
     if (name := matching(text, names)) is None:
         raise ArtifactError(
             f"unknown observer {shown(text)}{suggestion(text, names)}; shipped: {', '.join(names) or 'none'}; "
@@ -83,12 +83,12 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
 
 
 def matching(text: str, names: Iterable[str]) -> str | None:
-    """The name that matches a text, apart from capitals, underscores and the form of an environment's id, or None."""
+    """Return the name that matches a text, or None; capitals, underscores, "KKL" and "-v0" do not count."""
     return {_plain(name): name for name in names}.get(_plain(text.removeprefix("KKL").removesuffix("-v0")))
 
 
 def suggestion(text: str, names: Iterable[str]) -> str:
-    """A hint for error messages: the name closest to a text, if one is close."""
+    """Return a hint for error messages: the name closest to a text, if any name is close."""
     close = get_close_matches(text, list(names), n=1)
     return f", did you mean {close[0]!r}?" if close else ""
 

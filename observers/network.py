@@ -7,8 +7,8 @@ import numpy as np
 
 from observers.checks import choice, real_array, shown
 
-_PIECE = 2**15  # values of a layer that a batch computes together; they fit the second-level cache
-UNROLLED = 4  # inputs that machine code processes together
+_PIECE = 2**15  # values of a layer that are computed together, so that they fit the second-level cache
+UNROLLED = 4  # inputs of a layer that the machine code processes together
 
 
 def _tanh(h: np.ndarray) -> np.ndarray:
@@ -57,7 +57,7 @@ class MLP:
             with np.errstate(over="ignore"):  # numbers that are too large become infinite, and are rejected below
                 object.__setattr__(self, name, [real_array(name, each).astype(np.float32) for each in arrays])
         if not self.weights or len(self.weights) != len(self.biases):
-            raise ValueError(f"{len(self.weights)} weights and {len(self.biases)} biases do not make a network")
+            raise ValueError(f"a network needs as many weights as biases, got {len(self.weights)}, {len(self.biases)}")
         width, layers = None, []
         for weight, bias in zip(self.weights, self.biases, strict=True):
             if weight.ndim != 2 or bias.shape != weight.shape[:1]:
@@ -65,7 +65,7 @@ class MLP:
                     f"weights must be (outputs, inputs), biases (outputs,), got {weight.shape} and {bias.shape}"
                 )
             if width not in (None, weight.shape[1]):
-                raise ValueError(f"weights of shape {weight.shape} cannot follow {width} values")
+                raise ValueError(f"weights of shape {weight.shape} cannot follow a layer of {width} outputs")
             layers.append((np.ascontiguousarray(weight.T), bias))
             if not all(np.isfinite(values).all() for values in layers[-1]):
                 raise ValueError("the network holds weights or biases that are not finite")
@@ -83,7 +83,7 @@ class MLP:
         return int(self.weights[-1].shape[0])
 
     def part(self, outputs: slice) -> "MLP":
-        """The same network with only some of its outputs."""
+        """Return the same network with only some of its outputs."""
         *weights, last = self.weights
         *biases, bias = self.biases
         return MLP([*weights, last[outputs]], [*biases, bias[outputs]], self.activation)
@@ -112,10 +112,10 @@ class MLP:
         return h
 
     def packed(self, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Layers from ``first`` on in the form of :func:`observers.kernel_functions.evaluate`.
+        """Return the layers from ``first`` on in the form that :func:`observers.kernel_functions.evaluate` takes.
 
-        Returns one array of all biases and weights, padded with rows of zeros to a multiple of UNROLLED, and one with
-        the index of the activation and all widths.
+        One array holds all biases and weights, padded with rows of zeros to a multiple of UNROLLED; the other holds the
+        index of the activation and all widths.
         """
         layers, (outputs, inputs) = self.layers[first:], np.shape(self.weights[max(first - 1, 0)])
         padded = [(bias, np.pad(weight, ((0, -len(weight) % UNROLLED), (0, 0)))) for weight, bias in layers]

@@ -1,4 +1,4 @@
-"""The observer at run time."""
+"""The observer that users call: state estimates from samples, one by one or along a record."""
 
 import math
 import warnings
@@ -24,11 +24,11 @@ from observers.samples import (
 
 
 class KKLObserver(RecordEstimates):
-    """z' = A z + B y, x_hat = T_inv(z): a causal state estimate from sampled outputs (paper, sec. 3.2).
+    """z' = A z + B y, x_hat = T_inv(z): a causal state estimate from sampled outputs (Niazi et al., 2025).
 
     ``x_hat_0 = reset(y_0)``, then ``x_hat_k+1 = step(y_k+1, u_k)`` with u_k the input held over [t_k, t_k+1].
-    All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx). A step is :meth:`advance`, the
-    linear filter, followed by :meth:`decode`, the network; :meth:`restart` restarts some rows of a batch.
+    All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx). A step is :meth:`advance`,
+    which takes the sample, and then :meth:`decode`, which returns the estimate; :meth:`restart` restarts some rows.
 
     After a reset the filter has a transient. If the state x_0 is known and the artifact holds the forward map T,
     ``reset(y_0, x_0)`` starts at z_0 = T(x_0) without transient. T also gives :attr:`mismatch`, the distance of z from
@@ -43,12 +43,12 @@ class KKLObserver(RecordEstimates):
     artifact : Artifact
         The learned filter, maps and motion.
     measurement_noise : float or sequence of float, length ny, optional
-        Standard deviation of the noise on each sample, one for all outputs or one for each, for maps that take it. None
-        is :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
+        Standard deviation of the noise on each sample, one for all outputs or one for each, for maps that take it. By
+        default :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
     process_noise : float, optional
         Level of the noise on the state's derivative, in multiples of the system's scale per second as in environments,
-        for maps that take it. T_inv limits the level to the largest of its training; the tracker takes any level. None
-        is the system's own level, which environments and the monitor's limits also assume.
+        for maps that take it. T_inv limits the level to the largest in its training; the tracker takes any level. By
+        default the largest level in T_inv's training, which is also the default of the system's environments.
     monitor : bool, default False
         Whether to test if the samples fit the estimates, see :attr:`score`.
     tracking : bool, optional
@@ -56,16 +56,16 @@ class KKLObserver(RecordEstimates):
         motion model.
     compiled : bool, optional
         Whether Numba compiles the step (the extra ``fast``). None compiles if Numba is installed, True requires it, and
-        False uses NumPy. The first process on a machine compiles for some seconds; later ones read the machine code
-        from disk. Numba and NumPy agree to rounding.
+        False uses NumPy. The first process on a machine compiles for some seconds; later processes read the machine
+        code from disk. Numba and NumPy agree to rounding.
     gate : float, optional
-        Largest innovation, in its own standard deviations. Outputs beyond it are rejected: they count as missing, and
-        :attr:`rejected` counts them. The gate accepts all outputs in the first window, half a second for the
-        maps that ship. It also opens after a divergence, and for an output that was beyond it for a whole window, and
-        stays open until the output fits again: so a lasting jump is accepted. A gate needs a map that tracks.
+        Largest innovation, in multiples of its standard deviation. The observer rejects outputs with larger
+        innovations: it treats them as missing, and :attr:`rejected` counts them. In the first window, half a second for
+        the maps that ship, it accepts all outputs. After a divergence, and for an output beyond the gate for a whole
+        window, it accepts outputs until they fit again, so a lasting jump is accepted. A gate needs a map that tracks.
     delay : int, default 0
         Samples by which outputs arrive late. ``step(y, u)`` takes the output of ``delay`` samples ago and the input
-        held since the last sample; the motion model then predicts the estimate to now. A delay needs a map that tracks.
+        held since the last sample; the motion model then predicts the current state. A delay needs a map that tracks.
 
     Raises
     ------
@@ -111,7 +111,7 @@ class KKLObserver(RecordEstimates):
         if level != (within := inverse.within(level)):
             raise ValueError(
                 f"measurement_noise = {level} is beyond the map's range, 0 to {inverse.measurement_noise_max}; "
-                f"pass measurement_noise={within} to use it nevertheless"
+                f"pass measurement_noise={within}, the nearest level that the map takes"
             )
         self._set_levels(level, self._process_noise)
 
@@ -126,7 +126,7 @@ class KKLObserver(RecordEstimates):
 
     @property
     def gate(self) -> float | None:
-        """Largest innovation of an accepted output, in its own standard deviations; None accepts all."""
+        """Largest innovation of an accepted output, in multiples of its standard deviation; None accepts all."""
         return self._gate
 
     @gate.setter
@@ -162,9 +162,9 @@ class KKLObserver(RecordEstimates):
         self._kkl, self._measurement_noise, self._process_noise = kkl, measurement_noise, process_noise
 
     def replace(self, artifact: Artifact) -> None:
-        """Use the maps of another artifact with the same filter from now on. The filter's state stays.
+        """Use the maps of another artifact with the same filter from now on. The filter's state stays unchanged.
 
-        If the new map tracks and the old one did not, tracking starts at the current sample. A monitor restarts.
+        If the new map tracks and the old map did not, tracking starts at the current sample. A monitor restarts.
 
         Parameters
         ----------
@@ -174,8 +174,8 @@ class KKLObserver(RecordEstimates):
         Raises
         ------
         ValueError
-            If the artifact differs in more than its maps, the noise level is beyond its range, or it holds no limits
-            for the monitor. The observer is then unchanged.
+            If the artifact differs in more than its maps, does not cover the noise level, or holds no limits for the
+            monitor. The observer is then unchanged.
         """
         check_replacement(self.artifact, artifact)
         how: dict[str, Any] = {**self._options, "gate": self._gate, "delay": self._delay}
@@ -206,7 +206,7 @@ class KKLObserver(RecordEstimates):
         x0 : array_like, shape (..., nx), optional
             The state, if it is known. The filter then starts at z_y = T(x0) and z_u = 0, as if it had always followed
             a motion without input: there is no transient. An observer that tracks starts at x0 itself, limited to the
-            bounds of the states, with or without T. If x0 is known in some rows only, :meth:`restart` these.
+            bounds of the states, with or without T. If x0 is known in some rows only, pass it to :meth:`restart`.
 
         Returns
         -------
@@ -227,7 +227,7 @@ class KKLObserver(RecordEstimates):
         return self.decode()
 
     def _begin(self, y0: np.ndarray, x0: np.ndarray | None) -> np.ndarray:
-        """Rows of the state at first samples (..., ny), or at known states (..., nx)."""
+        """Return rows of the state at first samples (..., ny) and, if given, known states (..., nx)."""
         z0, age = first_state(self.artifact, y0, x0)
         n = math.prod(y0.shape[:-1])
         x0 = None if x0 is None else real_array("x0", x0).reshape(n, self.artifact.nx)
@@ -238,9 +238,9 @@ class KKLObserver(RecordEstimates):
         """How badly the samples since reset fit the estimates, shape (...,): above 1 a fault is likely.
 
         The score is the largest of the running means and mean squares of y - h(x_hat), each relative to its limit. It
-        is 0 right after reset, and missing outputs do not change it. A biased, frozen or dead sensor raises the score,
-        and so do states outside the training. :class:`observers.Limits` gives the rate of false alarms. Raises
-        RuntimeError before :meth:`reset`, or without ``monitor=True``.
+        is 0 in the warm-up after a reset, and missing outputs do not change it. Biased, frozen and dead sensors raise
+        the score, and so do states outside the training. :class:`observers.Limits` gives the rate of false alarms.
+        Raises RuntimeError before :meth:`reset`, or without ``monitor=True``.
         """
         if self._kkl.monitor is None or self._state is None:
             raise RuntimeError("score needs an observer made with monitor=True, and reset(y0)")
@@ -260,20 +260,20 @@ class KKLObserver(RecordEstimates):
     def mismatch(self) -> np.ndarray:
         """Distance of the filter's state from the image of T, shape (...,): 0 where z_y = T(x_hat).
 
-        It is the root mean square of (T(x_hat) - z_y) / :attr:`ForwardMap.z_scale` over the modes. It is large in the
-        transient, under sensor faults and inputs, on another plant, and outside the training; noise adds a little. It
-        does not show a fault that keeps z on the image of T. No limits are stored: compare with runs without faults.
+        It is the root mean square of (T(x_hat) - z_y) / :attr:`ForwardMap.z_scale` over the entries of z_y. It is large
+        in the transient, under sensor faults and inputs, on another plant, and outside the training; noise adds a
+        little. It does not show a fault that keeps z on the image of T. Compare it with its value in sound runs.
         Raises RuntimeError before :meth:`reset`, and ValueError if the artifact holds no T.
         """
         z, T = self.z, self.artifact.require_forward()
         x_hat = self._kkl.decode(self._begun()).reshape(*self._batch, self.artifact.nx)  # at the time of z
-        apart = (T(x_hat) - z[..., : len(T.z_scale)]) / T.z_scale
-        return np.sqrt(np.mean(apart**2, axis=-1, keepdims=True))[..., 0]
+        difference = (T(x_hat) - z[..., : len(T.z_scale)]) / T.z_scale
+        return np.sqrt(np.mean(difference**2, axis=-1, keepdims=True))[..., 0]
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray | None = None) -> None:
         """Start again at first samples in some rows of the batch.
 
-        Raises the errors of :meth:`reset`, and RuntimeError before it.
+        Raises the errors of :meth:`reset`, and RuntimeError before the first reset.
 
         Parameters
         ----------
@@ -293,9 +293,8 @@ class KKLObserver(RecordEstimates):
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None, *, dt: float | None = None) -> np.ndarray:
         """Process the next sample.
 
-        If outputs are missing, such as those of slower sensors, the observer uses predictions in their place: an
-        observer that tracks predicts by its motion model, any other by h(T_inv(z)). Without h, a missing output keeps
-        its last value.
+        If outputs are missing, such as those of slower sensors, the observer predicts them: by its motion model if it
+        tracks, else by h(T_inv(z)). Without h, a missing output keeps its last value.
 
         Parameters
         ----------
@@ -304,8 +303,8 @@ class KKLObserver(RecordEstimates):
         u : array_like, shape (..., nu), optional
             The input held since the last sample, by default zero.
         dt : float, optional
-            Seconds since the last sample, by default the map's interval, and at most 1,000 intervals. A learned flow,
-            like a system in discrete time, needs a whole multiple of the interval.
+            Seconds since the last sample, by default the map's sampling interval, and at most 1,000 intervals. A
+            learned flow, like a system in discrete time, needs a whole multiple of the interval.
 
         Returns
         -------
@@ -315,9 +314,9 @@ class KKLObserver(RecordEstimates):
         Raises
         ------
         ValueError
-            If a shape is wrong, an entry is not a finite real number (or NaN as described), an input that the map
-            does not take is not zero, ``dt`` does not suit the motion model, or ``dt`` and a delay are both given. The
-            observer is then unchanged.
+            If a shape is wrong, an entry is not a finite real number (apart from NaN in ``y``), a nonzero input is
+            given to a map without inputs, ``dt`` does not suit the motion model, or ``dt`` and a delay are both given.
+            The observer is then unchanged.
         RuntimeError
             Before :meth:`reset`.
         """
@@ -353,7 +352,7 @@ class KKLObserver(RecordEstimates):
         dt = None if dt is None else check_dt(dt)
         if self._delay:
             if dt is not None:
-                raise ValueError("an observer with a delay takes samples at the interval of its map: leave dt out")
+                raise ValueError("with a delay, samples must be one interval of the map apart: leave dt out")
             every = np.ones(len(u), dtype=bool)
             self._pending, u, rows = self._pending.after(u, every if rows is None else rows)
         if rows is None:
@@ -424,7 +423,7 @@ class KKLObserver(RecordEstimates):
         return self._state
 
     def _some(self, rows: np.ndarray | None) -> tuple[np.ndarray, tuple[int, ...]]:
-        """Some rows of the state, predicted to the present if outputs are delayed, and the shape of their batch."""
+        """Return some rows of the state, predicted to now if outputs are delayed, and the shape of their batch."""
         state, batch = self._begun(), self._batch
         chosen: Any = slice(None)
         if rows is not None:

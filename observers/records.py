@@ -22,7 +22,7 @@ class RecordEstimates:
     def estimate(
         self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None, t: np.ndarray | None = None
     ) -> np.ndarray:
-        """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
+        """Return the estimates along a whole record that :meth:`reset` and :meth:`step` would return row by row.
 
         The observer's own state does not change. Raises the errors of :meth:`reset` and :meth:`step`.
 
@@ -35,7 +35,7 @@ class RecordEstimates:
         x0 : array_like, shape (..., nx), optional
             The state at y_0, if it is known, as for :meth:`reset`.
         t : array_like, shape (steps,), optional
-            Increasing times of the samples in seconds; by default one interval of the map apart.
+            Increasing times of the samples in seconds. By default samples are one sampling interval of the map apart.
 
         Returns
         -------
@@ -45,7 +45,7 @@ class RecordEstimates:
         return self._along(y, u, x0, of=self._kkl.decode, t=t)
 
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Estimate the system's uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
+        """Return the estimates of uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
 
         Arguments and errors are those of :meth:`estimate`. Shapes: returns (steps, ..., number of parameters).
         """
@@ -54,7 +54,7 @@ class RecordEstimates:
     def estimate_covariance(
         self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
     ) -> np.ndarray:
-        """Error covariances of the estimates that :meth:`estimate` returns: :attr:`covariance` at each sample.
+        """Return the error covariances of the estimates of :meth:`estimate`: :attr:`covariance` at each sample.
 
         Arguments and errors are those of :meth:`estimate`. Shapes: returns (steps, ..., nx, nx).
         """
@@ -64,9 +64,9 @@ class RecordEstimates:
     def _along(
         self, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, *, of: Any, t: np.ndarray | None = None
     ) -> np.ndarray:
-        """The values of a function of the state's rows at each sample."""
+        """Return the values of ``of``, a function of the state's rows, at each sample."""
         if self._delay:
-            raise ValueError("a record has no delay: shift its outputs by the delay, and use an observer without one")
+            raise ValueError("a record needs an observer without a delay: shift its outputs by the delay instead")
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
             raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")

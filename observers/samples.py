@@ -1,4 +1,4 @@
-"""Checks of all that is passed to an observer: arguments, replacement maps, samples, inputs, records and states."""
+"""Checks of the values that users pass to an observer: arguments, other artifacts, samples, inputs and states."""
 
 import math
 from collections.abc import Callable
@@ -18,10 +18,10 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tr
     if not isinstance(artifact, Artifact):
         raise ValueError(f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names")
     if flag("monitor", monitor) and artifact.limits is None:
-        found = "them" if artifact.knows_output else "them, and with the output h(x), which this one lacks as well"
+        parts = "limits" if artifact.knows_output else "limits, and with the output h(x), which this one lacks, too"
         raise ValueError(
             f"this artifact for {artifact.system!r} holds no limits for a monitor; training.calibrate(artifact, "
-            f"system) returns an artifact with {found}"
+            f"system) returns an artifact with {parts}"
         )
     if tracking is not None and flag("tracking", tracking):
         artifact.require_motion()
@@ -57,27 +57,27 @@ def _check_tracks(artifact: Artifact, tracking: bool | None) -> None:
 
 
 def check_replacement(artifact: Artifact, other: Artifact) -> None:
-    """Raise ArtifactError unless an artifact can replace another while the filter runs."""
+    """Raise ArtifactError unless the artifact ``other`` can replace ``artifact`` while the filter runs."""
     if not isinstance(other, Artifact):
         raise ArtifactError(f"the replacement must be an observers.Artifact, got {shown(other)}")
-    there = _serves(other)
-    for what, here in _serves(artifact).items():
+    there = _shared(other)
+    for what, here in _shared(artifact).items():
         if here != there[what]:
             raise ArtifactError(
-                f"the observer in use has {what} {shown(here)}, the other {shown(there[what])}: the replacement "
-                "may differ only in its maps; make a new wrapper"
+                f"the observer in use has {what} {shown(here)}, the replacement {shown(there[what])}: only their maps "
+                "may differ; make a new wrapper instead"
             )
     for name in ("A", "B", "dt"):
         mine, others = (np.asarray(getattr(each.filter, name)) for each in (artifact, other))
         if mine.shape != others.shape or not np.allclose(mine, others, rtol=1e-9, atol=0.0):
             raise ArtifactError(
-                f"the filters differ in {name}, so that one cannot use the other's state: train with the "
-                "eigenvalues and dt of the observer in use, or make a new wrapper"
+                f"the filters differ in {name}, so the replacement cannot continue from the current state: train it "
+                "with the eigenvalues and dt of the observer in use, or make a new wrapper"
             )
 
 
-def _serves(artifact: Artifact) -> dict[str, Any]:
-    """Properties that a replacement must share, by their names in messages."""
+def _shared(artifact: Artifact) -> dict[str, Any]:
+    """Return the properties that a replacement must share, by their names in messages."""
     signals, environment = artifact.signals, artifact.environment
     return {
         "environment": environment,
@@ -93,7 +93,7 @@ def _serves(artifact: Artifact) -> dict[str, Any]:
 def check_output(
     artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], warn: Callable[[str], None] | None = None
 ) -> None:
-    """Check outputs (..., ny). Without ``warn`` they are a first sample, in which none may be missing."""
+    """Check outputs (..., ny). Without ``warn`` they are a first sample, in which no output may be missing."""
     if y.shape != (*batch, artifact.ny):
         raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
     if all_finite(y):
@@ -117,10 +117,10 @@ def held_input(
         raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
     if nu == 0 and u.any():
         raise ValueError(
-            f"this map for {artifact.system} takes no inputs, but u = {u}; use one that does, "
-            "or pass u=None to ignore the input"
+            f"this map for {artifact.system} takes no inputs, but u = {u}; use a map that takes inputs, "
+            "or pass u=None to ignore them"
         )
-    if not all_finite(u, artifact.usual_input):  # one pass for both checks is faster
+    if not all_finite(u, artifact.usual_input):  # smaller inputs need neither of the checks below
         _check_finite("u", u)
         most = np.array(artifact.u_max)
         if (far := np.abs(u) > FAR * most).any():
@@ -142,11 +142,11 @@ def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tu
         return artifact.filter.start(y0), 0
     z0 = np.zeros((*shape[:-1], artifact.filter.size))
     z0[..., : artifact.forward.mlp.outputs] = artifact.forward(x0)
-    return z0, math.inf  # every map limits this age to its age_max
+    return z0, math.inf  # the age of a filter without transient; maps limit it to their age_max
 
 
 def recorded_inputs(u: np.ndarray | None, steps: int) -> np.ndarray | None:
-    """Return the inputs (steps - 1, ..., nu) between samples; one more, after the last sample, is dropped."""
+    """Return the inputs (steps - 1, ..., nu) between samples, without any input after the last sample."""
     if u is None:
         return None
     u = real_array("u", u)

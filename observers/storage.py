@@ -20,7 +20,7 @@ from safetensors.numpy import save as serialise
 
 from observers.network import MLP
 
-MOST_BYTES = 256 * 2**20  # largest file; maps of the paper's sizes have one or two million bytes
+MOST_BYTES = 256 * 2**20  # largest file; the shipped maps have up to 350,000 bytes
 MOST_HEADER = 2**20  # bytes of the header, which holds the JSON
 DEEPEST = 32  # levels of nested objects and lists
 UNFINISHED = ".part-"  # prefix of temporary files
@@ -45,8 +45,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary file to write, which replaces ``path`` once it is complete and on disk.
 
     The temporary file is in the same folder, which is created if missing. It has the same suffix, from which some
-    writers choose a format, and the permissions of the umask. After an exception it is deleted, and ``path`` is
-    unchanged. If the process is killed, the temporary file stays, see :func:`clear_unfinished`.
+    writers choose a format, and the permissions that the umask allows. After an exception it is deleted, and ``path``
+    is unchanged. If the process is killed, the temporary file stays (:func:`training.files.clear_unfinished`).
     """
     target = Path(path)
     temporary = target.with_name(f"{UNFINISHED}{secrets.token_hex(4)}-{target.stem}{target.suffix}")
@@ -73,11 +73,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 def save(
     path: str | os.PathLike[str], tensors: Mapping[str, np.ndarray], *, key: str, described: Mapping[str, Any]
 ) -> None:
-    """Write arrays and their description to one file, atomically; creates its folder."""
+    """Write arrays and their description to one file, atomically, and create its folder if it is missing."""
     arrays = {name: np.asarray(tensor, order="C") for name, tensor in tensors.items()}
     for name, array in arrays.items():
         if array.dtype not in _TYPES.values():
-            raise TypeError(f"{name!r} is of type {array.dtype}, {path} can hold float32 and float64: convert it")
+            raise TypeError(f"{name!r} is of type {array.dtype}, but {path} holds only float32 and float64: convert it")
     text = json.dumps(dict(described), sort_keys=True, allow_nan=False)
     header, data = _parts(serialise(arrays, metadata={key: text}))
     header["__metadata__"][f"{key}-sha256"] = hashlib.sha256(_whole(header, data)).hexdigest()
@@ -94,7 +94,7 @@ def save(
 def read(
     path: str | os.PathLike[str], *, key: str, error: type[Exception], what: str
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read a file of :func:`save`; raises ``error``, which calls the file ``what``, if it is invalid."""
+    """Return arrays and description from a file of :func:`save`, or raise ``error``, which calls the file ``what``."""
     content = _content(path, error)
     try:
         views: list[tuple[str, dict[str, Any]]] = deserialize(content)  # type: ignore[no-untyped-call]
@@ -128,18 +128,18 @@ def read(
             raise error(f"{path}: its tensor {name} is of type {view['dtype']}, expected one of {', '.join(_TYPES)}")
         try:
             tensors[name] = np.frombuffer(view["data"], _TYPES[view["dtype"]]).reshape(view["shape"])
-        except (ValueError, OverflowError) as problem:  # a file may state any shape
+        except (ValueError, OverflowError) as problem:  # the file's shapes may not fit its data
             raise error(f"{path} is damaged: its tensor {name}: {problem}") from problem
     return tensors, described
 
 
 def checksum(path: str | os.PathLike[str], error: type[Exception]) -> str:
-    """The SHA-256 of a file; raises ``error`` if it cannot be read."""
+    """Return the SHA-256 of a file, or raise ``error`` if it cannot be read."""
     return hashlib.sha256(_content(path, error)).hexdigest()
 
 
 def _content(path: str | os.PathLike[str], error: type[Exception]) -> bytes:
-    """The bytes of a file, after checks of its type and size."""
+    """Return the bytes of a file, after checks of its type and size."""
     try:
         if not Path(path).is_file():  # reading a pipe may never end
             is_other = Path(path).exists()
@@ -159,13 +159,13 @@ def _header_size(content: bytes) -> int:
 
 
 def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
-    """The header and the arrays' bytes of a safetensors file."""
+    """Return the header and the arrays' bytes of a safetensors file."""
     end = 8 + _header_size(content)
     return json.loads(content[8:end]), content[end:]
 
 
 def _whole(header: Mapping[str, Any], data: bytes) -> bytes:
-    """The bytes of a safetensors file. The library would write several metadata entries in random order."""
+    """Return the bytes of a safetensors file; the library itself would write the metadata in random order."""
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text + data
@@ -198,8 +198,8 @@ def put_mlp(tensors: MutableMapping[str, np.ndarray], prefix: str, mlp: MLP) -> 
 
 def get_mlp(tensors: Mapping[str, np.ndarray], prefix: str, activation: str) -> MLP:
     """Return the network that :func:`put_mlp` added."""
-    found = (re.fullmatch(rf"{re.escape(prefix)}(\d+)\.(weight|bias)", name) for name in tensors)
-    layers = range(len({match[1] for match in found if match}))
+    matches = (re.fullmatch(rf"{re.escape(prefix)}(\d+)\.(weight|bias)", name) for name in tensors)
+    layers = range(len({match[1] for match in matches if match}))
     return MLP(
         [tensors[f"{prefix}{i}.weight"] for i in layers], [tensors[f"{prefix}{i}.bias"] for i in layers], activation
     )

@@ -11,21 +11,21 @@ from observers.decoder import Decoders
 from observers.motion import Motion
 from observers.unscented import add, factor, shift, solved, transformed, whitened
 
-# Both limits are quantiles of the normal distribution. A false alarm of the first discards a good estimate; one of the
-# second only inflates a covariance. Running means are more skewed than the chi-square distribution that the limits
-# assume, so white innovations exceed the second limit about twenty times as often as its quantile implies.
-_DIVERGED = 6.0  # quantile with tail probability 1e-9, for the NIS
-_COLOURED = 4.265  # the same with 1e-5, for the mean square of the innovations' running mean
-_TREND = 0.25  # time constant of the innovations' running mean, in windows
-_LONG = 4.0  # time constant of the mean of this running mean's square, in windows
+# The two limits of Supervision follow from these quantiles of the normal distribution. A NIS beyond its limit discards
+# the estimate; a trend beyond its limit only inflates the covariance. Running means are more skewed than the chi-square
+# distribution that the limits assume: white innovations exceed the trend's limit with probability 2e-4 (not 1e-5).
+_DIVERGED = 6.0  # for the NIS, with tail probability 1e-9
+_COLOURED = 4.265  # for the mean square of the trend, with tail probability 1e-5
+_TREND = 0.25  # time constant of the trend, the innovations' running mean, in windows
+_LONG = 4.0  # time constant of the mean square of the trend, in windows
 INFLATION = 10.0  # factor by which the covariance grows if innovations are not white
 RELINEARISATIONS = 2  # of each step in the first window; with 0, noise-free errors are 40 to 80 % larger
-KNOWN = 1e-3  # assumed standard deviation of a known start, in units of the states' scales
+KNOWN = 1e-3  # assumed standard deviation of a known initial state, in scaled states
 
 
 @dataclass(frozen=True)
 class Supervision:
-    """Limits of the running statistics of innovations, and each new sample's share in them, for all noise levels."""
+    """Limits of the innovations' running statistics, and the share of a new sample in each, at any noise level."""
 
     window: int
     share: float
@@ -39,7 +39,7 @@ class Supervision:
         """Return the supervision of a motion with samples every ``dt`` seconds."""
         window, ny = max(1, round(motion.window / dt)), len(motion.least_measurement_noise)
         share, trend_share, long_share = (-math.expm1(-1 / (each * window)) for each in (1.0, _TREND, _LONG))
-        memory = (1 - trend_share) ** 2 * (1 - long_share)  # share of a trend's square one sample later
+        memory = (1 - trend_share) ** 2 * (1 - long_share)  # squares of successive trends are correlated
         return cls(
             window,
             share,
@@ -56,7 +56,7 @@ class Supervision:
 
 
 def _limit(freedom: float, quantile: float) -> float:
-    """A quantile of the mean of ``freedom`` squared normal numbers, by Wilson and Hilferty's approximation."""
+    """Return the limit of a mean of ``freedom`` squared normal numbers at a quantile (Wilson and Hilferty, 1931)."""
     spread = 2 / (9 * freedom)
     return float((1 - spread + quantile * math.sqrt(spread)) ** 3)
 
@@ -64,14 +64,14 @@ def _limit(freedom: float, quantile: float) -> float:
 class Tracker:
     """An unscented Kalman filter on the system's equations, or on a learned flow, with one estimate in each row.
 
-    It starts from the mean and covariance of the motions' initial states, corrected by the first sample. In the first
-    window, each step is repeated twice: the sample corrects the state before the step, too, and the motion is
-    linearised about this smoothed state (Kullberg, Skog and Hendeby, 2023).
+    It starts from the mean and covariance of the initial states in training, corrected by the first sample. In the
+    first window after a reset, each step is repeated twice: the sample corrects the state before the step, too, and the
+    motion is linearised about this smoothed state (Kullberg, Skog and Hendeby, 2023).
 
     The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's in
     two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The
     filter has diverged if the mean square of its innovations over the window (NIS) exceeds its limit, or if its
-    covariance is no longer positive definite. T_inv's covariance is then taken as one window after a reset, because
+    covariance is no longer positive definite. T_inv's covariance is then that of an age of at most one window, because
     the cause of the divergence may have disturbed z, too.
 
     Estimation errors smaller than the noise still correlate the innovations. If the mean square of the innovations'
@@ -110,7 +110,7 @@ class Tracker:
         self.width = self.trends + ny
 
     def covariance(self, rows: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """Return calibrated error covariances (n, nx, nx) of estimates ``age`` samples, (n,), after their reset."""
+        """Return the calibrated error covariances (n, nx, nx) of rows whose ages (n,) are in samples since reset."""
         factors = np.exp(np.interp(age * self._dt, self.motion.factors.ages, self._log_factors))
         return self._covariances(rows) * factors[:, None, None]
 
@@ -131,7 +131,7 @@ class Tracker:
         return self._packed(x, P, np.concatenate([np.ones((n, 2)), seen, np.zeros((n, 1 + 2 * y.shape[1]))], 1))
 
     def take_over(self, rows: np.ndarray) -> np.ndarray:
-        """Return the rows of a tracker with another motion, limited to this motion's bounds."""
+        """Return the rows of a tracker with another motion, with estimates limited to this motion's bounds."""
         rows = rows.copy()
         rows[:, self.x] = self._within(rows[:, self.x])
         return rows
@@ -139,10 +139,10 @@ class Tracker:
     def advance(
         self, rows: np.ndarray, y: np.ndarray, u: np.ndarray, samples: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Predict ``samples`` sampling intervals under inputs (n, nu), and correct by outputs (n, ny), NaN if missing.
+        """Predict rows by ``samples`` intervals under inputs (n, nu), and correct by outputs (n, ny), NaN if missing.
 
-        Returns the rows, and the outputs (n, ny), in which predictions replace missing and rejected ones. Predictions
-        are not finite if the covariance is not positive definite.
+        Returns the rows, and the outputs (n, ny), in which predictions replace missing and rejected outputs. The
+        predictions are not finite if the covariance is not positive definite.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             advanced, whole = self._advanced(rows, y, u, samples)
@@ -187,7 +187,7 @@ class Tracker:
     def _gated(
         self, rows: np.ndarray, y: np.ndarray, innovation: np.ndarray, S: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Outputs (n, ny), NaN where they are rejected, and the counts of rejected outputs (n, 1 + ny)."""
+        """Return outputs (n, ny), NaN where rejected, and the updated counts (n, 1 + ny) of outputs beyond the gate."""
         counts, window = rows[:, self.nis + 3 : self.trends], self.supervision.window
         if self.gate == math.inf:
             return y, counts
@@ -198,7 +198,7 @@ class Tracker:
         return np.where(rejected, np.nan, y), np.hstack([count + rejected.sum(1, keepdims=True), in_a_row])
 
     def _expected(self, x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean and covariance of the expected outputs, and their covariance with the states."""
+        """Return the mean and covariance of the expected outputs, and their covariance with the states."""
         C = self._artifact.C
         if C is None:
             expected, S, across = transformed(x, P, self._output)
@@ -210,10 +210,10 @@ class Tracker:
     def _watched(
         self, watched: np.ndarray, P: np.ndarray, white: np.ndarray, seen: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Update the statistics of whitened innovations (n, ny), and inflate covariances if they are correlated."""
+        """Update the statistics by whitened innovations (n, ny), and inflate P where innovations are correlated."""
         watch, count = self.supervision, seen.sum(-1)
         (nis, trend_square, samples), trend = watched[:, :3].T, watched[:, -seen.shape[1] :]
-        weight = count / seen.shape[1]  # share of outputs measured; a mean over fewer weighs less
+        weight = count / seen.shape[1]  # samples with fewer measured outputs weigh less
         per_output = 1 / np.maximum(count, 1)
         nis = nis + watch.share * weight * (per_output * (white**2).sum(-1) - nis)
         trend = trend + watch.trend_share * np.where(seen, white - trend, 0.0)
@@ -226,7 +226,7 @@ class Tracker:
         return P, np.column_stack([nis, trend_square, samples + (count > 0), watched[:, 3 : -seen.shape[1]], trend])
 
     def supervise(self, rows: np.ndarray, z: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """Return rows (n, width), reinitialised from z (n, size) where needed; ``age`` (n,) counts samples."""
+        """Return rows (n, width), with T_inv's estimate where it replaces the tracker's; ``age`` (n,) is in samples."""
         watch, nis, seen = self.supervision, rows[:, self.nis], rows[:, self.nis + 2]
         lost = ~(nis <= watch.limit)
         where = np.flatnonzero(lost | (seen < watch.window))

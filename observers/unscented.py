@@ -1,7 +1,7 @@
 """Unscented transforms: batches of Gaussians through nonlinear functions, by sigma points.
 
 The points are the mean, and the mean +- sqrt(nx + kappa) times each column of the covariance's Cholesky factor (Wan and
-van der Merwe, 2000, with alpha = 1, beta = 2). A nonlinear output gets new points from the predicted covariance.
+van der Merwe, 2000, with alpha = 1, beta = 2). A nonlinear output uses new points, from the predicted covariance.
 """
 
 import math
@@ -13,7 +13,7 @@ _BETA = 2.0
 
 
 def weights(nx: int) -> tuple[float, float, float]:
-    """Weights: of the central point in means, of the central point in covariances, and of every other point in both."""
+    """Return the weights of the central point in means and in covariances, and of every other point in both."""
     middle = (_scale(nx) - nx) / _scale(nx)
     return middle, middle + _BETA, 1 / (2 * _scale(nx))
 
@@ -21,9 +21,9 @@ def weights(nx: int) -> tuple[float, float, float]:
 def transformed(
     x: np.ndarray, P: np.ndarray, function: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means (n, k), covariances (n, k, k) and covariances with x (n, nx, k) of a function of Gaussians x, P.
+    """Return means (n, k), covariances (n, k, k), and covariances with x (n, nx, k), of a function of Gaussian states.
 
-    They are NaN if P is not positive definite.
+    Shapes: means ``x`` (n, nx), covariances ``P`` (n, nx, nx). The results are NaN if P is not positive definite.
     """
     nx = x.shape[-1]
     middle, middle_squares, other = weights(nx)
@@ -42,16 +42,16 @@ def transformed(
 
 
 def _scale(nx: int) -> float:
-    """Return nx + kappa, where kappa is 3 - nx, or 0 if that is negative."""
+    """Return nx + kappa, with kappa = max(3 - nx, 0)."""
     return max(float(nx), 3.0)
 
 
 def whitened(
     innovation: np.ndarray, S: np.ndarray, across: np.ndarray, missing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """V (n, nx, ny) and whitened innovations (n, ny); the corrected state is x + V white, its covariance P - V V^T.
+    """Return V (n, nx, ny) and whitened innovations ``white`` (n, ny): the corrections are x + V white and P - V V^T.
 
-    Shapes: ``innovation``, ``missing`` (n, ny), ``S`` (n, ny, ny), ``across`` (n, nx, ny).
+    ``S`` (n, ny, ny) is the covariance of innovations (n, ny), and ``across`` (n, nx, ny) that of states and outputs.
     """
     if missing.any():
         innovation = np.where(missing, 0.0, innovation)
@@ -75,17 +75,17 @@ def add(P: np.ndarray, V: np.ndarray, W: np.ndarray, sign: float = 1.0) -> np.nd
 
 
 def solved(P: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Solve P X = b, (n, nx, k), for covariances P; NaN if P is not positive definite."""
+    """Return the solution X (n, nx, k) of P X = b for covariances P; NaN if P is not positive definite."""
     root = factor(P)
     solution: np.ndarray = np.linalg.solve(root.mT, np.linalg.solve(root, b))
     return solution
 
 
 def factor(P: np.ndarray) -> np.ndarray:
-    """Cholesky factors (n, nx, nx) of covariances; NaN if one is not positive definite or not finite."""
+    """Return the Cholesky factors (n, nx, nx) of covariances, NaN where P is not positive definite or not finite."""
     try:
         root: np.ndarray = np.linalg.cholesky(P)
-    except np.linalg.LinAlgError:  # the error does not name the matrix
+    except np.linalg.LinAlgError:  # it does not name the failing matrices, which halving finds
         root = np.full_like(P, np.nan)
         rows = np.flatnonzero(np.isfinite(P).all((1, 2)))
         if len(P) > 1:

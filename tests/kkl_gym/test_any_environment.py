@@ -72,7 +72,7 @@ def test_is_an_environment_that_is_made_again_from_its_specification(saved):
 
 def test_wrong_environments_of_artifacts():
     for wrong in ({"environment": {"id": "Pendulum-v1"}}, {"signals": None}):
-        with pytest.raises(ArtifactError, match=r"must (be an id and kwargs|name its signals)"):
+        with pytest.raises(ArtifactError, match=r"(a dict 'kwargs'|needs signals)"):
             replace(PENDULUM(), **wrong)
 
 
@@ -85,7 +85,7 @@ def test_other_environments_are_refused(saved):
     ):
         with pytest.raises(ValueError, match=told):
             KKLObservation(env, path)
-    with pytest.raises(ArtifactError, match="fits Pendulum-v1 alone"):
+    with pytest.raises(ArtifactError, match="fits only Pendulum-v1"):
         PENDULUM().require_system()
     KKLObservation(gym.make("Pendulum-v1", render_mode="rgb_array", max_episode_steps=7), path)
     with pytest.raises(ArtifactError, match=r"the sampling interval 0\.1, but this is 0\.05"):

@@ -297,7 +297,7 @@ def test_foreign_and_mixed_vectors(saved):
     mixed = SyncVectorEnv([partial(single, "lorenz", measurement_noise=noise) for noise in (0.1, 0.2)])
     with pytest.raises(ValueError, match="one observer cannot serve all"):
         KKLVectorObservation(mixed, saved(system="lorenz"))
-    with pytest.raises(ValueError, match=r"rho.*on purpose, exchange env\.unwrapped\.system once the observer is"):
+    with pytest.raises(ValueError, match=r"rho.*on purpose, wrap .* set env\.unwrapped\.system"):
         KKLVectorObservation(vector("lorenz", "NextStep", parameters={"rho": 20.0}), saved(system="lorenz"))
     envs = SyncVectorEnv([partial(single, "lorenz")] * 2)
     observed = KKLVectorObservation(envs, saved(system="lorenz"))

@@ -180,14 +180,14 @@ def nothing_estimated(tensors, meta):
     (lambda t, m: t.update({"inverse.x_offset": t["inverse.x_offset"][:, None]}), "x_offset does not fit"),
     *((lambda t, m, name=name: t.update({f"inverse.{name}": np.zeros(3)}), name)
       for name in ("z_offset", "noise_gain", "x_offset", "x_scale")),
-    *((lambda t, m, features=features: m["inverse"].update(features=features), "feature|network of")
+    *((lambda t, m, features=features: m["inverse"].update(features=features), "feature|network must have")
       for features in (["z_u", "z_y"], ["z_y", "z_u", "measurement_noise", "time"], ["z_y", "z_u", "age"], [])),
     *((lambda t, m, noise=noise: m.update(measurement_noise=noise), "measurement_noise")
       for noise in (-0.1, "0.1", [0.1, 0.2], None)),
     *((lambda t, m, h=h: (m.update(h={"components": h}), t.pop("C"), m.pop("limits")), "")
       for h in ([], [["x", 0], ["x", 1]], [["x", 2]], [["__import__", "os"]])),
-    (lambda t, m: m.update(h={"components": [["x", 0]]}), "there is a C beside it"),
-    (nothing_estimated, "has no room for a state"),
+    (lambda t, m: m.update(h={"components": [["x", 0]]}), "C must be None"),
+    (nothing_estimated, "must estimate states"),
     (lambda t, m: t.update({"inverse.0.weight": t["inverse.0.weight"].astype(np.int64)}), "weight is of type I64"),
     (lambda t, m: m.update(system=3), "name must be a string"),
     (lambda t, m: m.update(inverse=[]), "lacks"),
@@ -207,12 +207,12 @@ def test_contents_that_do_not_fit(file, change, words):
 
 def test_maps_must_fit_the_one_of_driven_motion(make_artifact):
     forward = make_artifact("lorenz", forward=True).forward
-    with pytest.raises(ArtifactError, match="3 states to 7 values does not fit 2 states and 5 values"):
+    with pytest.raises(ArtifactError, match="T must map 2 states to nz = 5 values, got a map of 3 states to 7 values"):
         dataclasses.replace(make_artifact(), forward=forward)
     artifact, plain = make_artifact(process=True, free_inverse=True), make_artifact(free_inverse=True)
     free, lorenz = artifact.free_inverse, make_artifact("lorenz", free_inverse=True).free_inverse
     for whole, other, words in (
-        (artifact, artifact.inverse, "must take z_y, 5 values"),
+        (artifact, artifact.inverse, "must take z_y alone, 5 values"),
         (artifact, lorenz, "must take z_y"),
         (artifact, dataclasses.replace(free, measurement_noise_max=2.0), "differ in measurement noise"),
         (artifact, plain.free_inverse, "differ in process noise"),

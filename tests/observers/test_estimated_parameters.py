@@ -71,7 +71,7 @@ def test_ranges_that_make_no_sense(make_artifact):
             dataclasses.replace(artifact, parameter_ranges=ranges)
     names = ("mu", "nu", "xi")
     own = {"parameters": dict.fromkeys(names, 3.0), "parameter_ranges": dict.fromkeys(names, (2, 4))}
-    with pytest.raises(ArtifactError, match="no room for a state"):
+    with pytest.raises(ArtifactError, match="must estimate states"):
         dataclasses.replace(artifact, estimated_parameters=names, **own)
 
 

@@ -138,7 +138,7 @@ def test_motions_that_know_whole_samples_alone(by):
     artifact = tracking(by)
     observer, dt = KKLObserver(artifact, 0.1), artifact.filter.dt
     observer.reset(np.zeros(1))
-    with pytest.raises(ValueError, match=r"predicts over whole samples, got a dt of 1\.5 samples"):
+    with pytest.raises(ValueError, match=r"predicts over whole sampling intervals, got a dt of 1\.5 intervals"):
         observer.step([0.1], dt=1.5 * dt)
     u, twice = np.array([0.2]), copy.copy(observer)
     expected = artifact.motion.step(artifact.motion.step(observer.decode(), u, dt), u, dt)
@@ -222,7 +222,7 @@ def test_the_first_gap_that_no_map_fills_warns_once():
 def test_what_is_wrong_is_named():
     artifact = tracking()
     for options in ({"gate": 5.0}, {"delay": 2}):
-        with pytest.raises(ValueError, match="does not track"):
+        with pytest.raises(ValueError, match="cannot track"):
             KKLObserver(random_artifact(), **options)
         with pytest.raises(ValueError, match="leave out tracking=False, or"):
             KKLObserver(artifact, tracking=False, **options)
@@ -233,5 +233,5 @@ def test_what_is_wrong_is_named():
         _ = observer.rejected
     with pytest.raises(ValueError, match="leave dt out"):
         late.step([0.0], dt=0.02)
-    with pytest.raises(ValueError, match="a record has no delay"):
+    with pytest.raises(ValueError, match="a record needs an observer without a delay"):
         late.estimate([[0.0], [0.1]])

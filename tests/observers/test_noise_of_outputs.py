@@ -30,7 +30,7 @@ def test_each_output_has_an_input_of_the_network_and_its_part_in_the_shrinkage(m
 def test_levels_beyond_the_range_of_an_output(make_artifact):
     artifact = make_artifact(outputs=2)
     for wrong, inside in (((0.5, 2.5), r"\(0\.5, 2\.0\)"), (1.5, r"\(1\.0, 1\.5\)")):
-        with pytest.raises(ValueError, match=rf"range, 0 to \(1, 2\); pass measurement_noise={inside} to use it"):
+        with pytest.raises(ValueError, match=rf"range, 0 to \(1, 2\); pass measurement_noise={inside}, the"):
             KKLObserver(artifact, wrong)
     assert KKLObserver(artifact, (1.0, 2.0)).measurement_noise == (1.0, 2.0)
     for wrong in ((0.1,), [], (0.1, -0.2), (0.1, "0.2")):
@@ -58,7 +58,7 @@ def test_what_is_told_of_each_output_must_fit_the_outputs(make_artifact):
         for wrong in ((1.0, 2.0, 3.0), (1.0, -1.0), (1.0, "1"), (0.0, 1.0)):
             with pytest.raises(ArtifactError, match=name):
                 dataclasses.replace(inverse, **{name: wrong})
-    with pytest.raises(ArtifactError, match="noise_gain of 3 outputs does not fit 2"):
+    with pytest.raises(ArtifactError, match="one row for each of 2 outputs, got 3"):
         dataclasses.replace(artifact, inverse=make_artifact(outputs=3).inverse)
     with pytest.raises(ArtifactError, match="differ in measurement noise"):
         dataclasses.replace(artifact, free_inverse=make_artifact(free_inverse=True).free_inverse)
@@ -129,5 +129,5 @@ def test_residuals_where_the_output_is_not_defined_count_as_none(make_artifact):
     with pytest.raises(ArtifactError, match="holds no output"):
         make_artifact().output(x_hat)
     assert not make_artifact().knows_output
-    with pytest.raises(ArtifactError, match="does not fit 1 outputs and 2 states"):
+    with pytest.raises(ArtifactError, match="must have 1 components and at most 2 states"):
         dataclasses.replace(make_artifact(), h=Expression([["x", 2]]))

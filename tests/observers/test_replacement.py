@@ -51,7 +51,7 @@ def test_what_cannot_replace_leaves_the_observer_as_it_was(artifact):
         (changed_filter(artifact, dt=0.02), "the filters differ in dt"),
         (changed_filter(artifact, A=2 * linear.A), "the filters differ in A"),
         (changed_filter(artifact, B=2 * linear.B), "the filters differ in B"),
-        (dataclasses.replace(artifact, system="lorenz"), "has system 'van_der_pol', the other 'lorenz'"),
+        (dataclasses.replace(artifact, system="lorenz"), "has system 'van_der_pol', the replacement 'lorenz'"),
         (dataclasses.replace(artifact, parameters={"mu": 7.0}), "has parameters"),
         ("van_der_pol", r"must be an observers\.Artifact, got 'van_der_pol'"),
     ):

@@ -1,1 +1,1 @@
-"""An observer's step outside NumPy: as a module of Torch, as ONNX, and as C99, without known starts and monitor."""
+"""An observer's step in Torch, ONNX and C99, without known initial states, monitor, gate and delay."""

@@ -1,4 +1,4 @@
-"""The step as C99 that needs only math.h. The tracker always uses doubles, or P would break down."""
+"""The step as C99 with only the C library. The tracker uses doubles: floats would not keep P positive definite."""
 
 import math
 import re
@@ -16,10 +16,10 @@ from observers.inverse import InverseMap
 from observers.network import MLP
 from training.export.exported import Exported, output_expression, tracker_arrays, tracker_numbers
 
-_POWERS = 8  # integer powers up to this one are written as products
+_POWERS = 8  # integer exponents up to this value are written as products
 _CONDITIONS = {**{name: f"{{0}} {name} {{1}}" for name in ("<", "<=", ">", ">=")}, "not": "!{0}"}
 _CONDITIONS |= {"and": "{0} && {1}", "or": "{0} || {1}"}
-_OPERATIONS = _CONDITIONS | {  # NumPy's definitions; each argument is a variable or a number
+_OPERATIONS = _CONDITIONS | {  # with NumPy's results; each argument is a variable or a number
     **{name: f"{name}({{0}})" for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "floor")},
     **{name: f"{{0}} {name} {{1}}" for name in ("+", "*")},
     "abs": "fabs({0})",
@@ -34,7 +34,7 @@ _OPERATIONS = _CONDITIONS | {  # NumPy's definitions; each argument is a variabl
 
 
 def c_files(exported: Exported) -> dict[str, str]:
-    """Write the observer in C."""
+    """Return the observer's C files: their texts by name."""
     artifact, name, motion = exported.artifact, exported.name, exported.artifact.motion
     networks = {label: inverse.mlp for label, inverse in exported.maps.items()}
     single, signals = exported.precision == "float", exported.signals
@@ -65,14 +65,14 @@ def c_files(exported: Exported) -> dict[str, str]:
 
 
 def _constants(exported: Exported, networks: Mapping[str, MLP]) -> str:
-    """Definitions of sizes and arrays."""
+    """Return the C definitions of sizes and arrays."""
     linear, motion = exported.artifact.filter, exported.artifact.motion
     nz, dt = len(linear.A), linear.dt
     rows, columns = np.nonzero(block := linear.transition[:nz, :nz])
     last = max((inverse.age_max for inverse in exported.maps.values() if "age" in inverse.features), default=0.0)
     macros: dict[str, Any] = {name: f"{exported.name.upper()}_{name}" for name in ("NX", "NY", "NU", "DT")}
     macros |= {"NZ": nz, "SIZE": linear.size, "TRANSITIONS": len(rows)}
-    macros["LAST_AGE"] = f"{min(math.ceil(last / dt), 2**32 - 1)}ul"  # the least range of unsigned long in C
+    macros["LAST_AGE"] = f"{min(math.ceil(last / dt), 2**32 - 1)}ul"  # C guarantees this range of unsigned long
     arrays = {"transition": block[rows, columns], "transition_row": rows, "transition_column": columns}
     arrays |= {name: getattr(linear, name)[:nz] for name in ("early_y", "late_y", "equilibrium")}
     if linear.nu:
@@ -92,7 +92,7 @@ def _constants(exported: Exported, networks: Mapping[str, MLP]) -> str:
             arrays |= {f"flow_{name}": getattr(motion.flow, name) for name in names}
         for label, inverse in exported.maps.items():
             assert inverse.error_covariance is not None
-            ages = inverse.error_covariance.ages / dt  # in samples, cut at the window below
+            ages = inverse.error_covariance.ages / dt  # in samples
             ages = np.append(ages[ages < numbers["window"]], numbers["window"])
             by_age = inverse.error_covariance.at_level(inverse.shares(levels[0])[0])
             covariance = by_age(ages * dt) / np.outer(motion.x_scale, motion.x_scale)
@@ -108,7 +108,7 @@ def _constants(exported: Exported, networks: Mapping[str, MLP]) -> str:
 
 
 def _map(exported: Exported, label: str, inverse: InverseMap) -> str:
-    """T_inv as a C function, with the noise levels as constants."""
+    """Return the C function of T_inv, with the noise levels as constants."""
     modes, size = inverse.whiten.shape
     words: dict[str, Any] = network_calls(label, inverse.mlp, "WIDTH", "OUT")
     levels = inverse.noise_features(exported.measurement_noise, exported.process_noise)
@@ -119,7 +119,7 @@ def _map(exported: Exported, label: str, inverse: InverseMap) -> str:
 
 
 def template(name: str, words: Mapping[str, object], parts: Collection[str]) -> str:
-    """Fill in a file of the folder ``c``: replace words, drop ranges "// if PART" to "// end PART" of other parts."""
+    """Fill in a file of the folder ``c``: replace words, keep "// if PART" to "// end PART" only for given parts."""
     text = files("training.export").joinpath("c", name).read_text(encoding="utf-8")
     ranges = re.compile(r"// if (\w+)\n(.*?)// end \1\n", re.DOTALL)
     while ranges.search(text):
@@ -128,7 +128,7 @@ def template(name: str, words: Mapping[str, object], parts: Collection[str]) -> 
 
 
 def array(name: str, values: np.ndarray) -> str:
-    """A constant array in C, with the fewest digits that reproduce each number; integers are unsigned short."""
+    """Return a constant C array, with the fewest digits that reproduce each number; integers are unsigned short."""
     kind = {"float32": "float", "float64": "double"}.get(values.dtype.name, "unsigned short")
     words = [f"{word}f" if kind == "float" else word for word in values.astype(str).flat]
     if values.ndim == 2:
@@ -139,12 +139,12 @@ def array(name: str, values: np.ndarray) -> str:
 
 
 def comment(text: str) -> str:
-    """Make names safe inside a C comment: on one line, without marks that end it."""
+    """Return names as text that is safe inside a C comment: on one line, and without marks that end the comment."""
     return " ".join(text.split()).replace("/*", "/ *").replace("*/", "* /").replace("\\", "/").replace("??", "?")
 
 
 def network_calls(prefix: str, mlp: MLP, width: str, out: str) -> dict[str, object]:
-    """Words for a network: width of the buffers a and b, calls of the layers, and the buffer with the result."""
+    """Return a template's words for a network: width of the buffers a and b, calls of layers, buffer of the result."""
     calls, rows = [], "ab"
     for i, (outputs, inputs) in enumerate(map(np.shape, mlp.weights)):
         if i:
@@ -155,7 +155,7 @@ def network_calls(prefix: str, mlp: MLP, width: str, out: str) -> dict[str, obje
 
 
 def function(name: str, expression: Expression) -> str:
-    """A C function ``name(x, u, out)`` that computes repeated parts of an expression once."""
+    """Return a C function ``name(x, u, out)``, which computes repeated parts of an expression only once."""
     lines: list[str] = []
     variables: dict[str, str] = {}
 

@@ -1,4 +1,4 @@
-"""An observer to export: its levels of noise, the names of its signals, and its metadata."""
+"""An observer to export: its noise levels, the names of its signals, and its metadata."""
 
 import os
 import re
@@ -40,7 +40,7 @@ class Exported:
         measurement_noise: float | tuple[float, ...] | None = None,
         process_noise: float | None = None,
     ) -> "Exported":
-        """Read an observer by its name or from its file; levels of noise as for :class:`observers.KKLObserver`."""
+        """Read a shipped observer or a file; the noise levels are as for :class:`observers.KKLObserver`."""
         choice("precision", precision, ("float", "double"))
         artifact = Artifact.read(path := resolve(name_or_path))
         observer = KKLObserver(artifact, measurement_noise, process_noise=process_noise)
@@ -49,13 +49,13 @@ class Exported:
 
     @property
     def maps(self) -> dict[str, InverseMap]:
-        """The inverse maps by name: "driven", and "free" for motion without input where the artifact has one."""
+        """The inverse maps by name: "driven", and "free" for motion without input, if the artifact has such a map."""
         maps = {"driven": self.artifact.inverse, "free": self.artifact.free_inverse}
         return {name: inverse for name, inverse in maps.items() if inverse is not None}
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """Levels of measurement noise: one for all outputs, or one for each if T_inv takes one for each."""
+        """Levels of measurement noise: one for each output if T_inv takes several, else one for all outputs."""
         if self.artifact.inverse.noise_gain.ndim == 2:
             return tuple(np.broadcast_to(self.measurement_noise, self.artifact.ny).tolist())
         return (float(np.max(self.measurement_noise)),)
@@ -84,7 +84,7 @@ class Exported:
 
 
 def output_expression(artifact: Artifact) -> Expression | None:
-    """The output h(x), or None if the artifact does not hold it."""
+    """Return the output h(x) as an expression, or None if the artifact does not hold it."""
     if artifact.C is None:
         return artifact.h
     rows = artifact.C.tolist()
@@ -92,7 +92,7 @@ def output_expression(artifact: Artifact) -> Expression | None:
 
 
 def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
-    """Weights of the sigma points, and constants of divergence detection."""
+    """Return the weights of the sigma points, and the constants of divergence detection."""
     watch = Supervision.of(motion, dt)
     weights = dict(zip(("middle", "middle_squares", "other"), sigma_weights(motion.nx), strict=True))
     others = {"trend_gain": watch.trend_gain, "inflation": INFLATION, "relinearisations": RELINEARISATIONS}
@@ -100,7 +100,7 @@ def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
 
 
 def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
-    """Offset and scale of the states; bounds, and mean and covariance of starts, in scaled states."""
+    """Return the states' offset and scale and, for scaled states, bounds and the initial mean and covariance."""
     low, high, mean = ((x - motion.x_offset) / motion.x_scale for x in (motion.low, motion.high, motion.mean))
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}

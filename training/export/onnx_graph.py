@@ -16,13 +16,13 @@ OPSET = 18
 
 
 def onnx_model(exported: Exported) -> Any:
-    """Export the graph with metadata."""
+    """Return the ONNX model of the step, with metadata."""
     import onnx_ir
     from onnx import checker, helper
     from onnxscript import opset18
 
     def scalar(s: float, dtype: int = 1, layout: str = "", device: str = "", pin_memory: bool = False) -> Any:
-        """Keep doubles, which Torch's own translation turns into floats."""
+        """Translate a number to a constant of its type; Torch's own translation would turn doubles into floats."""
         value: Any = onnx_ir.tensor(s, dtype=onnx_ir.DataType(dtype))
         return opset18.Constant(value=value)
 
@@ -33,7 +33,7 @@ def onnx_model(exported: Exported) -> Any:
     example: dict[str, Tensor | None] = {"state": step.start(2)}
     example |= {name: torch.zeros(2, width, dtype=dtype) if width else None for name, width in widths.items()}
     batch = torch.export.Dim("batch")
-    # Torch warns of a missing torchvision, and of its own code.
+    # Torch would warn that torchvision is missing, and of problems in its own code.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -46,15 +46,15 @@ def onnx_model(exported: Exported) -> Any:
             dynamic_shapes=[None if value is None else {0: batch} for value in example.values()],
             custom_translation_table={torch.ops.aten.scalar_tensor.default: scalar},
             dynamo=True,
-            optimize=False,  # ONNX Runtime optimises in a second, Torch in ten
+            optimize=False,  # ONNX Runtime optimises when it loads the model, which is faster
             verbose=False,
         )
     assert program is not None
     model = program.model_proto
     for node in model.graph.node:
-        del node.metadata_props[:]  # Torch's source lines, which make up most of the file
+        del node.metadata_props[:]  # lines of Torch's source, which would make up most of the file
     model.graph.name = exported.name
-    model.graph.doc_string = f"One step of the KKL observer {exported.source}; a row whose state is zeros starts again."
+    model.graph.doc_string = f"One step of the KKL observer {exported.source}. A state row of zeros marks a start."
     model.producer_name, model.producer_version = "kkl-gym", kkl_gym.__version__
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in exported.metadata.items()}
     helper.set_model_props(model, texts)
@@ -63,7 +63,7 @@ def onnx_model(exported: Exported) -> Any:
 
 
 class _Step(TorchObserver):
-    """A step that also returns the covariances after it."""
+    """A step that also returns the covariances of the estimates, if T_inv has a covariance."""
 
     def forward(  # type: ignore[override]
         self, state: Tensor, y: Tensor, u: Tensor | None, measurement_noise: Tensor | None, process_noise: Tensor | None

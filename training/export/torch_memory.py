@@ -14,7 +14,7 @@ from training.export.torch_parts import Module
 class TorchMemory(Module):
     """The memory of :class:`kkl_gym.KKLMemory` as a module of Torch: batched, differentiable, on any device.
 
-    A state row of zeros marks a start: the next outputs are its first. :meth:`start` returns such rows, and
+    A state row of zeros marks a start: the next outputs are its first outputs. :meth:`start` returns such rows, and
     ``state * ~done[:, None]`` restarts the rows of finished episodes.
 
     Parameters
@@ -22,9 +22,9 @@ class TorchMemory(Module):
     ny, nu : int
         Numbers of outputs and inputs.
     angles : sequence of (int, int), optional
-        Pairs of outputs that are cosine and sine of an angle, as for the wrapper.
+        Pairs of outputs that are cosine and sine of an angle, as for :class:`kkl_gym.KKLMemory`.
     time_constants, input_time_constants : sequence of float
-        Time constants of the memories of y and of u in steps, as for the wrapper.
+        Time constants of the memories of y and of u in steps, as for :class:`kkl_gym.KKLMemory`.
 
     Raises
     ------
@@ -67,7 +67,7 @@ class TorchMemory(Module):
         return self.mixing.new_zeros(n, sum(self.widths))
 
     def forward(self, state: Tensor, y: Tensor, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Take in the next outputs.
+        """Process the next outputs.
 
         Parameters
         ----------
@@ -83,7 +83,8 @@ class TorchMemory(Module):
         state : Tensor, shape (n, width)
             The next state.
         shown : Tensor, shape (n, size)
-            The wrapper's observation: y, the memory of y, and the memory of u; float32 unless ``y`` is float64.
+            The observation of the wrapper KKLMemory: y, the memory of y, and the memory of u; float32 unless ``y`` is
+            float64.
         """
         begins = state[:, :1] == 0
         age, before, w, v = torch.split(torch.where(begins, 0.0, state), self.widths, 1)
@@ -93,14 +94,14 @@ class TorchMemory(Module):
         w = w + self.rise * torch.where(begins, 0.0, signals - before)[:, None]
         v = v.reshape(-1, len(self.input_decay), self.nu)
         v = (v + (1.0 - self.input_decay) * (u[:, None] - v)).flatten(1)
-        steps = age[..., None].clamp(min=1.0)  # any value serves at the start, where w is 0
+        steps = age[..., None].clamp(min=1.0)  # at a start w is 0, so any positive value is right
         with_past = torch.expm1(-(steps + IMAGINED) / self.time_constants) / torch.expm1(-steps / self.time_constants)
         shown = torch.cat([y, (self.mixing @ (w * with_past)).flatten(1), v], 1)
         shown = shown.to(torch.promote_types(y.dtype, torch.float32))
         return torch.cat([age + 1.0, signals, w.flatten(1), v], 1), shown
 
     def _signals(self, y: Tensor, before: Tensor) -> Tensor:
-        """The signals to filter: the other outputs, then angles, unwrapped to turn by less than half a turn a step."""
+        """Return the signals to filter: the other outputs, then angles, unwrapped to at most half a turn per step."""
         cosine, sine, before = y[:, self.cosines], y[:, self.sines], before[:, len(self.others) :]
         known = cosine**2 + sine**2 > 0
         angle = torch.atan2(sine, torch.where(known, cosine, 1.0))

@@ -16,13 +16,13 @@ from training.export.torch_tracker import TorchTracker
 class TorchObserver(Module):
     """An observer's step as a module of Torch: batched, differentiable, on any device.
 
-    The state is explicit: ``state, x_hat = observer(state, y, u)`` does for n rows what
-    :meth:`observers.KKLObserver.step` does, without monitor and known starts. A state row of zeros marks a start: its
-    next sample is the first, and must not lack an output. :meth:`start` returns such rows, and
-    ``state * ~done[:, None]`` restarts the rows of finished episodes. A NaN in later ``y`` is a missing sample.
+    The caller keeps the state: ``state, x_hat = observer(state, y, u)`` does for n rows what
+    :meth:`observers.KKLObserver.step` does, without monitor, gate, delay and known initial states. A state row of zeros
+    marks a start: the next sample is its first, in which no output may be missing. :meth:`start` returns such rows, and
+    ``state * ~done[:, None]`` restarts the rows of finished episodes. In later samples, NaN marks missing outputs.
 
-    The whole step is differentiable, also by the weights. The filter's state and the tracker's covariance are float64
-    whatever ``dtype`` is; after ``observer.float()``, T_inv's estimates are inaccurate.
+    The whole step is differentiable, also with respect to the weights. The filter's state and the tracker's covariance
+    are float64 whatever ``dtype`` is; after ``observer.float()``, T_inv's estimates are inaccurate.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class TorchObserver(Module):
         return self.update.new_zeros(n, sum(self.widths))
 
     def estimate(self, state: Tensor) -> Tensor:
-        """Return the estimates (n, nx) that states (n, width) hold, followed by estimated parameters."""
+        """Return the estimates (n, nx) at states (n, width), followed by the estimated parameters, if any."""
         x = torch.split(state, self.widths, 1)[3]
         if self.tracker is not None:
             x = self.tracker.states(x[:, : self.nx].T).T
@@ -91,7 +91,7 @@ class TorchObserver(Module):
     def covariance(
         self, state: Tensor, measurement_noise: Tensor | None = None, process_noise: Tensor | None = None
     ) -> Tensor:
-        """Return the calibrated covariances of the estimates' errors, as :attr:`observers.KKLObserver.covariance`.
+        """Return the calibrated covariances of the estimates' errors, as in :attr:`observers.KKLObserver.covariance`.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class TorchObserver(Module):
         measurement_noise: Tensor | None = None,
         process_noise: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Take in the next sample.
+        """Process the next sample.
 
         Parameters
         ----------
@@ -131,16 +131,17 @@ class TorchObserver(Module):
         y : Tensor, shape (n, ny)
             The samples, NaN where missing.
         u : Tensor, shape (n, nu), optional
-            The inputs held since the samples before, by default zero.
+            The inputs held since the last samples, by default zero.
         measurement_noise, process_noise : Tensor, shapes (n or 1, 1 or ny) and (n or 1, 1), optional
-            Noise levels of each row, by default the observer's; of measurement noise one, or one for each output.
+            Noise levels of each row, by default the observer's. Measurement noise has one level, or one for each output
+            if T_inv takes them.
 
         Returns
         -------
         state : Tensor, shape (n, width)
             The next state.
         x_hat : Tensor, shape (n, nx)
-            The estimates, followed by estimated parameters.
+            The estimates, followed by the estimated parameters, if any.
         """
         begins = state[:, :1] == 0
         samples, before, z, rest = torch.split(torch.where(begins, 0.0, state), self.widths, 1)
@@ -156,7 +157,7 @@ class TorchObserver(Module):
         if self.tracker is not None:
             tracked, expected = self.tracker.advance(rest.T, y.T, u.T, begins[:, 0], levels[0].T, levels[1].T)
             y = filled(expected.T)
-        elif self.h is not None:  # a second prediction uses T_inv of the state that the first one leads to
+        elif self.h is not None:  # the first prediction leads to a z, from which T_inv makes a better prediction
             guess = filtered(filled(self.h(rest.T).T))
             y = filled(self.h(self._of_map(guess, TorchMap.__call__, age, *levels).T).T)
         else:
@@ -171,13 +172,13 @@ class TorchObserver(Module):
         return state, self.estimate(state)
 
     def _levels(self, measurement_noise: Tensor | None, process_noise: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Noise levels, by default those of the observer; measurement noise is cut at its largest level in training."""
+        """Return noise levels, by default the observer's, with measurement noise limited to the largest in training."""
         level = self.measurement_noise if measurement_noise is None else measurement_noise.to(self.update.dtype)
         process_level = self.process_noise if process_noise is None else process_noise.to(self.update.dtype)
         return torch.minimum(level, self.driven.measurement_noise_max), process_level
 
     def _of_map(self, z: Tensor, method: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
-        """Values (n, m) of a map's method: the free map's in rows on which no input has acted yet."""
+        """Return values (n, m) of a map's method: of the free map in rows without input since their start."""
         driven = method(self.driven, z, *arguments)
         if self.free is None:
             return driven
@@ -185,7 +186,7 @@ class TorchObserver(Module):
 
 
 class TorchMap(Module):
-    """T_inv and the covariance of its error, for rows (n, .)."""
+    """T_inv and the covariance of its error, for a batch of n rows."""
 
     def __init__(self, inverse: InverseMap, dtype: torch.dtype) -> None:
         super().__init__()
@@ -201,7 +202,7 @@ class TorchMap(Module):
             self.put(levels=error.levels, ages=error.ages, error=table)
 
     def forward(self, z: Tensor, age: Tensor, level: Tensor, process_level: Tensor) -> Tensor:
-        """The estimates (n, nx) from filter states (n, size) at ages (n, 1) in seconds."""
+        """Return the estimates (n, nx) from filter states (n, size) at ages (n, 1) in seconds."""
         inputs = [(z @ self.whiten - self.offset) / (1.0 + level**2 @ self.squared_gain)]
         for name, value in zip(FEATURES[2:], (level, process_level, age), strict=True):
             if name in self.features:
@@ -210,10 +211,10 @@ class TorchMap(Module):
         return self.x_offset + self.x_scale * self.network(torch.cat(inputs, 1))
 
     def share(self, level: Tensor) -> Tensor:
-        """Noise levels over the largest in training, (n, 1): the greatest such ratio of all outputs."""
+        """Return noise levels (n, 1) in multiples of the largest in training: those of the noisiest output."""
         return (level / self.measurement_noise_max).amax(1, keepdim=True)
 
     def covariance(self, _: Tensor, age: Tensor, level: Tensor) -> Tensor:
-        """The covariances (n, nx^2) of T_inv's errors at ages (n, 1) in seconds."""
+        """Return the covariances (n, nx^2) of T_inv's errors at ages (n, 1) in seconds."""
         by_age = between(self.share(level), self.levels, self.error)
         return between(age, self.ages, by_age.reshape(by_age.shape[0], len(self.ages), -1))

@@ -1,4 +1,4 @@
-"""Networks, expressions, tables and matrix factors in Torch, for export, compilation and gradients."""
+"""Parts of observers in Torch: networks, expressions, interpolation and Cholesky factors."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -12,11 +12,11 @@ from observers.expression import Expression
 from observers.network import MLP
 from training.maps.networks import from_mlp
 
-LEAST_PIVOT = 1e-30  # lower bound of the pivots (variances of scaled states) by which a factorisation divides
+LEAST_PIVOT = 1e-30  # lower bound of the pivots, which are variances, by which a Cholesky factorisation divides
 
 
 def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A function of tensors that also takes numbers, which become doubles, and bools."""
+    """Return a function that converts numbers to tensors of doubles, bools to tensors, and calls ``function``."""
 
     def tensor(value: Any) -> Tensor:
         return torch.tensor(value, dtype=torch.bool if isinstance(value, bool) else torch.float64)
@@ -44,7 +44,7 @@ class Module(nn.Module):
 
 
 class Network(Module):
-    """A multilayer perceptron: rows (n, inputs) to (n, outputs)."""
+    """A multilayer perceptron, which maps (n, inputs) to (n, outputs)."""
 
     def __init__(self, mlp: MLP, dtype: torch.dtype) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ class Network(Module):
 
 
 class TorchExpression(Expression):
-    """An expression of tensors: states (nx, ...) and inputs (nu, ...) to components (k, ...)."""
+    """An expression that maps tensors of states (nx, ...) and inputs (nu, ...) to its components (k, ...)."""
 
     _numpy = _NUMPY
 
@@ -68,7 +68,7 @@ class TorchExpression(Expression):
 
 
 def between(at: Tensor, points: Tensor, values: Tensor) -> Tensor:
-    """Interpolate values (k, m), given at rising points (k,), to ``at`` (n, 1): (n, m), constant beyond the ends."""
+    """Return values (n, m) at ``at`` (n, 1): linear between values (k, m) at rising points (k,), constant beyond."""
     if len(points) == 1:
         return values[..., 0, :]
     passed = ((at - points[:-1]) / (points[1:] - points[:-1])).clamp(0.0, 1.0)
@@ -76,15 +76,15 @@ def between(at: Tensor, points: Tensor, values: Tensor) -> Tensor:
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Products A B^T (i, j, n) of n matrices A (i, k, n) and B (j, k, n)."""
+    """Return the products A B^T (i, j, n) of n matrices A (i, k, n) and B (j, k, n)."""
     return (a[:, None] * b[None]).sum(2)
 
 
 def eliminated(P: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Cholesky factors L of covariances P = L L^T (m, m, n), stacked on B L^-T with B = ``rows`` (k, m, n).
+    """Return the Cholesky factors L of covariances P = L L^T (m, m, n), stacked on B L^-T for matrices B (k, m, n).
 
-    Also returns a mask (n,) of the P that are positive definite. In the others LEAST_PIVOT replaces smaller pivots, so
-    that gradients stay finite. Entries of L above the diagonal are rounding errors.
+    Also returns a mask (n,) of the P that are positive definite. In every other P, LEAST_PIVOT replaces smaller pivots,
+    so that gradients stay finite. Entries of L above the diagonal are rounding errors.
     """
     rest, columns, pivots = torch.cat([P, *rows]), [], []
     for j in range(len(P)):

@@ -14,13 +14,16 @@ from training.export.exported import tracker_arrays, tracker_numbers
 from training.export.torch_parts import Module, Network, TorchExpression, between, eliminated, product
 
 Tracked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Scaled states, covariance, NIS, mean square of the trend, number of samples, trend (ny, n)."""
+"""Scaled states (nx, n), covariance (nx, nx, n), NIS, mean square of the trend, number of samples (n,), trend (ny, n).
+
+The trend is the running mean of the innovations.
+"""
 Prediction = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Means (nx, n), covariances (nx, nx, n), cross-covariances with the states before (nx, nx, n), validity (n,)."""
+"""Means (nx, n), covariances (nx, nx, n), covariances with the last states (nx, nx, n), whether they are valid (n,)."""
 
 
 class TorchTracker(Module):
-    """The tracker of an artifact; between :meth:`advance` and :meth:`supervise` the KKL filter takes in the sample."""
+    """The tracker of an artifact; between :meth:`advance` and :meth:`supervise`, the linear filter takes the sample."""
 
     def __init__(self, artifact: Artifact, dtype: torch.dtype) -> None:
         super().__init__()
@@ -48,19 +51,22 @@ class TorchTracker(Module):
         self.put(levels=factors.levels, ages=factors.ages, factors=factors.factors[0], most=factors.factors[-1])
 
     def covariance(self, state: Tensor, age: Tensor, share: Tensor, process_share: Tensor) -> Tensor:
-        """Calibrated covariances (n, nx^2) at ages (n, 1) and at noise levels (n, 1) over the largest."""
+        """Return calibrated covariances (n, nx^2) at ages (n, 1) and shares (n, 1) of the largest noise levels."""
         table = self.factors + process_share.clamp(max=1.0)[..., None] * (self.most - self.factors)
         factor = between(age, self.ages, between(share, self.levels, table).log()[..., None]).exp()
         return factor * (self._unpacked(state)[1] * self.units).flatten(0, 1).T
 
     def states(self, s: Tensor) -> Tensor:
-        """Convert scaled states (nx, n) to their units."""
+        """Return the states (nx, n) in their own units, from scaled states."""
         return s * self.x_scale + self.x_offset
 
     def advance(
         self, state: Tensor, y: Tensor, u: Tensor, begins: Tensor, measurement_noise: Tensor, process_noise: Tensor
     ) -> tuple[Tracked, Tensor]:
-        """Predict, then correct by y (ny, n), NaN where missing; also return predicted outputs. NIS is inf if lost."""
+        """Predict, then correct by y (ny, n), NaN where missing.
+
+        Returns the state, whose NIS is infinite where the correction fails, and the predicted outputs (ny, n).
+        """
         Q = self.eye * ((process_noise.clamp(min=self.least_process_noise) * self.process_noise) ** 2 + self.error**2)
         R = self.eye_y * torch.maximum(measurement_noise, self.least_measurement_noise) ** 2
         numbers, (x0, P0, nis, square, seen, trend) = self.numbers, self._unpacked(state)
@@ -92,12 +98,16 @@ class TorchTracker(Module):
         ), expected
 
     def supervise(self, tracked: Tracked, x_hat: Tensor, covariance: Callable[[Tensor], Tensor]) -> Tensor:
-        """Take T_inv's estimates (nx, n) where their covariances, given ages, are smaller or the tracker diverged."""
+        """Use T_inv's estimates (nx, n) after a divergence, and in the first window if their covariance is smaller.
+
+        ``covariance`` maps ages in seconds to T_inv's covariances.
+        """
         x, P, nis, square, seen, trend = tracked
-        learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)  # z holds at least so many samples
+        # The linear filter has taken at least as many samples as the tracker.
+        learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)
         lost, learned = ~(nis <= self.numbers["limit"]), learned.reshape(P.shape) / self.units
         of_learned, own = (eliminated(each)[0].diagonal().log().sum(1) for each in (learned, P))
-        taken = lost | ((seen < self.window) & (of_learned < own))  # determinants are compared
+        taken = lost | ((seen < self.window) & (of_learned < own))  # compares determinants
         x = torch.where(taken, self._within((x_hat - self.x_offset) / self.x_scale), x)
         P = torch.where(taken, learned, P).flatten(0, 1)
         nis, square = torch.where(lost, 1.0, nis), torch.where(lost, 1.0, square)
@@ -118,7 +128,7 @@ class TorchTracker(Module):
     def _relinearised(
         self, x: Tensor, P: Tensor, prediction: Prediction, new: Tensor, y: Tensor, u: Tensor, Q: Tensor, R: Tensor
     ) -> Prediction:
-        """Predict rows younger than a window again, linearised about their last state as this sample corrects it."""
+        """Predict again in the first window, the motion linearised about the last state, smoothed by the sample."""
         nx, (mean, S, across, sound) = self.nx, prediction
         V, white, _, known = self._corrected(mean, S, y, R)
         rows, solvable = eliminated(S, across, V.transpose(0, 1))
@@ -128,7 +138,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """V and white, for the corrected mean + V white and P - V V^T; expected outputs; validity of V (n,)."""
+        """Return V and white, for the corrected mean + V white and P - V V^T; expected outputs; whether V is valid."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)
@@ -145,18 +155,21 @@ class TorchTracker(Module):
     def _transformed(
         self, x: Tensor, L: Tensor, function: Callable[[Tensor, Tensor], Tensor], u: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Means and covariances of a function of Gaussians by sigma points, and E; L E^T is the covariance with x."""
+        """Return means and covariances of a function of Gaussians, and E; L E^T is the covariance with x.
+
+        The Gaussians have means x and covariances L L^T; sigma points represent them.
+        """
         middle, far, count = x[:, None], self.far * L, 1 + 2 * self.nx
         to = function(torch.cat([middle, middle + far, middle - far], 1).flatten(1), u.repeat(1, count))
         to = to.reshape(len(to), count, -1)
-        if function == self._output:  # where h is undefined, its value at the mean serves
+        if function == self._output:  # where h is undefined, use h at the mean
             to = torch.where(to.isfinite(), to, to[:, :1])
         mean = (to * self.weights).sum(1)
         off, (plus, minus) = to - mean[:, None], torch.split(to[:, 1:], self.nx, 1)
         return mean, product(off * self.square_weights, off), self.far * self.numbers["other"] * (plus - minus)
 
     def _moved(self, s: Tensor, u: Tensor) -> Tensor:
-        """Scaled states (nx, n) one sample later."""
+        """Return the scaled states (nx, n) one sample later."""
         s = self._within(s)
         if hasattr(self, "flow"):
             q = torch.cat([s, u / self.u_scale])
@@ -165,7 +178,7 @@ class TorchTracker(Module):
         return (moved - self.x_offset) / self.x_scale
 
     def _output(self, s: Tensor, _: Tensor) -> Tensor:
-        """Outputs of scaled states (nx, n); where undefined, those of the states cut to the bounds."""
+        """Return the outputs of scaled states (nx, n), or of the states limited to their bounds if h is undefined."""
         assert self.h is not None
         y, near = (self.h(self.states(each)) for each in (s, self._within(s)))
         return torch.where(y.isfinite(), y, near)

@@ -61,7 +61,7 @@ def _records():
         ("evaluate pendulum --faults", "unknown observer 'pendulum'"),
         ("evaluate lorenz lorenz --faults", "name each observer once, got lorenz, lorenz"),
         ("evaluate lorenz --faults --limit", "--limit: of no use with --faults"),
-        ("evaluate script.py:Class", "script.py:Class names a system; name its observer's file, such as runs/"),
+        ("evaluate script.py:Class", "script.py:Class names a system; pass its observer's file, such as runs/"),
         ("export lorenz --format pdf", "'pdf' is not a format: write onnx or c"),
         ("train lorenz --policy controler", "unknown policy 'controler', did you mean 'controller'"),
         ("evaluate lorenz --faults --measurement-noise 0 1", "--faults takes one level of measurement noise, got 2"),

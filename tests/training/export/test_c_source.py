@@ -69,7 +69,7 @@ def test_a_line_without_all_its_numbers_is_an_error(make_artifact, tmp_path):
     for text in ("1.0\n0.5\n", "1.0\n0.5 word\n", "word\n"):
         done = fed(program, text)
         assert done.returncode == 1
-        assert done.stderr == "there is a line without all its numbers\n"
+        assert done.stderr == "a line has too few numbers, or an invalid one\n"
     assert fed(program, "").returncode == 0
 
 

@@ -1,15 +1,15 @@
 /*
- * Reads samples, writes estimates: cc -std=c99 -O2 NAME.c NAME_main.c -lm && ./a.out < steps.txt
+ * Reads samples and writes estimates: cc -std=c99 -O2 NAME.c NAME_main.c -lm && ./a.out < steps.txt
  *
- * The first line of steps.txt holds OUTPUTS. Every further line holds
+ * The first line of steps.txt holds the first sample, OUTPUTS. Every further line holds
 // if inputs
- * the input that led to the next sample, INPUTS, then the sample.
+ * the input held since the last sample, INPUTS, and then the next sample.
 // end inputs
 // if autonomous
  * the next sample.
 // end autonomous
 // if tracks
- * Outputs that are missing are nan, but for the first.
+ * Write nan for a missing output. The first sample must be complete.
 // end tracks
  */
 #include <stdio.h>
@@ -54,6 +54,6 @@ int main(void)
         write_numbers(x_hat, MACRO_NX);
     }
     if (found != EOF)
-        fprintf(stderr, "there is a line without all its numbers\n");
+        fprintf(stderr, "a line has too few numbers, or an invalid one\n");
     return found != EOF;
 }

@@ -11,7 +11,7 @@ typedef NAME_real real;
 static void layer(const real *in, int inputs, const float *weights, const float *biases, real *out, int outputs)
 {
     for (int i = 0; i < outputs; i++) {
-        real sums[4] = {biases[i]}; /* four at a time: none waits for the one before, and errors stay smaller */
+        real sums[4] = {biases[i]}; /* four independent sums, which are faster and have smaller rounding errors */
         int j = 0;
         for (; j + 4 <= inputs; j += 4)
             for (int k = 0; k < 4; k++)
@@ -48,7 +48,7 @@ static void activate_relu(real *h, int n)
 // end relu
 /* MAPS */
 // if free
-/* Whether no input has acted since reset. */
+/* Returns 1 if all inputs since reset were zero, else 0. */
 static int untouched(const NAME_observer *observer)
 {
     for (int i = NZ; i < SIZE; i++)
@@ -58,7 +58,7 @@ static int untouched(const NAME_observer *observer)
 }
 // end free
 
-/* T_inv. */
+/* Writes T_inv(z), by the map for the inputs so far, to x_hat. */
 static void invert(const NAME_observer *observer, real *x_hat)
 {
 // if free
@@ -70,7 +70,7 @@ static void invert(const NAME_observer *observer, real *x_hat)
 }
 
 // if tracks
-/* A covariance of T_inv's error in scaled states, at an age in samples up to the last of a table. */
+/* Interpolates P, the covariance of T_inv's error in scaled states, at an age in samples that is within the table. */
 static void tabulated(const double *table, const double *ages, double age, double P[NX][NX])
 {
     for (; age > ages[1]; ages++)
@@ -79,7 +79,7 @@ static void tabulated(const double *table, const double *ages, double age, doubl
         P[k / NX][k % NX] = table[k] + (age - ages[0]) / (ages[1] - ages[0]) * (table[NX * NX + k] - table[k]);
 }
 
-/* The bounds of the motion. */
+/* Returns the scaled state i limited to its bounds. */
 static double within(double s, int i)
 {
     s = s < low[i] ? low[i] : s;
@@ -88,7 +88,7 @@ static double within(double s, int i)
 
 /* MOTION */
 
-/* Scaled states a sample later. */
+/* Computes the scaled states one sample later. */
 static void move(const double at[NX], const real *u, double next[NX])
 {
     double s[NX + NU];
@@ -118,7 +118,7 @@ static void move(const double at[NX], const real *u, double next[NX])
     field(x, u, next);
 // end discrete
 // if continuous
-    double k[4][NX]; /* of Runge and Kutta */
+    double k[4][NX]; /* stages of the Runge-Kutta method */
     for (int substep = 0; substep < SUBSTEPS; substep++) {
         field(x, u, k[0]);
         for (int n = 0; n < 3; n++) {
@@ -135,7 +135,8 @@ static void move(const double at[NX], const real *u, double next[NX])
 // end equations
 }
 
-/* Outputs of scaled states; where they are undefined, as they may be at sigma points, those within the bounds. */
+/* Computes the outputs of scaled states. Sigma points may lie where an output is undefined: its value is then that at
+   the states limited to their bounds. */
 static void measure(const double s[NX], const real *u, double y[NY])
 {
     double x[2][NX], near[NY];
@@ -149,8 +150,8 @@ static void measure(const double s[NX], const real *u, double y[NY])
         y[k] = isfinite(y[k]) ? y[k] : near[k];
 }
 
-/* P = L L^T. Where there is no L, entries that are no numbers spread, and are noticed in the end. Returns the sum of
-   the logarithms of L's diagonal. */
+/* Computes L with P = L L^T, and returns the sum of the logarithms of L's diagonal. If P is not positive definite, L
+   and the sum contain NaN. */
 static double factorise(double P[NX][NX], double L[NX][NX])
 {
     double sum = 0.0;
@@ -166,7 +167,7 @@ static double factorise(double P[NX][NX], double L[NX][NX])
     return sum;
 }
 
-/* X = A^T P^-1 B, or A P^-1 B. */
+/* Computes X = A^T P^-1 B if transposed, else A P^-1 B. */
 static void weigh(double A[NX][NX], int transposed, double P[NX][NX], double B[NX][NY], double X[NX][NY])
 {
     double L[NX][NX], b[NX];
@@ -191,7 +192,7 @@ static void weigh(double A[NX][NX], int transposed, double P[NX][NX], double B[N
     }
 }
 
-/* Add V w to x, times a sign. */
+/* Adds sign * V w to x. */
 static void shift(double x[NX], double sign, double V[NX][NY], const double w[NY])
 {
     for (int i = 0; i < NX; i++)
@@ -199,7 +200,7 @@ static void shift(double x[NX], double sign, double V[NX][NY], const double w[NY
             x[i] += sign * V[i][k] * w[k];
 }
 
-/* Add V W^T to P, times a sign. */
+/* Adds sign * V W^T to P. */
 static void add(double P[NX][NX], double sign, double V[NX][NY], double W[NX][NY])
 {
     for (int i = 0; i < NX; i++)
@@ -208,8 +209,8 @@ static void add(double P[NX][NX], double sign, double V[NX][NY], double W[NX][NY
                 P[i][j] += sign * V[i][k] * W[j][k];
 }
 
-/* What a function makes of a Gaussian, by sigma points: mean (n), covariance (n, n), and that with the states (NX, n).
- */
+/* Computes, by sigma points, the mean (n) and covariance (n, n) of a function of a Gaussian with mean x and covariance
+   P, and the covariance (NX, n) of x and the function. */
 static void transform(void (*function)(const double *, const real *, double *), int n, const double x[NX],
                       double P[NX][NX], const real *u, double *mean, double *S, double *across)
 {
@@ -244,7 +245,7 @@ static void transform(void (*function)(const double *, const real *, double *), 
 }
 
 typedef struct {
-    double x[NX], P[NX][NX], across[NX][NX]; /* mean, covariance, and that with the states before */
+    double x[NX], P[NX][NX], across[NX][NX]; /* mean, covariance, and covariance with the last states */
 } prediction;
 
 typedef struct {
@@ -260,7 +261,7 @@ static prediction predict(const double x[NX], double P[NX][NX], const real *u)
     return p;
 }
 
-/* The correction by a sample, of which NaN is missing. */
+/* Returns the correction by a sample, in which NaN marks missing outputs. */
 static correction correct(prediction *p, const real y[NY])
 {
     correction c;
@@ -286,7 +287,7 @@ static correction correct(prediction *p, const real y[NY])
     return c;
 }
 
-/* Predict again, with the motion linearised about where the step began as far as the sample tells. */
+/* Predicts again, with the motion linearised about the last state, smoothed by the sample. */
 static void relinearise(NAME_observer *observer, prediction *p, const real y[NY], const real *u)
 {
     correction c = correct(p, y);
@@ -309,14 +310,15 @@ static void relinearise(NAME_observer *observer, prediction *p, const real y[NY]
         *p = again;
 }
 
-/* What the innovations tell is forgotten. */
+/* Resets the statistics of the innovations. */
 static void restart_watch(NAME_observer *observer)
 {
     observer->nis = observer->trend_square = 1.0;
     memset(observer->trend, 0, sizeof observer->trend);
 }
 
-/* Correct a prediction, unless that leaves no numbers; at the start, unless it leaves no factor. */
+/* Corrects a prediction by a sample. If the result is not finite, or at the start not positive definite, the observer
+   keeps its last estimate, and an infinite NIS marks a divergence. */
 static correction take_in(NAME_observer *observer, prediction *p, const real y[NY], int starts)
 {
     correction c = correct(p, y);
@@ -334,12 +336,12 @@ static correction take_in(NAME_observer *observer, prediction *p, const real y[N
         memcpy(observer->x, p->x, sizeof p->x);
         memcpy(observer->P, p->P, sizeof p->P);
     } else {
-        observer->nis = INFINITY; /* lost */
+        observer->nis = INFINITY;
     }
     return c;
 }
 
-/* Predict, and take in a sample. Predicted outputs replace missing ones. */
+/* Predicts, and corrects by the sample y. In whole, predicted outputs replace missing ones. */
 static void track(NAME_observer *observer, const real y[NY], const real *u, real whole[NY])
 {
     double squared = 0.0, raised = 0.0;
@@ -363,7 +365,7 @@ static void track(NAME_observer *observer, const real y[NY], const real *u, real
     observer->trend_square += TREND_SQUARE_SHARE * count / NY * (TREND_GAIN * raised / count - observer->trend_square);
     if (observer->seen < WINDOW)
         observer->seen++;
-    if (observer->trend_square > TREND_LIMIT) { /* innovations agree with one another */
+    if (observer->trend_square > TREND_LIMIT) { /* the innovations are correlated */
         observer->trend_square = 1.0;
         memset(observer->trend, 0, sizeof observer->trend);
         for (int i = 0; i < NX * NX; i++)
@@ -371,15 +373,15 @@ static void track(NAME_observer *observer, const real y[NY], const real *u, real
     }
 }
 
-/* Take T_inv's estimate where it is surer, soon after a reset, or where the filter diverged. */
+/* Replaces the estimate by T_inv's after a divergence, and in the first window if T_inv's covariance is smaller. */
 static void supervise(NAME_observer *observer)
 {
-    int lost = !(observer->nis <= LIMIT); /* also where it is NaN */
+    int lost = !(observer->nis <= LIMIT); /* also if the NIS is NaN */
     double P[NX][NX], L[NX][NX];
     real x_hat[NX];
     if (!lost && observer->seen >= WINDOW)
         return;
-    /* what misled the filter may have misled z as well: T_inv is as unsure as when it has seen so much, at most */
+    /* The cause of a divergence may have disturbed z, too: T_inv's covariance is that of an age of at most a window. */
 // if free
     if (untouched(observer))
         tabulated(free_covariance, free_ages, (double)observer->seen, P);
@@ -430,7 +432,7 @@ void NAME_reset(NAME_observer *observer, const real y[NY])
 // end tracks
 }
 
-/* z = transition z, of one block of the filter's state. */
+/* Multiplies one block of the filter's state by the transition matrix. */
 static void advance(double *z)
 {
     double next[NZ] = {0.0};

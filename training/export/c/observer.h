@@ -10,16 +10,16 @@
 // end inputs
  * x_hat: ESTIMATES
  *
- * NAME_reset takes in the first sample, NAME_step every later one.
+ * NAME_reset takes the first sample, NAME_step every later sample.
 // if static
- * Samples and inputs must be finite: a NaN stays until the next reset.
+ * Samples and inputs must be finite: after a NaN, all estimates are NaN until the next reset.
 // end static
 // if tracks
- * Where an output is missing, pass NaN: it is predicted. The first sample and inputs must be finite, and the compiler
- * must know NaN, as it does without -ffast-math.
+ * Pass NaN for a missing output: the observer predicts it. The first sample and all inputs must be finite. Compile
+ * without -ffast-math, which assumes that there is no NaN.
 // end tracks
- * Nothing is allocated, and observers share constants alone.
- * It assumes measurement noise of standard deviation LEVELS and process noise of level PROCESS.
+ * The functions allocate no memory, and use no variables but constants and the observer that is passed to them.
+ * The observer assumes measurement noise of standard deviation LEVELS and process noise of level PROCESS.
  */
 #ifndef MACRO_H
 #define MACRO_H
@@ -38,29 +38,30 @@ typedef PRECISION NAME_real;
 typedef struct {
     double z[COUNT_Z]; /* the filter's state */
     NAME_real y[MACRO_NY]; /* the last sample */
-    unsigned long age; /* samples since the first, as far as that matters */
+    unsigned long age; /* samples since reset, counted up to the largest age that T_inv distinguishes */
 // if tracks
     double x[MACRO_NX], P[MACRO_NX][MACRO_NX]; /* the estimate and its covariance, in scaled states */
-    double nis; /* mean square of the innovations in units of their standard deviations */
-    double trend[MACRO_NY], trend_square; /* their running mean, and its mean square: 1 where they are white */
-    unsigned long seen; /* samples of which anything was there, as far as that matters */
+    double nis; /* running mean square of the whitened innovations */
+    double trend[MACRO_NY]; /* running mean of the whitened innovations */
+    double trend_square; /* scaled running mean square of the trend, on average 1 if the innovations are white */
+    unsigned long seen; /* samples with at least one output, counted up to the window */
 // end tracks
 } NAME_observer;
 
-/* Forget the past and take in the first sample. */
+/* Starts, or starts again, at a first sample. */
 void NAME_reset(NAME_observer *observer, const NAME_real y[MACRO_NY]);
 
 // if inputs
-/* Take in the next sample and the input that was held since the last, and estimate. */
+/* Processes the next sample and the input that was held since the last sample, and writes the estimate to x_hat. */
 void NAME_step(NAME_observer *observer, const NAME_real y[MACRO_NY], const NAME_real u[MACRO_NU],
                NAME_real x_hat[MACRO_NX]);
 // end inputs
 // if autonomous
-/* Take in the next sample, and estimate. */
+/* Processes the next sample, and writes the estimate to x_hat. */
 void NAME_step(NAME_observer *observer, const NAME_real y[MACRO_NY], NAME_real x_hat[MACRO_NX]);
 // end autonomous
 
-/* The estimate as things stand, which is what step gives too: after reset, the first. */
+/* Writes the current estimate to x_hat, such as the first estimate after a reset. */
 void NAME_estimate(const NAME_observer *observer, NAME_real x_hat[MACRO_NX]);
 
 #ifdef __cplusplus
