@@ -117,7 +117,7 @@ class Agent:
         return self.network.inputs if self.lstm is None else self.lstm.inputs
 
     def policy(self, action_space: gym.Space[Any]) -> Callable[[np.ndarray], Any]:
-        """Return a function from observations (n, inputs) to n actions; a recurrent agent needs a new one per play."""
+        """Return a function from observations (n, inputs) to n actions; recurrent agents need a new one per episode."""
         space: Any = action_space
         memory: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -142,7 +142,7 @@ class Agent:
         return act
 
     def make(self, num_envs: int = 1, *, trusted: str | None = None, observer: str | None = None) -> VectorEnv:
-        """Make environments of the agent's task; ``observer`` is the path of its observer, if that file has moved.
+        """Make environments of the agent's task; ``observer`` is the path of the agent's observer, if this has moved.
 
         The agent's file may be untrusted, and making its environment may import a module or script that this file
         names. An environment that neither Gymnasium nor kkl_gym ships is therefore made only if ``trusted`` names it.
@@ -214,7 +214,7 @@ class Agent:
 
 
 def rules(task: Task) -> dict[str, Any]:
-    """Return the properties of the task's system that the task does not hold and on which an agent depends."""
+    """Return the equations, target, scale and process noise of the task's system, on which an agent depends."""
     if task.system is None:
         return {}
     system = get_system(task.system)

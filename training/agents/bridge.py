@@ -14,9 +14,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 class SB3VecEnv(VecEnv):
     """A stable-baselines3 ``VecEnv`` around any Gymnasium ``VectorEnv`` that resets in the same step.
 
-    ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` may wrap it. A row is one environment of the vector. When its
-    episode ends, its info holds ``terminal_observation`` (the last one before the reset), ``TimeLimit.truncated`` and
-    all that the environment reported for the last step. At other steps the info holds only ``info_keys``, because
+    ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` may wrap it. A row is one environment of the vector. When a
+    row's episode ends, its info has ``terminal_observation`` (the last one before the reset), ``TimeLimit.truncated``
+    and all that the environment reported for the last step. At other steps the info holds only ``info_keys``, because
     filling a full dictionary for each row takes longer than a step of a batched simulation.
 
     Parameters
@@ -132,7 +132,7 @@ class SB3VecEnv(VecEnv):
 
 
 def _row(info: dict[str, Any], row: int, keys: Sequence[str]) -> dict[str, Any]:
-    """Return the entries of ``info`` for a row; a mask ``_key``, if there is one, marks the rows that ``key`` has."""
+    """Return the entries of ``info`` for a row; a mask ``_key``, if there is one, marks the rows that have ``key``."""
     out = {}
     for key in keys:
         if key in info and (f"_{key}" not in info or info[f"_{key}"][row]):

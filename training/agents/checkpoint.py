@@ -23,7 +23,7 @@ _ARRAYS = ("t", "y", "u", "x")  # arrays of a record
 
 
 class Checkpoint(BaseCallback):
-    """Writes a checkpoint and the learning curve at intervals, between two rollouts, and at the end.
+    """Writes a checkpoint and the learning curve at the end of a training and, at intervals, between two rollouts.
 
     A checkpoint holds networks, optimisers, counters, the scaling of observations, the replay buffer, the learning
     curve, the memory's weights and the steps from which an observer is learned. It holds neither the environments nor

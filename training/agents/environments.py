@@ -28,7 +28,7 @@ def vector(
 ) -> VectorEnv:
     """Make a task's environments, which reset in the same step.
 
-    ``wrap`` wraps them inside the action repeat. ``each`` makes one environment, if the task has no system.
+    ``wrap`` wraps them inside the action repeat. If the task has no system, ``each`` makes one of them.
     """
     if task.system is None:
         side_by_side = SyncVectorEnv([each or partial(single, task)] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)

@@ -13,7 +13,7 @@ from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 
 
 class History(VectorWrapper):
-    """Shows the state s of linear filters: ``keep`` s + ``take`` [y, u] follows s if the action u leads to y.
+    """Shows the state of linear filters: after s comes ``keep`` s + ``take`` [y, u], if the action u leads to y.
 
     An episode begins with each filter at the first observation and a zero action. The environment must reset in the
     same step. Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.

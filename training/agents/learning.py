@@ -102,9 +102,9 @@ def learn(
     and afterwards their estimates. Under noise the estimates are less accurate, and a policy for true signals does not
     suit them. The first steps are then fewer, their actions are random, and only the observer learns.
 
-    For an agent that sees z under noise, the weights of z are learned from ``observer_steps`` random steps, if these
-    are given. All first steps count. The observer is refitted ``aggregate`` times to the agent's own steps, and once
-    more at the end.
+    For an agent that sees z under noise, the weights of z are learned from ``observer_steps`` random steps, if given.
+    All these first steps count as steps of the training. If ``aggregate`` is not 0, the observer is refitted so many
+    times to the agent's own steps, and once more at the end.
 
     A resumed training starts new episodes, so that its agent differs from that of an uninterrupted training.
     ``Agent.training`` then holds the number of resumptions.
@@ -210,7 +210,7 @@ def _first_steps(task: Task, steps: int, rehearsal: int, given: int | None) -> i
 
 
 def _like(task: Task) -> Any:
-    """Return a record of one step; records of the same environment share all its fields but the samples."""
+    """Return a record of one step, which has the fields that all records of the task share."""
     alone = Privileged(task, 1)
     with closing(alone.make()) as env:
         env.reset(seed=0)
@@ -310,7 +310,7 @@ class Learner:
 
 
 class _Until(BaseCallback):
-    """Stops a training of ``last`` steps before the first rollout after ``steps``, or before the last rollout."""
+    """Stops a training of ``last`` steps before the first rollout after ``steps``, or else before the last."""
 
     def __init__(self, steps: int, last: int) -> None:
         super().__init__()
@@ -320,7 +320,7 @@ class _Until(BaseCallback):
         self._begun = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        # The next rollout should be as long as the previous one. A callback can stop only after a step of all rows.
+        # The next rollout is expected to be as long as the previous one. Stopping takes one more step of all rows.
         rollout = self.num_timesteps - self._begun
         self._begun = self.num_timesteps
         stopping = self.training_env.num_envs

@@ -19,7 +19,7 @@ from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
 from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset
 
 OBSERVER = "observer.safetensors"
-HEADROOM = 1.5  # largest noise level in the training of T_inv, over the task's noise level
+HEADROOM = 1.5  # largest noise level in the training of T_inv, as a multiple of the task's
 HELD_OUT = 0.2  # held-out share of the episodes
 KEPT = 100_000  # number of latest steps from which an observer is learned
 SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
@@ -31,7 +31,7 @@ def hidden_entries(task: Task, size: int) -> tuple[int, ...]:
 
 
 def estimated_entries(task: Task, size: int) -> tuple[int, ...]:
-    """Return the indices of the entries that an observer estimates: the hidden ones, under noise also the measured."""
+    """Return the indices of the entries that an observer estimates: the hidden and, under noise, the measured ones."""
     hidden = hidden_entries(task, size)
     return tuple(sorted({*hidden, *task.measured})) if task.measurement_noise else hidden
 

@@ -16,7 +16,7 @@ SIGNALS = ("x", "x_hat", "y")  # keys of info whose values are recorded at each 
 class Episodes:
     """A batch of n episodes; after the end of an episode its last signals are repeated, with ``u`` = 0.
 
-    Shapes: ``returns``, ``lengths`` and ``escaped`` (n,), which marks terminations; ``x``, ``x_hat`` and ``y``
+    Shapes: ``returns``, ``lengths`` and ``escaped`` (n,), the mask of terminated episodes; ``x``, ``x_hat`` and ``y``
     (steps + 1, n, signals), ``u`` (steps, n, nu), each None if ``info`` does not hold it.
     """
 

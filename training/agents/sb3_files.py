@@ -1,4 +1,4 @@
-"""Conversion of agents to and from stable-baselines3's own files, AGENT.zip, without unpickling."""
+"""Conversion of agents to and from the files of stable-baselines3 (AGENT.zip), without unpickling."""
 
 import io
 import json
@@ -117,7 +117,7 @@ def from_sb3(
 
 
 def _content(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Return a policy's tensors and settings from a zip; settings that are pickled remain text."""
+    """Return a policy's tensors and settings from a zip; pickled settings are left as text."""
     try:
         with zipfile.ZipFile(path) as files:
             if max(files.getinfo(name).file_size for name in ("policy.pth", "data")) > _MAX_BYTES:

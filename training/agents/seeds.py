@@ -1,6 +1,6 @@
 """Seeds of the episodes on which agents learn and are evaluated; no evaluation uses a seed of a training."""
 
-# Seeds of first episodes, from which later episodes count up. A training multiplies its seed by (agent's seed + 1).
+# Seeds of first episodes, from which later ones count up; a training's is multiplied by (the agent's seed + 1).
 AGENT_TRAINING_SEED = 10_000
 AGENT_EVALUATION_SEED = 10**9
 AGENT_EVALUATION_EPISODES = 10_000  # largest number of episodes of an evaluation

@@ -123,7 +123,7 @@ class Train:
     """Standard deviation of the noise on each measured sample."""
     timesteps: Annotated[int | None, hint("the hyperparameters'")] = None
     """Number of actions in the training, over all environments."""
-    observer: Annotated[str | None, hint("the system's; for environments one is learned", metavar="MAP")] = None
+    observer: Annotated[str | None, hint("the system's map; one is learned for environments", metavar="MAP")] = None
     """A shipped map's name or a .safetensors file, for an agent that sees x_hat, x_hat_std or z."""
     algorithm: Annotated[
         Literal["ppo", "sac", "td3", "tqc", "dqn", "a2c", "ppo_lstm"] | None,
@@ -133,7 +133,7 @@ class Train:
     observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
     """Number of first steps in an environment from which the observer is learned, if --observer names none; of more
     than 100,000, the latest are used. Without noise the agent also learns in these steps, from true hidden signals in
-    place of estimates. With noise these steps have random actions. For z, they teach which parts of z predict y."""
+    place of estimates. With noise these steps have random actions; for z, the weights of z are learned from them."""
     aggregate: int = 0
     """How often the observer is refitted to the agent's own steps while the agent learns from estimates. If this is not
     0, the agent does not explore in the last twentieth of all steps, after which a last refit follows."""

@@ -24,7 +24,7 @@ from training.files import require_writable
 from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports of progress
-SECONDS = 12.0  # length of an animation, which shows systems with a pace of 1 s in real time
+SECONDS = 12.0  # length of an animation; systems with a pace of 1 s run in real time
 FRAMES = 144  # largest number of frames in an animation
 TRAIL = 0.35  # share of the samples that one frame draws; older points would hide the latest
 
@@ -196,7 +196,7 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
                     ax.plot(t, episode.spinn[:, i], ":", color=RIVAL, label="SPINN")
                 low, high = episode.x[:, i].min(), episode.x[:, i].max()
                 margin = 0.25 * (high - low) or 1.0
-                # The limits leave out first estimates that are far off.
+                # First estimates that are far off stay outside the axis.
                 ax.set_ylim(low - margin, high + margin)
                 ax.set_ylabel(system.state_names[i])
             axes[0, column].set_title(system.name.replace("_", " "))
@@ -244,7 +244,7 @@ class Column:
         self.x, self.x_hat = (states[: self.samples, shown] for states in (motion.x, motion.x_hat))
         self.y, self.t = motion.y[: self.samples], np.arange(self.samples) * motion.dt
         low, high = self.x.min(0), self.x.max(0)
-        # The limits leave out first estimates that are far off.
+        # First estimates that are far off stay outside the axes.
         margin = 0.2 * np.where(high > low, high - low, 1.0)
         (left, bottom), (right, top) = low - margin, high + margin
         names = [system.state_names[i] for i in shown]

@@ -62,7 +62,7 @@ class Diagnose:
             help=f"{SYSTEM} With --measured and --hidden: an environment as gym.make takes it, such as Pendulum-v1.",
         ),
     ] = None
-    measurement_noise: Annotated[NoiseLevels, hint("the system's own; else 1 % and 10 % of y's deviation")] = None
+    measurement_noise: Annotated[NoiseLevels, hint("the system's; else 1 % and 10 % of y's standard deviation")] = None
     """Standard deviations of noise on each sample of y, besides 0; one for all outputs, or one for each: 0.1,0.3."""
     dt: Annotated[float | None, hint("the system's")] = None
     """Sampling interval of a system in seconds."""

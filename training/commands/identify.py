@@ -35,7 +35,7 @@ class Identify:
     """Learn a plant's unknown parameters, and an observer for it, from records of its outputs only.
 
     No recorded state is needed. Multiple shooting fits the parameters, and the states at which windows of the records
-    start, from random states in the training box. It gives standard errors. The observer is then trained on simulated
+    start, from random states in the training box, and gives standard errors. The observer is then trained on simulated
     motions of the identified plant. --observer adapts an observer to a plant that differs from the observer's model,
     with the settings of the observer's training.
 

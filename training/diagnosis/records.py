@@ -28,12 +28,12 @@ QUERY_SHARE = 0.2  # share of the records with samples to predict; neighbours co
 MIN_QUERIES = 50  # least number of samples to predict
 MIN_OTHERS = 5  # least number of possible neighbours for each coordinate of z
 NOISE_SHARES = 0.01, 0.1  # default noise levels, in standard deviations of the output
-MIN_NEIGHBOURS = 32  # least number of neighbours; they must be twice as many as z has coordinates, to determine a plane
+MIN_NEIGHBOURS = 32  # least number of neighbours; a z of many coordinates needs more, to determine a plane
 ROUNDING = 1e-9  # ridge of the linear regression on z, about the relative rounding of z
 # Largest error of a determined signal and least error of an undetermined one, in the signal's standard deviations.
 DETERMINED, UNDETERMINED = 0.05, 0.8
-AS_GOOD = 1.1  # a window whose error is at most so many times the least counts as good as the best
-SEEN = 0.1  # a signal is known up to a constant if the error of its changes is at most this share of its error
+AS_GOOD = 1.1  # a window whose error is at most this multiple of the least error is as good as the best
+SEEN = 0.1  # a signal is known up to a constant if its changes have at most this share of its own error
 
 # Severity and advice by the first word of the verdict on a signal.
 VERDICTS: dict[str, tuple[Verdict, str]] = {
@@ -190,8 +190,8 @@ def of_records(
 ) -> Observability:
     """Find which recorded states the recorded outputs and inputs determine.
 
-    A window is a number of steps before a sample, at which the KKL filter of a training on these records starts. The
-    filter's state z at the sample is compared with similar z in other records, with the noise that z then has.
+    For a window of k steps, the KKL filter that a training on these records would use starts k steps before a sample.
+    The filter's state z at the sample is compared with similar z in other records, with the noise that z then has.
     """
     integer("seed", seed, 0)
     check_signals(records)
@@ -211,7 +211,7 @@ def of_records(
         if compared is None:
             break
         errors.append(compared[0])
-        # After a longer window the filter has forgotten its start.
+        # After windows longer than this, the filter has forgotten its start.
         remembered = window <= settled / SETTLED
         changes.append(np.where(remembered, compared[1], np.nan))
     if not errors:
@@ -228,7 +228,7 @@ def of_records(
 
 
 def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[Level, ...]:
-    """Return the level 0, and the given levels or by default shares of the outputs' standard deviations."""
+    """Return level 0 and the given levels, which by default are shares of the outputs' standard deviations."""
     y = np.concatenate([record.y for record in records])
     if given is None:
         given = [tuple(float(f"{share * size:.3g}") for size in np.nanstd(y, 0)) for share in NOISE_SHARES]
@@ -250,7 +250,7 @@ def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.nd
 def compare(
     queries: Windows, others: Windows, window: int, *, noise: Sequence[Level], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return errors (k, nx) by noise level, and errors (nx,) of changes without noise; None with too few samples."""
+    """Return errors (k, nx) by noise level and errors (nx,) of changes without noise, or None for too few samples."""
     (z, x), (others_z, others_x) = _samples(queries, window, MAX_QUERIES), _samples(others, window, MAX_OTHERS)
     if len(z) < MIN_QUERIES or len(others_z) <= MIN_OTHERS * others_z.shape[1]:
         return None
@@ -271,9 +271,9 @@ def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.nda
     """Return the errors (nx,) of x given z, in standard deviations, by comparing samples with others of similar z.
 
     Weights are chosen so that the weighted mean of the neighbours' z is the sample's z. The weighted mean of their x
-    misses the sample's x for two reasons. First, z does not determine x: this error has the variance sought times
-    (1 + the sum of squared weights), by which squares are therefore divided. Second, x is no linear function of z: this
-    error falls with the square of the distance. With one neighbour of weight 1 this is the Delta test.
+    misses the sample's x for two reasons. First, z does not determine x. The variance of this error is the sought one
+    times 1 + the sum of squared weights, so that squares are divided by this factor. Second, x is no linear function of
+    z. This error falls with the square of the distance. With one neighbour of weight 1, this is the Delta test.
 
     Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
     """

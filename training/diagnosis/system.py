@@ -17,10 +17,10 @@ from training.evaluation.levels import Level
 from training.trajectories.motions import DRIVEN, Controller, random_inputs, under_policy
 
 COMPARED = 100  # number of points of X, and of 2X, at which the equations are evaluated
-POINTS = 1000  # points of X at which outputs are evaluated
+POINTS = 1000  # number of points of X at which outputs are evaluated
 MOTIONS = 100  # number of motions, half of which are driven if the system has inputs
 MANY = 0.5  # a larger share of motions that leave the bounds is a problem
-# Change of y in one sample over its standard deviation: least for a problem, least for a note, and of the advised dt.
+# Change of y in one sample, over y's standard deviation: a problem above COARSE, a note above JERKY, SMOOTH is advised.
 COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1
 STILL = 1e-9  # an output whose range is a smaller share of its size does not move
 
@@ -44,7 +44,7 @@ class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
     ``motions`` are states (steps + 1, MOTIONS, nx), NaN after they leave the bounds, and inputs; each of the ``kinds``
-    has an equal share. The mask ``stay`` (MOTIONS,) selects the motions within the bounds, whose outputs are ``y``.
+    has an equal share. The mask ``stay`` (MOTIONS,) selects those that stay within the bounds; ``y`` are their outputs.
     """
 
     def __init__(

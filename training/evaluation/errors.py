@@ -104,7 +104,7 @@ def unseen_trajectories(
     domain : {"X", "1.5X", "2X"}
         Where the trajectories start: in X, or in the multiple of X but outside X.
     driven : bool
-        Whether random inputs act, steps and sines in turn. With ``policy``: whether it has state errors and explores.
+        Whether random inputs act, steps and sines in turn. With ``policy``: whether it sees state errors and explores.
     stream : Stream
         Stream of random numbers, for evaluation or for validation.
     process_noise : float
@@ -162,7 +162,7 @@ def errors(
     seed: int,
     skip: float | None = None,
 ) -> Errors:
-    """Return an observer's errors on test trajectories. It knows the noise levels, but not how the plant differs.
+    """Return errors on test trajectories of an observer that knows the noise levels, but not how the plant differs.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def noise_limit(
     Parameters
     ----------
     system, trajectories, measurement_noise, skip
-        As for :func:`errors`. Trajectories must start in X. The noise counts as at least 0.2 % of the system's own.
+        As for :func:`errors`. Trajectories must start in X. The bound assumes at least 0.2 % of the system's own noise.
     seed : int
         Seed of the drawn errors.
 

@@ -18,7 +18,7 @@ from training.records import Record, check_signals, pieces
 HELD_OUT = 10  # one record in ten is held out of the fit
 KEPT_RATIOS = 100.0  # cost of a change in the ratios of unidentifiable parameters, over the cost of a common factor
 BACK = (1.0, 0.5, 0.25)  # shares of the way to the nearest parameters, tried in turn until a fit explains the windows
-UNSCALED = 0.05  # relative change of a state, over that of the parameters, from which its scale is unidentifiable
+UNSCALED = 0.05  # a state that changes by more, relative to the parameters' change, has no identifiable scale
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
 HIDDEN = 0.05  # a parameter with a larger component of an unidentifiable direction is unidentifiable
 

@@ -17,7 +17,7 @@ CONVERGED = 1e-3  # a start has converged if a step lowers the window's mean squ
 FIRST_DAMPING = 1e-3
 BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # shares of a window to which its start is fitted first
 DRAWS, KEPT = 64, 4  # random starts for each window, and the number of best ones that are fitted
-SAMPLES_PER_STATE = 8  # least number in a window's shortest beginning; with fewer, noise determines the start
+SAMPLES_PER_STATE = 8  # least number of samples per state to which a start is fitted, because of noise
 MOST_ROWS = 60_000  # largest number of motions in one simulation
 
 
@@ -74,7 +74,7 @@ class Shooting:
         return np.moveaxis((beside.reshape(len(y), moved, n, -1) - y[:, None]) / STEP, 1, -1)
 
 
-# A new class would be compiled again.
+# Each call of with_parameters makes a new class, which would be compiled again.
 @functools.lru_cache(maxsize=8)
 def _with_parameters(system: System, ranges: tuple[tuple[str, tuple[float, float]], ...]) -> System:
     return with_parameters(system, dict(ranges))

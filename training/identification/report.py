@@ -8,7 +8,7 @@ import numpy as np
 from training.figures import ESTIMATE, MEASURED, TRUTH, drawing
 from training.identification.identify import Identified
 
-LAGS = 40  # samples
+LAGS = 40  # largest lag in samples
 SHOWN = 3  # number of held-out records in the figure
 
 

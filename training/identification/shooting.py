@@ -17,7 +17,7 @@ EXACT = 1e-16  # a smaller mean square of residuals, over the outputs' variances
 ROUNDING = 1e-14  # lower bound of the noise, over an output's standard deviation
 MOST_DAMPING = 1e9
 CLUSTERS = 20  # least number of windows whose scatter gives standard errors
-COLOURED = 1.5  # ratio of standard errors, by scatter over by white noise, that chance does not reach in 20 windows
+COLOURED = 1.5  # ratio of standard errors from scatter to those for white noise; chance stays below in 20 windows
 OUTLIER = 9.0  # a window is left out if its mean square is so many median absolute deviations above the median
 
 
@@ -51,8 +51,8 @@ class Fit:
         """Return standard errors along directions: the larger of those for white noise and those by scatter of windows.
 
         Correlated residuals, such as those of process noise, make parameters less certain than white residuals of equal
-        size. The scatter of the windows' gradients accounts for this (the sandwich estimator for clustered data), given
-        at least CLUSTERS windows. ``known`` spans the identifiable directions.
+        size. The scatter of the gradients of at least CLUSTERS windows accounts for the correlation (the sandwich
+        estimator for clustered data). ``known`` spans the identifiable directions.
 
         Shapes: ``directions`` (p, k), ``known`` (p, m); returns (k,).
         """
@@ -184,7 +184,7 @@ def shoot(
             x0 = at.x0 + (along[..., -1] - along[..., :-1] @ change) * shooting.half
             tried = problem.follow(new, x0, problem.rows)
             problem.settle(new, tried, np.flatnonzero(tried.each > at.each), RESETTLING)
-            # A step that improves all other windows may make a chaotic one diverge: mean squares are bounded.
+            # Mean squares are bounded, as a step that suits all other windows may make a chaotic one diverge.
             worst = np.minimum(tried.each[used], 2 * at.each[used].max())
             fall = loss(at.each[used]).sum() - loss(worst).sum()
             better = fall > 0

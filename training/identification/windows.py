@@ -18,7 +18,7 @@ LEAST_USED = 0.8  # share of the windows that the model must explain at a new le
 GAIN = 0.7  # standard errors after a doubling of the length, over those before; larger ratios end the growth
 MORE_COST = 2.0  # largest mean square of the residuals after a doubling, over that before
 LEFT = 0.4  # in standard errors: longest Gauss-Newton step that may remain after a fit
-APART = 0.5  # in standard errors: largest distance between fits that begin on two sides
+APART = 0.5  # in standard errors: largest distance between the two fits of longer windows
 MOST_SAMPLES = 6400  # largest number of samples in a window
 DIFFERENCES = 4  # order of the differences of y that estimate the noise
 
@@ -118,7 +118,7 @@ def _first_fit(
     lengths: Sequence[int],
     fitted: Callable[[Shooting, np.ndarray, Windows], Fit],
 ) -> Fit:
-    """Return the fit of the longest first windows that the model explains; it begins at random starts in X."""
+    """Return the fit of the longest first windows that the model explains, after a search of random starts in X."""
     spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
     expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
     theta, best, problem = shooting.given, None, UnexplainedError("")
