@@ -38,11 +38,11 @@ from training.progress import ProgressBars, progress_bars
 from training.run import CHECKPOINT
 
 RECURRENT = "ppo_lstm"
-# Share of the first steps, before there are estimates, in a training without noise. The agent learns on true states in
-# them: later estimates are so accurate that its policy suits them too.
+# A training begins without estimates. If there is no noise, this phase takes this share of all steps, and the agent
+# learns from true states: later estimates are so accurate that its policy suits them, too.
 PRIVILEGED = 0.9
-WANDERED = 0.1  # share of the first steps in a training under noise; their actions are random
-REHEARSAL = 0.05  # share of the last steps, after the agent has learned, if an observer is refitted
+WANDERED = 0.1  # the same share if there is noise; the agent then acts at random
+REHEARSAL = 0.05  # share of all steps, at the end of a training with refits, without exploration and learning
 FILE = "agent.safetensors"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings that no algorithm takes
 _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes a system's task
@@ -310,7 +310,7 @@ class Learner:
 
 
 class _Until(BaseCallback):
-    """Stops a training of ``last`` steps before the first rollout after ``steps``, or else before the last."""
+    """Stops before the first rollout after ``steps`` steps, or else before the last rollout of ``last`` steps."""
 
     def __init__(self, steps: int, last: int) -> None:
         super().__init__()

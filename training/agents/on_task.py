@@ -20,7 +20,7 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     The reward is minus the cost, or the system's own ``reward``. With the seed that row i of the task's vector
     environment has, this environment behaves like row i.
 
-    The environment itself sets the noise, the starts and the length of episodes: make it with the ``env_kwargs`` of
+    The wrapped environment sets the noise, the starts and the length of episodes: make it with the ``env_kwargs`` of
     ``training.agents.tasks.get_task(SYSTEM)``. The files in training/agents/hyperparameters do so for rl-zoo3.
     """
 

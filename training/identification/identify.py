@@ -76,7 +76,7 @@ class Identified:
             only = ", ".join(f"{one.text} = {one.value:.6g} +- {one.standard_error:.2g}" for one in known)
             lines.append(f"not identifiable from the outputs: {', '.join(hidden)}" + (f"; only {only}" if only else ""))
             used = ", ".join(f"{name} = {values[name]:.6g}" for name in hidden)
-            lines.append(f"the observer uses {used}, the nearest to the first guesses of all values that fit")
+            lines.append(f"the observer uses {used}: of all values that fit, those nearest to the first guesses")
             if self.unscaled_states:
                 lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: these values fix it")
         lines += [
@@ -85,8 +85,8 @@ class Identified:
         ]
         for j, (noise, expected) in enumerate(zip(self.noise, self.expected_noise, strict=True)):
             if noise > 1.5 * expected + 1e-3 * np.nanstd(self.fit.windows.y[..., j]):
-                ratio = f"residuals of {noise:.3g} exceed the noise of {expected:.3g}"
-                lines.append(f"output {j + 1}: {ratio}: the model does not explain the output completely")
+                excess = f"residuals of {noise:.3g} exceed the noise of {expected:.3g}"
+                lines.append(f"output {j + 1}: {excess}: the model does not explain the output completely")
         return lines
 
 
@@ -118,7 +118,7 @@ def estimate_parameters(
 
 
 def _check_unknown(system: System, unknown: Limits) -> None:
-    """Raise ValueError if a parameter is unknown to the system, or its first guess not between finite limits."""
+    """Raise ValueError if a parameter is unknown to the system, or its first guess is not between finite limits."""
     if not unknown:
         raise ValueError("name an unknown parameter, as in --unknown mu=1.5")
     for name, (low, high) in unknown.items():
