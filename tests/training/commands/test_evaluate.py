@@ -130,7 +130,7 @@ def test_why_there_are_no_runs():
         unstable.run(console := Console(record=True))
     text = " ".join(console.export_text().split())
     assert "left out: starts in X: all 5 runs left bounds = ((-30, 30), (-30, 30))" in text
-    assert "starts in 2X \\ X: each of 5 runs left" in text
+    assert "starts in 2X \\ X: all 5 runs left" in text
 
 
 def test_a_level_beyond_the_maps_range_is_left_out_and_named(saved):
