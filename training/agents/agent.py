@@ -27,7 +27,7 @@ Head = Literal["tanh", "clip", "argmax"]
 
 
 class AgentError(ValueError):
-    """Raised for invalid or corrupt files of agents, and for agents that do not fit their environment or observer."""
+    """Raised for an invalid or corrupt agent file, and for an agent that does not fit its environment or observer."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class LSTM:
         return self.weight.shape[1] - self.size
 
     def __call__(self, x: np.ndarray, state: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Advance a state by the inputs (n, inputs)."""
+        """Return the state that follows ``state`` under the inputs ``x`` (n, inputs)."""
         i, f, g, o = np.split(np.concatenate([x, state[0]], axis=1) @ self.weight.T + self.bias, 4, axis=1)
         c = _sigmoid(f) * state[1] + _sigmoid(i) * np.tanh(g)
         return _sigmoid(o) * np.tanh(c), c
@@ -63,9 +63,9 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Agent:
-    """A deterministic policy, its task, and its information set.
+    """A deterministic policy, the task on which it was trained, and the information that it sees.
 
-    Shapes: ``mean`` and ``scale`` of the normalisation of observations, (inputs,).
+    Shapes: ``mean`` and ``scale``, which normalise observations, (inputs,).
     """
 
     network: MLP
@@ -103,12 +103,12 @@ class Agent:
         for name in ("rules", "training"):
             if not isinstance(getattr(self, name), Mapping):
                 raise AgentError(f"{name} must be a mapping, got {getattr(self, name)!r}")
-        if type(self.seed) is not int:  # it is part of file names
+        if type(self.seed) is not int:
             raise AgentError(f"the seed must be a whole number, got {self.seed!r}")
 
     @property
     def seed(self) -> int:
-        """Seed of the training, 0 if unknown."""
+        """Seed of the training, or 0 if it is unknown."""
         return self.training.get("seed", 0)
 
     @property
@@ -117,7 +117,7 @@ class Agent:
         return self.network.inputs if self.lstm is None else self.lstm.inputs
 
     def policy(self, action_space: gym.Space[Any]) -> Callable[[np.ndarray], Any]:
-        """Return a policy for new episodes, from (n, inputs) to n actions; a recurrent one keeps its own state."""
+        """Return a function from observations (n, inputs) to n actions; recurrent agents need a new one per episode."""
         space: Any = action_space
         memory: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -142,39 +142,39 @@ class Agent:
         return act
 
     def make(self, num_envs: int = 1, *, trusted: str | None = None, observer: str | None = None) -> VectorEnv:
-        """Make the environment of the agent's training; ``observer`` is the present path of its observer.
+        """Make environments of the agent's task; ``observer`` is the path of the agent's observer, if this has moved.
 
-        A file of an agent may be untrusted, and making its environment may import a module or script that the file
-        names. So an environment that is neither Gymnasium's nor a shipped system's needs ``trusted``, its name.
+        The agent's file may be untrusted, and making its environment may import a module or script that this file
+        names. An environment that neither Gymnasium nor kkl_gym ships is therefore made only if ``trusted`` names it.
         """
         named = self.task.system or self.task.env_id
         spec = gym.registry.get(named)
         harmless = named in SYSTEMS or (spec is not None and str(spec.entry_point).startswith("gymnasium.envs."))
         if trusted != named and (trusted is not None or not harmless):
             raise AgentError(
-                f"the agent's environment is {named!r}, and {trusted!r} is trusted: trust {named!r} if you trust the "
-                "agent's file with what that imports"
+                f"the agent's environment is {named!r}, but trusted is {trusted!r}: making it may import code that "
+                f"the agent's file names; trust {named!r} if you trust this code"
             )
         observer = observer or self.observer
         if observer is not None and fingerprint(observer) != self.fingerprint:
-            raise AgentError(f"the agent was trained on another observer than the one in {observer!r}")
+            raise AgentError(f"the agent was trained with another observer than {observer!r}")
         now = rules(self.task)
         for name in now:
             if self.rules.get(name) != now[name]:
-                raise AgentError(f"the agent was trained with {name} = {self.rules.get(name)}; it is {now[name]} now")
+                raise AgentError(f"the agent was trained with {name} = {self.rules.get(name)}; it is now {now[name]}")
         env = make(self.task, self.information, num_envs, observer=observer)
         sizes = tuple(map(gym.spaces.flatdim, (env.single_observation_space, env.single_action_space)))
         if sizes != (self.inputs, self.network.outputs):
             raise AgentError(
-                f"the policy has {self.inputs} inputs and {self.network.outputs} outputs, the environment {sizes[0]} "
-                f"and {sizes[1]}"
+                f"the policy has {self.inputs} inputs and {self.network.outputs} outputs, but the environment needs "
+                f"{sizes[0]} and {sizes[1]}"
             )
         if isinstance(env.single_action_space, gym.spaces.Discrete) != (self.head == "argmax"):
             raise AgentError(f"a policy whose head is {self.head} cannot act in {env.single_action_space}")
         return env
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write weights and description to one safetensors file, atomically."""
+        """Write the agent to one safetensors file, atomically."""
         tensors: dict[str, np.ndarray] = {}
         storage.put_mlp(tensors, "", self.network)
         if self.mean is not None and self.scale is not None:
@@ -199,11 +199,11 @@ class Agent:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> "Agent":
-        """Read an agent."""
+        """Read an agent from its file."""
         tensors, described = storage.read(path, key=KEY, error=AgentError, what="an agent")
         with storage.explained(path, AgentError):
             if (number := described.pop("format")) != FORMAT:
-                raise AgentError(f"it has format {number!r}, kkl-gym reads {FORMAT}: train the agent again")
+                raise AgentError(f"it has format {number!r}, but kkl-gym reads format {FORMAT}: train the agent again")
             known = {entry.name for entry in fields(cls)} - {"network", "mean", "scale", "lstm"}
             if unknown := sorted(described.keys() - known - {"activation"}):
                 raise AgentError(f"unknown metadata keys: {', '.join(unknown)}")
@@ -214,7 +214,7 @@ class Agent:
 
 
 def rules(task: Task) -> dict[str, Any]:
-    """Return the properties of a system, besides task and observer, on which the agent's observations depend."""
+    """Return the equations, target, scale and process noise of the task's system, on which an agent depends."""
     if task.system is None:
         return {}
     system = get_system(task.system)
@@ -242,5 +242,5 @@ def find(name: str) -> Path:
     folder = files("training.agents").joinpath("shipped")
     names = sorted(entry.name.removesuffix(".safetensors") for entry in folder.iterdir())
     if (known := matching(name, names)) is None:
-        raise AgentError(f"no agent {name!r} ships; there are {', '.join(names)}; a file ends in .safetensors")
+        raise AgentError(f"no agent {name!r} ships, only {', '.join(names)}; a file's name must end in .safetensors")
     return Path(str(folder.joinpath(f"{known}.safetensors")))

@@ -14,10 +14,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 class SB3VecEnv(VecEnv):
     """A stable-baselines3 ``VecEnv`` around any Gymnasium ``VectorEnv`` that resets in the same step.
 
-    ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` may wrap it. A row is one environment of the vector. When its
-    episode ends, its info holds ``terminal_observation`` (the one before the reset), ``TimeLimit.truncated`` and all
-    that the environment reported for the last step. Other steps report only ``info_keys``, because a dictionary for
-    each row and step costs more than a batched simulation.
+    ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` may wrap it. A row is one environment of the vector. When a
+    row's episode ends, its info has ``terminal_observation`` (the last one before the reset), ``TimeLimit.truncated``
+    and all that the environment reported for the last step. At other steps the info holds only ``info_keys``, because
+    filling a full dictionary for each row takes longer than a step of a batched simulation.
 
     Parameters
     ----------
@@ -29,15 +29,14 @@ class SB3VecEnv(VecEnv):
     Raises
     ------
     ValueError
-        If the environment has another autoreset mode or no inputs, or stable-baselines3 sets different options for
-        different rows.
+        If the environment has another autoreset mode or an empty action space, or if the options of the rows differ.
     """
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], info_keys: Sequence[str] = ()) -> None:
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(
-                f"stable-baselines3 needs environments that reset in the same step, got one with {mode}: make it with "
+                f"stable-baselines3 needs environments that reset in the same step, got one with {mode}: use "
                 'autoreset_mode="SameStep" (vector_kwargs={"autoreset_mode": "SameStep"} for Sync and Async vectors)'
             )
         if 0 in (env.single_action_space.shape or ()):
@@ -47,13 +46,13 @@ class SB3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Reset all rows with the seeds and options that were set for the next reset. Returns their observations."""
+        """Reset all rows with the seeds and options that were set for this reset, and return the observations."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         options = self._options
         self._reset_seeds()
         self._reset_options()
         if any(repr(other) != repr(options[0]) for other in options):
-            raise ValueError("a vector environment takes the same options for all rows: set_options(one dictionary)")
+            raise ValueError("a vector environment needs the same options for all rows: set one dictionary")
         obs, info = self.env.reset(seed=seeds, options=dict(options[0]) or None)
         self.reset_infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
         return deepcopy(obs)
@@ -63,28 +62,30 @@ class SB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all rows; after the end of an episode, the observation is the first of the next one."""
+        """Step all rows; a row whose episode ends returns the first observation of its next episode."""
         obs, reward, terminated, truncated, info = self.env.step(self._actions)
         done = terminated | truncated
         infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
+        # Where an episode has ended, ``info`` describes the new episode, and ``final_info`` the end of the old one.
         for row in np.flatnonzero(done).tolist():
-            self.reset_infos[row] = infos[row]  # info describes the new episode
+            self.reset_infos[row] = infos[row]
             infos[row] = _row(info, row, _keys(info)) | _row(info["final_info"], row, _keys(info["final_info"]))
             infos[row]["terminal_observation"] = info["final_obs"][row]
             infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
-        return deepcopy(obs), np.asarray(reward, dtype=np.float32), done, infos  # some environments reuse their arrays
+        # Some environments write the next observation into the same array.
+        return deepcopy(obs), np.asarray(reward, dtype=np.float32), done, infos
 
     def close(self) -> None:
         """Close the environment."""
         self.env.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Return frames of all rows, None if the environment renders nothing."""
+        """Return a frame for each row, or None for each if the environment renders none."""
         frames: Any = self.env.render() if self.render_mode == "rgb_array" else None
         return [None] * self.num_envs if frames is None else list(frames)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of each row, from the vector environment's wrappers or else from its environments."""
+        """Return an attribute for each row: that of the wrapper that has it, else that of the environment inside."""
         rows = list(self._get_indices(indices))
         owner = self._owner(attr_name)
         if owner is not None:
@@ -95,7 +96,7 @@ class SB3VecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of all rows, in the object where :meth:`get_attr` finds it."""
         if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError("attributes of a vector environment are set for all rows at once")
+            raise ValueError("attributes can only be set in all rows at once: leave indices out")
         owner = self._owner(attr_name)
         if owner is not None:
             setattr(owner, attr_name, value)
@@ -103,13 +104,13 @@ class SB3VecEnv(VecEnv):
             self._rows_of("set_attr", attr_name)(attr_name, [value] * self.num_envs)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **options: Any) -> list[Any]:
-        """Call a method of every row's environment, in Sync and Async vectors only, and return the results."""
+        """Call a method of each row's environment, and return the results; the vector must be Sync or Async."""
         if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError("a method of a vector environment's rows is called in all rows at once")
+            raise ValueError("methods can only be called in all rows at once: leave indices out")
         return list(self._rows_of("call", method_name)(method_name, *args, **options))
 
     def _owner(self, name: str) -> Any:
-        """The wrapper that has an attribute, else the vector environment; None if its rows have their own."""
+        """Return the wrapper that has an attribute, else the vector environment; None for a Sync or Async vector."""
         env: Any = self.env
         while hasattr(env, "env"):
             if name in vars(env):
@@ -131,7 +132,7 @@ class SB3VecEnv(VecEnv):
 
 
 def _row(info: dict[str, Any], row: int, keys: Sequence[str]) -> dict[str, Any]:
-    """The part of ``info`` that belongs to a row; a key without a mask belongs to all rows."""
+    """Return the entries of ``info`` for a row; a mask ``_key``, if there is one, marks the rows that have ``key``."""
     out = {}
     for key in keys:
         if key in info and (f"_{key}" not in info or info[f"_{key}"][row]):

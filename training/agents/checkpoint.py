@@ -1,4 +1,4 @@
-"""Checkpoints of an agent's training; they replace the files of stable-baselines3, which are pickled."""
+"""Checkpoints of an agent's training, which need no pickle, unlike the files of stable-baselines3."""
 
 import csv
 import time
@@ -23,12 +23,12 @@ _ARRAYS = ("t", "y", "u", "x")  # arrays of a record
 
 
 class Checkpoint(BaseCallback):
-    """Writes a checkpoint and the learning curve from time to time, between two rollouts, and at the end.
+    """Writes a checkpoint and the learning curve at the end of a training and, at intervals, between two rollouts.
 
     A checkpoint holds networks, optimisers, counters, the scaling of observations, the replay buffer, the learning
-    curve, the weights of z and the steps from which an observer is learned. It holds neither the environments nor
-    random generators: a training that goes on begins new episodes, with random numbers of its own. The learning curve
-    has a row for each episode: steps, CPU seconds and return.
+    curve, the memory's weights and the steps from which an observer is learned. It holds neither the environments nor
+    the random generators: a resumed training begins new episodes with other random numbers. The learning curve has a
+    row for each episode: steps, CPU seconds and return.
     """
 
     def __init__(self, path: Path, fingerprint: str, *, resume: bool) -> None:
@@ -37,15 +37,15 @@ class Checkpoint(BaseCallback):
         self.resumed = self.restarts = 0
         self.spent = 0  # number of random steps before the algorithm's first step
         self.privileged = False  # whether the agent sees true hidden signals instead of estimates
-        self.records: Callable[[], Sequence[Record]] = list  # the records to save
+        self.records: Callable[[], Sequence[Record]] = list  # returns the records to save
         self._curve, self._began = list[tuple[float, ...]](), time.process_time()
         if not resume:
             path.unlink(missing_ok=True)
         self.saved = run.load_checkpoint(path, fingerprint=fingerprint) if path.exists() else None
-        self.weights = (self.saved or {}).get("weights")  # weights of z under noise
+        self.weights = (self.saved or {}).get("weights")  # the memory's weights
 
     def restore(self, model: BaseAlgorithm, steps: int) -> None:
-        """Restore the saved training, if there is one."""
+        """Restore the saved training, if there is one; ``steps`` is the length of the whole training."""
         if (saved := self.saved) is None:
             return
         with run.restoring(self.path):
@@ -65,7 +65,7 @@ class Checkpoint(BaseCallback):
         self.saved = None  # frees memory
 
     def saved_records(self, like: Record) -> list[Record]:
-        """Return the saved records, whose fields other than samples are those of ``like``."""
+        """Return the saved records; only samples are saved, and ``like`` gives all other fields."""
         if self.saved is None:
             return []
         with run.restoring(self.path):
@@ -81,7 +81,8 @@ class Checkpoint(BaseCallback):
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
-            if "episode" in info:  # from VecMonitor
+            # VecMonitor adds this key at the end of an episode.
+            if "episode" in info:
                 seconds = round(time.process_time() - self._began, 2)
                 self._curve.append((self.num_timesteps + self.spent, seconds, round(float(info["episode"]["r"]), 4)))
         return True
@@ -91,7 +92,7 @@ class Checkpoint(BaseCallback):
 
     def _save(self) -> None:
         model = self.model
-        counters = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls")  # the last one belongs to DQN
+        counters = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls")  # only DQN has _n_calls
         kept = [{key: torch.from_numpy(getattr(one, key)) for key in _ARRAYS} for one in self.records()]
         state: dict[str, Any] = {
             "parameters": model.get_parameters(),
@@ -114,7 +115,7 @@ class Checkpoint(BaseCallback):
 
 
 def _moments(scaling: VecNormalize | None) -> dict[str, Any]:
-    """The running moments for the normalisation of observations and returns."""
+    """Return the running moments that normalise observations and returns."""
     if scaling is None:
         return {}
     pairs: dict[str, Any] = {name: getattr(scaling, name) for name in ("obs_rms", "ret_rms")}
@@ -125,7 +126,7 @@ def _moments(scaling: VecNormalize | None) -> dict[str, Any]:
 
 
 def _buffer(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    """The filled part of the replay buffer, and SAC's entropy coefficient."""
+    """Return the filled part of the replay buffer, and SAC's entropy coefficient."""
     buffer, weight = model.replay_buffer, getattr(model, "log_ent_coef", None)
     assert buffer is not None
     rows = buffer.size()

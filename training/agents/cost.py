@@ -1,4 +1,4 @@
-"""The reward in the training of agents for systems."""
+"""The reward from which agents learn to control systems."""
 
 from typing import Any
 
@@ -7,11 +7,16 @@ import numpy as np
 from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 from training.agents.tasks import Task
 
-MAX_COST = 10.0  # about three scales from the target in every state; larger costs would dominate the training
+# States that are about three scales from the target have this cost. Larger costs would dominate the training.
+MAX_COST = 10.0
 
 
 def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
-    """Return minus the cost c, at most ``MAX_COST``, from the mean reward 1/(1 + 4c) over an action's samples."""
+    """Return an action's reward: minus its cost c, which is at most ``MAX_COST``.
+
+    ``total`` is the sum of the environment's rewards 1/(1 + 4c) over the action's samples. An action that ends the
+    episode early, after ``age`` samples, also pays its cost for each action that would have followed.
+    """
     samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
     remaining = np.where(terminated, task.steps - np.ceil(age / task.repeat), 0.0)
     cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, MAX_COST)
@@ -19,10 +24,9 @@ def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
 
 
 class Cost(VectorWrapper):
-    """Rewards with minus the cost, see :func:`paid`, if a system does not define its own reward.
+    """Replaces the reward by minus the cost (:func:`paid`), for systems that do not define their own reward.
 
-    Far from the target the environment's reward is flat, while c still has a slope for an agent to follow. Escaping
-    never pays off.
+    Far from the target the reward 1/(1 + 4c) is flat, while the cost c still has a gradient.
     """
 
     def __init__(self, env: VectorEnv, task: Task) -> None:
@@ -30,7 +34,7 @@ class Cost(VectorWrapper):
         self._task = task
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step the environments, and replace the rewards. Shapes: ``actions`` (n, nu)."""
+        """Step the environments and replace the rewards. Shapes: ``actions`` (n, nu)."""
         obs, total, terminated, truncated, info = self.env.step(actions)
         age = info["final_info"]["sample"] if terminated.any() else info["sample"]
         return obs, paid(self._task, total, age, terminated), terminated, truncated, info

@@ -1,4 +1,4 @@
-"""The vector environments of tasks: systems as one batch, other environments in a Sync vector."""
+"""The vector environments of tasks: one batched simulation for a system, else a ``SyncVectorEnv``."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -26,7 +26,10 @@ def vector(
     *,
     each: Callable[[], gym.Env[Any, Any]] | None = None,
 ) -> VectorEnv:
-    """Make environments that reset in the same step; ``wrap`` goes inside the action repeat, ``each`` makes one."""
+    """Make a task's environments, which reset in the same step.
+
+    ``wrap`` wraps them inside the action repeat. If the task has no system, ``each`` makes one of them.
+    """
     if task.system is None:
         side_by_side = SyncVectorEnv([each or partial(single, task)] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
         return wrap(side_by_side)
@@ -37,7 +40,7 @@ def vector(
 
 
 def single(task: Task, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
-    """Make one environment that is not a system's, with flat observations and noise on the measured entries."""
+    """Make one environment of a task without a system: flat observations, measured entries with noise if ``noisy``."""
     env = make(task.env_id, task.env_kwargs)
     if not (isinstance(env.observation_space, spaces.Box) and len(env.observation_space.shape) == 1):
         env = gym.wrappers.FlattenObservation(env)
@@ -46,9 +49,7 @@ def single(task: Task, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
         raise ValueError(f"an observation of {task.env_id} is not a vector of numbers: {shown(space)}")
     for entry in (*task.measured, *(task.hidden or ())):
         if entry >= space.shape[0]:
-            raise ValueError(
-                f"there is no entry {entry} in an observation of {task.env_id}: it has 0 to {space.shape[0] - 1}"
-            )
+            raise ValueError(f"there is no entry {entry} in {task.env_id}, only entries 0 to {space.shape[0] - 1}")
     if not task.measurement_noise:
         return env
     assert isinstance(task.measurement_noise, float)
@@ -58,8 +59,8 @@ def single(task: Task, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
 class MeasurementNoise(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
     """Adds independent Gaussian noise to some entries of an observation.
 
-    It has its own random generator, so that a seed starts the same episodes with and without noise. ``info`` gains the
-    noise-free observation, ``clean``, and the noise-free values of the noisy entries, ``clean_y``.
+    The noise has its own random generator, so that a seed starts the same episodes with and without noise. ``info``
+    gains the noise-free observation, ``clean``, and the noise-free values of the noisy entries, ``clean_y``.
     """
 
     def __init__(self, env: gym.Env[np.ndarray, Any], entries: Sequence[int], standard_deviation: float) -> None:

@@ -1,4 +1,4 @@
-"""Past observations and actions, in banks of linear filters."""
+"""Stacked observations and exponential traces: linear filters that show an agent past observations and actions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,11 +13,10 @@ from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 
 
 class History(VectorWrapper):
-    """Shows the state s of filters s' = ``keep`` s + ``take`` [y, u], where the action u led to the observation y.
+    """Shows the state of linear filters: after s comes ``keep`` s + ``take`` [y, u], if the action u leads to y.
 
-    At reset s rests at the first observation and no action. The environment must reset in the same step.
-
-    Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.
+    An episode begins with each filter at the first observation and a zero action. The environment must reset in the
+    same step. Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.
     """
 
     def __init__(self, env: VectorEnv, keep: np.ndarray, take: np.ndarray, *, actions: bool = True) -> None:
@@ -32,13 +31,13 @@ class History(VectorWrapper):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Reset all environments and filters."""
+        """Reset the environments and the filters."""
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self._state = self._first(obs)
         return self._observation(), info
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step environments and filters."""
+        """Step the environments and the filters."""
         u = np.empty((self.num_envs, 0)) if self._inputs is None else self._inputs(actions, (self.num_envs,))
         obs, reward, terminated, truncated, info = self.env.step(actions)
         ended = np.flatnonzero(terminated | truncated)
@@ -63,7 +62,7 @@ class History(VectorWrapper):
 
 
 def stacked(env: VectorEnv, frames: int, *, actions: bool = True) -> History:
-    """Show the last observations in order of time, each with the action before it."""
+    """Show the last ``frames`` observations in order of time, each with the action that led to it."""
     return History(env, np.eye(frames, k=1), np.eye(frames)[-1], actions=actions)
 
 

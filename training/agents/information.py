@@ -1,4 +1,4 @@
-"""Information sets: the observations of an agent, as a vector environment of flat arrays."""
+"""Information sets: vector environments that show agents states, outputs, memories or estimates as flat arrays."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -25,15 +25,15 @@ from training.trajectories.equations import linearised
 Information = Literal["state", "y", "stacked", "traces", "z", "x_hat", "x_hat_std", "recurrent"]
 INFORMATION: tuple[Information, ...] = get_args(Information)
 ESTIMATED: tuple[Information, ...] = ("x_hat", "x_hat_std")
-OBSERVED: tuple[Information, ...] = (*ESTIMATED, "z")  # the information that a learned observer gives
-MIN_DEVIATION = 1e-6  # least standard deviation that agents see, over a state's scale
+OBSERVED: tuple[Information, ...] = (*ESTIMATED, "z")  # information that a learned observer can give
+MIN_DEVIATION = 1e-6  # lower bound of the standard deviations that agents see, in units of a state's scale
 
 Values = Mapping[str, np.ndarray]
 Feature = Callable[[Values], np.ndarray]
 
 
 class FeatureObservation(VectorWrapper):
-    """Shows a function of the observation ``obs`` and of entries of ``info``, float32."""
+    """Shows a function of the observation ``obs`` and of entries of ``info``, as float32."""
 
     def __init__(self, env: VectorEnv, feature: Feature, width: int, keys: Sequence[str] = ()) -> None:
         super().__init__(env)
@@ -69,7 +69,7 @@ class FeatureObservation(VectorWrapper):
 
 
 def make(task: Task, information: Information, num_envs: int, *, observer: str | None = None) -> VectorEnv:
-    """Make a task in which the agent sees ``information``; for systems relative to the target, in units of about 1."""
+    """Make environments that show ``information``; signals of a system are scaled deviations from its target."""
     choice("information", information, INFORMATION)
     if observer is not None and information not in OBSERVED:
         raise ValueError(f"an agent that sees {information!r} has no use for the observer {observer!r}")
@@ -100,19 +100,19 @@ def make(task: Task, information: Information, num_envs: int, *, observer: str |
 
 
 def weighted(task: Task, steps: int, *, seed: int) -> Task:
-    """Weight z so that it predicts the next outputs; the weights are learned from random actions in a simulator."""
+    """Return the task with weights of the memory z, fitted so that z predicts later outputs under random actions."""
     with closing(single(task)) as env:
         return replace(task, weights=KKLMemory(env, **_memory(task)).learn_weights(steps, seed=seed))
 
 
 def _memory(task: Task) -> dict[str, Any]:
-    """The arguments of a memory of an environment's measured entries."""
+    """Return the arguments of a memory of the task's measured entries."""
     arguments = {name: getattr(task, name) for name in ("measured", "angles", "time_constants", "weights")}
     return arguments if task.past_actions else arguments | {"input_time_constants": ()}
 
 
 def estimates(task: Task, information: Information, num_envs: int, observer: str) -> VectorEnv:
-    """Show an observer's x_hat (after y, if exact), its standard deviations, or z. The observer sees every sample."""
+    """Show an observer's x_hat (after y, if y is noise-free), also with standard deviations, or the observer's z."""
     artifact = Artifact.read(resolve(observer))
     options: dict[str, Any] = {
         "observer": observer,
@@ -124,10 +124,11 @@ def estimates(task: Task, information: Information, num_envs: int, observer: str
     system = None if task.system is None else get_system(task.system)
     if information == "z":
         return _modes(env, artifact, system)
-    first = len(task.measured) if task.measurement_noise else 0  # an observer also estimates noisy outputs
+    # Under noise the observer estimates the outputs too, and agents do not see y.
+    first = len(task.measured) if task.measurement_noise else 0
     last = len(task.measured) + artifact.nx
     if system is not None and artifact.nx > system.nx:
-        raise ValueError(f"the observer {observer} estimates a bias too, which agents do not know; take one without")
+        raise ValueError(f"the observer {observer} estimates a bias too, which agents do not see: take one without")
     scale = 1.0 if system is None else np.array(system.scale)
     width = artifact.nx if system is not None else last - first
 
@@ -135,7 +136,7 @@ def estimates(task: Task, information: Information, num_envs: int, observer: str
         x_hat = at["obs"][:, first:last] if system is None else deviation(system, at["x_hat"])
         if information == "x_hat":
             return x_hat
-        # Standard deviations differ by orders of magnitude in the course of an episode.
+        # Agents see logarithms, because standard deviations change by orders of magnitude within an episode.
         sizes = np.log10(np.maximum(standard_deviations(at["x_cov"]) / scale, MIN_DEVIATION))
         return np.concatenate([x_hat, sizes], axis=1)
 
@@ -145,22 +146,23 @@ def estimates(task: Task, information: Information, num_envs: int, observer: str
 
 
 def observer_of(system: System) -> str:
-    """Name of the shipped map of a system."""
+    """Return the name of a system's shipped observer."""
     if system.name not in shipped():
-        raise ValueError(f"no observer ships for {system.name!r}: name a .safetensors file (--observer FILE)")
+        raise ValueError(f"no observer ships for {system.name!r}: pass a .safetensors file (--observer FILE)")
     return system.name
 
 
 def output_deviation(system: System) -> Feature:
-    """Make the feature (y - h(target)) / size, where size is the first-order effect of the states' scales on y."""
+    """Return the feature (y - h(target)) / size, where size is the first-order effect of the states' scales on y."""
     _, _, C = linearised(system, system.target)
     y, size = np.array(system.h(system.target)), np.abs(C) @ np.array(system.scale)
-    size = np.where(size > 0, size, 1.0)  # outputs without a slope at the target
+    # An output whose gradient vanishes at the target keeps its unit.
+    size = np.where(size > 0, size, 1.0)
     return lambda at: (at["y"] - y) / size
 
 
 def _modes(env: VectorEnv, artifact: Artifact, system: System | None) -> VectorEnv:
-    """Show z as the observer's network reads it, and the age; for systems relative to the target, else with y."""
+    """Show z and any age as T_inv's network reads them: as deviations from a system's target, else after y."""
     inverse, linear, inside = artifact.inverse, artifact.filter, env
     while not isinstance(inside, KKLVectorObservation):
         inside = inside.env  # type: ignore[attr-defined]

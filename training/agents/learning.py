@@ -1,4 +1,4 @@
-"""Agents of stable-baselines3 learn a task."""
+"""Training of an agent by an algorithm of stable-baselines3."""
 
 import ast
 import hashlib
@@ -38,17 +38,18 @@ from training.progress import ProgressBars, progress_bars
 from training.run import CHECKPOINT
 
 RECURRENT = "ppo_lstm"
-# Share of a training's steps, at its start, in which there are no estimates yet.
-PRIVILEGED = 0.9  # without noise: the agent sees true states; estimates are so accurate that its policy suits them too
-WANDERED = 0.1  # under noise: the agent only acts at random
-REHEARSAL = 0.05  # share of the steps, at the end, in which the agent neither explores nor learns
+# A training begins without estimates. If there is no noise, this phase takes this share of all steps, and the agent
+# learns from true states: later estimates are so accurate that its policy suits them, too.
+PRIVILEGED = 0.9
+WANDERED = 0.1  # the same share if there is noise; the agent then acts at random
+REHEARSAL = 0.05  # share of all steps, at the end of a training with refits, without exploration and learning
 FILE = "agent.safetensors"
-_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings of the run
+_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings that no algorithm takes
 _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes a system's task
 
 
 def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:
-    """Choose the algorithm: recurrent PPO for recurrent agents, SAC if it is tuned for the task, else PPO."""
+    """Return the default algorithm: recurrent PPO for recurrent agents, SAC if tuned for the task, else PPO."""
     if information == "recurrent":
         return RECURRENT
     if task.system is not None:
@@ -58,7 +59,7 @@ def algorithm_for(task: Task, information: Information, actions: gym.Space[Any])
 
 @cache
 def settings_of(algorithm: str) -> dict[str, dict[str, Any]]:
-    """The content of hyperparameters/ALGORITHM.yml, by environment; rl-zoo3 reads these files too."""
+    """Return the settings in hyperparameters/ALGORITHM.yml, by environment; rl-zoo3 reads these files too."""
     if algorithm not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
     text = files("training.agents").joinpath("hyperparameters", f"{algorithm}.yml").read_text()
@@ -94,13 +95,16 @@ def learn(
     show: Callable[..., VectorEnv] = make,
     progress: ProgressBars | None = None,
 ) -> Agent:
-    """Train one agent, with checkpoints. Writes agent.safetensors, curve.csv and, if learned, observer.safetensors.
+    """Train one agent, with checkpoints; write agent.safetensors, curve.csv and, if learned, observer.safetensors.
 
-    If an observer must be learned, it is learned from the agent's first steps. Without noise, the agent learns in these
-    steps, too: it sees the true hidden signals, and continues with estimates. With noise, estimates are less accurate,
-    and a policy for true signals does not suit them. There are then fewer first steps, with random actions, from which
-    only the observer learns. They count as steps of the training. If ``observer_steps`` are given for z under noise,
-    the memory's weights are learned from them.
+    For an agent that sees x_hat in an environment without a system, an observer is learned, if none is given, from the
+    first ``observer_steps`` steps. Without noise the agent also learns in these steps: it sees the true hidden signals,
+    and afterwards their estimates. Under noise the estimates are less accurate, and a policy for true signals does not
+    suit them. The first steps are then fewer, their actions are random, and only the observer learns.
+
+    For an agent that sees z under noise, the weights of z are learned from ``observer_steps`` random steps, if given.
+    All these first steps count as steps of the training. If ``aggregate`` is not 0, the observer is refitted so many
+    times to the agent's own steps, and once more at the end.
 
     A resumed training starts new episodes, so that its agent differs from that of an uninterrupted training.
     ``Agent.training`` then holds the number of resumptions.
@@ -112,21 +116,21 @@ def learn(
     steps, rows = settings["n_timesteps"], settings.get("n_envs", 1)
     _check_actions(name, actions, task.env_id)
     if information == "recurrent" and name != RECURRENT:
-        raise ValueError(f"recurrent agents learn by {RECURRENT}, got {name!r}")
+        raise ValueError(f"recurrent agents learn by {RECURRENT} only, got {name!r}")
     if aggregate and (task.system is not None or information not in ESTIMATED):
-        raise ValueError(f"an agent that sees {information!r} of {task.env_id} has no observer to fit again")
+        raise ValueError(f"an agent that sees {information!r} of {task.env_id} has no observer to refit")
     if task.system is not None and information in OBSERVED and observer is None and show is make:
         observer = observer_of(get_system(task.system))
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
     # Whether an observer is learned during the training.
     fits = task.system is None and information in ESTIMATED and observer is None
     if fits and information != "x_hat":
-        raise ValueError(f"{information}: train an observer with error bars first, and name it (--observer FILE)")
+        raise ValueError(f"{information} needs a trained observer with error bars: pass its file (--observer FILE)")
     if fits and not estimated_entries(task, size):
-        raise ValueError(f"all entries of {task.env_id} are measured, without noise: nothing is left to estimate")
+        raise ValueError(f"all entries of {task.env_id} are measured without noise: nothing is left to estimate")
     noisy_z = information == "z" and observer is None and task.measurement_noise and task.weights is None
     if observer_steps is not None and not (fits or noisy_z):
-        raise ValueError("observer_steps is for agents on z under noise, and for those on x_hat without an observer")
+        raise ValueError("observer_steps needs an agent that sees z under noise, or x_hat if no observer is given")
     weighs = noisy_z and observer_steps is not None
     first = _first_steps(task, steps, rehearsal, observer_steps) if fits or weighs else 0
     how = {"algorithm": name, **settings, "seed": seed, "observer_steps": first, "aggregate": aggregate}
@@ -135,7 +139,7 @@ def learn(
     checkpoint = Checkpoint(folder / f"agent{CHECKPOINT}", hashlib.sha256(identity.encode()).hexdigest(), resume=resume)
     resumes = checkpoint.saved is not None
     if resumes and (folder / FILE).exists():
-        return Agent.read(folder / FILE)  # the training is complete
+        return Agent.read(folder / FILE)
     if weighs:
         checkpoint.spent = first
         task = replace(task, weights=checkpoint.weights) if resumes else weighted(task, first, seed=seed)
@@ -143,7 +147,7 @@ def learn(
     with progress_bars(progress) as bars:
         fit = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
         privileged = None
-        if fits and task.measurement_noise:  # a policy for true signals does not suit noisy estimates
+        if fits and task.measurement_noise:
             checkpoint.spent = first
             if not resumes:
                 fit(wander(task, first, seed=seed, progress=bars))
@@ -165,20 +169,18 @@ def learn(
             learner.begin(checkpoint, left)
             if privileged is not None and checkpoint.privileged:
                 checkpoint.records = privileged.records
-                with bars.phase(f"{description}, hidden signals shown", first) as report:
+                with bars.phase(f"{description}, on true hidden signals", first) as report:
                     learner.learn(left, [_Bar(report), checkpoint], until=first)
                 if learner.steps >= left:
-                    raise ValueError(
-                        f"the agent would never see an estimate: {name} collects {learner.steps} steps before it goes "
-                        f"on; give it more than {steps} (--timesteps)"
-                    )
+                    raise ValueError(f"all {left} steps come before the first estimate: pass more (--timesteps)")
                 fit(privileged.records())
                 checkpoint.privileged = False
                 checkpoint.restarts += 1
                 learner.move(make_envs(), checkpoint.restarts)
             callbacks: list[BaseCallback] = [checkpoint]
             if aggregate:
-                before = [] if privileged is None else privileged.records()  # without the random steps
+                # Refits leave out the steps with random actions.
+                before = [] if privileged is None else privileged.records()
                 checkpoint.records = lambda: before
                 every = max(1, (left - (first - checkpoint.spent)) // (aggregate + 1))
                 callbacks.append(refits(task, every, rehearsal, folder / OBSERVER, before))
@@ -187,8 +189,9 @@ def learn(
             with bars.phase(description, left) as report:
                 learner.learn(left, [_Bar(report), *callbacks])
     model = learner.model
+    # The refits have saved the observer that the agent used last.
     if aggregate:
-        observer = str(folder / OBSERVER)  # the last observer that the agent used
+        observer = str(folder / OBSERVER)
     resumed = {"resumed": checkpoint.resumed} if checkpoint.resumed else {}
     training = {**how, "timesteps": model.num_timesteps + checkpoint.spent, **resumed}
     agent = agent_of(model, task, information, observer=observer, training=training)
@@ -197,17 +200,17 @@ def learn(
 
 
 def _first_steps(task: Task, steps: int, rehearsal: int, given: int | None) -> int:
-    """Number of first steps, from which an observer is learned."""
+    """Return the number of first steps, from which an observer or the memory's weights are learned."""
     first = round((WANDERED if task.measurement_noise else PRIVILEGED) * steps) if given is None else given
     if 0 < first < steps - rehearsal:
         return first
     if given is None:
-        raise ValueError(f"{steps} steps are too few for an observer and an agent; give it more (--timesteps)")
-    raise ValueError(f"observer_steps must be from 1 to below the {steps - rehearsal} steps of learning; got {given}")
+        raise ValueError(f"{steps} steps are too few for an observer and an agent: pass more (--timesteps)")
+    raise ValueError(f"observer_steps must be from 1 to {steps - rehearsal - 1}, got {given}")
 
 
 def _like(task: Task) -> Any:
-    """Make a record of two samples of a task's environment."""
+    """Return a record of one step, which has the fields that all records of the task share."""
     alone = Privileged(task, 1)
     with closing(alone.make()) as env:
         env.reset(seed=0)
@@ -216,15 +219,15 @@ def _like(task: Task) -> Any:
 
 
 def _check_actions(algorithm: str, space: gym.Space[Any], env_id: str) -> None:
-    """Raise ValueError unless an algorithm can act in a space."""
+    """Raise ValueError if the algorithm cannot learn with these actions."""
     if isinstance(space, spaces.Discrete):
         fits, others = algorithm not in CONTINUOUS, "ppo, a2c or dqn"
     elif isinstance(space, spaces.Box) and len(space.shape) == 1:
         fits, others = algorithm != "dqn", "ppo, a2c, sac, td3 or tqc"
         if algorithm in CONTINUOUS and not space.is_bounded():
-            fits, others = False, "ppo or a2c, as there are no bounds"
+            fits, others = False, "ppo or a2c, as the actions are unbounded"
     else:
-        raise ValueError(f"agents learn where actions are Discrete or a row of numbers; those of {env_id} are {space}")
+        raise ValueError(f"agents need Discrete actions or a vector of numbers; the actions of {env_id} are {space}")
     if not fits:
         raise ValueError(f"{algorithm} cannot learn in {env_id}, whose actions are {space}: take {others}")
 
@@ -263,7 +266,7 @@ class Learner:
 
     @property
     def steps(self) -> int:
-        """Number of steps so far."""
+        """Number of steps that the model has made."""
         return self.model.num_timesteps
 
     def begin(self, checkpoint: Checkpoint, steps: int) -> None:
@@ -273,19 +276,20 @@ class Learner:
         first = agent_training_seed(self._seed, checkpoint.restarts, vec_env.num_envs)
         if checkpoint.restarts:
             self.model.set_random_seed(first)
-        vec_env.seed(first)  # replaces the model's own seed
+        # The model has seeded the environments with its own seed.
+        vec_env.seed(first)
 
     def learn(self, steps: int, callbacks: list[BaseCallback], *, until: int | None = None) -> None:
-        """Learn until ``steps`` are reached.
+        """Learn until the model has made ``steps`` steps.
 
-        With ``until``, learning stops earlier, after so many steps: before a rollout, and at the latest before the last
-        rollout.
+        If ``until`` is given, learning stops before the first rollout that would begin after ``until`` steps, and at
+        the latest before the last rollout.
         """
         stop = [] if until is None else [_Until(until, steps)]
         self.model.learn(steps - self.steps, callback=[*callbacks, *stop], reset_num_timesteps=False)
 
     def move(self, env: VectorEnv, restarts: int) -> None:
-        """Continue in other environments with the same observations; close the previous ones."""
+        """Continue in other environments with the same observation space; close the previous ones."""
         vec_env, before = self._monitored(env), self.model.get_env()
         if isinstance(before, VecNormalize):
             moments = before.obs_rms, before.ret_rms
@@ -306,7 +310,7 @@ class Learner:
 
 
 class _Until(BaseCallback):
-    """Stops a training between two rollouts after so many steps, and at the latest before the last rollout."""
+    """Stops before the first rollout after ``steps`` steps, or else before the last rollout of ``last`` steps."""
 
     def __init__(self, steps: int, last: int) -> None:
         super().__init__()
@@ -316,10 +320,11 @@ class _Until(BaseCallback):
         self._begun = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        collects = self.num_timesteps - self._begun  # assumed to be as many as in the last rollout
+        # The next rollout is expected to be as long as the previous one. Stopping takes one more step of all rows.
+        rollout = self.num_timesteps - self._begun
         self._begun = self.num_timesteps
-        stopping = self.training_env.num_envs  # steps that stopping takes, as a callback can only stop a step
-        self._over = self.num_timesteps >= min(self._steps, max(1, self._last - stopping - collects))
+        stopping = self.training_env.num_envs
+        self._over = self.num_timesteps >= min(self._steps, max(1, self._last - stopping - rollout))
 
     def _on_step(self) -> bool:
         return not self._over
@@ -338,7 +343,7 @@ class _Bar(BaseCallback):
 
 
 def _keywords(call: str) -> dict[str, Any]:
-    """The arguments in a text ``dict(...)``, which rl-zoo3 needs for classes of torch.nn."""
+    """Return the arguments in a text ``dict(...)``, in which rl-zoo3's files name classes of torch.nn."""
     tree: Any = ast.parse(call, mode="eval")
     return {
         k.arg: getattr(nn, k.value.attr) if isinstance(k.value, ast.Attribute) else ast.literal_eval(k.value)

@@ -1,4 +1,4 @@
-"""An observer for an agent, learned from the agent's first steps in an environment, and again from later ones."""
+"""Observers that are learned from an agent's first steps in an environment and refitted to its later steps."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,34 +19,34 @@ from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
 from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset
 
 OBSERVER = "observer.safetensors"
-HEADROOM = 1.5  # largest noise in a map's training, over the noise of the task
-HELD_OUT = 0.2  # share of the episodes
-KEPT = 100_000  # an observer is learned from so many of the latest steps
+HEADROOM = 1.5  # largest noise level in the training of T_inv, as a multiple of the task's
+HELD_OUT = 0.2  # held-out share of the episodes
+KEPT = 100_000  # number of latest steps from which an observer is learned
 SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
 
 
 def hidden_entries(task: Task, size: int) -> tuple[int, ...]:
-    """Indices of the hidden entries of an observation of a given size."""
+    """Return the indices of the hidden entries of an observation with ``size`` entries."""
     return tuple(i for i in range(size) if i not in task.measured) if task.hidden is None else task.hidden
 
 
 def estimated_entries(task: Task, size: int) -> tuple[int, ...]:
-    """Indices of the entries that an observer estimates: the hidden ones, and under noise also the measured ones."""
+    """Return the indices of the entries that an observer estimates: the hidden and, under noise, the measured ones."""
     hidden = hidden_entries(task, size)
     return tuple(sorted({*hidden, *task.measured})) if task.measurement_noise else hidden
 
 
 def signals(task: Task, env: gym.Env[Any, Any]) -> dict[str, Any]:
-    """The signals to record in a task's environment, as arguments of :class:`Recorder`."""
+    """Return the signals to record in a task's environment, as arguments of :class:`Recorder`."""
     source = f"info[{CLEAN}]" if task.measurement_noise else "obs"
     hidden = [f"{source}[{i}]" for i in estimated_entries(task, gym.spaces.flatdim(env.observation_space))]
     return {"measured": [str(i) for i in task.measured], "hidden": hidden}
 
 
 class Privileged:
-    """Environments that show the true hidden signals in place of estimates, and record the latest steps.
+    """Makes environments that show the true hidden signals in place of estimates, and records their latest steps.
 
-    ``earlier`` are records of an interrupted training, in order of time.
+    ``rows`` is their number; ``earlier`` are records of an interrupted training, in order of time.
     """
 
     def __init__(self, task: Task, rows: int, earlier: Sequence[Record] = ()) -> None:
@@ -54,7 +54,7 @@ class Privileged:
         self._recorders = list[Recorder]()
 
     def make(self) -> VectorEnv:
-        """Make the environments."""
+        """Make the environments, which show the measured and then the hidden entries."""
         env = vector(self._task, self._rows, each=self._each)
         entries = [*self._task.measured, *hidden_entries(self._task, gym.spaces.flatdim(env.single_observation_space))]
         return FeatureObservation(env, lambda at: at["obs"][:, entries], len(entries))
@@ -65,13 +65,13 @@ class Privileged:
         return self._recorders[-1]
 
     def records(self) -> list[Record]:
-        """Return the recorded episodes, in the order of their ends."""
+        """Return the latest records, those of the interrupted training first, in the order of their ends."""
         rows = [recorder.rollouts(going_on=True).records() for recorder in self._recorders]
         return latest([*self._earlier, *oldest_first(rows)])
 
 
 def latest(records: Sequence[Record]) -> list[Record]:
-    """Return the latest records, with at least ``KEPT`` steps if there are so many."""
+    """Return the fewest latest records that hold ``KEPT`` steps, or all records if they hold fewer."""
     kept, steps = list[Record](), 0
     for record in reversed(records):
         if steps >= KEPT:
@@ -85,7 +85,7 @@ def oldest_first(rows: Sequence[Sequence[Record]]) -> list[Record]:
     """Merge the records of environments that were stepped together, in the order of their ends."""
     dated = list[tuple[int, Record]]()
     for records in rows:
-        after = 0  # steps since the end of a record
+        after = 0  # number of steps since the end of a record
         for record in reversed(records):
             dated.append((after, record))
             after += len(record.t) - 1
@@ -93,7 +93,7 @@ def oldest_first(rows: Sequence[Sequence[Record]]) -> list[Record]:
 
 
 def wander(task: Task, steps: int, *, seed: int, progress: ProgressBars) -> list[Record]:
-    """Record random actions, each held for a while."""
+    """Record episodes with random actions, each held for several steps."""
     with single(task, noisy=False) as env, progress.phase(f"playing {task.env_id}", steps) as report:
         policy = policy_of(WANDERING, env)
         rollouts = roll_out(env, policy, **signals(task, env), steps=steps, seed=seed, report=report)
@@ -109,7 +109,7 @@ def learn_observer(
     progress: ProgressBars,
     tracking: bool | None = None,
 ) -> Path:
-    """Learn an observer from recorded steps; by default it tracks only under noise."""
+    """Learn an observer from records, and return its file; by default it has a tracker only under noise."""
     changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, **SETTINGS}
     changes["tracking"] = bool(task.measurement_noise) if tracking is None else tracking
     if task.measurement_noise:
@@ -125,7 +125,7 @@ def learn_observer(
 
 
 def refits(task: Task, every: int, rehearsal: int, path: Path, records: Sequence[Record]) -> KKLTrainingCallback:
-    """A callback that refits an observer to an agent's own steps and to earlier ``records``."""
+    """Return a callback that refits an observer to the agent's steps and to earlier ``records``."""
     outputs = CLEAN_Y if task.measurement_noise else "y"
     return KKLTrainingCallback(
         every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS

@@ -1,4 +1,4 @@
-"""The control task of a shipped system as a wrapper, for training on single environments, as in rl-zoo3."""
+"""The control task of a system as a wrapper, for training on single environments, as in rl-zoo3."""
 
 from typing import Any
 
@@ -17,10 +17,10 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     """Gives an agent the observations and rewards of ``kkl-gym agent train SYSTEM``.
 
     The agent sees (x_hat - target) / scale and acts once in a period of the task, while the observer sees every sample.
-    The reward is minus the cost, or the system's own ``reward``. With the seed of row i of the task's vector
-    environment, this environment behaves like that row.
+    The reward is minus the cost, or the system's own ``reward``. With the seed that row i of the task's vector
+    environment has, this environment behaves like row i.
 
-    The environment itself sets the noise, the starts and the length of episodes: make it with the ``env_kwargs`` of
+    The wrapped environment sets the noise, the starts and the length of episodes: make it with the ``env_kwargs`` of
     ``training.agents.tasks.get_task(SYSTEM)``. The files in training/agents/hyperparameters do so for rl-zoo3.
     """
 
@@ -31,7 +31,7 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
         RecordConstructorArgs.__init__(self, observer=observer)
         self._system, self._task = base.system, task_of(base.system)
         if base.dt != (dt := self._task.env_kwargs["dt"]):
-            raise ValueError(f"the environment has dt = {base.dt} s, the task {dt} s: make it with the task's")
+            raise ValueError(f"the environment has dt = {base.dt} s, but its task {dt} s: make it with dt={dt}")
         seen = KKLObservation(env, observer or observer_of(base.system))
         gym.Wrapper.__init__(self, ActionRepeat(seen, self._task.repeat))
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (base.system.nx,), np.float32)
@@ -44,7 +44,7 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
         return self._seen(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Act for a period. Shapes: ``action`` (nu,); returns ``observation`` (nx,)."""
+        """Hold an action for a period of the task. Shapes: ``action`` (nu,); returns ``observation`` (nx,)."""
         _, total, terminated, truncated, info = self.env.step(action)
         pays = total if self._system.states_task else paid(self._task, total, info["sample"], terminated)
         return self._seen(info), float(pays), terminated, truncated, info

@@ -9,15 +9,15 @@ import numpy as np
 from kkl_gym.wrappers.vector import VectorEnv
 
 Policy = Callable[[np.ndarray], Any]
-SIGNALS = ("x", "x_hat", "y")  # keys of info that are recorded whenever the agent acts
+SIGNALS = ("x", "x_hat", "y")  # keys of info whose values are recorded at each action
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """A batch of n episodes; after the end of an episode its last values are repeated.
+    """A batch of n episodes; after the end of an episode its last signals are repeated, with ``u`` = 0.
 
-    Shapes: ``returns``, ``lengths`` and ``escaped`` (n,); ``x``, ``x_hat`` and ``y`` (steps + 1, n, signals), None
-    if the environment does not show them; ``u`` (steps, n, nu).
+    Shapes: ``returns``, ``lengths`` and ``escaped`` (n,), the mask of terminated episodes; ``x``, ``x_hat`` and ``y``
+    (steps + 1, n, signals), ``u`` (steps, n, nu), each None if ``info`` does not hold it.
     """
 
     returns: np.ndarray
@@ -29,9 +29,9 @@ class Episodes:
     u: np.ndarray | None = None
 
     def signals(self, name: str) -> np.ndarray:
-        """Return x, x_hat, y or u; raises ValueError if the environment did not show it."""
+        """Return x, x_hat, y or u; raise ValueError if the episodes do not hold it."""
         if (values := getattr(self, name)) is None:
-            raise ValueError(f"these episodes hold no {name}: the environment does not show it")
+            raise ValueError(f"these episodes hold no {name}: the environment's info does not show it")
         return np.asarray(values)
 
 

@@ -1,4 +1,4 @@
-"""Policies of stable-baselines3, and their layers as perceptrons."""
+"""The algorithms of stable-baselines3, and the networks of their policies in NumPy."""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,19 +22,19 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "tqc": TQC,
     "ppo_lstm": RecurrentPPO,
 }
-CONTINUOUS = ("sac", "td3", "tqc")  # these need bounded actions
+CONTINUOUS = ("sac", "td3", "tqc")  # algorithms that need bounded actions
 ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.SiLU: "silu"}
 
 
 def head_of(algorithm: str, *, discrete: bool) -> Head:
-    """The function from the output of an algorithm's network to an action."""
+    """Return the name of the function that turns the output of an algorithm's network into an action."""
     if discrete:
         return "argmax"
     return "tanh" if algorithm in CONTINUOUS else "clip"
 
 
 def actor(model: BaseAlgorithm) -> list[nn.Module]:
-    """The linear modules and activations of an agent's deterministic policy after the LSTM, in order."""
+    """Return the linear layers and activations of a model's deterministic policy in order, without any LSTM."""
     policy: Any = model.policy
     if isinstance(model, SAC | TQC):
         return [*policy.actor.latent_pi, policy.actor.mu]
@@ -46,7 +46,7 @@ def actor(model: BaseAlgorithm) -> list[nn.Module]:
 
 
 def perceptron(model: BaseAlgorithm) -> MLP:
-    """Return the layers of a trained agent's deterministic policy."""
+    """Return a model's deterministic policy as a perceptron, without any LSTM."""
     body = actor(model)
     layers = [layer for layer in body if isinstance(layer, nn.Linear)]
     activation = next((ACTIVATIONS[type(layer)] for layer in body if type(layer) in ACTIVATIONS), "tanh")
@@ -54,7 +54,7 @@ def perceptron(model: BaseAlgorithm) -> MLP:
 
 
 def lstm_in(weights: dict[str, torch.Tensor]) -> LSTM | None:
-    """The LSTM in the tensors of a policy, or None."""
+    """Return the LSTM in the tensors of a policy, or None if it has no LSTM."""
     parts = [weights.get(f"lstm_actor.{name}_l0") for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
     if any(part is None for part in parts):
         return None
@@ -63,8 +63,9 @@ def lstm_in(weights: dict[str, torch.Tensor]) -> LSTM | None:
 
 
 def linear(start: float) -> Callable[[float], float]:
-    """Return a linear schedule that ends at zero."""
-    return lambda remaining: start * max(remaining, 0.0)  # remaining is below 0 in the last rollout
+    """Return a schedule that falls linearly from ``start`` to zero in the course of a training."""
+    # The last rollout may exceed the steps of the training; the remaining share is then negative.
+    return lambda remaining: start * max(remaining, 0.0)
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Conversion of agents to and from stable-baselines3's own files, AGENT.zip, without unpickling."""
+"""Conversion of agents to and from the files of stable-baselines3 (AGENT.zip), without unpickling."""
 
 import io
 import json
@@ -23,20 +23,21 @@ from training.agents.information import OBSERVED, Information, make, observer_of
 from training.agents.policy import ACTIVATIONS, ALGORITHMS, CONTINUOUS, actor, head_of, lstm_in
 from training.agents.tasks import Task
 
-_LAYERS = {  # layers of the deterministic policy by algorithm; TQC has SAC's, and A2C has PPO's
+# Names of the deterministic policy's layers by algorithm; TQC has the names of SAC, and A2C those of PPO.
+_LAYERS = {
     "sac": re.compile(r"actor\.latent_pi\.\d+|actor\.mu"),
     "td3": re.compile(r"actor\.mu\.\d+"),
     "dqn": re.compile(r"q_net\.q_net\.\d+"),
     "ppo": re.compile(r"mlp_extractor\.policy_net\.\d+|action_net"),
 }
-_MAX_BYTES = 1 << 28  # size of an unpacked policy
+_MAX_BYTES = 1 << 28  # largest size of an unpacked file in the zip
 
 
 def to_sb3(agent: Agent, *, trusted: str | None = None) -> BaseAlgorithm:
-    """Make an agent of stable-baselines3 that acts like this one; its ``save`` writes the zip.
+    """Make a model of stable-baselines3 that acts like ``agent``; the model's ``save`` writes the zip.
 
-    Its value functions are untrained, so that it can play but not continue to learn. Its first layer includes the
-    normalisation of observations, without the clip at ±10.
+    The model's value functions are untrained, so that it can play but not continue to learn. Its first layer includes
+    the normalisation of observations, without the clip at ±10.
     """
     network = agent.network
     hidden = [len(bias) for bias in network.biases[:-1]]
@@ -88,7 +89,7 @@ def from_sb3(
         layers_of = {known: [name for name in names if layer.fullmatch(name)] for known, layer in _LAYERS.items()}
         algorithm = next((known for known, layers in layers_of.items() if len(layers) > 1), None)
         if algorithm is None:
-            raise AgentError(f"it holds no perceptron of {', '.join(ALGORITHMS)}, but {', '.join(names)}")
+            raise AgentError(f"it holds no policy of {', '.join(ALGORITHMS)}; its layers are {', '.join(names)}")
         layers = layers_of[algorithm]
         network = MLP(
             [weights[f"{name}.weight"].numpy() for name in layers],
@@ -110,16 +111,17 @@ def from_sb3(
             rules=rules(task),
             training={"algorithm": algorithm if lstm is None else "ppo_lstm", "from": os.path.basename(path)},
         )
-        agent.make(trusted=task.system or task.env_id).close()  # raises AgentError if it does not fit
+        # Making the environment raises AgentError if the agent does not fit it.
+        agent.make(trusted=task.system or task.env_id).close()
     return agent
 
 
 def _content(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """The tensors of a policy, and the settings as text."""
+    """Return a policy's tensors and settings from a zip; pickled settings are left as text."""
     try:
         with zipfile.ZipFile(path) as files:
             if max(files.getinfo(name).file_size for name in ("policy.pth", "data")) > _MAX_BYTES:
-                raise AgentError(f"its policy has more than {_MAX_BYTES >> 20} MiB")
+                raise AgentError(f"its policy or settings exceed {_MAX_BYTES >> 20} MiB")
             weights = torch.load(io.BytesIO(files.read("policy.pth")), map_location="cpu", weights_only=True)
             return weights, json.loads(files.read("data"))
     except (KeyError, zipfile.BadZipFile, RuntimeError, UnpicklingError) as error:
@@ -129,7 +131,7 @@ def _content(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
 
 
 def _activation(described: dict[str, Any], default: str) -> str:
-    """The activation between the layers, from the text beside the pickled settings."""
+    """Return the activation between the layers, from the text that is stored beside pickled settings."""
     named = str(described.get("policy_kwargs", {}).get("activation_fn", default))
     for module, name in ACTIVATIONS.items():
         if named.rpartition(".")[2].removesuffix("'>") == module.__name__:

@@ -1,13 +1,13 @@
-"""Seeds of the episodes on which agents learn and are evaluated; no two purposes share one."""
+"""Seeds of the episodes on which agents learn and are evaluated; no evaluation uses a seed of a training."""
 
-# Seeds of the first episodes; later episodes count up from them. A training multiplies its seed by (agent's seed + 1).
+# Seeds of first episodes, from which later ones count up; a training's is multiplied by (the agent's seed + 1).
 AGENT_TRAINING_SEED = 10_000
 AGENT_EVALUATION_SEED = 10**9
-AGENT_EVALUATION_EPISODES = 10_000  # largest number of episodes in an evaluation
+AGENT_EVALUATION_EPISODES = 10_000  # largest number of episodes of an evaluation
 
 
 def agent_training_seed(seed: int, resumed: int = 0, rows: int = 1) -> int:
-    """Seed of the first episode on which an agent learns; the other rows count up from it."""
+    """Return the seed of an agent's first episode in training; the seeds of the other rows count up from it."""
     most = AGENT_EVALUATION_SEED // AGENT_TRAINING_SEED - 2
     if not 0 <= seed <= most:
         raise ValueError(f"an agent's seed must lie between 0 and {most}, got {seed}")
@@ -15,9 +15,8 @@ def agent_training_seed(seed: int, resumed: int = 0, rows: int = 1) -> int:
 
 
 def agent_evaluation_seed(seed: int, episodes: int) -> int:
-    """Seed of the first episode of an evaluation; evaluations with different seeds share no episode."""
+    """Return the seed of an evaluation's first episode; evaluations with different seeds share no episode."""
     if seed < 0 or not 1 <= episodes <= AGENT_EVALUATION_EPISODES:
-        raise ValueError(
-            f"seed must not be negative, and episodes from 1 to {AGENT_EVALUATION_EPISODES}; got {seed} and {episodes}"
-        )
+        most = AGENT_EVALUATION_EPISODES
+        raise ValueError(f"seed must be at least 0, and episodes from 1 to {most}; got {seed} and {episodes}")
     return AGENT_EVALUATION_SEED + AGENT_EVALUATION_EPISODES * seed

@@ -1,4 +1,4 @@
-"""Control tasks: an environment, its measured entries and the time between actions; scores of systems' tasks."""
+"""Tasks of agents: an environment, its measured entries and the time between actions; scores in systems' tasks."""
 
 import json
 import re
@@ -17,9 +17,9 @@ from observers.checks import LARGEST, flag, integer, is_finite, real_array, show
 from observers.names import matching
 from training.evaluation.levels import Level
 
-MAX_SAMPLES = 100_000  # longest episode, because play stores all its samples
-MAX_FRAMES = 1_000  # bounded, because an untrusted file may set it
-TOLERANCE = 0.2  # an agent holds the target within this distance, over the scale
+MAX_SAMPLES = 100_000  # largest number of samples in an episode, all of which are stored
+MAX_FRAMES = 1_000  # largest number of stacked observations; an untrusted file may ask for more
+TOLERANCE = 0.2  # largest distance from the target that counts as a success, in units of the scale
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Task:
     """An environment and the entries of its observations that agents may see.
 
     In a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` stay empty. ``env_id`` and
-    ``env_kwargs`` are those of ``gym.make``; ``repeat`` is in samples, ``time_constants`` and ``frames`` in actions.
-    ``weights`` are those of z, as :meth:`kkl_gym.KKLMemory.learn_weights` returns them.
+    ``env_kwargs`` are those of ``gym.make``. ``repeat`` counts samples per action; ``time_constants`` and ``frames``
+    count actions. ``weights`` are the memory's, as :meth:`kkl_gym.KKLMemory.learn_weights` returns them.
     """
 
     env_id: str
@@ -46,7 +46,8 @@ class Task:
     def __post_init__(self) -> None:
         if not isinstance(self.env_id, str):
             raise ValueError(f"env_id must be a string, got {shown(self.env_id)}")
-        try:  # in the form in which a file holds them
+        # A task that is read from a file must equal this one, and JSON turns tuples into lists.
+        try:
             object.__setattr__(self, "env_kwargs", json.loads(json.dumps(dict(self.env_kwargs))))
         except (TypeError, ValueError) as error:
             raise ValueError(f"env_kwargs must be JSON, got {shown(self.env_kwargs)}: {error}") from None
@@ -60,13 +61,10 @@ class Task:
         object.__setattr__(self, "angles", angle_entries(self.angles))
         if self.system is None:
             if not is_finite(self.measurement_noise) or not 0 <= self.measurement_noise < LARGEST:  # type: ignore[operator]
-                raise ValueError(
-                    "measurement_noise must be one number from 0 on, for all that is measured, got "
-                    f"{shown(self.measurement_noise)}"
-                )
+                raise ValueError(f"measurement_noise must be one number from 0 on, got {shown(self.measurement_noise)}")
             object.__setattr__(self, "measurement_noise", float(self.measurement_noise))  # type: ignore[arg-type]
             if self.repeat != 1:
-                raise ValueError(f"only environments of systems repeat actions, not {self.env_id}")
+                raise ValueError(f"repeat must be 1: only environments of systems repeat actions, not {self.env_id}")
         else:
             if isinstance(self.measurement_noise, list):
                 object.__setattr__(self, "measurement_noise", tuple(self.measurement_noise))
@@ -80,7 +78,7 @@ class Task:
 
     @property
     def system(self) -> str | None:
-        """Name of the system whose environment this is, None if it is another environment."""
+        """Name of the system whose environment this is, or None for another environment."""
         if self.env_id == OWN_ID:
             return str(self.env_kwargs.get("system"))
         return next((name for name, env_id in ENV_IDS.items() if env_id == self.env_id), None)
@@ -92,12 +90,12 @@ class Task:
 
     @property
     def steps(self) -> int:
-        """Actions in an episode of a system."""
+        """Number of actions in an episode of a system."""
         return int(self.env_kwargs["max_episode_steps"]) // self.repeat
 
     @property
     def without_noise(self) -> "Task":
-        """The same environment, measured exactly."""
+        """The same task without measurement noise."""
         return replace(self, measurement_noise=0.0)
 
 
@@ -124,17 +122,17 @@ def control_task(
 
 
 TASKS: dict[str, Task] = {
-    # Marginally stable: an agent that does not know the state cannot remove energy.
+    # The target is marginally stable: an agent that does not know the state cannot remove energy.
     "reverse_duffing": control_task("reverse_duffing", period=0.1),
-    # The target is unstable. Starts have |x1| < 3: beyond, a slow manifold holds the motion under any input.
+    # The target is unstable. Starts have |x1| < 3: farther out, motions stay on a slow manifold under any input.
     "van_der_pol": control_task("van_der_pol", start_box=((-3, 3), (-6, 6))),
     "rossler": control_task("rossler", period=0.1, duration=30.0),
-    "lorenz": control_task("lorenz", duration=5.0),  # the input is weak
+    "lorenz": control_task("lorenz", duration=5.0),
 }
-PREFERRED = {"reverse_duffing": "sac"}  # preferred algorithm; for all other systems it is ppo
+PREFERRED = {"reverse_duffing": "sac"}  # algorithms by system; for all other systems it is ppo
 
-# Positions are measured and velocities are hidden, as in rl-zoo3's tasks. ``hidden`` names the estimated entries, if
-# these are not all others: the double pendulum's constraint forces are left out.
+# Positions are measured and velocities are hidden, as in rl-zoo3's tasks. Observers estimate all hidden entries but the
+# double pendulum's constraint forces.
 HIDDEN_VELOCITIES: dict[str, Task] = {
     task.env_id: task
     for task in (
@@ -152,7 +150,7 @@ HIDDEN_VELOCITIES: dict[str, Task] = {
 
 
 def get_task(name: str, measurement_noise: Level | None = None, **changes: Any) -> Task:
-    """Return the task of a system, of a script's class or of any environment id, with changes of its fields."""
+    """Return the task of a system, of a script's class or of an environment id, with ``changes`` of its fields."""
     name = matching(name, SYSTEMS) or name
     if name not in SYSTEMS and (name in gym.registry or re.search(r"-v\d+$", name)):
         if ":" not in name:
@@ -162,14 +160,13 @@ def get_task(name: str, measurement_noise: Level | None = None, **changes: Any) 
                 raise ValueError(f"unknown environment {name!r}: {error}") from error
         known = HIDDEN_VELOCITIES.get(name)
         if known is None and not changes.get("measured"):
-            raise ValueError(
-                f"name the measured entries of {name} (--measured 0,1); {', '.join(HIDDEN_VELOCITIES)} have defaults"
-            )
+            known_ids = ", ".join(HIDDEN_VELOCITIES)
+            raise ValueError(f"name the measured entries of {name} (--measured 0,1); only {known_ids} have defaults")
         task = known if known is not None and not changes.get("measured") else Task(name, tuple(changes["measured"]))
         return replace(task, **{"measurement_noise": measurement_noise or 0.0, **changes})
     system = get_system(name)
     if given := {"measured", "hidden", "angles"} & changes.keys():
-        raise ValueError(f"{', '.join(sorted(given))}: of the system {name} y is measured; these are for environments")
+        raise ValueError(f"{', '.join(sorted(given))}: only for environments; the system {name} measures y")
     task = task_of(system, name)
     if measurement_noise is not None:
         changes["measurement_noise"] = measurement_noise
@@ -177,7 +174,7 @@ def get_task(name: str, measurement_noise: Level | None = None, **changes: Any) 
 
 
 def task_of(system: System, name: str | None = None) -> Task:
-    """Return the task of a system; ``name`` imports a system that does not ship."""
+    """Return the task of a system; ``name`` is the script's class of a system that does not ship."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs for an agent to act on")
     dt = system.dt
@@ -187,18 +184,18 @@ def task_of(system: System, name: str | None = None) -> Task:
 
 
 def deviation(system: System, x: np.ndarray) -> np.ndarray:
-    """(x - target) / scale. Shapes: ``x`` (..., nx); returns (..., nx)."""
+    """Return (x - target) / scale. Shapes: ``x`` (..., nx); returns (..., nx)."""
     out: np.ndarray = (x - np.array(system.target)) / np.array(system.scale)
     return out
 
 
 def scores(system: System, x: np.ndarray) -> np.ndarray:
-    """Scores (n,) of ``x`` (steps, n, nx): mean over time of exp(-4 c) - 1, c = mean(((x - target) / scale)^2)."""
+    """Return scores (n,) of ``x`` (steps, n, nx): time means of exp(-4 c) - 1, c = mean(((x - target) / scale)^2)."""
     c = np.square(deviation(system, x)).mean(-1)
     return np.asarray(np.expm1(-4.0 * c).mean(0))
 
 
 def successes(system: System, x: np.ndarray) -> np.ndarray:
-    """Whether ``x`` (steps, n, nx) stays within the tolerance of the target in its last fifth; returns (n,)."""
+    """Return whether ``x`` (steps, n, nx) stays within ``TOLERANCE`` of the target in its last fifth, as (n,)."""
     late = x[-max(1, round(0.2 * len(x))) :]
     return np.asarray((np.linalg.norm(deviation(system, late), axis=-1) <= TOLERANCE).all(0))

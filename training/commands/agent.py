@@ -31,7 +31,7 @@ from training.evaluation.levels import show_level
 from training.files import locked
 from training.progress import LOG, ProgressBars, progress_bars
 
-TRANSIENT = 20  # first steps of an episode, whose errors do not count
+TRANSIENT = 20  # number of first steps of an episode whose errors do not count
 Name = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
@@ -48,14 +48,14 @@ Trust = Annotated[
     str | None,
     hint(
         metavar="NAME",
-        help="The agent's system or environment, if it is your own: script.py:Class, module:Class or module:ID, "
-        "as the agent's file names it.",
+        help="Your own system or environment that the agent's file names, as script.py:Class, module:Class or "
+        "module:ID, if you trust its code.",
     ),
 ]
 
 
 def numbers(kind: type, form: str, count: int | None = None) -> Callable[[str], tuple[Any, ...]]:
-    """Return a reader of comma-separated numbers."""
+    """Return a function that reads comma-separated numbers; ``form`` describes them in its error."""
 
     def read(text: str) -> tuple[Any, ...]:
         try:
@@ -63,14 +63,14 @@ def numbers(kind: type, form: str, count: int | None = None) -> Callable[[str], 
         except ValueError:
             values = None
         if values is None or (count and len(values) != count):
-            raise ValueError(f"got {text!r}, not {form}")
+            raise ValueError(f"expected {form}; got {text!r}")
         return values
 
     return read
 
 
 _INDICES = words(numbers(int, "indices in the flattened observation, as in 0,1"), "INDICES", 1)
-_PAIR = words(numbers(int, "the cosine's entry and the sine's, once for each angle, as in 0,1", 2), "PAIR", 1)
+_PAIR = words(numbers(int, "the entries of a cosine and a sine, as in 0,1", 2), "PAIR", 1)
 _STEPS = words(numbers(float, "numbers of steps, as in 1,2"), "STEPS", 1)
 Measured = Annotated[tuple[int, ...], _INDICES, hint("the positions, in known environments")]
 
@@ -85,7 +85,7 @@ class TaskOptions:
     """Entries of the flattened observation that an observer estimates."""
     env_kwargs: EnvironmentArguments = ()
     time_constants: Annotated[tuple[float, ...], _STEPS, hint("1,2,4,8")] = ()
-    """Time constants of z's memory and of traces, in actions. Without noise, agents may learn more easily with 1 or
+    """Time constants of the memory z and of traces, in actions. Without noise, agents may learn more easily with 1 or
     1,2."""
     frames: Annotated[int | None, hint("8")] = None
     """Number of stacked observations, each with the action before it."""
@@ -93,10 +93,10 @@ class TaskOptions:
     """Leave past actions out of z, traces and stacked."""
     angles: Annotated[tuple[Annotated[tuple[int, ...], _PAIR], ...], tyro.conf.UseAppendAction, hint("none")] = ()
     """Measured entries that are the cosine and the sine of an angle, once for each angle, as in 0,1. z then holds the
-    turned angle."""
+    unwrapped angle."""
 
     def task(self, name: str, measurement_noise: Any = None) -> Task:
-        """The task of a system or an environment with these options."""
+        """Return the task of a system or an environment with these options."""
         options = {name: value for name, value in vars(self).items() if value not in ((), None)}
         if self.env_kwargs:
             options["env_kwargs"] = merged("--env-kwargs", self.env_kwargs)
@@ -107,7 +107,7 @@ class TaskOptions:
 
 @dataclass(frozen=True)
 class Train:
-    """Train an agent with stable-baselines3: to hold a system's target, or in any partly observed environment.
+    """Train an agent with stable-baselines3: to hold a system at its target, or in any partly observed environment.
 
     Writes agent.safetensors (the policy, with its task and observer) and curve.csv (steps, CPU seconds and return of
     each episode) into the run's folder. Hyperparameters are those of training/agents/hyperparameters. A resumed
@@ -123,26 +123,27 @@ class Train:
     """Standard deviation of the noise on each measured sample."""
     timesteps: Annotated[int | None, hint("the hyperparameters'")] = None
     """Number of actions in the training, over all environments."""
-    observer: Annotated[str | None, hint("the system's; for environments one is learned", metavar="MAP")] = None
+    observer: Annotated[str | None, hint("the system's map; one is learned for environments", metavar="MAP")] = None
     """A shipped map's name or a .safetensors file, for an agent that sees x_hat, x_hat_std or z."""
     algorithm: Annotated[
         Literal["ppo", "sac", "td3", "tqc", "dqn", "a2c", "ppo_lstm"] | None,
         hint("sac for reverse_duffing and wherever it is tuned, else ppo"),
     ] = None
     """The algorithm of stable-baselines3. Recurrent agents need ppo_lstm."""
-    observer_steps: Annotated[int | None, hint("nine tenths of all, with noise one tenth")] = None
-    """Number of first steps in an environment from which the observer is learned, if none is named; the latest 100,000
-    count. Without noise the agent learns during these steps, too, on true hidden signals in place of estimates. With
-    noise these steps are random actions; if given for z, they decide which parts of the memory predict y."""
+    observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
+    """Number of first steps in an environment from which the observer is learned, if --observer names none; of more
+    than 100,000, the latest are used. Without noise the agent also learns in these steps, from true hidden signals in
+    place of estimates. With noise these steps have random actions; for z, the weights of z are learned from them."""
     aggregate: int = 0
-    """How often the observer is refitted to the agent's own steps while the agent learns on estimates. In the last
-    twentieth of all steps the agent then does not explore, and one more fit follows."""
+    """How often the observer is refitted to the agent's own steps while the agent learns from estimates. If this is not
+    0, the agent does not explore in the last twentieth of all steps, after which a last refit follows."""
     options: tyro.conf.OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
     def run(self, console: Console) -> None:
         """Train an agent, and evaluate it on a hundred episodes."""
-        from training.agents.learning import learn  # the import takes seconds
+        # These imports take seconds.
+        from training.agents.learning import learn
         from training.run import CHECKPOINT
 
         task = self.options.task(self.name, self.measurement_noise)
@@ -186,7 +187,7 @@ class Evaluate:
     trust: Trust = None
 
     def run(self, console: Console) -> None:
-        """Evaluate."""
+        """Play the episodes, and print the results."""
         with progress_bars(console) as progress:
             evaluate(progress, Agent.read(find(self.agent)), self.episodes, self.seed, trusted=self.trust)
 
@@ -195,16 +196,16 @@ class Evaluate:
 class Export:
     """Write an agent as a zip of stable-baselines3, for PPO.load, SAC.load and so on.
 
-    Its value functions are untrained, so that it can play but not continue to learn.
+    The agent in the zip has untrained value functions, so that it can play but not continue to learn.
     """
 
     agent: AgentFile
     out: Path
-    """The zip."""
+    """Zip file to write."""
     trust: Trust = None
 
     def run(self, console: Console) -> None:
-        """Export."""
+        """Write the zip file."""
         from training.agents.sb3_files import to_sb3
 
         model = to_sb3(Agent.read(find(self.agent)), trusted=self.trust)
@@ -215,25 +216,25 @@ class Export:
 
 @dataclass(frozen=True)
 class Import:
-    """Convert an agent that stable-baselines3 or rl-zoo3 has trained; for systems, on training.agents.OnTask.
+    """Convert an agent of stable-baselines3 or rl-zoo3; for a system, one that was trained in training.agents.OnTask.
 
     Writes agent.safetensors for kkl-gym agent evaluate. Nothing is unpickled.
     """
 
     path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="AGENT.zip")]
-    """The zip of an agent, trained without VecNormalize."""
+    """Zip file of an agent that was trained without VecNormalize."""
     name: Name
     information: Information = "x_hat"
     """The agent's observation."""
     out: Path = Path("agent.safetensors")
-    """The agent's file."""
+    """File to write."""
     observer: Annotated[str | None, hint("the system's", metavar="MAP")] = None
     """The shipped map or .safetensors file with which the agent was trained."""
     measured: Measured = ()
     """Entries of the flattened observation that the agent may see, as in 0,1."""
 
     def run(self, console: Console) -> None:
-        """Import."""
+        """Convert the agent, and write its file."""
         from training.agents.sb3_files import from_sb3
 
         from_sb3(self.path, TaskOptions(self.measured).task(self.name), self.information, self.observer).save(self.out)
@@ -258,7 +259,7 @@ class AgentCommand:
 
 
 def evaluate(progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, trusted: str | None = None) -> Episodes:
-    """Play episodes and print their return, for systems also score and success, for environments errors of x_hat."""
+    """Play episodes and print the return, in systems also score and success, in environments errors of x_hat."""
     first, task = agent_evaluation_seed(seed, n), agent.task
     env = agent.make(n, trusted=trusted)
     try:
@@ -297,6 +298,6 @@ def evaluate(progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, tru
 
 
 def _mean(values: Sequence[float] | np.ndarray) -> str:
-    """The mean over episodes with its 95 % interval. Shapes: ``values`` (n,)."""
+    """Return the mean over episodes with its 95 % interval. Shapes: ``values`` (n,)."""
     half = 1.96 * np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return f"{np.mean(values):.4g}" + ("" if np.isnan(half) else f" ± {half:.2g}")

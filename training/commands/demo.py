@@ -23,17 +23,17 @@ from training.figures import ESTIMATE, MEASURED, RIVAL, TRUTH, drawing, save_mov
 from training.files import require_writable
 from training.progress import progress_bars
 
-EVERY = 100  # steps between two reports
-SECONDS = 12.0  # length of animations for systems with a pace of 1 s, which are shown in real time
+EVERY = 100  # steps between two reports of progress
+SECONDS = 12.0  # length of an animation; systems with a pace of 1 s run in real time
 FRAMES = 144  # largest number of frames in an animation
-TRAIL = 0.35  # share of the samples drawn: older points would hide the new ones
+TRAIL = 0.35  # share of the samples that one frame draws; older points would hide the latest
 
 
 @dataclass(frozen=True)
 class Demo:
     """Run the environments with their observers: a table of errors, a figure of true and estimated states.
 
-    The observer runs inside the environment. The paper's observer SPINN, if one ships, then runs on the same outputs.
+    The observer runs inside the environment. The paper's observer, SPINN, then runs on the same outputs, if it ships.
     """
 
     system: OneSystem = None
@@ -48,10 +48,10 @@ class Demo:
     """Seed of the starts and the noise."""
     policy: OwnPolicy = None
     gif: bool = False
-    """Also animate the phase portraits: estimates.gif, of 12 s, or 1,200 samples for systems of another pace."""
+    """Also write estimates.gif: phase portraits over 12 s, or over 1,200 samples for systems of another pace."""
 
     def run(self, console: Console) -> Path:
-        """Run."""
+        """Play the episodes, and write the figure."""
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
         environments = shown(self.system, self.observer)
@@ -85,7 +85,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of an environment with an observer; ``spinn`` holds the estimates of SPINN, if one ships."""
+    """One episode of an environment with an observer; ``spinn`` holds the estimates of SPINN, if it ships."""
 
     environment: Shown
     artifact: Artifact
@@ -99,7 +99,7 @@ class Episode:
 
     @property
     def system(self) -> System:
-        """The environment's."""
+        """The environment's system."""
         return self.environment.system
 
 
@@ -112,7 +112,7 @@ def play(
     policy: str | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> Episode:
-    """Play one episode with an observer, without input unless it was trained under a policy."""
+    """Play one episode with an observer; inputs act only if the observer was trained under a policy."""
     options: dict[str, Any] = {"measurement_noise": measurement_noise, "max_episode_steps": steps}
     env = kkl_gym.KKLObservation(gym.make(environment.env_id, **environment.options, **options), environment.observer)
     base: Any = env.unwrapped
@@ -133,7 +133,7 @@ def play(
         if k % EVERY == 0:
             report(k)
     x, x_hat, y = (np.array([info[key] for info in infos]) for key in ("x", "x_hat", "y"))
-    # SPINN's maps have no inputs.
+    # SPINN's maps take no inputs, so that SPINN runs only where no policy acts.
     ships = acting is None and type(system) in kkl_gym.SYSTEMS.values()
     return Episode(
         environment,
@@ -144,12 +144,13 @@ def play(
         x_hat=x_hat[:, : system.nx],  # without an estimated bias
         spinn=load(f"{system.name}-spinn", level).estimate(y) if ships else None,
         y=y,
-        seconds=float(np.median(seconds)),  # median, because the first step compiles or loads machine code
+        # The median leaves out the first step, which compiles or loads machine code.
+        seconds=float(np.median(seconds)),
     )
 
 
 def table(episodes: Sequence[Episode]) -> Table:
-    """A table of the observers' errors and of the time of a step."""
+    """Return a table of the observers' errors and of the time of a step."""
     noise = ", ".join(dict.fromkeys(episode.noise for episode in episodes))
     with_spinn = any(episode.spinn is not None for episode in episodes)
     laid_out = Table(
@@ -167,9 +168,8 @@ def table(episodes: Sequence[Episode]) -> Table:
             for x_hat in estimates
             for skip in (0, len(episode.x) // 5)
         ]
-        laid_out.add_row(
-            episode.environment.label, *(f"{error:.2f}" for error in errors), f"{1e6 * episode.seconds:.0f}"
-        )
+        cells = [f"{error:.2f}" for error in errors]
+        laid_out.add_row(episode.environment.label, *cells, f"{1e6 * episode.seconds:.0f}")
     return laid_out
 
 
@@ -196,7 +196,8 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
                     ax.plot(t, episode.spinn[:, i], ":", color=RIVAL, label="SPINN")
                 low, high = episode.x[:, i].min(), episode.x[:, i].max()
                 margin = 0.25 * (high - low) or 1.0
-                ax.set_ylim(low - margin, high + margin)  # the first estimates may be far off
+                # First estimates that are far off stay outside the axis.
+                ax.set_ylim(low - margin, high + margin)
                 ax.set_ylabel(system.state_names[i])
             axes[0, column].set_title(system.name.replace("_", " "))
             axes[system.nx - 1, column].set_xlabel("t in s")
@@ -205,7 +206,8 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=len(handles))
         noise = ", ".join(dict.fromkeys(episode.noise for episode in episodes))
         what = "one noisy output" if all(episode.y.shape[1] == 1 for episode in episodes) else "noisy outputs"
-        end = "\n" if len(episodes) == 1 else " "  # a narrow figure needs two lines
+        # The title of a narrow figure needs two lines.
+        end = "\n" if len(episodes) == 1 else " "
         figure.suptitle(f"Hidden states estimated from {what}{end}(standard deviation {noise} on every sample)")
 
 
@@ -214,7 +216,8 @@ def animate(path: Path, motions: Sequence[Episode]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    side = 2.4 if len(motions) > 1 else 4.8  # a single one needs room for the legend
+    # A single column needs room for the legend.
+    side = 2.4 if len(motions) > 1 else 4.8
     frames: list[Image.Image] = []
     with style():
         figure = Figure(figsize=(side * len(motions), side + 0.7), dpi=120)
@@ -241,7 +244,8 @@ class Column:
         self.x, self.x_hat = (states[: self.samples, shown] for states in (motion.x, motion.x_hat))
         self.y, self.t = motion.y[: self.samples], np.arange(self.samples) * motion.dt
         low, high = self.x.min(0), self.x.max(0)
-        margin = 0.2 * np.where(high > low, high - low, 1.0)  # the first estimates may be far off
+        # First estimates that are far off stay outside the axes.
+        margin = 0.2 * np.where(high > low, high - low, 1.0)
         (left, bottom), (right, top) = low - margin, high + margin
         names = [system.state_names[i] for i in shown]
         portrait.set(xlim=(left, right), ylim=(bottom, top), title=system.name.replace("_", " "), xticks=[], yticks=[])
@@ -265,7 +269,7 @@ class Column:
         figure.legend(lines, ["state", "estimate", "what the observer sees"], loc="outside upper center", ncols=3)
 
     def show(self, share: float) -> None:
-        """Draw a frame."""
+        """Draw the frame in which ``share`` of the samples have passed."""
         now = max(1, round(share * self.samples))
         first = max(0, now - round(TRAIL * self.samples))
         for (trail, head), states in zip(self.trails, (self.x, self.x_hat), strict=True):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from training.diagnosis import Finding
 
 COLOURS = {"ok": "green", "note": "yellow", "problem": "bold red"}
-# Options that do not apply to every subject. With --measured and --hidden, a name is that of an environment.
+# Options that apply only to some subjects. With --measured and --hidden, NAME is an environment.
 ONLY = {
     "a system": ("dt", "duration", "parameters"),
     "an environment": ("episodes", "steps", "env_kwargs"),
@@ -49,9 +49,10 @@ class Diagnose:
     The subject is a system (only NAME), an environment, of which episodes are then played (NAME with --measured and
     --hidden), or recorded data (--data without NAME). The command takes about ten seconds.
 
-    For a system it checks the equations on all types of numbers, motions, sampling, outputs and noise, and the least
-    error of each state. For data and environments it reports which hidden signals y and u determine, over which window
-    and under how much noise. The exit status is 1 if there is a problem. docs/guides/diagnose.md explains the lines.
+    For a system it checks the equations on floats, arrays and symbols, motions, sampling, outputs and noise, and the
+    least error of each state. For data and environments it reports which hidden signals y and u determine, over which
+    window and under how much noise. The exit status is 1 if there is a problem. docs/guides/diagnose.md explains the
+    lines.
     """
 
     name: Annotated[
@@ -61,7 +62,7 @@ class Diagnose:
             help=f"{SYSTEM} With --measured and --hidden: an environment as gym.make takes it, such as Pendulum-v1.",
         ),
     ] = None
-    measurement_noise: Annotated[NoiseLevels, hint("the system's own; else 1 % and 10 % of each output's size")] = None
+    measurement_noise: Annotated[NoiseLevels, hint("the system's; else 1 % and 10 % of y's standard deviation")] = None
     """Standard deviations of noise on each sample of y, besides 0; one for all outputs, or one for each: 0.1,0.3."""
     dt: Annotated[float | None, hint("the system's")] = None
     """Sampling interval of a system in seconds."""
@@ -72,7 +73,7 @@ class Diagnose:
     script.py:function. For an environment, as in `kkl-gym record`."""
     parameters: Parameters = ()
     seed: int = 0
-    """Seed of the environment's episodes and of the comparison."""
+    """Seed of the environment's episodes and of the choice of samples to compare."""
     json: Annotated[Path | None, NO_FILE] = None
     """File for the findings in JSON."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
@@ -81,7 +82,7 @@ class Diagnose:
     """Options for recorded data. --measured and --hidden also serve environments, with names as in `kkl-gym record`."""
 
     def run(self, console: Console) -> "list[Finding]":
-        """Diagnose and print."""
+        """Diagnose the subject, and print the findings."""
         named = bool(self.records.measured or self.records.hidden)
         subject = "recorded data" if self.records.data else "an environment" if named else "a system"
         self._refuse(subject)
@@ -101,14 +102,16 @@ class Diagnose:
         return findings
 
     def _of_system(self, progress: ProgressBars) -> "Iterator[Finding]":
-        from training.diagnosis import check  # imported here, because --help need not wait for torch
+        # Imported here, so that --help does not wait for torch.
+        from training.diagnosis import check
         from training.presets import named_policy
 
         assert self.name is not None
         parameters = merged("--parameters", self.parameters)
         try:
             system = get_system(self.name, parameters)
-        except EquationError:  # the findings describe the error
+        except EquationError:
+            # A finding will describe the error.
             system = load_class(self.name, System)().replace(parameters)
         except ValueError as error:
             if not str(error).startswith("unknown system"):
@@ -132,7 +135,7 @@ class Diagnose:
         yield from observability(self.name or "", policy=policy, console=progress, **how).findings()
 
     def _refuse(self, subject: str) -> None:
-        """Raise ValueError if the subject is not given properly, or an option belongs to another kind of subject."""
+        """Raise ValueError if NAME is missing or superfluous, or an option belongs to another kind of subject."""
         if (self.name is None) != (subject == "recorded data"):
             raise ValueError(
                 f"NAME is the system or the environment, and cannot be given with --data; got {self.name}"

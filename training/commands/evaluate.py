@@ -49,15 +49,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
-SKIPPED = 5.0  # seconds of driven runs that do not count, in units of the pace; at most half of the run
-FIRST, SETTLED = 2.0, 5.0  # also in units of the pace: error bars are evaluated before FIRST and after SETTLED
+SKIPPED = 5.0  # transient of driven runs in units of the system's pace, at most half of a run
+FIRST, SETTLED = 2.0, 5.0  # in units of the pace: error bars are evaluated before FIRST and after SETTLED
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, in multiples of the map's largest
 FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %")
 
 
 @dataclass(frozen=True)
 class Motions:
-    """The trajectories and their plant, which may differ from the observer's model."""
+    """Options of the trajectories and of their plant, which may differ from the observer's model."""
 
     trajectories: Annotated[int | None, hint("100, or 500 with --faults")] = None
     """Number of trajectories from each region of starts."""
@@ -70,10 +70,10 @@ class Motions:
     plant: Plant = ()
     """Parameters of the simulated plant, such as mu=3.3. The observer keeps its model."""
     plant_error: Annotated[float | None, hint("none", metavar="SHARE")] = None
-    """Instead of --plant: makes every parameter of the plant larger by this share; 0.1 is 10 %."""
+    """Instead of --plant: share by which each parameter of the plant is larger; 0.1 is 10 %."""
 
     def plant_of(self, system: System) -> System | None:
-        """Return the plant, or None if it is the system itself."""
+        """Return the plant, or None if the plant is the system itself."""
         changes = merged("--plant", self.plant)
         if self.plant_error is None:
             return system.replace(changes) if changes else None
@@ -88,9 +88,9 @@ class Motions:
 
 @dataclass(frozen=True)
 class Subject:
-    """An observer, its system, its model, which may have a bias as a state, and the plant and policy of the motions.
+    """An observer, its system, its model (the system with any estimated bias), and the motions' plant and policy.
 
-    ``plant`` is None if it is the system itself.
+    ``plant`` is None if the plant is the system itself.
     """
 
     name: str
@@ -107,7 +107,7 @@ class Subject:
         return f", plant {show_parameters(self.plant)}" if self.plant else ""
 
     def runs(self, **motions: Any) -> dict[str, Any]:
-        """All arguments of :func:`training.unseen_trajectories`; ``motions`` are some of them."""
+        """Return ``motions`` and the other arguments of :func:`training.unseen_trajectories`."""
         plant = self.plant and model_of(self.artifact, self.plant)
         return {"duration": self.duration, "policy": self.policy, "plant": plant, **motions}
 
@@ -116,21 +116,21 @@ class Subject:
 class Evaluate:
     """Evaluate observers on unseen trajectories: errors, coverage of error bars, or detection of faults.
 
-    Trajectories start in X and in 2X without X, with and without noise. SMAPE, in percent, uses the norm of all states,
+    Trajectories start in X and in 2X outside X, with and without noise. SMAPE, in percent, uses the norm of all states,
     over all steps (the paper's measure) and after the transient. NRMSE is the root mean square error of each state
-    after the transient, in percent of its standard deviation. The transient is the first fifth of a run, or 5 s if
-    random steps and sines drive it (500 samples for systems of another pace).
+    after the transient, in percent of the state's standard deviation. The transient is the first fifth of a run. In
+    runs that random steps and sines drive, it is the first 5 s (500 samples for systems of another pace).
 
     2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out, and so are
-    noise levels beyond a map's range. For an observer trained under a policy, the policy acts in all runs. In driven
-    runs it acts on a state with errors, and explores. In the others its inputs reveal the state to the observer.
+    noise levels beyond a map's range. If an observer was trained under a policy, this policy acts in all runs. In
+    driven runs it sees the state with errors, and explores. In other runs its inputs reveal the state to the observer.
 
-    --calibration: the shares of errors within the regions of 50, 90 and 99 % of the covariances, for all states and for
-    each, and the mean normalised square of errors (NEES), at six noise levels.
+    --calibration: the shares of errors within the 50, 90 and 99 % regions of the covariances, for all states together
+    and for each, and the mean normalised estimation error squared (NEES), at six noise levels.
 
     --faults: from the middle of each run the sensor is biased by a fifth of the output's range, dead (y = 0), or frozen
-    at its last value. Half of the runs are driven, if the observer takes inputs. The time in which a fault should be
-    detected is chosen for each shipped system; for others it is a fifth of the duration.
+    at its last value. Half of the runs are driven, if the observer takes inputs. The time in which the monitor should
+    detect a fault is chosen for each shipped system; for other systems it is a fifth of the duration.
     """
 
     observers: Observers
@@ -156,8 +156,9 @@ class Evaluate:
     motions: tyro.conf.OmitArgPrefixes[Motions] = field(default_factory=Motions)
 
     def run(self, console: Console) -> "pd.DataFrame":
-        """Evaluate."""
-        import pandas as pd  # imported here, because --help need not wait half a second
+        """Evaluate the observers, and print the tables."""
+        # Imported here, so that --help does not wait half a second.
+        import pandas as pd
 
         self._check()
         frames: list[pd.DataFrame] = []
@@ -222,7 +223,8 @@ class Evaluate:
         for starts, driven, trajectories, level in self._cases(f"evaluating {of.name}", of, levels, progress, left_out):
             skip = min(SKIPPED * of.system.pace, of.duration / 2) if driven else None
             for estimator, measure in estimators.items():
-                if estimator == "limit" and starts != "X":  # the bound needs the covariance of the starts
+                # The bound needs the covariance of the starts, which is known in X.
+                if estimator == "limit" and starts != "X":
                     continue
                 one = measure(trajectories, measurement_noise=level, seed=self.motions.seed, skip=skip)
                 case = [estimator] * several + [starts] + [("no", "yes")[driven]] * inputs
@@ -253,7 +255,7 @@ class Evaluate:
         return frames
 
     def _parameters(self, of: Subject, levels: Sequence[Level]) -> Table:
-        """A table with the errors of estimated parameters, for starts in X."""
+        """Return a table with the errors of estimated parameters, for starts in X."""
         inputs, rows, names = bool(of.artifact.nu), list[list[str]](), of.artifact.estimated_parameters
         ranges = {name: of.artifact.parameter_ranges[name] for name in names}
         system = of.system if of.plant else with_parameters(of.system, ranges)
@@ -298,7 +300,7 @@ class Evaluate:
             return []
         frame = pd.DataFrame(rows)
         limits = f"{frame.nees_low.min():.2f} to {frame.nees_high.max():.2f}"
-        caption = f"NEES lies from {limits} with probability 95 % where covariances are true"
+        caption = f"with true covariances, NEES lies within {limits} with probability 95 %"
         title = f"{of.name}: errors in regions, %, {self._runs(of)}{of.on}"
         right = ["noise", *(f"{name} %" for name in REGIONS), "NEES"]
         progress.console.print(table(title, ["observer", "starts", "span"], shown, right, caption))
@@ -312,7 +314,7 @@ class Evaluate:
         if reason := beyond(of.artifact, level):
             left_out.append(reason)
             return []
-        with progress.phase(f"breaking the sensor of {of.name}", 1 + len(FAULTS)) as report:
+        with progress.phase(f"simulating sensor faults for {of.name}", 1 + len(FAULTS)) as report:
             motions: dict[str, Any] = {"trajectories": self._trajectories, "duration": of.duration}
             motions |= {"seed": self.motions.seed, "policy": of.policy, "measurement_noise": level}
             runs = simulate_faults(of.artifact, of.model, report=report, **motions)
@@ -322,9 +324,9 @@ class Evaluate:
     def _cases(
         self, description: str, of: Subject, levels: Sequence[Level], progress: ProgressBars, left_out: list[str]
     ) -> Iterator[tuple[str, bool, UnseenTrajectories, Level]]:
-        """Yield, for each noise level, the name of the starts, whether inputs drive, the trajectories and the level.
+        """Yield, for each noise level, the name of the starts, whether inputs act, the trajectories and the level.
 
-        A line in ``left_out`` describes starts without trajectories.
+        Starts from which all trajectories leave the bounds get a line in ``left_out``.
         """
         cases = CASES[: 3 if of.artifact.nu else 2] if levels else ()
         bar = progress.add_task(description, total=len(cases) * len(levels))
@@ -334,7 +336,7 @@ class Evaluate:
                 runs = of.runs(domain=domain, driven=driven, **motions)
                 trajectories = unseen_trajectories(of.model, of.artifact.filter.dt, **runs)
                 if not trajectories.inside.any():
-                    raise NoStartsError(f"each of {self._trajectories} runs left bounds = {of.model.bounds}")
+                    raise NoStartsError(f"all {self._trajectories} runs left bounds = {of.model.bounds}")
             except NoStartsError as error:
                 left_out.append(f"starts in {starts}{', driven' if driven else ''}: {error}")
                 progress.advance(bar, len(levels))
@@ -344,7 +346,7 @@ class Evaluate:
                 progress.advance(bar)
 
     def _levels(self, of: Subject, left_out: list[str]) -> list[Level]:
-        """Levels of measurement noise within a map's range; lines in ``left_out`` describe the others."""
+        """Return the levels of measurement noise within a map's range; other levels get lines in ``left_out``."""
         if self.measurement_noise is None:
             return list(dict.fromkeys([0.0, level_for(of.artifact, of.model)]))
         levels = [level_for(of.artifact, of.model, level) for level in self.measurement_noise]
@@ -367,7 +369,7 @@ def table(
     right: Sequence[str] = (),
     caption: str | None = None,
 ) -> Table:
-    """A table whose first columns are aligned left, and the others right."""
+    """Return a table whose first columns are aligned left, and the others right."""
     columns = [Column(name, justify="right") for name in right]
     laid_out = Table(*left, *columns, title=title or None, caption=caption)
     for row in rows:
@@ -376,7 +378,7 @@ def table(
 
 
 def fault_rows(runs: "pd.DataFrame") -> list[list[str]]:
-    """The rows of the table of ``--faults``, one for each observer and fault."""
+    """Return the rows of the table of ``--faults``, one for each observer and fault."""
     rows = []
     for observer, group in runs.groupby("observer", sort=False):
         false = f"{100 * (group[group.fault == 'none'].score > 1).mean():.1f} %"
@@ -388,16 +390,16 @@ def fault_rows(runs: "pd.DataFrame") -> list[list[str]]:
 
 
 def show_parameters(system: System) -> str:
-    """Parameters as text, such as ``mu=3.3 a=1``."""
+    """Return parameters as text, such as ``mu=3.3 a=1``."""
     return " ".join(f"{name}={value:g}" for name, value in system.parameters.items())
 
 
 def spread(values: np.ndarray) -> str:
-    """Median and interquartile range as text."""
+    """Return the median and interquartile range as text."""
     low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
     return f"{median:.2f} ({low:.2f} – {high:.2f})"
 
 
 def percent(value: float) -> str:
-    """An NRMSE as text; it is NaN for a constant state."""
+    """Return an NRMSE, which is NaN for a constant state, as text."""
     return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.2f}"

@@ -22,8 +22,8 @@ def read_format(text: str) -> str:
 class ExportCommand:
     """Export an observer for programs without Python: as an ONNX graph or as C99.
 
-    Like observers.KKLObserver, both take a sample and the input before it, and return the estimate. All maps can be
-    exported: shipped ones, those of your own systems, and those from records and rollouts.
+    Like observers.KKLObserver, the exported observer takes a sample and the input before it, and returns the estimate.
+    Every map can be exported: shipped ones, those of your own systems, and those from records and rollouts.
 
     --format onnx: NAME.onnx takes a batch of any size, and noise levels as inputs. It needs the extra onnx.
     --format c: NAME.h and NAME.c allocate no memory and need only the C library. NAME_main.c is a program that reads
@@ -47,7 +47,7 @@ class ExportCommand:
     """Folder for the files."""
 
     def run(self, console: Console) -> list[Path]:
-        """Export."""
+        """Write the files."""
         from training.export.exported import Exported
 
         if self.format == "onnx" and (self.measurement_noise, self.process_noise) != (None, None):
@@ -72,5 +72,6 @@ class ExportCommand:
             with replacing(path) as temporary:
                 temporary.write_bytes(content)
         written = ", ".join(f"{path} ({len(content) / 1e3:.0f} kB)" for path, content in files.items())
-        console.print(f"wrote {written}", markup=False, highlight=False, soft_wrap=True)  # unbroken paths, to copy
+        # The printed paths have no line breaks, so that they can be copied.
+        console.print(f"wrote {written}", markup=False, highlight=False, soft_wrap=True)
         return list(files)

@@ -35,9 +35,9 @@ class Identify:
     """Learn a plant's unknown parameters, and an observer for it, from records of its outputs only.
 
     No recorded state is needed. Multiple shooting fits the parameters, and the states at which windows of the records
-    start, from random states in the training box. It gives standard errors. The observer is then trained on simulated
-    motions of the identified plant. --observer adapts an observer to a plant that differs from its model, with the
-    settings of its training.
+    start, from random states in the training box, and gives standard errors. The observer is then trained on simulated
+    motions of the identified plant. --observer adapts an observer to a plant that differs from the observer's model,
+    with the settings of the observer's training.
 
     The folder, runs/NAME-identified or with --observer runs/NAME-adapted, receives parameters.json, identification.png
     (residuals, and predictions of held-out records), NAME.safetensors, checkpoints and log.txt. Parameters that the
@@ -96,7 +96,7 @@ class Identify:
 
 
 def limits(unknown: Mapping[str, tuple[float, ...]]) -> dict[str, tuple[float, float]]:
-    """Limits of unknown parameters: the given ones, or a tenth of the first guess and ten times the guess."""
+    """Return limits of unknown parameters: the given ones, or a tenth of the first guess and ten times the guess."""
     by_name: dict[str, tuple[float, float]] = {}
     for name, (guess, *ends) in unknown.items():
         if not ends and not guess:

@@ -41,7 +41,7 @@ class Maps:
 
 
 def tracks_by(artifact: Artifact) -> str:
-    """The motion by which an observer tracks: "equations", "flow", or "" if it does not track."""
+    """Return the motion by which an observer tracks: "equations", "flow", or "" if it does not track."""
     if artifact.motion is None:
         return ""
     return "flow" if artifact.motion.equations is None else "equations"

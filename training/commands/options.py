@@ -27,7 +27,7 @@ Repeated = tuple[Pairs, ...]  # an option that may be given several times; merge
 
 
 def words(read: Callable[[str], Any], metavar: str, nargs: Any = "*") -> PrimitiveConstructorSpec[Any]:
-    """An option that takes several words, or one if ``nargs`` is 1; ``read`` converts each."""
+    """Return an option that takes several words, or one if ``nargs`` is 1; ``read`` converts each word."""
     return PrimitiveConstructorSpec(
         nargs=nargs,
         metavar=metavar,
@@ -38,7 +38,7 @@ def words(read: Callable[[str], Any], metavar: str, nargs: Any = "*") -> Primiti
 
 
 def pair(read: Callable[[str], Any], kind: str, form: str, alone: str = "") -> Callable[[str], tuple[str, Any]]:
-    """Return a reader of NAME=VALUE; with ``alone``, a value without a name gets that name."""
+    """Return a function that reads NAME=VALUE; a value without a name gets the name ``alone``, if given."""
 
     def read_pair(text: str) -> tuple[str, Any]:
         name, equals, value = text.partition("=")
@@ -55,7 +55,7 @@ def pair(read: Callable[[str], Any], kind: str, form: str, alone: str = "") -> C
 
 
 def read_unknown(text: str) -> tuple[float, ...]:
-    """Read a first guess, possibly with limits."""
+    """Read a first guess, VALUE, or a first guess with limits, VALUE:LOW:HIGH."""
     numbers = tuple(map(float, text.split(":")))
     if len(numbers) not in (1, 3):
         raise ValueError(text)
@@ -63,7 +63,7 @@ def read_unknown(text: str) -> tuple[float, ...]:
 
 
 def read_json(text: str) -> Any:
-    """Read JSON; anything else is text."""
+    """Read JSON, or return any other text."""
     try:
         return json.loads(text)
     except ValueError:
@@ -87,7 +87,7 @@ def hint(default: str = "", **named: Any) -> Any:
 
 
 def merged(option: str, repeated: Iterable[Pairs]) -> dict[str, Any]:
-    """The values of an option by name; ValueError if a name has two."""
+    """Return the values of an option by name; raise ValueError if a name has two values."""
     names = [name for pairs in repeated for name, _ in pairs]
     if len({*names}) < len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -96,7 +96,7 @@ def merged(option: str, repeated: Iterable[Pairs]) -> dict[str, Any]:
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """Comma-separated names."""
+    """Return the names in a comma-separated text."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
@@ -118,9 +118,9 @@ OwnSystem = Annotated[
 OneObserver = Annotated[
     str | None,
     hint(
-        "the one that ships for it",
+        "the system's shipped map",
         metavar="MAP",
-        help="An observer for that system: a shipped map or a .safetensors file.",
+        help="An observer for SYSTEM: a shipped map or a .safetensors file.",
     ),
 ]
 Observers = Annotated[tyro.conf.Positional[tuple[str, ...]], hint(metavar="[MAP [MAP ...]]")]
@@ -141,7 +141,7 @@ EnvironmentArguments = Annotated[
     tyro.conf.UseAppendAction,
     hint("none", help="Arguments of the environment. Values are JSON or text."),
 ]
-# A level is one number for all outputs, or comma-separated numbers, one for each. Defaults are described in words.
+# A level is one number for all outputs, or comma-separated numbers, one for each.
 NoiseLevel = Annotated[Level | None, words(read_level, "LEVEL", 1), hint("the system's own")]
 NoiseLevels = Annotated[
     tuple[Level, ...] | None, words(read_level, "LEVEL [LEVEL ...]"), hint("0 and the system's own")
@@ -171,7 +171,8 @@ class RunOptions:
 
 def set_threads(threads: int) -> None:
     """Set the number of torch's threads."""
-    import torch  # torch takes longest to import
+    # Imported here, because the import of torch takes seconds.
+    import torch
 
     if threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
@@ -195,7 +196,7 @@ class DataOptions:
     """Recorded states. By default x, or x1, x2, ... For an angle, name cos(COLUMN) and sin(COLUMN)."""
 
     def read(self, progress: ProgressBars, system: System | None = None) -> list[Record]:
-        """Read the files; ValueError if a column is named twice."""
+        """Read the files; raise ValueError if a column is named twice."""
         signals = Signals(self.time, *map(names_in, (self.measured, self.inputs, self.hidden)))
         with progress.phase("reading the records"):
             return read_records(
@@ -217,7 +218,7 @@ class SettingsOptions:
     """Seed of all random numbers."""
 
     def read(self) -> dict[str, Any]:
-        """The changed settings by name, after checks."""
+        """Return the changed settings by name, after checks."""
         settings = read_changes(self.config) if self.config else {}
         settings |= checked_changes(merged("--set", self.set), "--set")
         return settings if self.seed is None else settings | {"seed": self.seed}
@@ -249,7 +250,7 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
 
 @dataclass(frozen=True)
 class Shown:
-    """An environment for a demo, and its observer; None is the one that ships for the system."""
+    """An environment for a demo, and its observer, or None for the one that ships for the system."""
 
     label: str
     env_id: str
@@ -264,7 +265,7 @@ class Shown:
 
 
 def shown(system: str | None, observer: str | None) -> list[Shown]:
-    """The environments to show: all that ship, or the named one."""
+    """Return the environments to show: all that ship, or the named one."""
     if system is None:
         if observer is not None:
             raise ValueError(f"name the system of the observer {observer} as well")
@@ -280,7 +281,7 @@ def shown(system: str | None, observer: str | None) -> list[Shown]:
 
 
 def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> Controller | None:
-    """The policy for the evaluation of an observer: that of its training."""
+    """Return the policy for the evaluation of an observer, which is the policy of its training."""
     trained = artifact.training.get("policy")
     if own_policy is None and trained is not None and trained != "controller":
         raise ValueError(
@@ -297,7 +298,7 @@ def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> C
 
 
 def system_of(artifact: Artifact, given: str | None) -> System:
-    """The system of an artifact, after a check that both match."""
+    """Return the system of an artifact, after a check that both match."""
     artifact.require_system()
     if given is None and artifact.system not in SYSTEMS:
         raise ValueError(f"{artifact.system!r} is not a shipped system: name its class with --system script.py:Class")
@@ -309,6 +310,6 @@ def system_of(artifact: Artifact, given: str | None) -> System:
 
 
 def model_of(artifact: Artifact, system: System) -> System:
-    """A system with the biases that an artifact estimates as additional states."""
+    """Return a system with the biases that an artifact estimates as additional states."""
     bias = artifact.training.get("bias", 0.0)
     return with_bias(system, bias) if np.any(bias) else system

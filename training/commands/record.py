@@ -42,12 +42,13 @@ class RecordCommand:
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)
 
     def run(self, console: Console) -> str:
-        """Play, record and write."""
+        """Play and record the episodes, and write the data set."""
         from training.records.episodes import dataset_folder, write_dataset
         from training.rollouts import play, policy_of
 
         name = self.dataset or f"{_word(self.env_id)}/{_word(self.policy)}-v0"
-        dataset_folder(name)  # raises now instead of at the end
+        # An invalid name raises here, before any episode is played.
+        dataset_folder(name)
         policy_in = partial(_player if self.policy.endswith(".safetensors") else policy_of, self.policy)
         with progress_bars(console) as progress:
             rollouts = play(
@@ -77,14 +78,14 @@ class RecordCommand:
 
 
 def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
-    """The policy of one of this package's agents, which must observe the whole state."""
+    """Return the policy of one of this package's agents, which must observe the whole state."""
     from training.agents.agent import Agent
 
     agent, here = Agent.read(path), env.spec.id if env.spec else ""
     if agent.information != "state" or agent.task.env_id != here:
         raise ValueError(
-            f"{path} is an agent for {agent.task.env_id} that sees {agent.information}; to act in {here} it "
-            "must see its state"
+            f"{path} is an agent for {agent.task.env_id} that sees {agent.information}; to act in {here}, "
+            "an agent must see its state"
         )
     policy = agent.policy(env.action_space)
     flatten: Any = gym.spaces.flatten
@@ -92,5 +93,5 @@ def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
 
 
 def _word(text: str) -> str:
-    """A text in the form of a part of a data set's name."""
+    """Return a text in the form that parts of a data set's name have."""
     return re.sub(r"\W+", "-", text.rpartition("/")[2].lower().removesuffix(".safetensors")).strip("-") or "data"

@@ -72,8 +72,8 @@ class Train:
     input-aware and writes NAME-large."""
     parameters: Parameters = ()
     uncertain: HalfWidths = ()
-    """Relative uncertainty of parameters: mu=0.1, or 0.1 for all. Some trajectories then have their own parameters, and
-    the observer serves every plant within the ranges. It does not track. Needs input-aware."""
+    """Relative uncertainty of parameters: mu=0.1, or 0.1 for all. Some trajectories then have other parameters, and the
+    observer serves every plant within the ranges. It does not track. Needs input-aware."""
     policy: Annotated[str | None, hint("random inputs", metavar="FUNCTION")] = None
     """Policy of the simulated motions: "controller" for the system's own, or script.py:function, from states
     (n, nx) to actions (n, nu) in [-1, 1]. For plants that leave their bounds under random inputs."""
@@ -86,7 +86,7 @@ class Train:
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
     def run(self, console: Console) -> Path:
-        """Train."""
+        """Train the observer, and write its file and the report."""
         began = time.monotonic()
         set_threads(self.folder.threads)
         import torch
@@ -113,7 +113,8 @@ class Train:
             )
             device = None if self.device == "auto" else torch.device(self.device)
             result = train(source, folder=folder, resume=self.folder.resume, device=device, console=progress)
-            result.artifact.save(path)  # first, because the report may fail
+            # The observer is saved before the report, which may fail.
+            result.artifact.save(path)
             with progress.phase("drawing the report"):
                 write_report(folder / "report.png", result, source)
             for line in summary(result):
@@ -128,7 +129,7 @@ class Train:
         return path
 
     def _has_records(self, changes: Mapping[str, Any]) -> bool:
-        """Whether motions are recorded; ValueError if an option belongs to the other kind."""
+        """Return whether motions are recorded, not simulated; raise ValueError for options of the other kind."""
         if not self.data.data:
             given = [f"--{option}" for option in ("time", "measured", "inputs", "hidden") if getattr(self.data, option)]
             if given := [*given, *(name for name in changes if name in OF_RECORDS)]:
@@ -143,7 +144,7 @@ class Train:
         return True
 
     def _name(self, system: System | None, changes: Mapping[str, Any]) -> str:
-        """The name of the observer and of its file."""
+        """Return the name of the observer and of its file."""
         if system is None:
             name = self.system or RECORDED
             if not re.fullmatch(NAME, name):
@@ -190,7 +191,7 @@ class Train:
 
 
 def summary(result: "Result") -> list[str]:
-    """Lines of text on a training: its CPU time, and the observer's method of estimation."""
+    """Return lines of text on a training: its CPU time, and the observer's method of estimation."""
     artifact = result.artifact
     by, covariance = tracks_by(artifact), artifact.inverse.error_covariance
     lines = [

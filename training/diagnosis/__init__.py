@@ -16,7 +16,8 @@ from training.trajectories.motions import Controller
 
 CHECKS: dict[str, Callable[[Subject], Iterator[Finding]]] = {
     "system": system.declaration,
-    "equations": system.equations,  # the others need equations that work
+    # All checks below need equations that work.
+    "equations": system.equations,
     "compiled": system.machine_code,
     "bounds": system.bounds,
     "sampling": system.sampling,
@@ -34,12 +35,12 @@ def check(
     policy: Controller | None = None,
     measurement_noise: Sequence[Level] | None = None,
 ) -> Iterator[Finding]:
-    """Find what would fail with a system in environments, training and evaluation."""
+    """Yield the findings of all checks: whether the system works in environments, training and evaluation."""
     first = list(CHECKS)[:2]
     equations = [finding for name in first for finding in _findings(name, Subject(of, np.nan, np.nan))]
     yield from equations
     if any(finding.verdict == "problem" for finding in equations):
-        yield Finding("equations", "note", "all other checks are left out", "mend this first")
+        yield Finding("equations", "note", "all other checks are left out", "correct the equations first")
         return
     given = [of.measurement_noise] if measurement_noise is None else measurement_noise
     noise = tuple(level for one in given if np.any(level := noise_levels("measurement_noise", one, of.ny)))
@@ -49,7 +50,8 @@ def check(
         check_interval(of, interval)
         check_duration(seconds, interval)
         _ = subject.motions
-    except (SubstepsError, ArithmeticError) as error:  # equations may divide by zero in the middle of X
+    except (SubstepsError, ArithmeticError) as error:
+        # Equations that are finite at the points of the first checks may still divide by zero along a motion.
         yield _problem("sampling", error)
         return
     for name in list(CHECKS)[2:]:
@@ -57,7 +59,7 @@ def check(
 
 
 def _findings(name: str, subject: Subject) -> Iterator[Finding]:
-    """Findings of one check; an error in the check is a problem."""
+    """Yield the findings of one check; an error that the check raises becomes a problem."""
     try:
         yield from CHECKS[name](subject)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:

@@ -10,7 +10,7 @@ Verdict = Literal["ok", "note", "problem"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a check: the finding, and the remedy."""
+    """One line of a diagnosis: the check, its verdict, what it found, and advice."""
 
     check: str
     verdict: Verdict
@@ -24,5 +24,5 @@ def percent(share: float) -> str:
 
 
 def error(share: float) -> str:
-    """Format an error in percent; one below the resolution of a network as an upper bound."""
+    """Format an error in percent, or as an upper bound if it is below the resolution of a network."""
     return percent(share) if share >= RESOLUTION else f"< {percent(RESOLUTION)}"

@@ -16,19 +16,20 @@ from training.sources.simulated import unknown_start
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
 MIN_STEPS = 10  # least number of samples of a motion
-# A direction is a problem or a note if more than this share of its initial standard deviation remains after all of y.
+# A direction of x is a problem or a note if this share of its initial standard deviation is left at a motion's end.
 UNSEEN, HARDLY = 0.9, 0.3
-INVOLVED = 0.3  # a finding names the states with larger components in that direction
-VAGUE = 0.3  # larger errors without noise, in standard deviations of the state, are noted
+INVOLVED = 0.3  # a finding names the states with larger components in the direction
+VAGUE = 0.3  # least error without noise that is noted, in standard deviations of the state
 # A state has a symmetry if its error is at most LOCALLY by the equations, but at least GLOBALLY by neighbours in z.
 LOCALLY, GLOBALLY = 0.1, 0.3
 
 
 def observability(subject: Subject) -> Iterator[Finding]:
-    """The least error of each state at each level of noise, and the states that y does not determine."""
+    """Yield the least error of each state at each noise level, and the states that y does not determine."""
     names = subject.system.state_names
     errors, left = least_errors(subject)
-    weights = np.ones(errors.shape[1])  # steps beyond MAX_STEPS count as those of the second half
+    # The second half of the steps also stands for the steps beyond MAX_STEPS.
+    weights = np.ones(errors.shape[1])
     late = weights[len(weights) // 2 :]
     late += max(0, round(subject.duration / subject.dt) + 1 - len(weights)) / len(late)
     least = np.average(errors, axis=1, weights=weights)
@@ -50,24 +51,20 @@ def observability(subject: Subject) -> Iterator[Finding]:
 
 
 def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
-    """The posterior Cramér-Rao bound along motions, without process noise.
+    """Return posterior Cramér-Rao bounds along motions without process noise, and the covariance at their end.
 
-    Returns the bounds (levels, steps, nx) in standard deviations of the states along motions, the first level without
-    noise, and the covariance (nx, nx) at the end without noise, relative to the variances of the start.
+    The bounds (levels, steps, nx) are in standard deviations of the states along motions; the first level is without
+    noise. The covariance (nx, nx), without noise, is relative to the variances of the start.
     """
     system, levels = subject.system, (0.0, *subject.noise)
     x, u = subject.followed[0][: MAX_STEPS + 1, :FOLLOWED], subject.followed[1][:MAX_STEPS, :FOLLOWED]
     (length, n, nx), start = x.shape, unknown_start(system)[1]
     if 2 * n < FOLLOWED:
-        raise ValueError(
-            f"only {n} motions from X stayed within the bounds; widen the bounds, shrink X or shorten the motions, or "
-            "give a policy that holds the system (--policy)"
-        )
+        advice = "widen the bounds, shrink X, shorten the motions, or pass a policy that holds the system (--policy)"
+        raise ValueError(f"only {n} motions from X stayed within the bounds; {advice}")
     if length < MIN_STEPS:
-        raise ValueError(
-            f"motions of {subject.duration:g} s have only {length - 1} samples of {subject.dt:g} s; take a longer "
-            "duration, or a smaller dt"
-        )
+        few = f"motions of {subject.duration:g} s have only {length - 1} samples of {subject.dt:g} s"
+        raise ValueError(f"{few}; take a longer duration, or a smaller dt")
     floor = [RESOLUTION * (size or 1.0) for size in system.output_range]  # no network reads y more accurately
     R = np.repeat([np.diag(np.maximum(level, floor) ** 2) for level in levels], n, axis=0)
     bound = ExtendedKalmanFilter(system, subject.dt, Q=np.zeros_like(start), R=R)
@@ -79,7 +76,7 @@ def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], Finding]:
-    """Directions of the state that y determines hardly or not at all, by the states involved."""
+    """Return findings on directions of x that y determines hardly or not at all, by indices of the states involved."""
     findings = dict[tuple[int, ...], Finding]()
     values, directions = np.linalg.eigh(left)
     for share, direction in zip(np.sqrt(np.maximum(values, 0.0)), directions.T, strict=True):
@@ -97,18 +94,19 @@ def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], F
 
 
 def spectrum(subject: Subject) -> Iterator[Finding]:
-    """The eigenvalues of A that a training uses."""
+    """Yield the eigenvalues of A that a training uses."""
     taken = eigenvalues(subject.system, subject.dt)
     text = f"{len(taken)} eigenvalues of A for each output, {taken[0]:.3g} to {taken[-1]:.3g} 1/s"
     yield Finding("spectrum", "ok", text)
 
 
 def _symmetries(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Finding]:
-    """States that y determines locally but not globally, as with a symmetry; motions without input serve as records."""
+    """Return a finding on the states that y determines locally but not globally, as under a symmetry."""
     system, x = subject.system, subject.followed[0]
     t = subject.dt * np.arange(len(x))
     records = [Record("motion", t, system.output(one), x=one) for one in np.moveaxis(x, 1, 0)]
-    with contextlib.suppress(ValueError):  # the motions are too short, or an output never moves
+    # of_records raises if the motions are too short, or if an output never moves.
+    with contextlib.suppress(ValueError):
         confused = (exact <= LOCALLY) & (of_records(records, measurement_noise=[]).errors[0].min(0) >= GLOBALLY)
         if confused.any() and not subject.policy:
             names = ", ".join(name for name, here in zip(system.state_names, confused) if here)

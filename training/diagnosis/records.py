@@ -28,14 +28,14 @@ QUERY_SHARE = 0.2  # share of the records with samples to predict; neighbours co
 MIN_QUERIES = 50  # least number of samples to predict
 MIN_OTHERS = 5  # least number of possible neighbours for each coordinate of z
 NOISE_SHARES = 0.01, 0.1  # default noise levels, in standard deviations of the output
-MIN_NEIGHBOURS = 32  # or twice the number of coordinates of z if this is larger, so that they determine a plane
-ROUNDING = 1e-9  # ridge of the linear regression on z, for the relative rounding of z
-# Largest error of a determined signal, and least error of an undetermined one, in its standard deviations.
+MIN_NEIGHBOURS = 32  # least number of neighbours; a z of many coordinates needs more, to determine a plane
+ROUNDING = 1e-9  # ridge of the linear regression on z, about the relative rounding of z
+# Largest error of a determined signal and least error of an undetermined one, in the signal's standard deviations.
 DETERMINED, UNDETERMINED = 0.05, 0.8
-AS_GOOD = 1.1  # a window whose error is at most so many times the least counts as good as the best
-SEEN = 0.1  # a signal is known up to a constant if the error of its changes is at most this fraction of its own
+AS_GOOD = 1.1  # a window whose error is at most this multiple of the least error is as good as the best
+SEEN = 0.1  # a signal is known up to a constant if its changes have at most this share of its own error
 
-# Severity and advice, by the first word of a signal's verdict.
+# Severity and advice by the first word of the verdict on a signal.
 VERDICTS: dict[str, tuple[Verdict, str]] = {
     "determined": ("ok", ""),
     "up": ("note", "an observer follows it from a known start; measure a signal that depends on its value, too"),
@@ -77,7 +77,7 @@ class Observability:
         Errors of the best estimates of each signal's change over the window, without noise, in standard deviations of
         that change; NaN for signals that do not change, and for windows whose start the filter has forgotten.
     warnings : tuple of str
-        Results for which the data are too few.
+        Reports of results for which there are too few data.
     """
 
     measured: tuple[str, ...]
@@ -153,9 +153,9 @@ def observability(
     measured, hidden : sequence of str or int
         Signals that an observer measures, and those that it estimates, as for :func:`training.learn`.
     policy : str or callable
-        The policy that acts, as for :func:`training.learn`. The result holds where it has been.
+        The policy that acts, as for :func:`training.learn`. The result holds for the states that the policy visits.
     episodes, steps : int, optional
-        Length of the play, whichever is reached first; by default 10,000 steps.
+        Largest numbers of episodes and of steps to play; by default 10,000 steps.
     env_kwargs : mapping of str to object, optional
         Arguments of the environment.
     measurement_noise : sequence of (float or tuple of float), optional
@@ -190,8 +190,8 @@ def of_records(
 ) -> Observability:
     """Find which recorded states the recorded outputs and inputs determine.
 
-    For each window, the filter that a training on these records would use starts that many steps before a sample. Its
-    state z at the sample is compared with similar z in other records, under the noise that z has after such a window.
+    For a window of k steps, the KKL filter that a training on these records would use starts k steps before a sample.
+    The filter's state z at the sample is compared with similar z in other records, with the noise that z then has.
     """
     integer("seed", seed, 0)
     check_signals(records)
@@ -211,19 +211,16 @@ def of_records(
         if compared is None:
             break
         errors.append(compared[0])
-        remembered = window <= settled / SETTLED  # the filter forgets starts of longer windows
+        # After windows longer than this, the filter has forgotten its start.
+        remembered = window <= settled / SETTLED
         changes.append(np.where(remembered, compared[1], np.nan))
     if not errors:
-        raise ValueError(
-            f"{sum(len(record.t) for record in records)} samples in {len(records)} records are too few to judge "
-            f"{', '.join(signals.hidden)}: record more"
-        )
+        total = sum(len(record.t) for record in records)
+        raise ValueError(f"{total} samples are too few to judge {', '.join(signals.hidden)}: record more")
     warnings = list[str]()
     if len(records) < FEW:
-        warnings.append(
-            f"there are fewer than {FEW} records: samples are compared within a record, so that a constant of the "
-            "record looks determined; record more"
-        )
+        text = "samples are compared within a record, where a constant of the record looks determined; record more"
+        warnings.append(f"there are fewer than {FEW} records: {text}")
     if len(errors) < len(windows):
         warnings.append(f"too few samples for windows of {windows[len(errors)]} steps or more; record longer episodes")
     known = (signals.measured, signals.inputs, signals.hidden, linear.dt, windows[: len(errors)], noise)
@@ -231,7 +228,7 @@ def of_records(
 
 
 def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[Level, ...]:
-    """No noise, then the given levels, or by default shares of the outputs' standard deviations."""
+    """Return level 0 and the given levels, which by default are shares of the outputs' standard deviations."""
     y = np.concatenate([record.y for record in records])
     if given is None:
         given = [tuple(float(f"{share * size:.3g}") for size in np.nanstd(y, 0)) for share in NOISE_SHARES]
@@ -242,7 +239,7 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
 
 
 def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """States z (n, size) at evenly spread samples, ``steps`` after the filter's start; x and its changes (n, 2 nx)."""
+    """Return z (n, size) at evenly spread samples, ``steps`` after the filter's start, and x and its changes there."""
     rows = windows.rows(steps)
     rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
     rows = evenly(rows, min(most, len(rows)))
@@ -253,7 +250,7 @@ def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.nd
 def compare(
     queries: Windows, others: Windows, window: int, *, noise: Sequence[Level], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Errors (k, nx) at each noise level, first 0, and (nx,) of changes at level 0; None if samples are too few."""
+    """Return errors (k, nx) by noise level and errors (nx,) of changes without noise, or None for too few samples."""
     (z, x), (others_z, others_x) = _samples(queries, window, MAX_QUERIES), _samples(others, window, MAX_OTHERS)
     if len(z) < MIN_QUERIES or len(others_z) <= MIN_OTHERS * others_z.shape[1]:
         return None
@@ -262,7 +259,7 @@ def compare(
         noisy = bool(np.any(level))
         own = np.einsum("j,jab->ab", np.broadcast_to(np.square(level), len(covariance)), covariance)
         scaled = coordinates(others_z, own if noisy else covariance.sum(0))
-        signal = 1 / (1 + scaled.noise_gain**2) if noisy else 1.0  # the signal's share of each coordinate
+        signal = 1 / (1 + scaled.noise_gain**2) if noisy else 1.0  # share of the signal in each coordinate's variance
         R = root(own).T
         at, others_at = (signal * scaled(each + rng.standard_normal(each.shape) @ R) for each in (z, others_z))
         errors.append(left_by(at, x, others_at, others_x))
@@ -271,12 +268,12 @@ def compare(
 
 
 def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.ndarray) -> np.ndarray:
-    """Errors (nx,) of x given z, in standard deviations, from samples of both and from other samples near them.
+    """Return the errors (nx,) of x given z, in standard deviations, by comparing samples with others of similar z.
 
-    Weights on the nearest others reproduce each sample's z, as a plane through them would. The same weights on their x
-    miss the sample's x for two reasons. First, z does not determine x, in the sample and in the others. This error has
-    the variance sought times 1 + the sum of squared weights, so squares are divided by this. Second, x is curved;
-    this error falls with the square of the distance. One neighbour of weight 1 gives the Delta test.
+    Weights are chosen so that the weighted mean of the neighbours' z is the sample's z. The weighted mean of their x
+    misses the sample's x for two reasons. First, z does not determine x. The variance of this error is the sought one
+    times 1 + the sum of squared weights, so that squares are divided by this factor. Second, x is no linear function of
+    z. This error falls with the square of the distance. With one neighbour of weight 1, this is the Delta test.
 
     Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
     """
@@ -284,7 +281,8 @@ def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.nda
     design = np.column_stack([np.ones(len(others_z)), others_z])
     gram = design.T @ design + ROUNDING * len(design) * np.eye(len(design.T))
     coefficients = np.linalg.solve(gram, design.T @ others_x)
-    others_x = others_x - design @ coefficients  # neighbours predict only the nonlinear rest
+    # Neighbours predict only the rest that the linear regression leaves.
+    others_x = others_x - design @ coefficients
     x = x - np.column_stack([np.ones(len(z)), z]) @ coefficients
     linear: np.ndarray = np.sqrt((x**2).mean(0)) / deviation
     n, modes = z.shape
@@ -293,7 +291,7 @@ def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.nda
     k = min(len(others_z), max(MIN_NEIGHBOURS, 2 * (modes + 1)))
     near = cKDTree(others_z).query(z, k=k)[1]
     apart = others_z[near] - z[:, None]
-    # The smallest weights with sum 1 for which the neighbours' weighted deviations cancel up to RESOLUTION.
+    # These are the smallest weights of sum 1 under which the deviations ``apart`` cancel up to RESOLUTION.
     weights = np.linalg.solve(apart @ apart.mT + RESOLUTION**2 * modes * np.eye(k), np.ones((n, k, 1)))[..., 0]
     weights /= weights.sum(1, keepdims=True)
     squared = (np.einsum("nk,nkj->nj", weights, others_x[near]) - x) ** 2 / (1 + (weights**2).sum(1))[:, None]

@@ -16,13 +16,13 @@ from training.diagnosis.finding import Finding, Verdict, percent
 from training.evaluation.levels import Level
 from training.trajectories.motions import DRIVEN, Controller, random_inputs, under_policy
 
-COMPARED = 100  # the equations are evaluated at so many points of X, and at as many of 2X
-POINTS = 1000  # points of X at which outputs are evaluated
-MOTIONS = 100  # number of motions; where there are inputs, half of them are driven
+COMPARED = 100  # number of points of X, and of 2X, at which the equations are evaluated
+POINTS = 1000  # number of points of X at which outputs are evaluated
+MOTIONS = 100  # number of motions, half of which are driven if the system has inputs
 MANY = 0.5  # a larger share of motions that leave the bounds is a problem
-# Changes of y from sample to sample, over its standard deviation: least for a problem, least for a note, advised.
+# Change of y in one sample, over y's standard deviation: a problem above COARSE, a note above JERKY, SMOOTH is advised.
 COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1
-STILL = 1e-9  # an output with a smaller range, over its size, does not move
+STILL = 1e-9  # an output whose range is a smaller share of its size does not move
 
 COST = {
     "floats": "single environments and observers do not run",
@@ -32,7 +32,7 @@ COST = {
 
 
 def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
-    """Points (n, nx) of X or a multiple of it, the same in each call."""
+    """Return points (n, nx) of X or of a multiple of X, the same in each call."""
     x = system.draw_starts(np.random.default_rng(1), n, factor)
     if np.shape(x) != (n, system.nx):
         call = f"draw_starts(rng, {n}, {factor:g})"
@@ -44,7 +44,7 @@ class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
     ``motions`` are states (steps + 1, MOTIONS, nx), NaN after they leave the bounds, and inputs; each of the ``kinds``
-    has an equal share. The mask ``stay`` (MOTIONS,) selects those that stay within the bounds, whose outputs are ``y``.
+    has an equal share. The mask ``stay`` (MOTIONS,) selects those that stay within the bounds; ``y`` are their outputs.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class Subject:
 
     @cached_property
     def step(self) -> SamplingStep[np.ndarray]:
-        """One sampling interval of a batch, compiled where it can be."""
+        """Function that advances a batch by one sampling interval, compiled where possible."""
         return batch_step(self.system)
 
     @cached_property
     def motions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Simulate the motions at the first use."""
+        """States and inputs of the motions, which are simulated at the first use."""
         system, rng, steps = self.system, np.random.default_rng(3), max(1, round(self.duration / self.dt))
         x0 = system.draw_starts(rng, MOTIONS)
         if self.policy:
@@ -94,7 +94,7 @@ class Subject:
 
 
 def declaration(subject: Subject) -> Iterator[Finding]:
-    """The states, inputs and parameters of the system."""
+    """Yield the states, inputs and parameters of the system."""
     system = subject.system
     inputs = ", ".join(f"{u_max:g}" for u_max in system.u_max)
     values = ", ".join(f"{name} = {value:g}" for name, value in system.parameters.items())
@@ -103,7 +103,7 @@ def declaration(subject: Subject) -> Iterator[Finding]:
 
 
 def equations(subject: Subject) -> Iterator[Finding]:
-    """Whether the equations work on floats, arrays and symbols, and give finite numbers."""
+    """Check whether the equations work on floats, arrays and symbols, and give finite numbers."""
     import sympy
 
     system, works = subject.system, list[str]()
@@ -114,7 +114,8 @@ def equations(subject: Subject) -> Iterator[Finding]:
             with np.errstate(all="ignore"):
                 values = [_everything(system, state) for state in states]
         except (EquationError, NotImplementedError) as error:
-            if kind != "floats" or not isinstance(error.__cause__, ArithmeticError):  # 1 / 0 is infinite in arrays
+            # Where floats raise at 1 / 0, arrays give infinity, which is reported below.
+            if kind != "floats" or not isinstance(error.__cause__, ArithmeticError):
                 verdict: Verdict = "note" if kind == "symbols" else "problem"
                 yield Finding("equations", verdict, f"on {kind}: {error}", f"as it is, {COST[kind]}")
                 continue
@@ -130,7 +131,7 @@ def equations(subject: Subject) -> Iterator[Finding]:
                 yield Finding("equations", "problem", text, advice)
             for j in range(0 if system.discrete else system.nu):
                 if not np.any(rows[system.nx + j : system.nx * (1 + system.nu) : system.nu]):
-                    advice = f"give column {j + 1} of G, or of g(x), its numbers"
+                    advice = f"give column {j + 1} of G or g(x) a nonzero entry"
                     yield Finding("equations", "problem", f"input {j + 1} moves no state", advice)
     if works:
         parts = "step and h" if system.discrete else "f, g and h"
@@ -138,7 +139,7 @@ def equations(subject: Subject) -> Iterator[Finding]:
 
 
 def _everything(system: System, x: Any) -> list[Any]:
-    """All values of the equations at a state, in one list."""
+    """Return all values of the equations at a state in one list."""
     if system.discrete:
         return [*components(system.step, x, [0.5 * u_max for u_max in system.u_max]), *components(system.h, x)]
     g = [gij for row in input_matrix(system, x) for gij in row]
@@ -146,7 +147,7 @@ def _everything(system: System, x: Any) -> list[Any]:
 
 
 def machine_code(subject: Subject) -> Iterator[Finding]:
-    """Whether batches and single environments run as machine code."""
+    """Check whether batches and single environments run as machine code."""
     obstacle = subject.step.obstacle
     if importlib.util.find_spec("numba") is None:
         yield Finding("compiled", "note", "Numba is not installed: batches run on NumPy", 'pip install "kkl-gym[fast]"')
@@ -162,7 +163,7 @@ def machine_code(subject: Subject) -> Iterator[Finding]:
 
 
 def bounds(subject: Subject) -> Iterator[Finding]:
-    """Whether motions from X stay within the bounds."""
+    """Check whether motions from X stay within the bounds."""
     (x, _), lost = subject.motions, ~subject.stay
     followed = f"{len(lost)} motions of {subject.duration:g} s from X"
     if not lost.any():
@@ -178,7 +179,7 @@ def bounds(subject: Subject) -> Iterator[Finding]:
 
 
 def sampling(subject: Subject) -> Iterator[Finding]:
-    """How much the outputs change from sample to sample."""
+    """Check how much the outputs change from sample to sample."""
     dt, y, change = subject.dt, subject.y, 0.0
     text, advice = f"dt = {dt:g} s, motions of {subject.duration:g} s", ""
     verdict: Verdict = "ok"
@@ -194,7 +195,7 @@ def sampling(subject: Subject) -> Iterator[Finding]:
 
 
 def outputs(subject: Subject) -> Iterator[Finding]:
-    """The range of each output, and how noisy it is."""
+    """Check whether each output moves, and yield its range and noise."""
     system, y, moving = subject.system, subject.system.output(of_X(subject.system, POINTS)), subject.y
     levels = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
     for i, level in enumerate(levels):

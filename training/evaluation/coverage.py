@@ -8,7 +8,7 @@ from training.evaluation.errors import UnseenTrajectories, estimates
 from training.evaluation.levels import Level
 
 REGIONS = {"50": 0.5, "90": 0.9, "99": 0.99}  # nominal shares of errors, by their names in tables
-INTERVAL = 0.95  # the mean NEES of a consistent filter lies within its limits with this probability
+INTERVAL = 0.95  # probability that the mean NEES of a consistent filter lies within its limits
 
 
 def coverage(
@@ -22,8 +22,8 @@ def coverage(
 ) -> list[dict[str, float]]:
     """Compare covariances with errors on test trajectories; arguments are those of :func:`training.errors`.
 
-    Returns for each span of samples the percentages of errors in the regions, of all states together ("90") and of
-    each ("90 x1"), the mean NEES, and the limits between which that of a consistent filter lies.
+    Returns for each span of samples the percentages of errors in the regions, for all states together ("90") and for
+    each state ("90 x1"), the mean NEES, and the limits of a consistent filter's mean NEES.
     """
     x_hat, P = estimates(
         artifact, system, trajectories, measurement_noise=measurement_noise, seed=seed, covariances=True

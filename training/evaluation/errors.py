@@ -17,19 +17,19 @@ from training.seeds import Stream, generator
 from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
 from training.trajectories.motions import Controller, draw_process_noise, random_inputs, under_policy
 
-TRANSIENT = 0.2  # part of a trajectory that the errors "after the transient" leave out
-MAX_TRIES = 1000  # after so many starts in a row within X, none is expected outside it
+TRANSIENT = 0.2  # share of a trajectory, at its start, that errors after the transient leave out
+MAX_TRIES = 1000  # number of starts in a row within X after which the search for one outside X ends
 
 Domain = Literal["X", "1.5X", "2X"]
 
 
 class NoStartsError(ValueError):
-    """A domain holds no starts, or trajectories from all of them leave the bounds."""
+    """Raised if a domain holds no starts, or if the trajectories from all starts leave the bounds."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """SMAPE over all samples and after the transient, (n,), and NRMSE after it, (n, nx), by trajectory."""
+    """Errors of n trajectories: SMAPE of all samples and after the transient (n,), NRMSE after it (n, nx)."""
 
     full: np.ndarray
     late: np.ndarray
@@ -38,7 +38,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class UnseenTrajectories:
-    """Test trajectories ``x`` (steps + 1, n, nx) within the bounds; ``inside`` marks them among all that were drawn."""
+    """Test trajectories ``x`` (steps + 1, n, nx) within the bounds; ``inside`` marks them among all drawn ones."""
 
     x: np.ndarray
     u: np.ndarray
@@ -54,7 +54,7 @@ class UnseenTrajectories:
 
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts (n, nx), as the system draws them in X, or in a multiple of X (as in the paper) outside X itself."""
+    """Return starts (n, nx) that the system draws in X, or in a multiple of X but outside X, as in the paper."""
     if domain == "X":
         return system.draw_starts(rng, n)
     low, high = system.box()
@@ -68,7 +68,7 @@ def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> 
         else:
             raise NoStartsError(
                 f"no state of {system.name} in {domain} lies beyond X = {system.X}: bounds = {system.bounds} leave no "
-                "room there, or its draw_starts ignores the factor"
+                "room there, or draw_starts ignores its factor"
             )
     return np.array(beyond)
 
@@ -98,19 +98,19 @@ def unseen_trajectories(
     n : int
         Number of trajectories.
     duration : float
-        Length of each in seconds.
+        Length of each trajectory in seconds.
     seed : int
         Seed of the starts, the inputs and the process noise.
     domain : {"X", "1.5X", "2X"}
-        Where they start, see :func:`starts`.
+        Where the trajectories start: in X, or in the multiple of X but outside X.
     driven : bool
-        Whether inputs act: random bounded steps and sines in turn. With a policy: whether it errs and explores.
+        Whether random inputs act, steps and sines in turn. With ``policy``: whether it sees state errors and explores.
     stream : Stream
-        The stream of random numbers: that of evaluation or that of validation.
+        Stream of random numbers, for evaluation or for validation.
     process_noise : float
         Level of the process noise, in multiples of the system's scale per second.
     policy : callable, optional
-        From states (n, nx) to actions (n, nu) in [-1, 1], which drive the trajectories.
+        Function from states (n, nx) to actions (n, nu) in [-1, 1], which drive the trajectories.
     plant : System, optional
         The system to simulate, such as ``system`` with other parameters (:meth:`kkl_gym.System.replace`); by default
         ``system``.
@@ -119,7 +119,7 @@ def unseen_trajectories(
     -------
     UnseenTrajectories
         The trajectories that stayed within the bounds of the plant: ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu), and
-        the mask ``inside`` of them among all that were drawn.
+        the mask ``inside`` that marks them among all drawn trajectories.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def errors(
     seed: int,
     skip: float | None = None,
 ) -> Errors:
-    """Errors of an observer on test trajectories. The observer knows the noise levels, but not that the plant differs.
+    """Return errors on test trajectories of an observer that knows the noise levels, but not how the plant differs.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def errors(
     trajectories : UnseenTrajectories
         Test trajectories.
     measurement_noise : float or sequence of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
+        Standard deviation of the noise on each sample of y, one for all outputs or one for each.
     seed : int
         Seed of the measurement noise.
     skip : float, optional
@@ -198,7 +198,7 @@ def errors(
 def noise_limit(
     system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int, skip: float | None = None
 ) -> Errors:
-    """Errors of an estimator that attains the posterior Cramér-Rao bound, the least of any unbiased causal estimator.
+    """Return errors at the posterior Cramér-Rao bound, the least errors of any unbiased causal estimator.
 
     The errors are drawn from N(0, P), where P is the bound along each trajectory. The bound follows from the plant's
     exact equations, its inputs, both noise levels, and the covariance of the starts in X. A biased estimator, such as
@@ -207,7 +207,7 @@ def noise_limit(
     Parameters
     ----------
     system, trajectories, measurement_noise, skip
-        As for :func:`errors`. The trajectories start in X; at least 0.2 % of the system's own noise is assumed.
+        As for :func:`errors`. Trajectories must start in X. The bound assumes at least 0.2 % of the system's own noise.
     seed : int
         Seed of the drawn errors.
 
@@ -245,7 +245,7 @@ def estimates(
     seed: int,
     covariances: bool = False,
 ) -> tuple[np.ndarray, Any]:
-    """Estimates (steps + 1, n, nx) along test trajectories, and their covariances or None; see :func:`errors`."""
+    """Return estimates (steps + 1, n, nx) along test trajectories, and covariances or None; see :func:`errors`."""
     level, dt, u = noise_levels("measurement_noise", measurement_noise, system.ny), trajectories.dt, trajectories.u
     y, process_noise = measured(system, trajectories, level, seed), trajectories.process_noise
     if artifact is None:
@@ -256,7 +256,7 @@ def estimates(
 
 
 def measured(system: System, trajectories: UnseenTrajectories, measurement_noise: Level, seed: int) -> np.ndarray:
-    """Noisy outputs (steps + 1, n, ny) of trajectories."""
+    """Return the noisy outputs (steps + 1, n, ny) of trajectories."""
     y = (trajectories.plant or system).output(trajectories.x)
     return y + np.asarray(measurement_noise) * generator(Stream.EVALUATION, seed, 1).standard_normal(y.shape)
 
@@ -264,10 +264,10 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Errors of parameters after the transient, in percent of the true values: the plant's, or else the last states."""
+    """Return parameter errors after the transient in percent of true values: the plant's, or else the last states."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
-        raise ValueError(f"each of {trajectories.escaped} runs left bounds = {system.bounds}")
+        raise ValueError(f"all {trajectories.escaped} runs left bounds = {system.bounds}")
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     observer, u = KKLObserver(artifact, level, process_noise=trajectories.process_noise), trajectories.u
     values = observer.estimate_parameters(measured(system, trajectories, level, seed), u if artifact.nu else None)

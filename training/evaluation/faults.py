@@ -33,17 +33,16 @@ def simulate_faults(
     """Simulate sensors that fail in the middle of a trajectory; return the scores and delays of the monitor."""
     deadline = profile(system).fault_deadline or duration / 5
     if not deadline <= duration / 2:
-        raise ValueError(
-            f"a fault in the middle of {duration} s leaves less than the deadline of {deadline:g} s to detect it; take "
-            "a longer duration"
-        )
+        late = f"a fault in the middle of {duration} s leaves less than the deadline of {deadline:g} s to detect it"
+        raise ValueError(f"{late}; take a longer duration")
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
     steps = round(duration / dt)
     motions = Motions(system, dt, steps, **SOUND, levels=(system.process_noise,), policy=policy)
     x, u, *_ = motions.with_inputs(artifact.nu).drawn(trajectories, rng)
     clean = system.output(x)
     y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
-    free = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen the output's range
+    # The bias is a share of the output's range along free motions, because random inputs widen this range.
+    free = slice(None) if policy else ~u.any((0, 2))
     half, within = len(y) // 2, round(deadline / dt)
     bias = BIAS * np.ptp(clean[half:, free], axis=(0, 1))
     faulty = {"none": y[half:], "bias": y[half:] + bias, "drop-out": 0.0, "freeze": y[half]}

@@ -12,7 +12,7 @@ Level = float | tuple[float, ...]  # standard deviation of the noise on y: one f
 
 
 def read_level(text: str) -> Level:
-    """Parse one number, or one for each output, separated by commas."""
+    """Parse a level: one number, or one for each output, separated by commas."""
     try:
         levels = tuple(float(number) for number in text.split(","))
     except ValueError:
@@ -28,7 +28,7 @@ def show_level(level: float | Sequence[float]) -> str:
 
 
 def as_cell(level: Level) -> float | str:
-    """A level as CSV files hold it: a number, or a text where it differs by output."""
+    """Return a level as CSV files hold it: a number, or a text where it differs by output."""
     return show_level(level) if isinstance(level, tuple) else level
 
 
@@ -38,7 +38,7 @@ def multiple(system: System, factor: float) -> Level:
 
 
 def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
-    """Return the given level, or the system's own cut to the map's range; its largest if the map takes only one."""
+    """Return the given level, or the system's own (its largest, if the map takes only one) cut to the map's range."""
     if given is not None:
         return noise_levels("measurement_noise", given, system.ny)
     own = multiple(system, 1.0)

@@ -68,11 +68,11 @@ def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
 
 
 def by_state(values: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns nrmse1, nrmse2, ... of a CSV file from the values (n, nx) of :func:`nrmse`."""
+    """Return the columns nrmse1, nrmse2, ... of a CSV file, from the values (n, nx) of :func:`nrmse`."""
     return {f"nrmse{i + 1}": column for i, column in enumerate(values.T)}
 
 
 def _compared(x: np.ndarray, x_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np.ndarray]:
     if x.shape != x_hat.shape or not 0 <= skip < len(x):
-        raise ValueError(f"cannot compare {x.shape} with {x_hat.shape} after {skip} steps")
+        raise ValueError(f"cannot compare states {x.shape} with estimates {x_hat.shape} after skip = {skip} steps")
     return x[skip:], np.where(np.isfinite(x_hat), x_hat, np.inf)[skip:]

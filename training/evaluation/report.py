@@ -16,7 +16,7 @@ from training.sources.simulated import SimulatedSource
 
 
 def write_report(path: Path, result: Result, source: Source | System) -> None:
-    """Draw the losses, and the estimates of two calibration motions: one without noise, and one at the usual level."""
+    """Draw the losses, and the estimates of two calibration motions: one without noise, one at the usual level."""
     artifact = result.artifact
     if isinstance(source, System):
         source = SimulatedSource(source, settings_of(artifact.training))
@@ -39,7 +39,8 @@ def write_report(path: Path, result: Result, source: Source | System) -> None:
             y = y + np.asarray(level) * np.random.default_rng(0).standard_normal(y.shape)
             process_noise, t = float(runs.process_noise[run]), np.arange(len(x)) * artifact.filter.dt
             observer = KKLObserver(artifact, level, process_noise=process_noise, compiled=False)
-            x_hat = np.where(np.isnan(x), np.nan, observer.estimate(y, u))  # recorded runs differ in length
+            # Recorded runs differ in length, and NaN fills up the shorter ones.
+            x_hat = np.where(np.isnan(x), np.nan, observer.estimate(y, u))
             for i, name in enumerate(names):
                 ax = figure.add_subplot(grid[1 + i, column], ylabel=name)
                 ax.plot(t, x[:, i], color=TRUTH, lw=1.8, label="true")

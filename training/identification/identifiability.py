@@ -1,4 +1,4 @@
-"""Tests of identifiability from outputs: of parameters, of products of their powers, and of signs."""
+"""Tests whether the outputs determine parameters, products of their powers, and signs."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,28 +10,28 @@ from kkl_gym.equations import input_matrix
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
-RANK = 1e-7  # eigenvalues of the information below this share of the largest count as zero
+RANK = 1e-7  # eigenvalues of the information matrix below this share of the largest count as zero
 HARDLY = 1.0  # relative standard error from which a direction counts as unidentifiable
 PART = 0.05  # a parameter whose component of a direction is smaller does not belong to the direction
-LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # exponents are rounded to fractions within this relative error
-MOST_SIGNS = 12  # states and parameters; with more, there are too many combinations of signs to test
+LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # largest denominator of an exponent, and relative error of its rounding
+MOST_SIGNS = 12  # largest number of states and parameters of which all combinations of signs are tested
 POINTS = 64  # states at which a symmetry is tested
 
 
 def unidentifiable_directions(information: np.ndarray) -> np.ndarray:
-    """Directions (p, k) of the parameters that change the outputs little or not at all."""
+    """Return the directions (p, k) in which parameters can change with little or no effect on the outputs."""
     values, vectors = np.linalg.eigh(information)
     return vectors[:, (values <= RANK * values[-1]) | (values <= HARDLY**-2)]
 
 
 def identifiable_directions(information: np.ndarray) -> np.ndarray:
-    """Directions (p, k) of the parameters that change the outputs, even if little."""
+    """Return the directions (p, k) in which a change of the parameters changes the outputs, even if little."""
     values, vectors = np.linalg.eigh(information)
     return vectors[:, values > RANK * max(values[-1], 0.0)]
 
 
 def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fraction | float]]:
-    """Identifiable products of powers of parameters, for unidentifiable directions ``hidden`` (p, k)."""
+    """Return the identifiable products of powers of parameters, given unidentifiable directions ``hidden`` (p, k)."""
     p, k = hidden.shape
     if p == k:
         return []
@@ -59,12 +59,12 @@ def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fra
 
 
 def written(powers: dict[str, Fraction | float]) -> str:
-    """A product as text, such as ``a b^3``."""
+    """Return a product as text, such as ``a b^3``."""
     return " ".join(name if power == 1 else f"{name}^{_power(power)}" for name, power in powers.items())
 
 
 def sign_symmetries(system: System, parameters: Sequence[str], *, driven: bool = False) -> list[tuple[str, ...]]:
-    """Sets of states and parameters that may change sign together without any change of the outputs."""
+    """Return the smallest sets of states and parameters whose common change of sign leaves the outputs unchanged."""
     values = system.parameters
     ranges = {name: _around(values[name]) for name in parameters}
     both = with_parameters(system, ranges)
@@ -86,7 +86,7 @@ def sign_symmetries(system: System, parameters: Sequence[str], *, driven: bool =
 
 
 def _inputs(system: System, x: np.ndarray) -> np.ndarray:
-    """Input matrices (n, nx, nu) at states (n, nx)."""
+    """Return the input matrices g(x) (n, nx, nu) at states (n, nx)."""
     rows = [np.broadcast_to(value, len(x)) for row in input_matrix(system, x.T) for value in row]
     return np.reshape(rows, (system.nx, system.nu, len(x))).transpose(2, 0, 1)
 

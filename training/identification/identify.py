@@ -15,11 +15,11 @@ from training.identification.windows import LEAST_USED, MORE_COST, Prediction, f
 from training.progress import ProgressBars
 from training.records import Record, check_signals, pieces
 
-HELD_OUT = 10  # every tenth record is held out of the fit
+HELD_OUT = 10  # one record in ten is held out of the fit
 KEPT_RATIOS = 100.0  # cost of a change in the ratios of unidentifiable parameters, over the cost of a common factor
-BACK = (1.0, 0.5, 0.25)  # shares of the way to the nearest parameters; smaller ones if states leave their bounds
-UNSCALED = 0.05  # relative change of a state's scale, over that of the unidentifiable parameters
-SIMULATED = 1e-7  # relative error of simulation, the lower bound of relative standard errors
+BACK = (1.0, 0.5, 0.25)  # shares of the way to the nearest parameters, tried in turn until a fit explains the windows
+UNSCALED = 0.05  # a state that changes by more, relative to the parameters' change, has no identifiable scale
+SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
 HIDDEN = 0.05  # a parameter with a larger component of an unidentifiable direction is unidentifiable
 
 Limits = Mapping[str, tuple[float, float]]
@@ -35,7 +35,7 @@ class Product:
 
     @property
     def text(self) -> str:
-        """The product, such as ``a b^3``."""
+        """The product as text, such as ``a b^3``."""
         return written(self.powers)
 
 
@@ -55,40 +55,38 @@ class Identified:
     predictions: list[Prediction]
 
     def to_json(self) -> dict[str, dict[str, float | None]]:
-        """Value and standard error of each parameter; both are None if it is not identifiable."""
+        """Return the value and standard error of each parameter; both are None if it is not identifiable."""
         return {
             name: {"value": None if error is None else self.system.parameters[name], "standard_error": error}
             for name, error in self.standard_errors.items()
         }
 
     def summary(self) -> list[str]:
-        """Lines of text: parameters and products with their standard errors, and the unidentifiable parameters."""
+        """Return lines of text: parameters and products with standard errors, and the unidentifiable parameters."""
         values = self.system.parameters
         lines = [f"{name} = {values[name]:.6g} +- {e:.2g}" for name, e in self.standard_errors.items() if e is not None]
         lines += [f"{name} is at its limit: give it a wider range" for name in self.at_limits]
         if self.fit.coloured:
-            lines.append("the residuals are not white: the standard errors follow from the scatter of the windows")
+            lines.append("the residuals are not white: the standard errors come from the scatter between windows")
         elif self.fit.used.sum() < CLUSTERS:
-            lines.append(f"fewer than {CLUSTERS} windows: the standard errors are right only for white noise")
+            lines.append(f"fewer than {CLUSTERS} windows: the standard errors hold only for white noise")
         hidden = [name for name, error in self.standard_errors.items() if error is None]
         if hidden:
             known = [one for one in self.products if len(one.powers) > 1 or set(one.powers) & set(hidden)]
             only = ", ".join(f"{one.text} = {one.value:.6g} +- {one.standard_error:.2g}" for one in known)
             lines.append(f"not identifiable from the outputs: {', '.join(hidden)}" + (f"; only {only}" if only else ""))
             used = ", ".join(f"{name} = {values[name]:.6g}" for name in hidden)
-            lines.append(f"the observer has {used}, the values nearest to the first guesses that explain the outputs")
+            lines.append(f"the observer uses {used}: of all values that fit, those nearest to the first guesses")
             if self.unscaled_states:
-                lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: it follows")
+                lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: these values fix it")
         lines += [
             f"the outputs stay the same if {', '.join(names)} change sign: the signs are not identifiable"
             for names in self.symmetries
         ]
         for j, (noise, expected) in enumerate(zip(self.noise, self.expected_noise, strict=True)):
             if noise > 1.5 * expected + 1e-3 * np.nanstd(self.fit.windows.y[..., j]):
-                lines.append(
-                    f"output {j + 1}: the residuals of {noise:.3g} exceed the noise of {expected:.3g}: the model does "
-                    "not explain all of it"
-                )
+                excess = f"residuals of {noise:.3g} exceed the noise of {expected:.3g}"
+                lines.append(f"output {j + 1}: {excess}: the model does not explain the output completely")
         return lines
 
 
@@ -97,15 +95,15 @@ def estimate_parameters(
 ) -> Identified:
     """Estimate unknown parameters of a system from records of its outputs.
 
-    Multiple shooting fits parameters and starts on windows of growing length (:func:`fit_windows`). Parameters then
-    return to the first guesses along unidentifiable directions.
+    Multiple shooting fits parameters and starts on windows of growing length (:func:`fit_windows`). Along
+    unidentifiable directions the parameters then return towards the first guesses.
     """
     _check_unknown(system, unknown)
     check_signals(records, system)
     least = SAMPLES_PER_STATE * system.nx
     whole = [record for record in pieces(records) if len(record.t) > least]
     if not whole:
-        raise ValueError(f"no record has more than {least} samples without a gap, as a fit of its start needs")
+        raise ValueError(f"no record has more than {least} samples without a gap: a fit of its start needs more")
     held_out = whole[HELD_OUT // 2 :: HELD_OUT] if len(whole) >= HELD_OUT // 2 else []
     fitted = [record for record in whole if not any(record is other for other in held_out)]
     rng, dt = np.random.default_rng(seed), float(records[0].t[1] - records[0].t[0])
@@ -120,24 +118,23 @@ def estimate_parameters(
 
 
 def _check_unknown(system: System, unknown: Limits) -> None:
-    """Raise ValueError unless unknown parameters are the system's, with first guesses between finite limits."""
+    """Raise ValueError if a parameter is unknown to the system, or its first guess is not between finite limits."""
     if not unknown:
         raise ValueError("name an unknown parameter, as in --unknown mu=1.5")
     for name, (low, high) in unknown.items():
         if name not in system.parameters:
-            raise ValueError(
-                f"{system.name} has no parameter {shown(name)}; it has {', '.join(system.parameters) or 'none'}"
-            )
+            known = ", ".join(system.parameters) or "no parameters"
+            raise ValueError(f"{system.name} has no parameter {shown(name)}; it has {known}")
         value = system.parameters[name]
         if not (is_finite(low) and is_finite(high) and low < high and low <= value <= high):
-            raise ValueError(f"{name} must start between finite limits, got {value:g} in {shown(low)} to {shown(high)}")
+            raise ValueError(f"{name} = {value:g} must lie between finite limits, got {shown(low)} and {shown(high)}")
 
 
 def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Among all parameters that explain the outputs equally well, return those nearest to the given ones.
+    """Return the parameters nearest to the given ones among all that explain the outputs equally well.
 
-    A parameter without any influence on the outputs keeps its given value. For the others, the distance measures mainly
-    changes of their ratios: a plant that is faster by a factor has all of them larger.
+    A parameter without any influence on the outputs keeps its given value. For the other parameters, the distance
+    grows mainly with changes of their ratios, because a faster plant may have all parameters larger by one factor.
 
     Shapes: ``values`` (p,), ``given`` (p,), ``hidden`` (p, k); returns (p,).
     """
@@ -158,7 +155,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
 
 
 def _brought_back(fit: Fit, given: np.ndarray) -> Fit:
-    """A fit that explains the records equally well, with parameters nearer to the given ones."""
+    """Return a fit that explains the records equally well with parameters nearer to the given ones, else ``fit``."""
     shooting, values, hidden = fit.shooting, fit.theta, unidentifiable_directions(fit.relative_information)
     if not hidden.size:
         return fit
@@ -181,14 +178,14 @@ def _judged(
     predictions: list[Prediction],
     expected_noise: np.ndarray,
 ) -> Identified:
-    """The result of a fit: standard errors, products, symmetries and predictions."""
+    """Return the result of a fit: standard errors, products, symmetries and predictions."""
     names, hidden = tuple(unknown), unidentifiable_directions(fit.relative_information)
     values = fit.theta
     identifiable = np.abs(hidden).max(1, initial=0.0) < HIDDEN
     seen = np.linalg.svd(hidden)[0][:, hidden.shape[1] :] if hidden.size else np.eye(len(names))
 
     def relative_error(exponents: np.ndarray) -> float:
-        """Relative standard error of a product of powers."""
+        """Return the relative standard error of the product of powers with these exponents."""
         found = fit.errors((exponents / fit.size)[:, None], seen * fit.size[:, None])
         return max(float(found[0]), SIMULATED)
 
@@ -221,7 +218,7 @@ def _judged(
 
 
 def _unscaled(fit: Fit, system: System, hidden: np.ndarray) -> tuple[str, ...]:
-    """States whose scale changes along unidentifiable directions (p, k) of the parameters, in units of these."""
+    """Return the states whose scale changes along unidentifiable directions ``hidden`` (p, k) of the parameters."""
     if not hidden.size:
         return ()
     half = np.array([(high - low) / 2 for low, high in system.X])

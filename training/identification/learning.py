@@ -24,8 +24,8 @@ from training.records import Record, check_signals, resampled, sampling_interval
 from training.records import check_dt as check_steps
 from training.trajectories.equations import describe
 
-NOISE_RANGE = 2.0  # largest measurement noise in the observer's training, over that of the records
-LEAST_NOISE = 0.002  # lower bound of that noise, over the output's range
+NOISE_RANGE = 2.0  # largest noise level in the observer's training, over that of the records
+LEAST_NOISE = 0.002  # lower bound of this largest noise level, over the output's range
 OBSERVER_FOLDER = "observer"
 
 
@@ -88,7 +88,8 @@ def identify(
     check_signals(records, system)
     interval = sampling_interval(*records) if dt is None else check_dt(dt)
     given = {"dt": interval, "seed": seed, **(settings or {})}
-    preset(system, "input-aware", "fast", changes={"eigenvalues": (-1.0,), **given})  # rejects bad settings early
+    # Invalid settings raise before the identification, which may take long.
+    preset(system, "input-aware", "fast", changes={"eigenvalues": (-1.0,), **given})
     inputs = bool(system.nu) and records[0].u is not None
 
     def configured(found: Identified) -> Config:
@@ -182,7 +183,7 @@ def _learned(
     resume: bool,
     console: Console | ProgressBars | None,
 ) -> tuple[Identified, Result]:
-    """Identify the parameters, write them, and train the observer."""
+    """Identify the parameters, write them to the folder, and train the observer."""
     check_steps(records, dt)
     uniform = [resampled(record, dt) for record in records]
     fingerprints = [record.fingerprint for record in records]
@@ -201,5 +202,5 @@ def _learned(
 
 
 def _level(noise: np.ndarray) -> float | tuple[float, ...]:
-    """A noise level in the form of artifacts and settings: a number for one output, else a tuple."""
+    """Return noise levels in the form of artifacts and settings: a number for one output, else a tuple."""
     return float(noise[0]) if len(noise) == 1 else tuple(noise.tolist())

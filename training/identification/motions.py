@@ -1,4 +1,4 @@
-"""Motions that fit windows of measured outputs under given parameters, and their derivatives."""
+"""Simulated motions that fit windows of records for given parameters, and the derivatives of their outputs."""
 
 import functools
 from collections.abc import Mapping
@@ -12,18 +12,18 @@ from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
 STEP = 1e-8  # step of numerical derivatives, in half-widths of states or units of parameters
-SETTLING = 12  # Levenberg-Marquardt steps that fit starts
-CONVERGED = 1e-3  # a start has converged if its window's mean square falls by a smaller share
+SETTLING = 12  # largest number of Levenberg-Marquardt steps that fit a start
+CONVERGED = 1e-3  # a start has converged if a step lowers the window's mean square by a smaller share
 FIRST_DAMPING = 1e-3
-BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # shares of windows to which starts are fitted first
+BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # shares of a window to which its start is fitted first
 DRAWS, KEPT = 64, 4  # random starts for each window, and the number of best ones that are fitted
-SAMPLES_PER_STATE = 8  # least number in the shortest beginning, so that noise does not determine the start
-MOST_ROWS = 60_000  # most motions in one simulation
+SAMPLES_PER_STATE = 8  # least number of samples per state to which a start is fitted, because of noise
+MOST_ROWS = 60_000  # largest number of motions in one simulation
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Equally long windows of records, ``y`` (steps + 1, n, ny), each with its own start."""
+    """Equally long windows of records: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu) and starts ``x0`` (n, nx)."""
 
     y: np.ndarray
     u: np.ndarray
@@ -31,10 +31,10 @@ class Windows:
 
 
 class Shooting:
-    """Outputs of a system as a function of its start and its unknown parameters, and their derivatives.
+    """Outputs of a system as a function of its start and its unknown parameters, and the outputs' derivatives.
 
-    The rate of ``system`` sets the substeps, so its parameters must be near the unknown ones. Shapes: ``unit`` (p,),
-    the parameters' units.
+    The simulation's substeps suit ``system``, whose parameters must therefore be near the unknown ones. Shapes:
+    ``unit`` (p,), the units of the parameters.
     """
 
     def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
@@ -47,12 +47,12 @@ class Shooting:
         self._step = batch_step(self._both)
 
     def around(self, theta: np.ndarray) -> "Shooting":
-        """The same for a system with other parameters."""
+        """Return the same shooting for the system with the parameters ``theta`` (p,)."""
         system = self.system.replace(dict(zip(self.names, theta.tolist(), strict=True)))
         return Shooting(system, self.dt, self.limits, self.unit)
 
     def outputs(self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Predicted outputs (steps + 1, n, ny) of motions with parameters (n, p), starts (n, nx) and inputs."""
+        """Return the outputs (steps + 1, n, ny) of motions with parameters (n, p), starts (n, nx) and inputs."""
         starts = np.concatenate([x0, theta], 1)
         parts = []
         for rows in np.array_split(np.arange(len(x0)), -(-len(x0) // MOST_ROWS)):
@@ -64,7 +64,7 @@ class Shooting:
     def derivatives(
         self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
     ) -> np.ndarray:
-        """Derivatives (steps + 1, n, ny, nx + p) by starts, in X's half-widths, and by parameters, in their units."""
+        """Return derivatives (steps + 1, n, ny, nx + p) by starts, in half-widths of X, and parameters, in ``unit``."""
         n, nx = x0.shape
         size = np.concatenate([self.half, self.unit]) * STEP
         moved = len(size) if parameters else nx
@@ -74,14 +74,15 @@ class Shooting:
         return np.moveaxis((beside.reshape(len(y), moved, n, -1) - y[:, None]) / STEP, 1, -1)
 
 
-@functools.lru_cache(maxsize=8)  # a new class would be compiled again
+# Each call of with_parameters makes a new class, which would be compiled again.
+@functools.lru_cache(maxsize=8)
 def _with_parameters(system: System, ranges: tuple[tuple[str, tuple[float, float]], ...]) -> System:
     return with_parameters(system, dict(ranges))
 
 
 @dataclass
 class Motions:
-    """Motions from starts (n, nx) of windows: outputs ``y`` and residuals ``r`` (steps + 1, n, ny)."""
+    """Motions from ``x0`` (n, nx): ``y``, residuals ``r`` (steps + 1, n, ny), and mean squares ``each`` (n,)."""
 
     x0: np.ndarray
     y: np.ndarray
@@ -89,13 +90,13 @@ class Motions:
     each: np.ndarray
 
     def take(self, others: "Motions", rows: np.ndarray, of: np.ndarray) -> None:
-        """Replace some rows by rows of others."""
+        """Replace the motions ``rows`` by the motions ``of`` from others."""
         self.x0[rows], self.each[rows] = others.x0[of], others.each[of]
         self.y[:, rows], self.r[:, rows] = others.y[:, of], others.r[:, of]
 
 
 class Problem:
-    """The weighted least squares of one set of windows."""
+    """The weighted least-squares problem of one set of windows."""
 
     def __init__(self, shooting: Shooting, windows: Windows, noise: np.ndarray | None = None) -> None:
         self.shooting, self.windows = shooting, windows
@@ -108,7 +109,7 @@ class Problem:
         self.rows = np.arange(len(windows.x0))
 
     def follow(self, theta: np.ndarray, x0: np.ndarray, rows: np.ndarray) -> Motions:
-        """Motions of some windows from starts, after these are clipped to the bounds."""
+        """Simulate some windows from starts ``x0``, which are first clipped to the bounds."""
         x0, there = np.clip(x0, self.low, self.high), self.there[:, rows]
         y = self.shooting.outputs(np.tile(theta, (len(x0), 1)), x0, self.windows.u[:, rows])
         r = np.where(there & np.isfinite(y), self.windows.y[:, rows] - y, 0.0)
@@ -118,14 +119,14 @@ class Problem:
     def normal(
         self, theta: np.ndarray, at: Motions, rows: np.ndarray, *, parameters: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """J'J (m, d, d) and J'r (m, d) of some windows, for starts and, if ``parameters``, for parameters."""
+        """Return J'WJ (m, d, d) and J'Wr (m, d) of some windows, by starts and, if ``parameters``, by parameters."""
         J = self.derivatives(theta, at, rows, parameters=parameters)
         Jw = J * self.weight[:, None]
         H = np.einsum("knya,knyb->nab", Jw, J, optimize=True)
         return H, np.einsum("knya,kny->na", Jw, at.r[:, rows], optimize=True)
 
     def derivatives(self, theta: np.ndarray, at: Motions, rows: np.ndarray, *, parameters: bool = True) -> np.ndarray:
-        """J (steps + 1, m, ny, d) of some windows, zero where the output is missing."""
+        """Return J (steps + 1, m, ny, d) of some windows, which is zero where an output is missing."""
         u = self.windows.u[:, rows]
         J = self.shooting.derivatives(theta, at.x0[rows], u, y=at.y[:, rows], parameters=parameters)
         there = self.there[:, rows][..., None] & np.isfinite(J).all(-1, keepdims=True)
@@ -141,10 +142,8 @@ class Problem:
                 return
             if len(moved):
                 H[moved], g[moved] = self.normal(theta, at, moved, parameters=False)
-            x0 = (
-                at.x0[rows]
-                + self.shooting.half * np.linalg.solve(damped(H[rows], damping[rows]), g[rows, :, None])[..., 0]
-            )
+            steps = np.linalg.solve(damped(H[rows], damping[rows]), g[rows, :, None])[..., 0]
+            x0 = at.x0[rows] + self.shooting.half * steps
             tried = self.follow(theta, x0, rows)
             better = tried.each < at.each[rows]
             going = tried.each < (1.0 - CONVERGED) * at.each[rows]
@@ -153,20 +152,20 @@ class Problem:
             moved, rows = rows[going], rows[going | ~better]
 
     def part(self, rows: np.ndarray, x0: np.ndarray, length: int | None = None) -> "Problem":
-        """The same problem for some windows, or for their beginnings, with other starts."""
+        """Return the same problem for some windows with starts ``x0``, or for their first ``length`` samples."""
         u = self.windows.u[:length, rows]
         return Problem(self.shooting, Windows(self.windows.y[: len(u) + 1, rows], u, x0), self.weight**-0.5)
 
     def beginnings(self) -> list[int]:
-        """Rising lengths of the windows' beginnings, up to the whole windows."""
+        """Return rising lengths of the windows' beginnings, up to the whole windows."""
         steps, nx = len(self.windows.u), self.shooting.system.nx
         return sorted({min(max(round(part * steps), SAMPLES_PER_STATE * nx), steps) for part in (*BEGINNINGS, 1.0)})
 
     def searched(self, theta: np.ndarray, rng: np.random.Generator) -> Motions:
-        """Motions that fit the windows, from random starts in X.
+        """Return motions that fit the windows, found from random starts in X.
 
-        The least squares of a long chaotic window have many minima, those of its beginning few. So starts are fitted
-        first to the beginning, and then to more and more of the window.
+        The squared residuals of a long chaotic window have many minima, those of its beginning few. A start is
+        therefore fitted first to the beginning, and then to longer and longer parts of the window.
         """
         x0, (length, *longer) = self.windows.x0.copy(), self.beginnings()
         draws = self.shooting.system.draw_starts(rng, DRAWS)
@@ -183,14 +182,14 @@ class Problem:
         return at
 
     def settled(self, theta: np.ndarray) -> Motions:
-        """Motions whose starts fit best with given parameters."""
+        """Return motions whose starts fit the windows best for the parameters ``theta``."""
         at = self.follow(theta, self.windows.x0, self.rows)
         self.settle(theta, at, self.rows, SETTLING)
         return at
 
 
 def damped(H: np.ndarray, damping: "float | np.ndarray") -> np.ndarray:
-    """Matrices (n, d, d) with a share of their diagonals added (Levenberg-Marquardt)."""
+    """Return the matrices (n, d, d) with a share of their diagonals added (Levenberg-Marquardt)."""
     diagonal = np.einsum("naa->na", H)
     more = np.reshape(damping, (-1, 1)) * diagonal + 1e-12 * diagonal.max(1, keepdims=True, initial=0.0) + 1e-30
     return H + more[:, :, None] * np.eye(H.shape[-1])

@@ -8,12 +8,12 @@ import numpy as np
 from training.figures import ESTIMATE, MEASURED, TRUTH, drawing
 from training.identification.identify import Identified
 
-LAGS = 40  # samples
-SHOWN = 3  # held-out records
+LAGS = 40  # largest lag in samples
+SHOWN = 3  # number of held-out records in the figure
 
 
 def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
-    """Autocorrelation (lags,) of residuals (steps + 1, n) from lag 1 on."""
+    """Return the autocorrelation (lags,) of residuals (steps + 1, n) from lag 1 on."""
     r = residuals - np.nanmean(residuals)
     products = [np.nanmean(r[lag:] * r[:-lag]) for lag in range(1, min(lags, len(r) - 1) + 1)]
     return np.array(products) / max(np.nanmean(r**2), 1e-300)
@@ -37,7 +37,7 @@ def write_report(path: Path, found: Identified) -> None:
 
 
 def _draw_residuals(ax: Any, found: Identified) -> None:
-    """Draw the autocorrelation of each output's residuals; that of white residuals stays in the band."""
+    """Draw the autocorrelation of each output's residuals, and the 95 % band of white residuals."""
     fit = found.fit
     for j, noise in enumerate(fit.noise):
         values = autocorrelation(fit.residuals[:, fit.used, j], LAGS)

@@ -8,27 +8,28 @@ import numpy as np
 from training.identification.identifiability import PART, identifiable_directions
 from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped
 
-RESETTLING = 3  # steps that refit the starts of windows that fit worse after a step of the parameters
-NONLINEAR = 0.3  # largest rms error of linearised outputs, over the noise, for a change by one standard error
+RESETTLING = 3  # largest number of steps that refit a start if its window fits worse after a step of the parameters
+NONLINEAR = 0.3  # largest rms error of linearised outputs, over the noise, if parameters change by a standard error
 ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
-SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square by less is slow; three slow steps end the fit
+SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square by less is slow; three slow steps in a row end the fit
 SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit
 EXACT = 1e-16  # a smaller mean square of residuals, over the outputs' variances, ends the fit
-ROUNDING = 1e-14  # lower bound of the noise, in an output's standard deviations
+ROUNDING = 1e-14  # lower bound of the noise, over an output's standard deviation
 MOST_DAMPING = 1e9
 CLUSTERS = 20  # least number of windows whose scatter gives standard errors
-COLOURED = 1.5  # ratio of standard errors, scatter over white noise, that chance does not reach in 20 windows
+COLOURED = 1.5  # ratio of standard errors from scatter to those for white noise; chance stays below in 20 windows
 OUTLIER = 9.0  # a window is left out if its mean square is so many median absolute deviations above the median
 
 
 class UnexplainedError(ValueError):
-    """The model explains no window of the records from the first guesses."""
+    """Raised if the model explains no window of the records from the first guesses."""
 
 
 @dataclass(frozen=True)
 class Fit:
     """A least-squares fit: ``curvature`` is J'WJ, ``white`` and ``scattered`` are covariances of the gradient.
 
+    ``cost`` is the residuals' mean square, and ``left`` the length of the next Gauss-Newton step in standard errors.
     Shapes: ``theta`` (p,), ``residuals`` (steps + 1, n, ny), ``noise`` (ny,), ``curvature``, ``white``, ``scattered``
     (p, p), ``used`` (n,), ``starts_by_parameters`` (number used, nx, p).
     """
@@ -47,11 +48,11 @@ class Fit:
     starts_by_parameters: np.ndarray
 
     def errors(self, directions: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Standard errors along some directions: the larger of those for white noise and those by scatter of windows.
+        """Return standard errors along directions: the larger of those for white noise and those by scatter of windows.
 
         Correlated residuals, such as those of process noise, make parameters less certain than white residuals of equal
-        size. The scatter of the windows' gradients measures this (the sandwich estimator for clustered data). It needs
-        CLUSTERS windows.
+        size. The scatter of the gradients of at least CLUSTERS windows accounts for the correlation (the sandwich
+        estimator for clustered data). ``known`` spans the identifiable directions.
 
         Shapes: ``directions`` (p, k), ``known`` (p, m); returns (k,).
         """
@@ -59,10 +60,9 @@ class Fit:
         return np.max([self._errors(directions, known, kind) for kind in kinds], axis=0)
 
     def _errors(self, directions: np.ndarray, known: np.ndarray, kind: np.ndarray) -> np.ndarray:
-        """Standard errors from one covariance of the gradient."""
-        spread = (
-            known @ np.linalg.pinv(known.T @ self.curvature @ known, rcond=1e-13, hermitian=True) @ known.T @ directions
-        )
+        """Return the standard errors that follow from the covariance ``kind`` of the gradient."""
+        inverse = np.linalg.pinv(known.T @ self.curvature @ known, rcond=1e-13, hermitian=True)
+        spread = known @ inverse @ known.T @ directions
         return np.sqrt(np.maximum(np.einsum("ak,ab,bk->k", spread, kind, spread), 0.0))
 
     @property
@@ -77,7 +77,7 @@ class Fit:
 
     @property
     def size(self) -> np.ndarray:
-        """Absolute values (p,) of the parameters in their units; 1 for zero."""
+        """Absolute values (p,) of the parameters in their units, with 1 in place of 0."""
         values = np.abs(self.theta) / self.unit
         return np.where(values == 0, 1.0, values)
 
@@ -93,7 +93,7 @@ class Fit:
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Standard errors of the parameters, (p,); infinite if one is not identifiable."""
+        """Standard errors (p,) of the parameters, infinite for those that are not identifiable."""
         known = identifiable_directions(self.relative_information)
         unidentifiable = 1.0 - (known**2).sum(1) > PART**2
         errors = self.errors(np.eye(len(self.unit)), known * self.size[:, None])
@@ -101,16 +101,16 @@ class Fit:
 
     @property
     def coloured(self) -> bool:
-        """Whether windows scatter more than white residuals explain."""
+        """Whether the windows' gradients scatter more than white residuals explain."""
         known = identifiable_directions(self.information)
         return bool((self.errors(known, known) > COLOURED * self._errors(known, known, self.white)).any())
 
 
 def predictable(fit: Fit, windows: Windows) -> np.ndarray:
-    """A mask (n,) of the windows that respond linearly to changes of the parameters by a standard error.
+    """Return a mask (n,) of the windows whose outputs respond linearly to parameter changes by a standard error.
 
-    Long windows of a chaotic motion do not: their least squares have many minima, and the curvature gives no standard
-    errors.
+    Long windows of a chaotic motion do not: their squared residuals have many minima, and the curvature at a minimum
+    gives no standard errors.
     """
     shooting, theta, problem = fit.shooting, fit.theta, Problem(fit.shooting, windows)
     at = problem.settled(theta)
@@ -127,7 +127,7 @@ def predictable(fit: Fit, windows: Windows) -> np.ndarray:
 
 
 def explained(each: np.ndarray) -> np.ndarray:
-    """A mask of the windows that are not outliers by the mean squares (n,) of their residuals."""
+    """Return a mask of the windows whose residuals' mean squares ``each`` (n,) are no outliers."""
     median = np.median(each)
     deviation = np.median(np.abs(each[np.isfinite(each)] - median)) if np.isfinite(median) else 0.0
     return np.isfinite(each) & (each <= median + OUTLIER * deviation)
@@ -143,18 +143,18 @@ def shoot(
     noise: Sequence[float] | None = None,
     report: Callable[[float], object] = lambda part: None,
 ) -> Fit:
-    """Least squares over parameters and starts of windows of one length; ``report`` is called with the share done.
+    """Fit parameters, and starts of windows of one length, by least squares; ``report`` receives the share done.
 
-    Windows that the model explains much worse than most are left out. If a model, such as one of friction, is good for
-    some motions and rough for others, give the ``noise``. Each window then has the weight 1 / (1 + mean square of its
-    residuals over the noise's).
+    Windows that the model explains much worse than most are left out. If the model is accurate for some motions and
+    rough for others, as models of friction are, pass the standard deviations of the ``noise`` instead: each window then
+    has the weight 1 / (1 + c), where c is the mean square of its residuals over the noise.
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):
         raise ValueError(f"noise must be {windows.y.shape[-1]} positive numbers, one for each output, got {noise}")
     problem = Problem(shooting, windows, deviations)
     nx, damping, slow = shooting.system.nx, FIRST_DAMPING, 0
-    # The loss log(1 + mean square) has the weight 1 / (1 + mean square).
+    # The weight 1 / (1 + c) is the derivative of the loss log(1 + c).
     loss = np.log1p if noise is not None else np.asarray
     fits = explained if noise is None else np.isfinite
     at = problem.settled(theta)
@@ -166,7 +166,7 @@ def shoot(
             raise UnexplainedError(
                 f"windows of {len(windows.u)} samples: all motions leave the bounds of {shooting.system.name}, from "
                 f"first guesses of the state between {np.round(low, 3)} and {np.round(high, 3)} and of the parameters "
-                f"{dict(zip(shooting.names, theta.round(6).tolist()))}; give other first guesses, or limits"
+                f"{dict(zip(shooting.names, theta.round(6).tolist()))}; pass other first guesses or limits"
             )
         H, g = problem.normal(theta, at, problem.rows, parameters=True)
         cost = at.each[used].mean()
@@ -184,7 +184,7 @@ def shoot(
             x0 = at.x0 + (along[..., -1] - along[..., :-1] @ change) * shooting.half
             tried = problem.follow(new, x0, problem.rows)
             problem.settle(new, tried, np.flatnonzero(tried.each > at.each), RESETTLING)
-            # A step that is good for all others may make a chaotic window diverge, so its loss is bounded.
+            # Mean squares are bounded, as a step that suits all other windows may make a chaotic one diverge.
             worst = np.minimum(tried.each[used], 2 * at.each[used].max())
             fall = loss(at.each[used]).sum() - loss(worst).sum()
             better = fall > 0
@@ -202,9 +202,9 @@ def shoot(
 def _reduced(
     H: np.ndarray, g: np.ndarray, *, used: np.ndarray, nx: int, damping: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normal equations S (p, p), s (p,) of the parameters, after elimination of the starts (Schur complement).
+    """Return the normal equations S (p, p), s (p,) of the parameters after the starts' elimination (Schur complement).
 
-    From the third array, (n, nx, p + 1), follow the starts' steps: last column - others @ steps of the parameters.
+    The third array (n, nx, p + 1) gives the starts' steps: its last column - its other columns @ the parameters' step.
     """
     D, cross = damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
     along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))
@@ -213,7 +213,7 @@ def _reduced(
 
 
 def _left(S: np.ndarray, s: np.ndarray, cost: float) -> float:
-    """Length of a Gauss-Newton step in standard errors, if ``cost`` is the mean square of the residuals."""
+    """Return the length of a Gauss-Newton step in standard errors; ``cost`` is the mean square of the residuals."""
     step = np.linalg.lstsq(S, s, rcond=1e-12)[0]
     return float(np.sqrt(max(step @ s, 0.0) / max(cost, 1e-300)))
 
@@ -223,12 +223,14 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
     J = problem.derivatives(theta, at, np.flatnonzero(used))
     there = problem.there[:, used] & (J != 0).any(-1)
     count = there.sum((0, 1))
-    free = 1.0 - min(nx * used.sum() / max(count.sum(), 1), 0.9)  # share of degrees of freedom that starts leave
+    # The fitted starts leave this share of the degrees of freedom.
+    free = 1.0 - min(nx * used.sum() / max(count.sum(), 1), 0.9)
     squares = np.where(there, at.r[:, used] ** 2, 0.0).sum((0, 1)) / np.maximum(count, 1) / free
     noise = np.sqrt(np.maximum(squares, ROUNDING**2 / problem.weight))
     curvature, beyond, by_parameters = _beyond_starts(J, problem.weight, nx)
     gradients = np.einsum("knyp,kny->np", beyond, at.r[:, used] * problem.weight)
-    few = len(gradients) / max(len(gradients) - len(theta), 1)  # because the gradients add up to zero
+    # At the minimum the gradients add up to zero, which lowers the scatter of few windows.
+    few = len(gradients) / max(len(gradients) - len(theta), 1)
     return Fit(
         shooting=shooting,
         theta=theta,
@@ -246,9 +248,9 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
 
 
 def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Curvature (n, p, p); derivatives by parameters of outputs with refitted starts, and of starts (n, nx, p)."""
+    """Return J'WJ (n, p, p) of outputs with refitted starts, this J, and the starts' derivatives (n, nx, p)."""
     H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
     by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
     beyond = J[..., nx:] + np.einsum("knyx,nxp->knyp", J[..., :nx], by_parameters)
-    curvature = np.einsum("knya,knyb,y->nab", beyond, beyond, weight, optimize=True)  # never negative
+    curvature = np.einsum("knya,knyb,y->nab", beyond, beyond, weight, optimize=True)
     return curvature, beyond, by_parameters

@@ -1,4 +1,4 @@
-"""Shooting over windows of growing length, as long as longer windows improve the parameters."""
+"""Multiple shooting on windows whose length grows as long as longer windows improve the parameters."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -13,26 +13,27 @@ from training.records import Record
 
 FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows; all lengths are fitted in turn
 MORE_NOISE = 1.5  # largest standard deviation of the first windows' residuals, over the noise level
-SMALL = 0.01  # or, if this is larger, over the output's standard deviation
+SMALL = 0.01  # the same limit over the output's standard deviation; the larger limit counts
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
 GAIN = 0.7  # standard errors after a doubling of the length, over those before; larger ratios end the growth
 MORE_COST = 2.0  # largest mean square of the residuals after a doubling, over that before
 LEFT = 0.4  # in standard errors: longest Gauss-Newton step that may remain after a fit
-APART = 0.5  # in standard errors: largest distance between the fits from two sides
-MOST_SAMPLES = 6400  # longest window
+APART = 0.5  # in standard errors: largest distance between the two fits of longer windows
+MOST_SAMPLES = 6400  # largest number of samples in a window
 DIFFERENCES = 4  # order of the differences of y that estimate the noise
 
 Starts = Mapping[tuple[int, int], np.ndarray]
-"""States (nx,) at the first samples of windows, by record and sample."""
+"""States (nx,) at the first samples of windows, by indices of the record and of the sample."""
 
 
 def noise_level(records: Sequence[Record]) -> np.ndarray:
-    """Standard deviation (ny,) of white noise on outputs, from differences of neighbouring samples."""
+    """Return the standard deviation (ny,) of white noise on outputs, from differences of neighbouring samples."""
     order = DIFFERENCES
-    gain = math.comb(2 * order, order)  # sum of the difference's squared coefficients
+    gain = math.comb(2 * order, order)  # sum of the squared coefficients of the difference
     parts = [np.diff(record.y, n=order, axis=0) ** 2 / gain for record in records if len(record.y) > order]
     blocks = [part.mean(0) for whole in parts for part in np.array_split(whole, max(1, len(whole) // 100))]
-    return np.sqrt(np.median(blocks, axis=0))  # the median, because fast parts of a motion are not noise
+    # The median leaves out the fast parts of a motion, whose differences are not noise.
+    return np.sqrt(np.median(blocks, axis=0))
 
 
 def fit_windows(
@@ -43,11 +44,11 @@ def fit_windows(
     say: Callable[[str], object] = lambda line: None,
     report: Callable[[float], object] = lambda part: None,
 ) -> Fit:
-    """Fit parameters and starts on windows of growing length; ``report`` is called with the share done.
+    """Fit parameters and starts on windows of growing length; ``report`` receives the share done.
 
-    Long windows give smaller standard errors, short ones converge from rougher guesses. Chaos and process noise end the
-    growth: residuals are then no longer white, and the least squares have many minima. So longer windows are fitted
-    twice, from one standard error on either side, and count only if both fits converge to the same point.
+    Long windows give smaller standard errors, short ones converge from rougher guesses. Chaos and process noise limit
+    the length: the residuals of longer windows are not white, and their squares have many minima. Longer windows are
+    therefore fitted twice, from one standard error on either side of the last fit, and count only if both fits agree.
     """
     longest = min(max(len(record.y) for record in records) - 1, MOST_SAMPLES)
     first = [length for length in FIRST_LENGTHS if length <= longest] or [longest]
@@ -68,7 +69,8 @@ def fit_windows(
         length *= 2
         starts = {key: starts[key] for key in _cuts(records, length) if key in starts}
         if len(starts) < CLUSTERS and best.coloured:
-            break  # too few windows for standard errors under coloured residuals
+            # Standard errors under coloured residuals need more windows.
+            break
         keep = predictable(best, windows(records, starts, length))
         if keep.mean() < LEAST_USED:
             break
@@ -101,7 +103,7 @@ def fit_windows(
 
 
 def _lasts(longer: Fit, shorter: Fit) -> bool:
-    """Whether the model explains longer windows about as well as shorter ones."""
+    """Return whether the model explains longer windows about as well as shorter ones."""
     return bool(
         longer.used.mean() >= LEAST_USED
         and longer.cost <= MORE_COST * shorter.cost
@@ -116,7 +118,7 @@ def _first_fit(
     lengths: Sequence[int],
     fitted: Callable[[Shooting, np.ndarray, Windows], Fit],
 ) -> Fit:
-    """A fit, from random starts in X, on the longest of the first windows that the model explains."""
+    """Return the fit of the longest first windows that the model explains, after a search of random starts in X."""
     spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
     expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
     theta, best, problem = shooting.given, None, UnexplainedError("")
@@ -136,12 +138,12 @@ def _first_fit(
 
 
 def _cuts(records: Sequence[Record], length: int) -> list[tuple[int, int]]:
-    """Record and first sample of each window of a given length."""
+    """Return the indices of record and first sample for each window of a given length."""
     return [(i, k) for i, record in enumerate(records) for k in range(0, len(record.y) - length, length)]
 
 
 def windows(records: Sequence[Record], starts: Starts, length: int) -> Windows:
-    """Cut windows of a given length out of records."""
+    """Cut the windows that begin at ``starts`` and have a given length out of records."""
 
     def cut(values: Sequence[np.ndarray], samples: int) -> np.ndarray:
         return np.stack([values[index][k : k + samples] for index, k in starts], 1)
@@ -160,7 +162,7 @@ class Prediction:
 
 
 def predict(fit: Fit, records: Sequence[Record], rng: np.random.Generator) -> list[Prediction]:
-    """Predict the outputs in the first window of each record, with a start fitted to the window's first half."""
+    """Predict the outputs in the first window of each record, from a start fitted to the window's first half."""
     length, theta = len(fit.windows.u), fit.theta
     chosen = [record for record in records if len(record.y) > length]
     if not chosen:
@@ -173,7 +175,7 @@ def predict(fit: Fit, records: Sequence[Record], rng: np.random.Generator) -> li
 
 
 def described(fit: Fit) -> str:
-    """A line of text with parameters, their standard errors and the residuals of a fit."""
+    """Return a line of text with the parameters, standard errors and residuals of a fit."""
     values = ", ".join(
         f"{name} = {value:.6g} +- {error:.2g}"
         for (name, value), error in zip(fit.parameters.items(), fit.standard_errors)

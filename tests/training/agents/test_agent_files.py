@@ -79,12 +79,12 @@ def test_mismatches_are_errors(saved, tmp_path):
         on_map.make(1)
     assert on_map.make(1, observer=str(tmp_path / "moved.safetensors"))
     shutil.copy(saved(noise=False), path)
-    with pytest.raises(AgentError, match="trained on another observer"):
+    with pytest.raises(AgentError, match="trained with another observer"):
         on_map.make(1)
     with pytest.raises(AgentError, match="trained with target = "):
         replace(agent(task=task, information="state"), rules={**rules(task), "target": [1.0, 1.0]}).make(1)
     for wrong, says in (
-        ({"task": TASKS["lorenz"], "information": "state"}, "2 inputs and 1 outputs, the environment 3 and 1"),
+        ({"task": TASKS["lorenz"], "information": "state"}, "1 outputs, but the environment needs 3 and 1"),
         ({"head": "argmax"}, "head is argmax"),
     ):
         with pytest.raises(AgentError, match=says):
@@ -132,7 +132,7 @@ def test_what_an_agents_file_names_is_imported_only_if_the_caller_names_it(kind,
     stranger.save(tmp_path / "agent.safetensors")
     found = Agent.read(tmp_path / "agent.safetensors")
     for trusted in (None, OWN, "van_der_pol", "evil.py:Evil"):
-        with pytest.raises(AgentError, match=re.escape(f"environment is {named!r}, and {trusted!r} is trusted")):
+        with pytest.raises(AgentError, match=re.escape(f"environment is {named!r}, but trusted is {trusted!r}")):
             found.make(1, trusted=trusted)
     assert sorted(os.listdir(tmp_path)) == ["agent.safetensors", "evil.py"]
     with pytest.raises(ValueError, match=r"no_such_module|evil"):

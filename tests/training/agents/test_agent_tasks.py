@@ -175,7 +175,7 @@ def test_what_is_not_there_is_named():
         make(PENDULUM, "y", 1, observer="van_der_pol")
     with pytest.raises(ValueError, match="name the measured entries of Acrobot-v1"):
         get_task("Acrobot-v1")
-    with pytest.raises(ValueError, match="measured: of the system lorenz y is measured"):
+    with pytest.raises(ValueError, match="measured: only for environments; the system lorenz measures y"):
         get_task("lorenz", measured=(0,))
     with pytest.raises(ValueError, match="no observer ships for 'oscillator'"):
         observer_of(Oscillator())

@@ -107,7 +107,7 @@ def test_attributes_of_batched_environments(saved):
     assert not env.has_attr("nothing")
     env.set_attr("max_episode_steps", 3)
     assert env.get_attr("max_episode_steps", 0) == [3]
-    with pytest.raises(ValueError, match="for all rows at once"):
+    with pytest.raises(ValueError, match="in all rows at once"):
         env.set_attr("max_episode_steps", 3, [0])
     with pytest.raises(AttributeError, match="not separate environments"):
         env.env_method("step", 0)

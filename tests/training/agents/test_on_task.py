@@ -77,7 +77,7 @@ def test_the_shipped_agent_reaches_the_reward_threshold(name):
 def test_refusals():
     with pytest.raises(ValueError, match="OnTask needs an environment of a system"):
         OnTask(gym.make("Pendulum-v1"))
-    with pytest.raises(ValueError, match=r"has dt = 0.02 s, the task 0.01 s"):
+    with pytest.raises(ValueError, match=r"has dt = 0.02 s, but its task 0.01 s"):
         OnTask(gym.make("KKLLorenz-v0", dt=0.02))
 
 

@@ -100,7 +100,7 @@ def test_files_that_are_something_else(tmp_path, trained):
     assert from_sb3(trained, TASKS["rossler"]).network.activation == "relu"  # SAC's by default
     with pytest.raises(AgentError, match=r"missing\.zip: it cannot be read: No such file"):
         from_sb3(tmp_path / "missing.zip", TASKS["rossler"])
-    with pytest.raises(AgentError, match="the policy has 3 inputs and 1 outputs, the environment"):
+    with pytest.raises(AgentError, match="the policy has 3 inputs and 1 outputs, but the environment"):
         from_sb3(trained, TASKS["van_der_pol"])
     strange = replace(Agent.read(find("lorenz")), training={"algorithm": "reinforce"})
     with pytest.raises(AgentError, match=r"algorithm must be one of .* got 'reinforce'"):

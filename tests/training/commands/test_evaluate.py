@@ -129,8 +129,8 @@ def test_why_there_are_no_runs():
     with pytest.raises(ValueError, match=r"there is nothing to evaluate for map.safetensors"):
         unstable.run(console := Console(record=True))
     text = " ".join(console.export_text().split())
-    assert "left out: starts in X: each of 5 runs left bounds = ((-30, 30), (-30, 30))" in text
-    assert "starts in 2X \\ X: each of 5 runs left" in text
+    assert "left out: starts in X: all 5 runs left bounds = ((-30, 30), (-30, 30))" in text
+    assert "starts in 2X \\ X: all 5 runs left" in text
 
 
 def test_a_level_beyond_the_maps_range_is_left_out_and_named(saved):

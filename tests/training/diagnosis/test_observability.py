@@ -87,7 +87,7 @@ def test_too_little_data_is_warned_of():
         ({"measurement_noise": [(0.1, 0.2)]}, "one for each of 1 outputs"),
         ({"measurement_noise": 0.1}, r"must be a list of levels, as in \[0.1, 0.3\], got 0.1"),
         ({"records": []}, "no records are given"),
-        ({"records": wandering(2, 8)}, "16 samples in 2 records are too few"),
+        ({"records": wandering(2, 8)}, "16 samples are too few to judge x1"),
         ({"records": [replace(wandering(1)[0], x=None, signals=Signals())]}, "no hidden states were recorded"),
     ],
 )

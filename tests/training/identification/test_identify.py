@@ -121,8 +121,8 @@ def test_what_makes_no_sense():
     for unknown, given, message in (
         ({}, [free], "name an unknown parameter"),
         ({"mass": (0.0, 1.0)}, [free], "no parameter 'mass'"),
-        ({"stiffness": (5.0, 6.0)}, [free], "between finite limits, got 4 in 5.0 to 6.0"),
-        ({"stiffness": (0.0, float("inf"))}, [free], "between finite limits, got 4 in 0.0 to inf"),
+        ({"stiffness": (5.0, 6.0)}, [free], "= 4 must lie between finite limits, got 5.0 and 6.0"),
+        ({"stiffness": (0.0, float("inf"))}, [free], "between finite limits, got 0.0 and inf"),
         (stiffness, [], "no records are given"),
         (stiffness, [doubled], "spring has 1 measured, but the columns are y1, y2"),
         (stiffness, [free, driven], "inputs are columns u1, but none in"),
