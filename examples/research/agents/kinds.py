@@ -1,5 +1,6 @@
 """``python -m examples.research kinds``: agents in five kinds of partial observability, at equal CPU time."""
 
+import itertools
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -23,6 +24,7 @@ from training.agents.information import FeatureObservation, make, weighted
 from training.agents.play import play
 from training.agents.seeds import AGENT_EVALUATION_SEED, agent_training_seed
 from training.agents.tasks import Task
+from training.figures import drawing
 from training.progress import ProgressBars
 
 if TYPE_CHECKING:
@@ -39,10 +41,12 @@ PPO: dict[str, Any] = {
     "n_steps": 256,
     "batch_size": 256,
     "n_epochs": 10,
-    "gamma": 0.98,
+    "gamma": 0.95,
     "gae_lambda": 0.95,
+    "target_kl": 0.03,
     "policy_kwargs": {"net_arch": [64, 64]},
 }
+CONTINUOUS = {"use_sde": True, "sde_sample_freq": 4}  # smooth exploration where actions are continuous
 LEARNING_RATE = 0.001  # at the start; it falls linearly to zero
 FRAMES = 32  # length of the linear recurrent unit's history
 EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100
@@ -155,6 +159,8 @@ class TimedAgent(Job):
         # Steps from which the observer or the weights of z are learned count too.
         steps = OBSERVER_STEPS if self.shown == "x_hat" or self.task.weights is not None else 0
         settings = PPO | {"learning_rate": lambda _: LEARNING_RATE * max(0.0, 1.0 - clock.seconds / self.seconds)}
+        if self.env_id != "CartPole-v1":
+            settings |= CONTINUOUS
         if self.shown == "lru":
             extractor = {"features_extractor_class": LinearRecurrence, "features_extractor_kwargs": {"frames": FRAMES}}
             settings["policy_kwargs"] = {**PPO["policy_kwargs"], **extractor}
@@ -225,8 +231,8 @@ def _budget(clock: _Clock, until: float, evaluate: Callable[[float], None] | Non
 class Kinds:
     """Compare agents in five kinds of partial observability, at the same CPU time on one core.
 
-    Writes OUT/kinds.csv (returns along CPU seconds and steps) and OUT/table.md. The jobs are ordered by seed. After an
-    interruption, the same command continues.
+    Writes OUT/kinds.csv (returns along CPU seconds and steps), OUT/table.md and OUT/curves.png. The jobs are ordered by
+    seed. After an interruption, the same command continues.
     """
 
     environments: tuple[str, ...] = ("Pendulum-v1", "CartPole-v1")
@@ -237,7 +243,7 @@ class Kinds:
     """Information that agents see; lru is a linear recurrent unit over 32 frames."""
     seeds: int = 5
     """Number of agents of each kind."""
-    seconds: float = 60.0
+    seconds: float = 50.0
     """CPU seconds of an agent, including its observer."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     out: Path = Path("runs/agents/kinds")
@@ -271,7 +277,8 @@ class Kinds:
                 rows = pd.concat(map(pd.read_csv, done), ignore_index=True)
                 files.write(self.out / "kinds.csv", rows.to_csv(index=False))
                 files.write(self.out / "table.md", "\n".join(table(rows, len(agents) - len(done))) + "\n")
-                progress.say(f"wrote kinds.csv and table.md in {self.out}")
+                draw(self.out / "curves.png", rows)
+                progress.say(f"wrote kinds.csv, table.md and curves.png in {self.out}")
 
         run_and_report(agents, self.out, console, workers=self.workers, what="agents", report=report)
 
@@ -296,16 +303,43 @@ def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
     return lines
 
 
+def _trained_in(kind: str, shown: str) -> str:
+    """The kind whose agents are compared in a kind."""
+    return "masked" if shown == "state" and kind not in OF_STATE else kind
+
+
 def _by_kind(values: "pd.Series", cells: Callable[[dict[str, np.ndarray]], dict[str, str]]) -> list[str]:
     """A table with a row for each environment and kind, and a column for each kind of information."""
     shown = [name for name in get_args(Shown) if name in values.index.unique("shown")]
-    groups = {key: of.to_numpy() for key, of in values.groupby(["environment", "kind", "shown"])}
+    groups = dict(iter(values.groupby(["environment", "kind", "shown"])))
     lines = list[list[str]]()
     for env_id, kind in values.index.droplevel(["shown", "seed"]).unique():
-        keys = {name: (env_id, "masked" if name == "state" and kind not in OF_STATE else kind, name) for name in shown}
-        text = cells({name: groups[key] for name, key in keys.items() if key in groups})
+        keys = {name: (env_id, _trained_in(kind, name), name) for name in shown}
+        text = cells({name: groups[key].to_numpy() for name, key in keys.items() if key in groups})
         lines.append([f"`{env_id}`, {kind}", *(text.get(name, "–") for name in shown)])
     return files.table(["", *shown], lines)
+
+
+def draw(path: Path, rows: "pd.DataFrame") -> None:
+    """Draw mean returns over CPU seconds and over steps."""
+    agents = dict(iter(rows.groupby(["environment", "kind", "shown"])))
+    env_ids, kinds = rows.environment.unique(), rows.kind.unique()
+    with drawing(path, 12.0, 2.0 * len(kinds) + 0.8) as figure:
+        axes = figure.subplots(len(kinds), 2 * len(env_ids), squeeze=False, sharex="col")
+        lines = dict[str, Any]()
+        for (row, kind), (i, env_id), name in itertools.product(enumerate(kinds), enumerate(env_ids), get_args(Shown)):
+            pair = axes[row, 2 * i : 2 * i + 2]
+            for ax, over in zip(pair, ("seconds", "steps")):
+                if (own := agents.get((env_id, _trained_in(kind, name), name))) is not None:
+                    at = np.linspace(0, own[over].max(), 100)
+                    seeds = [np.interp(at, one[over], one["return"], left=np.nan) for _, one in own.groupby("seed")]
+                    (lines[name],) = ax.plot(at, np.mean(seeds, 0), color=f"C{get_args(Shown).index(name)}")
+                ax.set_xlabel({"seconds": "CPU seconds", "steps": "steps"}[over] if row == len(kinds) - 1 else "")
+            pair[0].set(ylabel="return", title=f"{env_id}, {kind}")
+            pair[1].sharey(pair[0])
+            pair[1].tick_params(labelleft=False)
+            pair[1].xaxis.set_major_formatter(lambda steps, _: f"{steps / 1000:g}k")
+        figure.legend(lines.values(), lines, loc="outside lower center", ncols=len(lines) or 1)
 
 
 def _returns(row: dict[str, np.ndarray]) -> dict[str, str]:
