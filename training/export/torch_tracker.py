@@ -63,10 +63,7 @@ class TorchTracker(Module):
     def advance(
         self, state: Tensor, y: Tensor, u: Tensor, begins: Tensor, measurement_noise: Tensor, process_noise: Tensor
     ) -> tuple[Tracked, Tensor]:
-        """Predict, then correct by y (ny, n), NaN where missing.
-
-        Returns the state, whose NIS is infinite where the correction fails, and the predicted outputs (ny, n).
-        """
+        """Predict, correct by y (ny, n), NaN if missing; return the state, with infinite NIS on failure, and outputs."""
         Q = self.eye * ((process_noise.clamp(min=self.least_process_noise) * self.process_noise) ** 2 + self.error**2)
         R = self.eye_y * torch.maximum(measurement_noise, self.least_measurement_noise) ** 2
         numbers, (x0, P0, nis, square, seen, trend) = self.numbers, self._unpacked(state)
@@ -98,10 +95,7 @@ class TorchTracker(Module):
         ), expected
 
     def supervise(self, tracked: Tracked, x_hat: Tensor, covariance: Callable[[Tensor], Tensor]) -> Tensor:
-        """Use T_inv's estimates (nx, n) after a divergence, and in the first window if their covariance is smaller.
-
-        ``covariance`` maps ages in seconds to T_inv's covariances.
-        """
+        """Use T_inv's estimates (nx, n) after a divergence, and in the first window if their covariance is smaller."""
         x, P, nis, square, seen, trend = tracked
         # The linear filter has taken at least as many samples as the tracker.
         learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)
@@ -155,10 +149,7 @@ class TorchTracker(Module):
     def _transformed(
         self, x: Tensor, L: Tensor, function: Callable[[Tensor, Tensor], Tensor], u: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return means and covariances of a function of Gaussians, and E; L E^T is the covariance with x.
-
-        The Gaussians have means x and covariances L L^T; sigma points represent them.
-        """
+        """Return means and covariances of a function of x ~ N(mean, L L^T), by sigma points, and E: L E^T = cov(x, .)."""
         middle, far, count = x[:, None], self.far * L, 1 + 2 * self.nx
         to = function(torch.cat([middle, middle + far, middle - far], 1).flatten(1), u.repeat(1, count))
         to = to.reshape(len(to), count, -1)
