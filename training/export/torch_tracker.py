@@ -63,7 +63,7 @@ class TorchTracker(Module):
     def advance(
         self, state: Tensor, y: Tensor, u: Tensor, begins: Tensor, measurement_noise: Tensor, process_noise: Tensor
     ) -> tuple[Tracked, Tensor]:
-        """Predict, correct by y (ny, n), NaN if missing; return the state, with infinite NIS on failure, and outputs."""
+        """Predict, correct by y (ny, n), NaN if missing; return the state, its NIS infinite on failure, and outputs."""
         Q = self.eye * ((process_noise.clamp(min=self.least_process_noise) * self.process_noise) ** 2 + self.error**2)
         R = self.eye_y * torch.maximum(measurement_noise, self.least_measurement_noise) ** 2
         numbers, (x0, P0, nis, square, seen, trend) = self.numbers, self._unpacked(state)
@@ -149,7 +149,7 @@ class TorchTracker(Module):
     def _transformed(
         self, x: Tensor, L: Tensor, function: Callable[[Tensor, Tensor], Tensor], u: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return means and covariances of a function of x ~ N(mean, L L^T), by sigma points, and E: L E^T = cov(x, .)."""
+        """Return means and covariances of a function of x ~ N(mean, L L^T) by sigma points, and E: L E^T = cov(x, .)."""
         middle, far, count = x[:, None], self.far * L, 1 + 2 * self.nx
         to = function(torch.cat([middle, middle + far, middle - far], 1).flatten(1), u.repeat(1, count))
         to = to.reshape(len(to), count, -1)
