@@ -149,7 +149,7 @@ class TorchTracker(Module):
     def _transformed(
         self, x: Tensor, L: Tensor, function: Callable[[Tensor, Tensor], Tensor], u: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return means and covariances of a function of x ~ N(mean, L L^T) by sigma points, and E: L E^T = cov(x, .)."""
+        """Return mean and covariance of a function of x ~ N(mean, L L^T) by sigma points, and E: L E^T = cov(x, .)."""
         middle, far, count = x[:, None], self.far * L, 1 + 2 * self.nx
         to = function(torch.cat([middle, middle + far, middle - far], 1).flatten(1), u.repeat(1, count))
         to = to.reshape(len(to), count, -1)
