@@ -113,15 +113,18 @@ environments: $(VENV)/ready  ## agents that see a part of Gymnasium's environmen
 	$(BIN)/python -m examples.research agents $(HIDDEN)
 	mkdir -p docs/results/environments
 	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
-	$(BIN)/python -m examples.research agents CartPole-v1 Pendulum-v1 --measurement-noise 0.1 0.2 0.3 \
-		--information state x_hat z stacked recurrent --aggregate 4 --seeds 5 --out runs/agents/noise
-	cp runs/agents/noise/results.csv docs/results/environments/noise.csv
 	$(BIN)/python -m examples.research agents InvertedDoublePendulum-v5 --information state x_hat --seeds 10 \
 		--out runs/agents/double-pendulum
 	cp runs/agents/double-pendulum/results.csv docs/results/environments/double-pendulum.csv
 	$(BIN)/python -m examples.research agents Pendulum-v1 --information z --angles 0,1 --time-constants 1 --no-past-actions \
 		--out runs/agents/short
 	cp runs/agents/short/results.csv docs/results/environments/short.csv
+	$(MAKE) figures
+
+kinds: $(VENV)/ready  ## agents in five kinds of partial observability, an hour and a half on two cores; resumable
+	$(BIN)/python -m examples.research kinds --seeds 3
+	mkdir -p docs/results/kinds
+	cp $(addprefix runs/agents/kinds/,kinds.csv table.md) docs/results/kinds
 	$(MAKE) figures
 
 speed: $(VENV)/ready  ## the speed of environments, beside Pendulum-v1 and CartPole-v1, one thread

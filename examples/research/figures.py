@@ -20,6 +20,7 @@ from PIL import Image
 
 from examples.research.agents import picture
 from examples.research.agents.comparison import read_results
+from examples.research.agents.kinds import draw as draw_kinds
 from examples.research.agents.tables import draw_curves, draw_scores
 from examples.research.benchmark.results import draw_results as draw_benchmark
 from kkl_gym import SYSTEMS
@@ -253,6 +254,7 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "results/environments/curves.png": lambda: partial(
         draw_curves, learned=pd.read_csv(RESULTS / "environments" / "curves.csv")
     ),
+    "results/kinds/curves.png": lambda: partial(draw_kinds, rows=pd.read_csv(RESULTS / "kinds" / "kinds.csv")),
     "results/faults/scores.png": lambda: partial(draw_faults, runs=pd.read_csv(RESULTS / "faults" / "faults.csv")),
 }
 

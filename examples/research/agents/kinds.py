@@ -2,7 +2,7 @@
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -100,8 +100,9 @@ class TimedAgent(Job):
     def _noise(self) -> float:
         return float(KINDS[self.kind].get("noise", 0.0))
 
-    def _states(self, size: int, known: Sequence[int] = ()) -> tuple[int, ...]:
-        """Indices of the state in an observation of some size, without the entries that are known."""
+    def _states(self, size: int) -> tuple[int, ...]:
+        """Indices of the state in an observation of some size; without faults, agents on x_hat read a part from y."""
+        known = MEASURED[self.env_id] if self.shown == "x_hat" and self.kind not in FAULTY else ()
         return tuple(place for place in range(self._ny, size) if place - self._ny not in known)
 
     def make(self, rows: int, observer: Path | None = None) -> "VectorEnv":
@@ -110,7 +111,7 @@ class TimedAgent(Job):
         if self.shown in ("state", "x_hat") and observer is None:
             env = vector(task, rows)
             y = () if self.shown == "state" or self.kind in FAULTY else task.measured
-            entries = [*y, *self._states(flatdim(env.single_observation_space), self._known)]
+            entries = [*y, *self._states(flatdim(env.single_observation_space))]
             return FeatureObservation(env, lambda at: at["obs"][:, entries], len(entries))
         if self.shown == "lru":
             return make(replace(task, frames=FRAMES), "stacked", rows)
@@ -126,11 +127,6 @@ class TimedAgent(Job):
         first = self._ny if self.kind in FAULTY else 0
         return FeatureObservation(env, lambda at: at["obs"][:, first:], flatdim(env.single_observation_space) - first)
 
-    @property
-    def _known(self) -> Sequence[int]:
-        """Entries of the state that agents on x_hat read from y."""
-        return MEASURED[self.env_id] if self.shown == "x_hat" and self.kind not in FAULTY else ()
-
     def learn_observer(self, act: Callable[[np.ndarray], Any]) -> Path:
         """Learn an observer in a simulator: from random steps, and from as many of an agent that sees the truth."""
         from training.agents.observing import learn_observer
@@ -138,7 +134,7 @@ class TimedAgent(Job):
 
         with single(self.task) as env:
             env.get_wrapper_attr("exact")()
-            places = self._states(flatdim(env.observation_space), self._known)
+            places = self._states(flatdim(env.observation_space))
             seen = [*(() if self.kind in FAULTY else self.task.measured), *places]
             signals: Any = {"measured": [str(i) for i in self.task.measured], "hidden": [str(i) for i in places]}
             records = [
