@@ -7,7 +7,7 @@ SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 LARGE := $(SYSTEMS:%=%-large)
 
 .PHONY: demo install test test-coverage guard test-slow test-research test-long test-browser lint format maps results figures benchmark ablation \
-	faults agents environments speed clients docs clean help
+	faults agents environments kinds speed clients docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
