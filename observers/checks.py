@@ -20,7 +20,7 @@ class ArtifactError(ValueError):
 
 
 def check_shapes(owner: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raise ArtifactError unless the arrays of ``owner``, by their names in ``shapes``, have these shapes."""
+    """Raise ArtifactError unless each attribute of ``owner`` that ``shapes`` names has the shape given there."""
     for name, shape in shapes.items():
         if (given := getattr(owner, name).shape) != shape:
             raise ArtifactError(f"{name} does not fit the other parts: it must have shape {shape}, got {given}")
@@ -30,7 +30,7 @@ def shown(value: object) -> str:
     """Return the text of a value for error messages: one line, shortened if it is long."""
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # such as that of repr for integers of more than 4,300 digits
+    except Exception:  # for example, repr raises ValueError for integers of more than 4,300 digits
         return f"a {type(value).__name__}"
     return text if len(text) <= 200 else f"{text[:150]} … {text[-40:]}"
 
@@ -156,7 +156,7 @@ def bool_array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array of bools, or raise ValueError."""
     try:
         array = values if type(values) is np.ndarray else np.asarray(values)
-    except Exception as error:  # for the same values as in real_array
+    except Exception as error:  # for ragged lists, and for objects whose __array__ fails
         raise ValueError(f"{name} must be boolean with shape {shape}, got {shown(values)}") from error
     if array.dtype.kind != "b" or array.shape != shape or (isinstance(values, MaskedArray) and is_masked(values)):
         raise ValueError(f"{name} must be boolean with shape {shape}, nothing masked, got {shown(values)}")

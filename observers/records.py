@@ -22,7 +22,7 @@ class RecordEstimates:
     def estimate(
         self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None, t: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the estimates along a whole record that :meth:`reset` and :meth:`step` would return row by row.
+        """Return the estimates along a whole record, as :meth:`reset` and :meth:`step` would return them row by row.
 
         The observer's own state does not change. Raises the errors of :meth:`reset` and :meth:`step`.
 
@@ -66,7 +66,7 @@ class RecordEstimates:
     ) -> np.ndarray:
         """Return the values of ``of``, a function of the state's rows, at each sample."""
         if self._delay:
-            raise ValueError("a record needs an observer without a delay: shift its outputs by the delay instead")
+            raise ValueError("a record needs an observer without a delay: shift the recorded outputs by the delay")
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
             raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")

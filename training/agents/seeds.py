@@ -1,13 +1,13 @@
 """Seeds of the episodes on which agents learn and are evaluated; no evaluation uses a seed of a training."""
 
-# Seeds of first episodes, from which later ones count up; a training's is multiplied by (the agent's seed + 1).
+# Base seeds. The functions below add an offset for ``seed``; seeds of parallel episodes count up from the result.
 AGENT_TRAINING_SEED = 10_000
 AGENT_EVALUATION_SEED = 10**9
 AGENT_EVALUATION_EPISODES = 10_000  # largest number of episodes of an evaluation
 
 
 def agent_training_seed(seed: int, resumed: int = 0, rows: int = 1) -> int:
-    """Return the seed of an agent's first episode in training; the seeds of the other rows count up from it."""
+    """Return the seed of the first of ``rows`` parallel environments after ``resumed`` restarts of a training."""
     most = AGENT_EVALUATION_SEED // AGENT_TRAINING_SEED - 2
     if not 0 <= seed <= most:
         raise ValueError(f"an agent's seed must lie between 0 and {most}, got {seed}")

@@ -55,7 +55,7 @@ def pair(read: Callable[[str], Any], kind: str, form: str, alone: str = "") -> C
 
 
 def read_unknown(text: str) -> tuple[float, ...]:
-    """Read a first guess, VALUE, or a first guess with limits, VALUE:LOW:HIGH."""
+    """Read the first guess of an unknown parameter: VALUE, or VALUE:LOW:HIGH with limits."""
     numbers = tuple(map(float, text.split(":")))
     if len(numbers) not in (1, 3):
         raise ValueError(text)
@@ -188,12 +188,12 @@ class DataOptions:
     rollouts in a Minari data set, as minari:ID or its folder, with signals named as in `kkl-gym record`."""
     time: Annotated[str, hint("t or time", metavar="COLUMN")] = ""
     """Column of the time in seconds."""
-    measured: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
-    """Measured outputs, separated by commas. By default y, or y1, y2, ..."""
-    inputs: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
-    """Known inputs, each held until the next sample. By default u, or u1, u2, ..."""
-    hidden: Annotated[str, hint("by the names of the columns", metavar="COLUMNS")] = ""
-    """Recorded states. By default x, or x1, x2, ... For an angle, name cos(COLUMN) and sin(COLUMN)."""
+    measured: Annotated[str, hint("y, or y1, y2, ...", metavar="COLUMNS")] = ""
+    """Measured outputs, separated by commas."""
+    inputs: Annotated[str, hint("u, or u1, u2, ...", metavar="COLUMNS")] = ""
+    """Known inputs, each held until the next sample."""
+    hidden: Annotated[str, hint("x, or x1, x2, ...", metavar="COLUMNS")] = ""
+    """Recorded states. For an angle, name cos(COLUMN) and sin(COLUMN)."""
 
     def read(self, progress: ProgressBars, system: System | None = None) -> list[Record]:
         """Read the files; raise ValueError if a column is named twice."""
@@ -250,7 +250,7 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
 
 @dataclass(frozen=True)
 class Shown:
-    """An environment for a demo, and its observer, or None for the one that ships for the system."""
+    """An environment for a demo, and its observer; None stands for the system's shipped observer, if there is one."""
 
     label: str
     env_id: str
@@ -285,7 +285,7 @@ def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> C
     trained = artifact.training.get("policy")
     if own_policy is None and trained is not None and trained != "controller":
         raise ValueError(
-            f"this observer was trained under the policy {trained!r}, which must act in its tests, too: name it by "
+            f"this observer was trained under the policy {trained!r}, and must be evaluated under it, too: name it by "
             "--policy script.py:function"
         )
     name = own_policy or trained

@@ -16,8 +16,8 @@ from training.trajectories.motions import Controller
 
 CHECKS: dict[str, Callable[[Subject], Iterator[Finding]]] = {
     "system": system.declaration,
-    # All checks below need equations that work.
     "equations": system.equations,
+    # All checks below need equations that work.
     "compiled": system.machine_code,
     "bounds": system.bounds,
     "sampling": system.sampling,

@@ -134,8 +134,8 @@ def resampled(record: Record, dt: float | None = None) -> Record:
 
     Outputs are interpolated linearly, as the filter assumes, so that a value depends on no sample after the next one.
     States, which no observer sees, follow a monotone cubic (PCHIP). Each column is NaN between its samples that are
-    more than 3 dt apart. Inputs, held between samples, are averaged over each interval of the grid. A record that
-    already has this grid changes only by rounding.
+    more than 3 dt apart. Inputs, held between samples, are averaged over each interval of the grid. A complete record
+    that already has this grid changes only by rounding.
     """
     dt = median_step(record) if dt is None else dt
     if not 0 < dt <= record.duration * (1 + ROUNDING):
@@ -186,7 +186,7 @@ def pieces(records: Iterable[Record]) -> list[Record]:
 
 
 class Windows:
-    """All samples of some records, concatenated, with a filter that runs along each piece between gaps.
+    """The pieces of some records between gaps, concatenated, with a filter that runs along each piece.
 
     Shapes: ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx), NaN where unknown, ``z`` (n, size), and ``before`` and
     ``after`` (n,): numbers of samples in the same piece before and after each.

@@ -10,7 +10,7 @@ from training.config import Config
 from training.trajectories.motions import Pairs as Pairs
 from training.trajectories.motions import Report as Report
 
-OF_MEDIAN = 1.4826  # standard deviation of a normal distribution, over the median of absolute values
+OF_MEDIAN = 1.4826  # ratio of a normal distribution's standard deviation to the median of its absolute deviations
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Increments:
 
 
 class Source(Protocol):
-    """The interface by which lessons get motions: simulated, recorded, or rollouts of an environment.
+    """The interface by which a training gets motions: simulated, recorded, or rollouts of an environment.
 
     Motions for calibration are never those for training.
 
@@ -96,7 +96,7 @@ class Source(Protocol):
         """Return changes of the state over one sampling interval: for learning a flow, and for measuring its error."""
 
     def tracking(self) -> dict[str, Any]:
-        """Return arguments of :class:`observers.Motion` but equations or flow; ValueError if tracking is impossible."""
+        """Return observers.Motion's arguments except equations and flow; raise ValueError if tracking is impossible."""
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
         """Return errors on held-out motions, for the training metadata of the artifact."""

@@ -85,5 +85,5 @@ def test_the_policy_of_its_training_acts(tmp_path):
     assert np.ptp(late[None], axis=0).min() > 0.5
     assert np.abs(late["controller"]).max() < 0.3
     assert late[pushed].mean(0) == pytest.approx([0.5, 0.0], abs=0.1)
-    with pytest.raises(ValueError, match=r"was trained under the policy .*, which must act"):
+    with pytest.raises(ValueError, match=r"was trained under the policy .*, and must be evaluated"):
         play(environment, 2000, 0.1, seed=0)
