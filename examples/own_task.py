@@ -1,4 +1,4 @@
-"""Your own task, from plant to agent: through a spring, a motor turns a link, which is not measured, to an angle.
+"""Your own task, from plant to agent: a motor turns a link, which is not measured, through a spring to an angle.
 
 The same from the command line, as docs/guides/own_task.md explains::
 

@@ -18,7 +18,7 @@ class Qube(kkl_gym.System):
     The defaults are the published model, without dry friction and without the spring of the arm's cable.
 
     Lengths, masses and inertias are those of Quanser's script qube2_rotpen_param.m; the arm's inertia is its published
-    mass length^2 / 12. The script's damping is much larger than in these runs. So both damping coefficients are those
+    mass length^2 / 12. The script's damping is much larger than in these runs, so both damping coefficients are those
     of BlueRiverTech's quanser-openai-driver, file qube_simulator.py. The motor's terminals are open.
     """
 
@@ -78,7 +78,7 @@ class BothAngles(Qube):
 
 @dataclass(frozen=True)
 class Sticking(BothAngles):
-    """The same model with friction so dry that the arm sticks until it is pushed."""
+    """The same model, but the friction changes its sign so abruptly that the arm sticks until it is pushed."""
 
     arm_slip: float = 0.004
     pendulum_slip: float = 0.2
@@ -92,7 +92,7 @@ class Sticking(BothAngles):
 
 @dataclass(frozen=True)
 class Pushed(Sticking):
-    """The same model with y = theta, and with an unknown torque on the arm for the errors of the friction model.
+    """The same model with y = theta, and with an unknown torque on the arm, which stands for errors of its friction.
 
     The torque is a fifth state, in 0.1 mN m: an Ornstein-Uhlenbeck process.
     """

@@ -30,12 +30,12 @@ def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
         max_episode_steps=2000,
         autoreset_mode="Disabled",
     )
-    envs = kkl_gym.KKLVectorObservation(envs, config["observer"])  # sees every sample, 0.01 s apart
-    return kkl_gym.VectorActionRepeat(envs, 5)  # resets in the next step, as RLlib expects
+    envs = kkl_gym.KKLVectorObservation(envs, config["observer"])  # the observer sees every sample, 0.01 s apart
+    return kkl_gym.VectorActionRepeat(envs, 5)  # a row resets in the next step, as RLlib expects
 
 
 def configuration(algorithm: Literal["ppo", "sac"]) -> AlgorithmConfig:
-    """The settings of an algorithm."""
+    """Return the settings of an algorithm."""
     if algorithm == "ppo":
         return PPOConfig().training(
             lr=1e-3, gamma=0.99, train_batch_size_per_learner=4096, minibatch_size=512, num_epochs=5

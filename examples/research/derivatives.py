@@ -18,10 +18,10 @@ _IN_NUMPY = {
 
 
 def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
-    """Derivatives of f or h: for each component, its nonzero derivatives by the index of the state.
+    """Return derivatives of f or h: for each component, its nonzero derivatives by the index of the state.
 
-    At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of both sides; at a jump it is that of the
-    neighbourhood.
+    At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of the derivatives on both sides; at a jump it is
+    the derivative beside the jump.
     """
     import sympy  # imported here, because it takes half a second
 

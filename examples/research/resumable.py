@@ -15,7 +15,7 @@ from training.progress import LOG, ProgressBars, progress_bars
 
 @dataclass(frozen=True)
 class Workers:
-    """The worker processes."""
+    """Options of the worker processes."""
 
     jobs: int = 2
     """Number of simultaneous jobs, each in a process with one thread."""
@@ -72,7 +72,7 @@ def run_and_report(
     what: str,
     report: Callable[[ProgressBars], None],
 ) -> None:
-    """Run the missing jobs, and report on the results, also after an interruption."""
+    """Run the missing jobs, and report on the results, even if the run is interrupted."""
     failures = list[str]()
     try:
         with progress_bars(console, out / LOG) as progress:

@@ -77,7 +77,7 @@ class Compare:
             raise ValueError("compare agents either on systems or in environments, in separate folders")
         (on_systems,) = systems
         if not on_systems and {"ekf", "x_hat_std"} & set(self.information or ()):
-            raise ValueError("agents in environments are not compared by ekf, x_hat_std")
+            raise ValueError("agents in environments cannot be compared by ekf and x_hat_std")
         out = self.out or Path("runs/agents") / ("comparison" if on_systems else "environments")
         kinds = self.information
         how: dict[str, Any] = {
@@ -108,7 +108,7 @@ class Compare:
         run_and_report(agents, out, console, workers=self.workers, what="agents", report=report)
 
     def _tasks(self, name: str) -> list[Task]:
-        """The task at each noise level."""
+        """Return the task at each noise level."""
         own = self.options.task(name)
         levels: list[Level] = list(self.measurement_noise or (own.measurement_noise,))
         if self.measurement_noise is None and own.name in comparison.SECOND_NOISE:
@@ -116,7 +116,7 @@ class Compare:
         return [self.options.task(name, level) for level in levels]
 
     def _observers(self, tasks: list[Task]) -> dict[str, str]:
-        """Observers by the name of their system; ValueError if one is missing."""
+        """Return the observers by the name of their system; ValueError if one is missing."""
         observers: dict[str, str] = {}
         systems = {task.name: task.system for task in tasks if task.system is not None}
         for observer in self.observers:

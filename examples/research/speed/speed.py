@@ -22,7 +22,8 @@ from training.progress import ProgressBars, progress_bars
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
 OTHERS = ("large",)  # kinds of shipped maps besides the default ones
-HOUR = 72  # length of records over a turn of an environment: an hour at 100 Hz by default
+# Ratio of the length of records to the steps of a turn; by default, records are an hour long at 100 Hz.
+HOUR = 72
 
 Tasks = Mapping[str, Callable[[], float]]
 
@@ -129,11 +130,11 @@ def _print(titles: Sequence[str], rows: Sequence[Sequence[str]], progress: Progr
 def variants(
     one: Shown, make: Callable[[], Any], observe: Callable[..., Any], *, with_z: bool = False
 ) -> dict[str, Any]:
-    """Variants of a system's environment by name: bare, and with each available observer."""
+    """Make variants of a system's environment by name: bare, and with each available observer."""
     wrapped: dict[str, dict[str, Any]] = {}
     if one.observed:
         artifact = Artifact.read(resolve(_default(one)))
-        default = {"observer": one.observer, "ignore_input": not artifact.nu}  # the estimates do not matter here
+        default = {"observer": one.observer, "ignore_input": not artifact.nu}  # only times matter here
         if with_z:
             wrapped["z"] = {**default, "estimate": "z"}
         wrapped["x_hat"] = default
@@ -149,7 +150,7 @@ def _default(one: Shown) -> str:
 
 
 def _others(one: Shown) -> dict[str, str]:
-    """Shipped maps of a system besides its default, by kind."""
+    """Return the shipped maps of a system besides its default, by kind."""
     names = {kind: f"{one.system.name}-{kind}" for kind in OTHERS}
     there = shipped_maps() if one.observer is None and one.observed else {}
     return {kind: name for kind, name in names.items() if name in there}
