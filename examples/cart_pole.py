@@ -38,7 +38,7 @@ class CartPole(kkl_gym.System):
     measurement_noise: ClassVar = 0.02  # m and rad
 
     def _terms(self, x):
-        """Total mass, the pole's moment, and the denominator of both accelerations."""
+        """Return the total mass, the pole's moment, and the denominator of both accelerations."""
         mass, moment = self.cart + self.pole, self.pole * self.length
         return mass, moment, self.length * (4.0 / 3.0 - self.pole * cos(x[2]) ** 2 / mass)
 
@@ -62,7 +62,7 @@ class CartPole(kkl_gym.System):
 
 
 def balance(x: np.ndarray) -> np.ndarray:
-    """Another policy than in the training: maps states (n, 4) to actions (n, 1) in [-1, 1]."""
+    """Map states (n, 4) to actions (n, 1) in [-1, 1], by another policy than in the training."""
     return np.clip(x @ [[0.3], [0.5], [4.0], [1.0]], -1.0, 1.0)
 
 

@@ -21,7 +21,7 @@ from training.figures import ALARM, ESTIMATE, MEASURED, TRUTH, style
 
 SECONDS = 12.0  # length of the time axis, in units of the system's pace
 FRAME = 0.04  # seconds between frames
-# Most samples that a frame advances. If a window is so slow that it would need more, the motion lags real time.
+# Most samples that a frame advances. If a window is too slow for this, the motion falls behind real time.
 MOST = 100
 KEYS = "space: pause   n: new start   left, right: input   up, down: noise   f: next fault"
 

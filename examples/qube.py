@@ -75,8 +75,8 @@ SETTINGS = {
     "members": 4,
 }
 
-# First guesses of the fitted parameters. The mass is fixed, because a common factor of all forces
-# and inertias has no effect without an input.
+# First guesses of the fitted parameters. The mass is fixed, because a common factor of all forces and inertias has no
+# effect without an input.
 GUESSES = {
     "arm_length": 0.085,
     "arm_inertia": 5.72e-5,

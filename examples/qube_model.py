@@ -33,7 +33,7 @@ class Qube(kkl_gym.System):
     pendulum_inertia: float = 0.024 * 0.129**2 / 3  # kg m^2, about its joint
     pendulum_damping: float = 0.00005  # N m s
     pendulum_friction: float = 0.0  # N m
-    arm_slip: float = 0.1  # rad/s, width of the change of sign of dry friction
+    arm_slip: float = 0.1  # rad/s, the range of rates in which dry friction changes its sign
     pendulum_slip: float = 0.8  # rad/s
 
     name: ClassVar[str] = "qube"
@@ -46,7 +46,7 @@ class Qube(kkl_gym.System):
         return self.moved(*x)
 
     def moved(self, theta, alpha, theta_dot, alpha_dot, torque=0.0):
-        """Lagrange's equations of the two angles, solved for their accelerations, under a torque on the arm in N m."""
+        """Return the state's derivatives by Lagrange's equations of both angles; the torque acts on the arm, in N m."""
         half, sine, cosine = self.pendulum_length / 2, sin(alpha), cos(alpha)
         inertia = self.pendulum_inertia
         coupling = -self.pendulum_mass * self.arm_length * half

@@ -28,7 +28,7 @@ from training.records import Record
 DT = 2**14 / 1e7  # s
 FILE = "SNLS80mV.csv"
 SAMPLES = 131_072
-# To these first samples of each test, its start is fitted; their errors do not count.
+# The start of each test is fitted to this number of first samples; their errors do not count.
 FREE = 50
 # Samples of the first three quarters of the multisine, and of its last quarter.
 TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)
@@ -64,7 +64,7 @@ class Silverbox(kkl_gym.System):
     cube: float = 4e5  # 1/(V^2 s^2)
     offset: float = 0.0  # V/s^2
     gain: float = 1.2e5  # 1/s^2
-    before: float = 0.0  # weights of the neighbouring samples; the sample itself has the rest
+    before: float = 0.0  # weights of the neighbouring samples; the sample itself has the rest of 1
     after: float = 0.0
 
     name: ClassVar[str] = "silverbox"

@@ -265,10 +265,10 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         at = points.T.copy(), u_max * rng.uniform(-1, 1, (nu, n)), scale * rng.uniform(-1, 1, (nx, n)), system.dt
         found, expected = np.empty((nx, n)), equal_substeps(system, *at)[0]
         kernel(*at, found)
-        # Where a motion escapes, one of them may be infinite and the other NaN.
+        # Where a motion escapes, one result may be infinite and the other NaN.
         expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan
         if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
-            raise ValueError(f"{system.name}: the equations return something else for symbols than for numbers")
+            raise ValueError(f"{system.name}: the equations return other values for symbols than for numbers")
     return kernel
 
 

@@ -15,7 +15,7 @@ _SIZES = {"nx": "X", "nu": "u_max", "ny": "h(x)", "parameters": "the fields"}
 
 
 def complete(cls: Any, base: Any) -> None:
-    """Check a system's class variables, convert their numbers to tuples, and set the defaults of others."""
+    """Check a system's class variables, convert their numbers to tuples, and set the defaults of missing ones."""
     _check_names(cls, base)
     _read_box(cls)
     nx = len(cls.X)
@@ -93,7 +93,7 @@ def _read_box(cls: Any) -> None:
         _read(cls, name, pairs, (None, 2))
         for i, (low, high) in enumerate(getattr(cls, name)):
             if not low < high:
-                raise _wrong(cls, f"{name}[{i}]", "(low, high), low before high", (low, high))
+                raise _wrong(cls, f"{name}[{i}]", "(low, high) with low < high", (low, high))
     if not cls.X:
         raise _wrong(cls, "X", pairs)
     if len(cls.bounds) != len(cls.X):

@@ -27,7 +27,7 @@ from observers.checks import integer, mapping, real_array, shown
 
 # Number of samples after which the step is compiled; in shorter simulations compiling takes more time than it saves.
 SOON = 1000
-_KEYS = (("a", "d"), ("s", "w"))  # keyboard keys for the low and the high end of the first two inputs
+_KEYS = (("a", "d"), ("s", "w"))  # keys for the lower and the upper bound of the first two inputs
 _INTEGER, _FLOAT32 = np.dtype(np.int64), np.dtype(np.float32)
 _ACTIONS = (_FLOAT32, np.dtype(np.float64))  # dtypes of actions that need no conversion
 
@@ -65,13 +65,13 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     system : str or System
         A shipped name, ``"module:Class"``, ``"script.py:Class"``, or a :class:`kkl_gym.System`.
     dt : float, optional
-        Sampling interval in seconds. None takes the system's own, 0.01 s for those that ship.
+        Sampling interval in seconds. None takes the system's own, 0.01 s for the shipped ones.
     process_noise : float, optional
         Bound of the uniform noise w, as a multiple of the system's ``scale`` per second:
         \|w_i\| <= process_noise * scale_i. None takes the system's own default.
     measurement_noise : float or sequence of float, length ny, optional
         Standard deviation of the Gaussian noise v on each sample: one for all outputs, or one for each. None takes the
-        system's own: 0.5 for those that ship, and by default 5 % of the range of each output over X.
+        system's own: 0.5 for the shipped ones, else by default 5 % of the range of each output over X.
     observe : {"state", "output"}
         Whether the agent sees the state x or the output y.
     parameters : mapping of str to float, optional

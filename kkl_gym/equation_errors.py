@@ -16,7 +16,7 @@ from kkl_gym.tracing import Symbol
 from kkl_gym.user_lines import line_of, path_of, steps_within, text_of
 
 METHODS = ("f", "g", "h", "rate", "step", "reward", "terminated")
-_SERVING = "floats, arrays, tensors and symbols"
+_TYPES = "floats, arrays, tensors and symbols"
 # Functions of other modules that fail on some types of numbers, and their names in kkl_gym.elementary.
 _FUNCTIONS = {name: name for name in vars(elementary) if not name.startswith("_")} | {
     "max": "maximum", "fmax": "maximum", "amax": "maximum", "Max": "maximum", "min": "minimum", "fmin": "minimum",
@@ -127,14 +127,14 @@ def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     known = [_FUNCTIONS[name] for name in called if name in _FUNCTIONS]
     # The hint also serves floats, as for math.sqrt(-1), but not their TypeErrors, as for abs(x) of the whole state.
     if known and not (on_floats and isinstance(error, TypeError)):
-        return f": use kkl_gym.elementary.{known[0]}, which serves {_SERVING}"
+        return f": use kkl_gym.elementary.{known[0]}, which takes {_TYPES}"
     if "truth value" in str(error) or "Boolean value" in str(error):
         return (
             ", on which `if`, `and`, `or` and `not` cannot decide: use kkl_gym.elementary.where, minimum, maximum "
             "or clip, and combine conditions by & and |"
         )
     if isinstance(error, IndexError) or "unpack" in str(error):
-        return f", {len(x)} of them"
+        return f": x has {len(x)} components"
     if not on_floats and not isinstance(error, NameError | KeyError | ArithmeticError):
-        return f": equations take arithmetic and the functions of kkl_gym.elementary, which serve {_SERVING}"
+        return f": equations take arithmetic and the functions of kkl_gym.elementary, which take {_TYPES}"
     return ""

@@ -203,7 +203,7 @@ def _check_components(equations: Any, values: Any, n: int | None, *, like: Any, 
         raise returned(equations, wanted, f"{len(values)} of them: {shown(values)}")
     for i, value in enumerate(values):
         if not _fits(value, like):
-            raise returned(equations, wanted, f"{shown(values)}, of which [{i}] is {_misfit(value, like)}")
+            raise returned(equations, wanted, f"{shown(values)}, whose entry [{i}] is {_misfit(value, like)}")
 
 
 def _fits(value: Any, like: Any) -> bool:

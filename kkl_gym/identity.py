@@ -28,7 +28,7 @@ def check_autoreset(env: Any) -> None:
     for one in base.envs if isinstance(base, gym.vector.SyncVectorEnv) else [env]:
         while isinstance(one, gym.Wrapper):
             if isinstance(one, gym.wrappers.Autoreset):
-                raise ValueError("Autoreset inside hides where episodes begin: put it outside")
+                raise ValueError("the wrapper Autoreset inside hides where episodes begin: put it outside")
             one = one.env
 
 

@@ -180,7 +180,7 @@ def turned(cosines: np.ndarray, sines: np.ndarray, before: np.ndarray | float) -
 
 
 def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Return the matrix that orthonormalises w, slowest first; its covariance is a mean over correlation times of y."""
+    """Return the matrix that orthonormalises w, slowest first, under a covariance averaged over correlation times."""
     covariance = np.zeros((len(decay), len(decay)))
     for correlation in np.geomspace(2 * time_constants[0], 8 * time_constants[-1], 6):
         # y has the variance 1, and the autocorrelation 1 - forgotten after a step.

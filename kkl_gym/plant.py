@@ -68,7 +68,7 @@ class Plant:
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Draw w (NOISE_BLOCK, nx) and v (NOISE_BLOCK, nv), which :meth:`noise` scales."""
-        # A sensor draws from its own generator, so that a seed gives the same motions and noise without one.
+        # A sensor draws from its own generator, so that a seed gives the same motions and noise without a sensor.
         n, ny = NOISE_BLOCK, self.ny
         w = rng.random((n, len(self._w_range)), out=w)
         if not self._random:
@@ -150,7 +150,7 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
         raise ValueError(f"start_box must be (low, high) for each of {system.nx} states, got {shown(box)}")
     if not ((low <= ends[:, 0]) & (ends[:, 0] <= ends[:, 1]) & (ends[:, 1] <= high)).all():
         raise ValueError(
-            f"start_box must lie within the declared bounds {system.bounds}, low before high, got {shown(box)}"
+            f"start_box must lie within the declared bounds {system.bounds}, with low <= high, got {shown(box)}"
         )
     return ends[:, 0], ends[:, 1]
 

@@ -91,7 +91,7 @@ class Sensor:
                 raise ValueError(f"the sensor's saturation must be (low, high), got {shown(self.saturation)}")
             ends = tuple(_each(f"the sensor's saturation[{i}]", end, _finite) for i, end in enumerate(self.saturation))
             if len({len(end) for end in ends if isinstance(end, tuple)}) < 2 and not np.all(np.less(ends[0], ends[1])):
-                raise ValueError(f"the sensor's saturation must be (low, high), low before high, got {ends}")
+                raise ValueError(f"the sensor's saturation must be (low, high) with low < high, got {ends}")
             object.__setattr__(self, "saturation", ends)
 
     @property

@@ -72,13 +72,13 @@ class Outputs:
             taken = _positions("measured", self.measured, owners)
         each = [angle if isinstance(angle, tuple) else (angle,) for angle in self.angles]
         if keys and each and not isinstance(each[0][0], str):
-            raise ValueError(f"angles must be keys, as those of measured are, got {self.angles}")
+            raise ValueError(f"angles must be keys, because measured holds keys, got {self.angles}")
         at = [tuple(_positions("angles", (entry,), owners) for entry in angle) for angle in each]
         if not {i for angle in at for entry in angle for i in entry} <= set(taken):
             raise ValueError(f"angles must be among the measured entries, {self.measured}, got {self.angles}")
         plain = [i for angle in at if len(angle) == 1 for i in angle[0]]
         if period is not None and not plain:
-            raise ValueError(f"period = {period:g} is a turn of entries that are angles, and angles names none")
+            raise ValueError(f"period = {period:g} has no effect: no entry of angles is an angle itself")
         units = {i: TURN / (self.period or self._period_of(low[i], high[i], self._names[i])) for i in plain}
         self._take = np.repeat(taken, [1 + (i in units) for i in taken])
         self._whole = self._take.tolist() == list(range(len(owners)))
@@ -153,7 +153,7 @@ class Outputs:
 
 
 class Inputs:
-    """Inputs from an environment's actions: bounded boxes scaled to [-1, 1], Discrete actions one-hot."""
+    """The inputs in an environment's actions: bounded boxes scaled to [-1, 1], Discrete actions one-hot."""
 
     def __init__(self, space: Space, *, source: str) -> None:
         self._space, self._source = space, f"the action of {source}"
@@ -272,8 +272,8 @@ def _signals(source: str, space: Space, value: Any, batch: tuple[int, ...]) -> n
     try:
         return _read(space, value, batch)
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        many = f", {batch[0]} times," if batch else ""
-        raise ValueError(f"{source} must be of {space}{many or ','} got {shown(value)}") from error
+        values = f"{batch[0]} values" if batch else "a value"
+        raise ValueError(f"{source} must be {values} of {space}, got {shown(value)}") from error
 
 
 def _read(space: Space, value: Any, batch: tuple[int, ...]) -> np.ndarray:

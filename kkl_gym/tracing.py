@@ -13,7 +13,7 @@ _COMPARISONS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": 
 
 
 class Tape:
-    """The operations recorded so far; ``exact`` if machine code rounds each of them as Python does."""
+    """The operations recorded so far; ``exact`` means that machine code rounds each of them as Python does."""
 
     def __init__(self) -> None:
         self.names: dict[str, str] = {}  # names of results, by operation

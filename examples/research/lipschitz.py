@@ -28,8 +28,8 @@ CHUNK = 4096  # points whose Jacobians are computed together
 class Lipschitz:
     """Bound the Lipschitz constant of T_inv: |x_hat(z + d) - x_hat(z)| <= constant |d| for all z and d.
 
-    T_inv is the map for motion without input, long after the reset. The lower bound is the largest Jacobian along
-    unseen motions.
+    T_inv is the map for motion without input, long after the reset. The lower bound is the largest norm of a Jacobian
+    along unseen motions.
     """
 
     observers: Observers

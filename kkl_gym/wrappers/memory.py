@@ -65,7 +65,9 @@ class _Remembering:
         self._beside = [] if keys is None else [*self.outputs.unseen, *range(len(self.outputs.low), self.memory.size)]
         if keys is not None:
             if weights is not None or "memory" in keys:
-                raise ValueError(f"{source}: with weights or a key named memory, measured must hold indices, as [0, 1]")
+                raise ValueError(
+                    f"{source}: with weights or a key named memory, measured must hold indices, such as [0, 1]"
+                )
             low, high = low[self._beside], high[self._beside]
         with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
             flat = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)

@@ -222,7 +222,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         ValueError
             If the noise level is beyond the new maps' range, or they have no limits for the monitor in use.
         observers.ArtifactError
-            If A, B, dt or the signals differ, or the file is missing or damaged.
+            If the filters' A, B or dt or the signals differ, or the file is missing or damaged.
         """
         self._estimator.replace(observer)
 

@@ -48,7 +48,7 @@ class VectorEstimate(VectorWrapper):
         while self._inside is not None and not isinstance(self._inside, KKLVectorEnv | VectorEstimate):
             self._inside = getattr(self._inside, "env", None)
         rendering = isinstance(env.unwrapped, KKLVectorEnv) and env.render_mode is not None
-        self._trails = Trails(env.num_envs) if rendering else None  # of the estimates
+        self._trails = Trails(env.num_envs) if rendering else None  # trails of the estimates
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None

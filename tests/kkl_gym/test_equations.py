@@ -69,7 +69,7 @@ def test_scripts_without_mistake(tank):
     ("x[1], -math.sin(x[0])", ["TypeError", "x held arrays of shape", "use kkl_gym.elementary.sin"]),
     ("x[1], math.sqrt(-x[0])", ["ValueError", "x = (", "use kkl_gym.elementary.sqrt"]),
     ("x[1], self.kk * x[0]", ["AttributeError: 'Tank' object has no attribute 'kk'; x = ("]),
-    ("x[2], x[0]", ["IndexError", ", 2 of them"]),
+    ("x[2], x[0]", ["IndexError", "x has 2 components"]),
 ])  # fmt: skip
 def test_an_equation_that_raises(tank, f, texts):
     path = tank(f=f)

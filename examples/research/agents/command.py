@@ -41,13 +41,13 @@ class Compare:
     information: Annotated[
         tuple[Kind, ...] | None, tyro.conf.arg(help_behavior_hint="(default: those of the published tables)")
     ] = None
-    """Information that agents see (docs/guides/agents.md); ekf serves only systems."""
+    """Information that agents see (docs/guides/agents.md); ekf exists only for systems."""
     seeds: int = comparison.SEEDS
     """Number of agents of each kind. On systems there are at most 3 recurrent agents, which take longest, and 1 at the
     second noise level."""
     episodes: int = 100
     """Number of evaluation episodes of each agent."""
-    timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None
+    timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: from the hyperparameters)")] = None
     """Number of actions in a training, over all environments."""
     measurement_noise: Annotated[
         NoiseLevels, tyro.conf.arg(help_behavior_hint="(default: the task's own, on Van der Pol also 0.2, on Lorenz 2)")

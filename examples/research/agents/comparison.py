@@ -186,7 +186,7 @@ def planned(
     observers: dict[str, str] | None = None,
     **how: Any,
 ) -> list[ComparedAgent]:
-    """Return all agents of a comparison, ordered by seed; in environments, noise levels share those without noise."""
+    """Return the agents of a comparison, by seed; in environments, all noise levels share the agents without noise."""
     agents: dict[Path, ComparedAgent] = {}
     for seed in range(seeds):
         for task in tasks:

@@ -54,7 +54,7 @@ class Benchmark:
 
     def run(self, console: Console) -> Path:
         """Run the missing jobs, then report."""
-        from examples.research.benchmark.results import check_results, collect, report  # slow: pandas
+        from examples.research.benchmark.results import check_results, collect, report  # imports pandas, which is slow
 
         name = "quick" if self.quick else self.budget
         out = self.out or Path("runs") / "benchmark" / name

@@ -46,7 +46,7 @@ def with_shared_noise(
 
 
 def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Return the mean of each component's SMAPE, (n,), as the paper's notebooks print it after 20 % of the steps."""
+    """Return the mean of the components' SMAPEs, (n,); the paper's notebooks print it for the last 80 % of steps."""
     return np.mean([smape(x[..., [i]], x_hat[..., [i]], skip) for i in range(x.shape[-1])], axis=0)
 
 
@@ -100,7 +100,7 @@ def tuned_for(method: Method[Any], system: System) -> tuple[Level, ...] | None:
 
 
 def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
-    """Return a configuration's SMAPE on validation trajectories from X: the geometric mean over noise levels."""
+    """Return the median SMAPE on validation trajectories from X, as a geometric mean over noise levels."""
     n = protocol.trajectories
     runs = unseen_trajectories(
         system,

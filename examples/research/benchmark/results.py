@@ -41,7 +41,7 @@ def collect(out: Path, beside: Path | None = None) -> None:
                 }
             )
     if len(benchmarks := {(cost["budget"], cost["seed"]) for cost in costs}) > 1:
-        raise ValueError(f"{out} holds jobs of several benchmarks, {sorted(benchmarks)}; remove those of one")
+        raise ValueError(f"{out} holds jobs of several benchmarks, {sorted(benchmarks)}; keep only those of one")
     for name, frame in zip(FILES, (pd.concat(errors), pd.DataFrame(costs))):
         rows = _as_written(StringIO(frame.to_csv(index=False, float_format="%.4g")))
         if beside is not None:

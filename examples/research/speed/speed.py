@@ -33,8 +33,8 @@ class Speed:
     """Time environments, bare and with an observer, against Gymnasium's Pendulum-v1 and batched CartPole-v1.
 
     Actions are drawn before the timing. The environments run in turns, because a shared machine's speed drifts: each
-    ratio is the median over turns of the ratio to the reference in the same turn. Your own system has rows with an
-    observer if you name one. The references are also timed with the memory of `kkl_gym.KKLMemory`.
+    ratio is the median over turns of the ratio to the reference in the same turn. An observer for your own system
+    is timed if you name its file. The references are also timed with the memory of `kkl_gym.KKLMemory`.
 
     Times are CPU times of this process, which other processes hardly affect: run it with one thread. Further tables
     compare observers without an environment with extended Kalman filters on the same samples.
