@@ -21,7 +21,7 @@ from training.rollouts import make, roll_out
 from training.sources.recorded import recorded_errors
 
 AFTER = 20  # first steps of each rollout, whose errors do not count
-GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # a linear-quadratic regulator of the double pendulum
+GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # gains of a linear-quadratic regulator for the double pendulum
 
 
 def swing_up(obs: np.ndarray) -> np.ndarray:

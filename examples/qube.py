@@ -106,7 +106,7 @@ ENCODER = 2 * np.pi / 2048  # rad, resolution of both angles
 # deviations of the filter at a restart. APART: the observer also restarts the filter where the distance of their
 # estimates of alpha, as points on the unit circle, is larger.
 LONGER, STARTED, SURE, APART = 250, 0.3, (0.002, 0.3, 1.0, 4.0, 1.0), 0.5
-PUSHED = 1.0  # 0.1 mN m, standard deviation of the unknown torque on the arm
+PUSHED = 1.0  # standard deviation of the unknown torque on the arm, in 0.1 mN m
 
 
 def main(

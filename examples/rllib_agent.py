@@ -18,7 +18,7 @@ import kkl_gym
 
 
 def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
-    """Batched environments with their observer inside: 20 s long, an action every 0.05 s.
+    """Make batched environments with their observer inside: episodes of 20 s, an action every 0.05 s.
 
     RLlib calls this function in each env runner and sends it only names. The runner itself imports kkl_gym and reads
     the observer's file.

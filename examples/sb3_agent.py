@@ -11,7 +11,7 @@ from training.agents import SB3VecEnv
 
 
 def make_envs(env_id: str, num_envs: int) -> SB3VecEnv:
-    """Batched environments with their observer inside: 20 s long, an action every 0.05 s."""
+    """Make batched environments with their observer inside: episodes of 20 s, an action every 0.05 s."""
     envs = gym.make_vec(
         env_id, num_envs=num_envs, measurement_noise=0.2, max_episode_steps=2000, autoreset_mode="Disabled"
     )

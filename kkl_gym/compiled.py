@@ -38,7 +38,7 @@ Values = TypeVar("Values")
 Advance = Callable[[Values, Values, Values, float], Values]
 """Maps (x, u, w, dt) to the next x."""
 
-# Longer programs, as of a neural network as f, would take many seconds to compile.
+# Longer programs, such as a neural network for f, would take many seconds to compile.
 MAX_OPERATIONS = 500
 _TRIALS = 200  # trial states of each kind, at which machine code is compared with Python
 _MAX_TRIAL_SUBSTEPS = 64  # trial states that need more substeps are skipped, because Python is slow there

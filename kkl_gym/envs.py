@@ -1,4 +1,4 @@
-"""Gymnasium environments over the systems: process noise, measurement noise and a bounded input."""
+"""Gymnasium environments of single systems, with process noise, measurement noise and a bounded input."""
 
 import itertools
 from collections import deque
@@ -152,7 +152,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         self._window: Window | None = None
         # The last observation. An observer wrapper outside compares it with the observation that it receives.
         self.emitted = b""
-        # Observer wrappers are numbered from inside, and the last one draws the window; 0: the environment draws it.
+        # Number of observer wrappers outside. The outermost draws the window; 0: the environment draws it.
         self.drawn_by = 0
 
     def reset(

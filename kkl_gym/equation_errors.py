@@ -125,7 +125,7 @@ def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     on_floats = isinstance(x[0], Real)
     called = re.findall(r"(?:(?:math|cmath|np|numpy|torch|sympy)\.|(?<![\w.]))(\w+)\(", text_of(step))
     known = [_FUNCTIONS[name] for name in called if name in _FUNCTIONS]
-    # The hint also serves floats, as for math.sqrt(-1), but not their TypeErrors, as for abs(x) of the whole state.
+    # On floats the hint is right where math.sqrt(-1) failed, but not for a TypeError, as of abs(x) on the whole state.
     if known and not (on_floats and isinstance(error, TypeError)):
         return f": use kkl_gym.elementary.{known[0]}, which takes {_TYPES}"
     if "truth value" in str(error) or "Boolean value" in str(error):

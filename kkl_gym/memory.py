@@ -18,7 +18,7 @@ CLOSEST = 1.5
 IMAGINED = 64
 # Up to this number of coordinates, one matrix product advances a single memory faster than several NumPy calls.
 SMALL = 200
-# After this number of the longest time constants, the past before the reset has the weight e^-20 and is neglected.
+# After this multiple of the longest time constant, the past before the reset has the weight e^-20 and is neglected.
 FILLED = 20
 TURN = 2 * math.pi
 
@@ -82,7 +82,10 @@ class Memory:
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two matrices for rows: a step of [signals, w, v, next signals, u], and the mixing of [signals, w, v]."""
+        """Two matrices that multiply rows from the right.
+
+        The first makes a step of [signals, w, v, next signals, u], and the second mixes [signals, w, v].
+        """
         n, m, nu, of_inputs = len(self._signals), len(self.decay), self._nu, len(self.input_decay)
         each, rise = np.eye(n), np.kron(self.rise, np.eye(n))
         sizes = np.cumsum([n, m * n, of_inputs * nu, n, nu])

@@ -14,7 +14,7 @@ from kkl_gym.system import Box, Components, System
 from kkl_gym.systems import get_system
 from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
-# To bound the outputs, h is evaluated at this number of random states, and on a grid of about as many states at most.
+# Number of random states at which h is evaluated to bound the outputs; a grid has about as many states at most.
 _MOST_POINTS = 1000
 # The noise of this number of samples is drawn at once, because single draws take longer than the simulation.
 NOISE_BLOCK = 256

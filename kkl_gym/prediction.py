@@ -8,7 +8,7 @@ import numpy as np
 from kkl_gym.memory import Memory
 from observers.checks import real_array
 
-# A combination is kept if its variance exceeds this multiple of the variance that a fit to white noise would have.
+# Predictions are kept if their variance exceeds this multiple of the variance that a fit to white noise would have.
 CHANCE = 3.0
 # The fit needs this number of samples for each feature.
 SAMPLES = 10

@@ -102,7 +102,7 @@ class Outputs:
         self.unseen = np.sort([*self._cosines, *self._sines]).astype(int)
 
     def _period_of(self, low: float, high: float, name: str) -> float:
-        """Return the length of a turn in the unit of an angle, which follows from the angle's bounds."""
+        """Return the length of a turn in an angle's unit, as it follows from the angle's bounds."""
         width = high - low
         if np.isinf(width) or (width < 2.01 * TURN and width not in UNITS):
             return TURN

@@ -169,7 +169,7 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
-    """Return the state after one interval, with substeps that follow the error; ``end`` if x leaves the bounds."""
+    """Return the state after an interval by substeps whose length follows the error; ``end`` if x leaves the bounds."""
     # Motions that accelerate, as at an ignition, need such substeps. They also verify an escape, because equal substeps
     # that were too long at the end of the interval may have left the bounds only by their error.
     if system.discrete:

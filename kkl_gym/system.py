@@ -114,7 +114,7 @@ class System:
             object.__setattr__(self, name, float(value))
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        # Another process finds a class of a user's script by the path of the script.
+        # Another process finds a class in a user's script by the script's path.
         script = getattr(sys.modules.get(type(self).__module__), "__kkl_gym_script__", None)
         return _restored, (f"{script}:{type(self).__qualname__}" if script else type(self), self.parameters)
 

@@ -9,7 +9,7 @@ import numpy as np
 from kkl_gym.equations import components
 from kkl_gym.system import Components
 
-# Functions that some releases of sympy cannot print for NumPy, or print for arrays of one shape only.
+# NumPy's form of functions that some releases of sympy cannot print, or print for arrays of one shape only.
 _IN_NUMPY = {
     "largest": lambda *values: functools.reduce(np.maximum, values),
     "smallest": lambda *values: functools.reduce(np.minimum, values),

@@ -72,7 +72,7 @@ def engine(workers: int) -> Iterator[Engine]:
 
 
 def _end_with(parent: int) -> None:
-    """End this worker soon after its parent is killed; loky's workers would finish their jobs."""
+    """End this worker soon after its parent is killed; otherwise loky's workers finish their jobs."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -55,7 +55,7 @@ class Job(ABC):
 
 def run_job(job: Job) -> None:
     """Run a job in one thread, unless it is done."""
-    import torch  # imported here, because --help need not wait for torch
+    import torch  # imported here, so that --help does not wait for torch
 
     torch.set_num_threads(1)
     with claimed_job(job.folder, job.identity, job.other):

@@ -46,7 +46,7 @@ WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 class Cell:
     """Agents of one kind in one task.
 
-    Shapes: ``values``, ``scores`` (n,). ``scores`` and ``interval`` are normalised, NaN if the task has no scale.
+    Shapes: ``values``, ``scores`` (n,). ``scores`` and ``interval`` are normalised, NaN without idle or best agents.
     """
 
     values: np.ndarray

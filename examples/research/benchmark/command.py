@@ -83,7 +83,7 @@ class Benchmark:
 
     def jobs(self, name: str, out: Path) -> "list[Training]":
         """Make the jobs of a budget; ValueError if an option is invalid."""
-        from examples.research.benchmark import budgets  # imported here, because --help need not wait for torch
+        from examples.research.benchmark import budgets  # imported here, so that --help does not wait for torch
         from examples.research.benchmark.jobs import Training
         from examples.research.methods import METHODS, get_method
 

@@ -1,6 +1,6 @@
-"""The gain of each idea: pipelines that differ from the next one in a few settings, trained for equal times.
+"""Ablation: series of pipelines, each of which differs from the next in a few settings, trained for equal times.
 
-One series of steps leads from the paper's SPINN to the package's, the other from inverses without T to the default.
+One series leads from the paper's SPINN to the package's, the other from inverses without T to the default.
 """
 
 from collections.abc import Callable, Mapping

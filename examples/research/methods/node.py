@@ -1,4 +1,4 @@
-"""Learned diagonal spectrum, T_inv trained through the filter (Miao and Gatsis, 2023)."""
+"""The method of Miao and Gatsis (2023): a diagonal filter and T_inv are trained together."""
 
 from typing import ClassVar
 
@@ -81,8 +81,8 @@ class NODENoise(NODE):
 class _Problem(nn.Module):
     """The trained parts: T_inv, and the logarithms of the rates -theta, which all outputs share.
 
-    The components of z are nearly collinear. Its principal directions under the initial spectrum are scaled to unit
-    variance, down to ``SOFT_FLOOR`` of the largest. Full whitening would have to follow the learned spectrum.
+    The components of z are nearly collinear. The principal directions of z under the initial spectrum are scaled to
+    unit variance, down to ``SOFT_FLOOR`` of the largest. Full whitening would have to follow the learned spectrum.
     """
 
     def __init__(self, task: Task, noise: float, fastest: float, slowest: float) -> None:
@@ -152,7 +152,7 @@ def rollout(
     gaps = np.diff(ages, prepend=0)
     powers = torch.eye(len(transition), dtype=transition.dtype)[None]
     square = transition
-    while len(powers) <= gaps.max():  # I, F, F^2, ... by doubling
+    while len(powers) <= gaps.max():  # all powers of the transition, by doubling
         powers = torch.cat([powers, powers @ square])
         square = square @ square
     # w = z - late y follows w_k+1 = transition w_k + (early + transition late) y_k, with one sample of y in each step.

@@ -21,8 +21,8 @@ ROWS, CHUNK = 64, 100  # rows of a batch, and samples of truncated back-propagat
 WIDTH = 64  # width of features and hidden vectors
 LEARNING_RATE = 3e-3
 READOUT = 128  # neurons of the layer between the hidden vector and the estimate
-FAINT_NOISE = 0.01  # share of the system's own level, below which the noise feature is linear; above, it is logarithmic
-ROUNDING = 1e-3  # share of a state's standard deviation, below which the error's length is smoothed
+FAINT_NOISE = 0.01  # levels below this share of the system's own enter linearly, higher ones logarithmically
+ROUNDING = 1e-3  # errors shorter than this share of a state's standard deviation are smoothed
 
 
 class Cell(nn.Module):
