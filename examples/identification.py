@@ -25,7 +25,7 @@ from training.records import Record
 from training.trajectories.motions import draw_process_noise
 
 FIRST_GUESSES = {
-    "reverse_duffing": {"b": 0.6},  # y determines only one of a and b
+    "reverse_duffing": {"b": 0.6},  # y determines b only if a is known
     "van_der_pol": {"mu": 1.5},
     "rossler": {"a": 0.13, "b": 0.28, "c": 4.0},
     "lorenz": {"sigma": 7.0, "rho": 20.0, "beta": 2.0},

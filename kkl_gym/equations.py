@@ -103,7 +103,8 @@ def check_equations(system: Any) -> None:
         if batch.shape != alone.shape or not np.allclose(batch, alone, rtol=1e-3, atol=rounding):
             wanted = "for each state of a batch the value that it returns for this state alone, at every call"
             found = f"{batch[0].tolist()} in a batch and {alone[0].tolist()} alone; {held(starts[0])}"
-            raise returned(equations, wanted, f"{found}: sum, max and norm mix states, use arithmetic on components")
+            fix = "sum, max and norm mix the states of a batch, so use arithmetic on components"
+            raise returned(equations, wanted, f"{found}: {fix}")
     try:
         target_of(system)
     except EquationError as error:

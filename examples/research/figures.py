@@ -69,13 +69,13 @@ DARK = {
 
 
 def estimates(duration: float = 15.0) -> Draw:
-    """States and estimates of all systems: ``kkl-gym demo --duration 15``."""
+    """Return the drawing of ``kkl-gym demo --duration 15``: states and estimates of all systems."""
     episodes = [demo.play(one, round(duration / one.system.dt), None, seed=0) for one in shown(None, None)]
     return lambda path: demo.draw(path, episodes)
 
 
 def portraits(name: str | None = None, duration: float = 12.0) -> Draw:
-    """Animated phase portraits of one system or all: ``kkl-gym demo --gif --seed 7 --duration 12``."""
+    """Return the animation of ``kkl-gym demo --gif --seed 7 --duration 12``: phase portraits of one system or all."""
     episodes = [demo.play(one, round(duration / one.system.dt), None, seed=SEED) for one in shown(name, None)]
     return lambda path: demo.animate(path, episodes)
 
@@ -91,19 +91,19 @@ def agents() -> tuple[Task, Mapping[str, Episodes]]:
 
 
 def agents_moving() -> Draw:
-    """Animated phase portraits of both agents."""
+    """Return the animation of both agents' phase portraits."""
     task, played = agents()
     return lambda path: picture.animate(task, played, path)
 
 
 def agents_over_time() -> Draw:
-    """States, outputs and inputs of both agents."""
+    """Return the drawing of both agents' states, outputs and inputs."""
     task, played = agents()
     return lambda path: picture.draw(task, played, path)
 
 
 def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
-    """Each state, its estimate and the band of 90 % of the errors, in the run of ``kkl-gym demo``."""
+    """Return the drawing of states, estimates and bands of 90 % of the errors, in the run of ``kkl-gym demo``."""
     (environment,) = shown(name, None)
     episode = demo.play(environment, round(duration / environment.system.dt), None, seed=0)
     observer = load(name, environment.system.measurement_noise)
@@ -136,7 +136,7 @@ def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
 
 
 def noise_levels() -> Draw:
-    """Errors by noise level for the shipped maps and some of the benchmark's observers."""
+    """Return the drawing of errors by noise level, for shipped maps and some of the benchmark's observers."""
     files = RESULTS / "accuracy.csv", RESULTS / "tracking" / "accuracy.csv"
     ours = pd.concat(map(pd.read_csv, files))
     rivals = pd.read_csv(RESULTS / "benchmark" / "results.csv")
@@ -188,7 +188,7 @@ def errors_of_runs(
 
 
 def errors_over_time(**sizes: Any) -> Draw:
-    """Medians and bands of errors at each step for observers and Kalman filters, by system and noise level."""
+    """Return the drawing of medians and bands of errors over time, for observers and Kalman filters."""
     errors = {level: errors_of_runs(level, **sizes) for level in LEVELS}
 
     def draw(path: Path) -> None:

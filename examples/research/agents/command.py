@@ -43,8 +43,8 @@ class Compare:
     ] = None
     """Information that agents see (docs/guides/agents.md); ekf exists only for systems."""
     seeds: int = comparison.SEEDS
-    """Number of agents of each kind. On systems there are at most 3 recurrent agents, which take longest, and 1 at the
-    second noise level."""
+    """Number of agents of each kind. On systems there are at most 3 recurrent agents, which take longest, and
+    only 1 at the second noise level."""
     episodes: int = 100
     """Number of evaluation episodes of each agent."""
     timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: from the hyperparameters)")] = None

@@ -102,7 +102,7 @@ class Speed:
         counts: Mapping[int, int],
         progress: ProgressBars,
     ) -> None:
-        """Time observers and Kalman filters without environments; ``counts`` has the number of samples by rows."""
+        """Time observers and Kalman filters without environments; ``counts`` are samples by number of rows."""
         lines = []
         for name, system in systems.items():
             artifact = Artifact.read(resolve(name))
