@@ -1,5 +1,5 @@
 PYTHON ?= python3
-# Each Python that is named has an environment of its own: .venv, or .venv-3.12 for make test PYTHON=python3.12.
+# make test PYTHON=python3.12 takes the virtual environment .venv-3.12 in place of .venv.
 VERSION := $(filter-out 3,$(patsubst python%,%,$(notdir $(PYTHON))))
 VENV := .venv$(if $(VERSION),-$(VERSION))
 BIN := $(VENV)/bin
@@ -12,16 +12,16 @@ LARGE := $(SYSTEMS:%=%-large)
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
 
-install: $(VENV)/ready  ## make the environment .venv with everything in it
+install: $(VENV)/ready  ## make the virtual environment .venv with the package, all extras and the tools
 
-# Two processes of one thread each: with more threads they get in each other's way.
-test: $(VENV)/ready $(if $(AREA),,lint)  ## all that CI runs; AREA=training/maps runs tests/training/maps alone
+# Two processes of one thread each: more threads would compete for the cores.
+test: $(VENV)/ready $(if $(AREA),,lint)  ## lint, then all tests; AREA=training/maps runs tests/training/maps alone, without lint
 	$(if $(AREA),$(BIN)/pytest tests/$(AREA),OMP_NUM_THREADS=1 $(BIN)/pytest -n 2)
 
-test-coverage: $(VENV)/ready  ## the same tests, and which lines they run, in htmlcov; takes a quarter longer
+test-coverage: $(VENV)/ready  ## all tests, and a report in htmlcov of the lines that they run; takes a quarter longer
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --cov --cov-report=html
 
-guard: $(VENV)/ready  ## what must not change: estimates, dynamics, names, held-out errors, short trainings; two minutes
+guard: $(VENV)/ready  ## compare estimates, dynamics, names, held-out errors and short trainings with stored ones; two minutes
 	OMP_NUM_THREADS=1 $(BIN)/python tests/guard/guard.py
 
 test-slow: $(VENV)/ready  ## the tests that train for minutes
@@ -30,34 +30,34 @@ test-slow: $(VENV)/ready  ## the tests that train for minutes
 test-research: $(VENV)/ready  ## the longer tests of examples/research, five minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m research
 
-test-long: $(VENV)/ready  ## campaigns of kills and random steps, half an hour; they print counts
+test-long: $(VENV)/ready  ## half an hour of killed trainings, random steps and repetitions; prints counts
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m long -s
 
-test-browser: $(VENV)/ready  ## the demo in headless Chromium; it says what to install
+test-browser: $(VENV)/ready  ## test the demo in headless Chromium; a failure names the packages to install
 	$(BIN)/python -m pip install --quiet --group browser
 	$(BIN)/pytest tests/browser -m browser
 
-lint: $(VENV)/ready  ## style, types and the contract of imports
+lint: $(VENV)/ready  ## check style, types and the direction of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-format: $(VENV)/ready  ## mend what can be mended of style
+format: $(VENV)/ready  ## correct style where ruff can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Into runs/. What ships lies in observers/maps: NAME, NAME-large and NAME-spinn.
-# One thread each, with which the same machine makes the same numbers to the last bit.
-maps: $(SYSTEMS:%=maps-%)  ## train the shipped maps again, an hour, or one with make -j 2 maps; resumable
+# The maps are written into runs/; NAME, NAME-large and NAME-spinn in observers/maps ship.
+# Each training has one thread, so that the same machine reproduces it to the last bit.
+maps: $(SYSTEMS:%=maps-%)  ## train the shipped maps again, about an hour, two at once with make -j 2 maps; resumable
 
 maps-%: $(VENV)/ready
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym train $* --resume
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym train $* --size large --resume
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym train $* --pipeline spinn --resume
 
-# T_inv alone is that of NAME-large, without tracking.
-results: $(VENV)/ready  ## the accuracy in the README and in docs/
+# The rows on T_inv alone come from NAME-large without tracking.
+results: $(VENV)/ready  ## the tables of accuracy in README.md and docs/results
 	mkdir -p runs/calibration
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --measurement-noise 0 0.1 0.5 1 --ekf --limit \
 		--csv docs/results/tracking/accuracy.csv
@@ -72,10 +72,10 @@ results: $(VENV)/ready  ## the accuracy in the README and in docs/
 	cp $(SYSTEMS:%=runs/calibration/%.csv) docs/results/tracking
 	$(MAKE) figures
 
-figures: $(VENV)/ready  ## the pictures of the pages, light and dark, from the files in docs/results, two minutes
+figures: $(VENV)/ready  ## the figures of the pages, light and dark, from the files in docs/results, two minutes
 	$(BIN)/python -m examples.research.figures
 
-benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; resumable
+benchmark: $(VENV)/ready  ## the benchmark: every method on every system, hours on two cores; resumable
 	$(BIN)/python -m examples.research benchmark
 	mkdir -p docs/results/benchmark
 	cp $(addprefix runs/benchmark/cpu/,results.csv methods.csv table.md) docs/results/benchmark
@@ -85,18 +85,18 @@ SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transi
 ABLATION := ablation-spinn $(SPINN) ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
 	default
 
-ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumable
+ablation: $(VENV)/ready  ## the ablation: how each change of the method changes errors, an hour on two cores; resumable
 	$(BIN)/python -m examples.research benchmark --budget short --methods $(ABLATION) --out runs/benchmark/ablation
 	mkdir -p docs/results/ablation
 	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md) docs/results/ablation
 	$(MAKE) figures
 
-faults: $(VENV)/ready  ## the faults in docs/results
+faults: $(VENV)/ready  ## the table of sensor faults in docs/results
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --faults --csv docs/results/faults/faults.csv
 	$(MAKE) figures
 
-# The one on y is what `kkl-gym agent train van_der_pol --information y` makes, for the picture of two agents side by side.
-agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: an hour and a half on two cores; resumable
+# The figure of two agents side by side needs the agent on y, van_der_pol-y.
+agents: $(VENV)/ready  ## every agent in docs/results/agents.md, and those that ship, an hour and a half on two cores; resumable
 	$(BIN)/python -m examples.research agents
 	$(BIN)/python -m examples.research agents reverse_duffing van_der_pol --information x_hat_std --measurement-noise 0.5
 	mkdir -p docs/results/agents training/agents/shipped
@@ -109,7 +109,7 @@ agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that s
 HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0 LunarLander-v3 InvertedPendulum-v5 \
 	InvertedDoublePendulum-v5 Reacher-v5 Hopper-v5 HalfCheetah-v5
 
-environments: $(VENV)/ready  ## agents that see a part of other environments, hours on two cores; resumable
+environments: $(VENV)/ready  ## agents that see a part of Gymnasium's environments, hours on two cores; resumable
 	$(BIN)/python -m examples.research agents $(HIDDEN)
 	mkdir -p docs/results/environments
 	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
@@ -124,16 +124,16 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 	cp runs/agents/short/results.csv docs/results/environments/short.csv
 	$(MAKE) figures
 
-speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
+speed: $(VENV)/ready  ## the speed of environments, beside Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/python -m examples.research speed
 
-# RLlib pins Gymnasium, and Tianshou what tyro needs: each has an environment of its own.
+# RLlib pins a version of Gymnasium, and Tianshou one of a package that tyro needs: each has a virtual environment.
 CLIENTS_zoo := --editable ".[agents]" rl-zoo3 torchrl "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
 CLIENTS_rllib := --editable . "distributed>=2025.1" "ray[rllib]>=2.40" "torch<2.14" tyro
 CLIENTS_tianshou := --editable . "tianshou[eval]>=2" "torch<2.14"
 CLIENTS := zoo rllib tianshou
 
-clients: $(CLIENTS:%=.venv-clients-%/ready)  ## programs of others on our environments, as they are; CLEANRL=FILE.py adds one
+clients: $(CLIENTS:%=.venv-clients-%/ready)  ## other libraries, unchanged, on the environments; CLEANRL=FILE.py adds CleanRL's script
 	status=0; for name in $(CLIENTS); do CLEANRL="$(if $(CLEANRL),$(abspath $(CLEANRL)))" RAY_worker_niceness=0 \
 		.venv-clients-$$name/bin/pytest -W default -m clients tests/clients || status=1; done; \
 		cat runs/clients/table.md; exit $$status
@@ -144,7 +144,7 @@ clients: $(CLIENTS:%=.venv-clients-%/ready)  ## programs of others on our enviro
 	$(@D)/bin/python -m pip install --quiet pytest $(CLIENTS_$*)
 	touch $@
 
-# With what they print and draw, which the files in examples/ do not hold.
+# The notebooks with their printed lines and figures, which the files in examples/ lack.
 TALKS := $(patsubst examples/%,runs/%,$(wildcard examples/notebooks/*.ipynb))
 
 runs/notebooks/%.ipynb: examples/notebooks/%.ipynb | $(VENV)/ready
@@ -156,7 +156,7 @@ docs: $(VENV)/ready $(TALKS)  ## the site, in runs/site, with the notebooks exec
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/site/mkdocs.yml
 	$(BIN)/python docs/demo/build.py runs/site/demo
 
-clean:  ## remove environments and caches; what lies under runs/ stays
+clean:  ## remove virtual environments and caches, but nothing under runs/
 	rm -rf .venv .venv-* .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache htmlcov .coverage .coverage.*
 	find kkl_gym observers training tests examples -name __pycache__ -type d -prune -exec rm -rf {} +
 
