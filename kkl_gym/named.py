@@ -51,8 +51,8 @@ def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str
             known = textwrap.shorten(", ".join(there), 200, placeholder=" ...") or "no numbers"
             ask = "" if not entries else ": name one entry of it"
             raise ValueError(
-                f"{role} names {name!r}, but an observation of {source} holds {known}{ask}; an index stands for its entry "
-                "(2 for obs[2]), and info[KEY] for an entry of info"
+                f"{role} names {name!r}, but an observation of {source} holds {known}{ask}; an index stands for its "
+                "entry (2 for obs[2]), and info[KEY] for an entry of info"
             )
         found += [f"{function[1]}({entry})" for entry in entries] if function else entries
     return tuple(found)
