@@ -27,12 +27,12 @@ from training.evaluation.errors import errors, unseen_trajectories
 from training.identification import adapt
 from training.records import Record
 
-WRONG = 1.1  # the plant's parameters over those of the observer's model
+WRONG = 1.1  # ratio of the plant's parameters to those of the observer's model
 
 
 @dataclass(frozen=True)
 class Compared:
-    """Median SMAPE in %, all steps, on unseen trajectories of the plant.
+    """Median SMAPE in %, over all steps of unseen trajectories of the plant.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def main(
         seconds: length of each record.
         seed: seed of the records.
         out: folder of the runs.
-        inverse_steps: batches of both trainings; by default as many as the shipped observer had.
+        inverse_steps: batches of both trainings; by default as many as for the shipped observer.
         trajectories: simulated trajectories of both trainings, with the same default.
     """
     console, model = Console(), get_system(system)

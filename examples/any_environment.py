@@ -21,7 +21,7 @@ from training.rollouts import make, roll_out
 from training.sources.recorded import recorded_errors
 
 AFTER = 20  # first steps of each rollout, whose errors do not count
-GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # a linear-quadratic regulator of the double pendulum
+GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # gains of a linear-quadratic regulator for the double pendulum
 
 
 def swing_up(obs: np.ndarray) -> np.ndarray:
@@ -50,7 +50,7 @@ def balance_both(obs: np.ndarray) -> np.ndarray:
     return np.float32([np.clip(-GAINS @ [obs[0], *angles, *obs[5:8]], -1, 1)])
 
 
-# The measured signals, the hidden ones, and the policy that acts.
+# For each environment: the measured signals, the hidden signals, and the policy that acts.
 CASES: dict[str, tuple[list[int], list[int], Callable]] = {
     "Pendulum-v1": ([0, 1], [2], swing_up),
     "CartPole-v1": ([0, 2], [1, 3], balance),
@@ -60,7 +60,7 @@ CASES: dict[str, tuple[list[int], list[int], Callable]] = {
 
 
 def exploring(policy: Callable, env: gym.Env, seed: int) -> Callable:
-    """A policy that draws a share of random actions for every hundred steps: none, some or all."""
+    """Return a policy with a share of random actions: 0, 0.3 or 1, drawn for every hundred steps."""
     rng, calls = np.random.default_rng(seed), 0
     env.action_space.seed(seed)
     share = 0.0
@@ -76,7 +76,7 @@ def exploring(policy: Callable, env: gym.Env, seed: int) -> Callable:
 
 
 def under_noise(env_id: str, artifact: Artifact | None, noise: float, seed: int, episodes: int = 20) -> float:
-    """Let the policy act on estimates, or on the true signals without an observer; returns the mean return."""
+    """Let the policy act on an observer's estimates, or else on the true signals; returns the mean return."""
     measured, _, policy = CASES[env_id]
     returns, apart = list[float](), list[np.ndarray]()
     env: gym.Env = MeasurementNoise(make(env_id), measured, noise)
@@ -120,8 +120,8 @@ def main(
         held_out: steps of the held-out rollouts, played once with and once without exploration.
         batches: training batches of each network.
         members: number of networks, whose outputs are averaged.
-        noise: standard deviation of the measurement noise. With noise the observer estimates all signals, and
-            tracks. The policy then acts on its estimates, on those of T_inv alone, and on the true signals.
+        noise: standard deviation of the measurement noise. With noise the observer estimates all signals and
+            tracks them. The policy then acts on these estimates, on those of T_inv alone, and on the true signals.
         seed: seed of all random numbers.
     """
     measured, hidden, policy = CASES[env_id]

@@ -1,8 +1,9 @@
-"""Learn an observer where the agent goes: PPO balances CartPole-v1 on estimates, in three ways with equally many steps.
+"""Learn an observer on the states that an agent visits: PPO balances CartPole-v1 on estimates.
 
-Positions are measured. Velocities are hidden, but a simulator shows them in training. In the first way, the observer is
-learned from random steps. In the second, it is also refitted while the agent learns. In the third, the agent first
-learns on the true velocities, and the observer is learned from the agent's own steps.
+Positions are measured. Velocities are hidden, but a simulator shows them in training. The example compares three ways
+with equally many steps. In the first, the observer is learned from random steps. In the second, it is also refitted
+while the agent learns. In the third, the agent first learns on the true velocities, and the observer is learned from
+the agent's steps.
 """
 
 import tempfile
@@ -21,30 +22,30 @@ from kkl_gym import KKLObservation
 from observers import Artifact, KKLObserver
 
 ENV_ID, MEASURED, HIDDEN = "CartPole-v1", [0, 2], [1, 3]
-ORDER = MEASURED + HIDDEN  # the order in KKLObservation's observations
+ORDER = MEASURED + HIDDEN  # the order of the signals in KKLObservation's observations
 AFTER = 20  # first steps of each episode, whose errors do not count
 
 
 def wrapped(path: Path) -> gym.Env:
-    """The environment with an observer around it."""
+    """Make the environment with an observer around it."""
     return KKLObservation(gym.make(ENV_ID), path)
 
 
 def with_hidden() -> gym.Env:
-    """The environment with the true velocities in place of estimates."""
+    """Make the environment with the true velocities in place of estimates."""
     env = gym.make(ENV_ID)
     space = gym.spaces.Box(env.observation_space.low[ORDER], env.observation_space.high[ORDER])
     return gym.wrappers.TransformObservation(env, lambda obs: obs[ORDER], space)
 
 
 def beginner(make: Callable[[], gym.Env], seed: int) -> PPO:
-    """An untrained agent."""
+    """Make an untrained agent."""
     envs = make_vec_env(make, 4, seed=seed)
     return PPO("MlpPolicy", envs, n_steps=256, batch_size=256, learning_rate=1e-3, seed=seed, device="cpu")
 
 
 def own_episodes(agent: PPO, env: gym.Env, episodes: int, seed: int) -> list[tuple[np.ndarray, ...]]:
-    """Outputs, inputs and hidden signals of an agent's episodes, from info."""
+    """Play episodes with an agent; returns their outputs, inputs and hidden signals, from info."""
     played = []
     for episode in range(episodes):
         obs, info = env.reset(seed=seed + episode)
@@ -58,7 +59,7 @@ def own_episodes(agent: PPO, env: gym.Env, episodes: int, seed: int) -> list[tup
 
 
 def errors(artifact: Artifact, episodes: list[tuple[np.ndarray, ...]]) -> np.ndarray:
-    """Root mean square error over standard deviation of each hidden signal."""
+    """Return each hidden signal's root mean square error, divided by the signal's standard deviation."""
     observer = KKLObserver(artifact)
     apart = np.concatenate([(observer.estimate(y, u) - x)[AFTER:] for y, u, x in episodes])
     return np.sqrt(np.mean(apart**2, 0)) / np.concatenate([x[AFTER:] for *_, x in episodes]).std(0)
@@ -72,13 +73,13 @@ def main(
     batches: int = 1_000,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Train the agents; returns the larger error of the two hidden signals on the agent's own episodes.
+    """Train the agents; returns for each way the larger error of the two hidden signals in the agent's episodes.
 
     Args:
-        observer_steps: steps for the first observer, random ones or the trained agent's.
+        observer_steps: steps from which the first observer is learned, random ones or those of a trained agent.
         members: number of networks of the first observer, whose outputs are averaged.
         timesteps: further steps, in which the agents learn.
-        every: steps between refits; also the steps on estimates of the third agent.
+        every: steps between refits; also the number of steps that the third agent learns on estimates.
         batches: training batches of each fit.
         seed: seed of all random numbers.
     """

@@ -28,7 +28,7 @@ class CartPole(kkl_gym.System):
     gravity: float = 9.8  # m/s^2
     cart: float = 1.0  # kg
     pole: float = 0.1  # kg
-    length: float = 0.5  # m, half of the pole's
+    length: float = 0.5  # m, half the length of the pole
 
     name: ClassVar[str] = "cart_pole"
     state_names: ClassVar = ("position in m", "velocity in m/s", "angle in rad", "rate in rad/s")
@@ -38,7 +38,7 @@ class CartPole(kkl_gym.System):
     measurement_noise: ClassVar = 0.02  # m and rad
 
     def _terms(self, x):
-        """Total mass, the pole's moment, and the denominator of both accelerations."""
+        """Return the total mass, the pole's moment, and the denominator of both accelerations."""
         mass, moment = self.cart + self.pole, self.pole * self.length
         return mass, moment, self.length * (4.0 / 3.0 - self.pole * cos(x[2]) ** 2 / mass)
 
@@ -62,7 +62,7 @@ class CartPole(kkl_gym.System):
 
 
 def balance(x: np.ndarray) -> np.ndarray:
-    """A policy that differs from that of the training below: maps states (n, 4) to actions (n, 1) in [-1, 1]."""
+    """Map states (n, 4) to actions (n, 1) in [-1, 1], by another policy than in the training."""
     return np.clip(x @ [[0.3], [0.5], [4.0], [1.0]], -1.0, 1.0)
 
 
@@ -84,13 +84,13 @@ def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("r
     x_hat, info = env.reset(seed=0)
     errors = []
     for _ in range(1000):
-        x_hat, _, fallen, _, info = env.step(balance(x_hat[None])[0])  # sees only the estimate
+        x_hat, _, fallen, _, info = env.step(balance(x_hat[None])[0])  # the policy sees only the estimate
         errors.append(x_hat - info["x"])
         if fallen:
             break
     print(f"after {len(errors) * env.unwrapped.dt:g} s: x = {info['x'].round(3)}, x_hat = {x_hat.round(3)}")
     late = np.square(errors[len(errors) // 5 :]).mean(0) ** 0.5 / system.scale
-    print(f"rms error after a fifth of it, over X's half-widths: {late.round(3)}")
+    print(f"rms error after the first fifth of this time, in half-widths of X: {late.round(3)}")
     return late
 
 

@@ -21,7 +21,7 @@ from training import preset, train
 
 @dataclass(frozen=True)
 class CirclePendulum(kkl_gym.System):
-    """Pendulum-v1's pendulum: cosine and sine of its angle are measured, its rate is hidden. Upright is 0."""
+    """Pendulum-v1's pendulum: cosine and sine of its angle are measured, its rate is hidden. The angle is 0 upright."""
 
     gravity: float = 10.0  # m/s^2
     mass: float = 1.0  # kg
@@ -73,13 +73,14 @@ def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("r
     x_hat, info = env.reset(seed=0)
     errors = []
     for _ in range(1000):
-        top = 1.5 * system.gravity / system.length  # potential energy at the top, in units of the moment of inertia
+        top = 1.5 * system.gravity / system.length  # potential energy at the top, divided by the moment of inertia
         missing = top - x_hat[2] ** 2 / 2 - top * x_hat[0]
-        x_hat, _, _, _, info = env.step(np.clip(missing * x_hat[2:], -1.0, 1.0))  # pumps energy up to that of the top
+        # The policy adds energy until the pendulum has as much as at rest at the top.
+        x_hat, _, _, _, info = env.step(np.clip(missing * x_hat[2:], -1.0, 1.0))
         errors.append(x_hat - info["x"])
     print(f"after {len(errors) * env.unwrapped.dt:g} s: x = {info['x'].round(3)}, x_hat = {x_hat.round(3)}")
     late = np.square(errors[len(errors) // 5 :]).mean(0) ** 0.5 / system.scale
-    print(f"rms error after a fifth of it, over X's half-widths: {late.round(3)}")
+    print(f"rms error after the first fifth of this time, in half-widths of X: {late.round(3)}")
     return late
 
 

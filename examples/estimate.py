@@ -16,7 +16,7 @@ def main(seconds: float = 10.0, seed: int = 0) -> float:
     """
     env = kkl_gym.KKLObservation(gym.make("KKLLorenz-v0", measurement_noise=0.5))
     x_hat, info = env.reset(seed=seed)
-    action = np.zeros(1, np.float32)  # the autonomous system
+    action = np.zeros(1, np.float32)  # no input
     for k in range(round(seconds / 0.01)):
         if k % 100 == 0:
             print(f"t = {k // 100:2d} s   x = {info['x'].round(2)}   x_hat = {x_hat.round(2)}")

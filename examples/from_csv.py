@@ -23,7 +23,7 @@ from training.records import read_records
 MU = 3.3  # the plant's parameter; the model begins with GUESS
 GUESS, LIMITS = 2.0, (0.2, 20.0)
 NOISE = 0.1
-STARTS = ((-3.0, 3.0), (-6.0, 6.0))  # the controller's input is strong enough from here
+STARTS = ((-3.0, 3.0), (-6.0, 6.0))  # from these starts the controller's bounded input is strong enough
 
 Policy = Callable[[np.ndarray, dict[str, np.ndarray]], np.ndarray]
 """Maps the state and the info of an environment to an action."""
@@ -43,9 +43,9 @@ def record(env: kkl_gym.KKLEnv, path: Path, *, seconds: float, seed: int) -> Non
 
 
 def cost(env: kkl_gym.KKLEnv, policy: Policy, *, seconds: float, episodes: int) -> float:
-    """Mean of c = mean(((x - target) / scale)^2) over time and episodes, which differ in start and noise."""
+    """Return the mean of c = mean(((x - target) / scale)^2) over time and episodes, which differ in start and noise."""
     costs = []
-    for seed in range(100, 100 + episodes):  # starts that differ from those of the records
+    for seed in range(100, 100 + episodes):  # other seeds than for the records
         x, info = env.reset(seed=seed)
         for _ in range(round(seconds / env.dt)):
             x, reward, _, _, info = env.step(policy(x, info))
@@ -110,7 +110,8 @@ def main(
 
     found = learned.identified.system.parameters["mu"]
     with_estimate, with_state = (cost(plant, policy, seconds=20.0, episodes=5) for policy in (on_estimate, on_state))
-    print(f"mu = {found:.4f} +- {learned.identified.standard_errors['mu']:.2g}, from {GUESS:g}; it is {MU:g}")
+    spread = learned.identified.standard_errors["mu"]
+    print(f"mu = {found:.4f} +- {spread:.2g}, from the guess {GUESS:g}; the plant has {MU:g}")
     print(f"mean cost of five episodes of 20 s: {with_estimate:.4f} with x_hat, {with_state:.4f} with the true state")
     return found, with_estimate, with_state
 

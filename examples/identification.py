@@ -1,6 +1,6 @@
 """Identify parameters and train an observer from outputs only, and compare them with the simulated plant.
 
-The records hold only t and y. First guesses are 30 to 50 % off::
+The records hold only t and y. First guesses of the parameters are 30 to 50 % off::
 
     python examples/identification.py lorenz --noise 0.5
 
@@ -25,12 +25,12 @@ from training.records import Record
 from training.trajectories.motions import draw_process_noise
 
 FIRST_GUESSES = {
-    "reverse_duffing": {"b": 0.6},  # y determines only one of a and b
+    "reverse_duffing": {"b": 0.6},  # y determines b only if a is known
     "van_der_pol": {"mu": 1.5},
     "rossler": {"a": 0.13, "b": 0.28, "c": 4.0},
     "lorenz": {"sigma": 7.0, "rho": 20.0, "beta": 2.0},
 }
-TRANSIENT = 3.0  # s at the start of each run, which do not count in errors
+TRANSIENT = 3.0  # s; errors before this time of each run do not count
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def main(
         off = learned.identified.system.parameters[name] - plant.parameters[name]
         parameters[name] = (100 * off / plant.parameters[name], np.nan if error is None else off / error)
         console.print(f"{name}: {parameters[name][0]:+.2g} %, {parameters[name][1]:+.1f} standard errors")
-    console.print(f"SMAPE after {TRANSIENT:g} s: {smape:.3g} %, default map {of_default:.3g} %; all took {took:.0f} s")
+    console.print(f"SMAPE after {TRANSIENT:g} s: {smape:.3g} %, default map {of_default:.3g} %; it took {took:.0f} s")
     return Found(parameters, smape, of_default)
 
 

@@ -19,9 +19,10 @@ from training.evaluation.faults import BIAS, FAULTS, Fault
 from training.evaluation.levels import Level
 from training.figures import ALARM, ESTIMATE, MEASURED, TRUTH, style
 
-SECONDS = 12.0  # seconds shown, on a clock whose second is the system's pace
+SECONDS = 12.0  # length of the time axis, in units of the system's pace
 FRAME = 0.04  # seconds between frames
-MOST = 100  # samples in a frame; a slow window drops the rest of its delay
+# Most samples that a frame advances. If a window is too slow for this, the motion falls behind real time.
+MOST = 100
 KEYS = "space: pause   n: new start   left, right: input   up, down: noise   f: next fault"
 
 
@@ -58,8 +59,8 @@ class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
 class Live:
     """An environment with its observer, on a figure that is redrawn continuously.
 
-    ``clock`` is the time of a sample in the window, in seconds; ``history`` holds x, x_hat, y and score of the samples
-    in the drawing.
+    ``clock`` is the time that a sample takes in the window, in seconds; ``history`` holds x, x_hat, y and score of the
+    samples in the drawing.
     """
 
     def __init__(self, figure: Any, environment: Shown, measurement_noise: Level | None, *, seed: int) -> None:
@@ -115,7 +116,7 @@ class Live:
         self._score.set_data(t, np.minimum(score, 2.5))
         sound = not score[-1] > 1
         self._score.set_color(TRUTH if sound else ALARM)
-        self._said.set_text("" if np.isnan(score[-1]) else f"{score[-1]:.2f}" + ("" if sound else ": a fault?"))
+        self._score_text.set_text("" if np.isnan(score[-1]) else f"{score[-1]:.2f}" + ("" if sound else ": a fault?"))
         return self.artists
 
     def press(self, key: str | None) -> None:
@@ -158,9 +159,9 @@ class Live:
         last.set(xlim=(-self.seconds, 0.0), ylim=(0.0, 2.5), ylabel="score", xlabel="seconds ago")
         last.axhline(1.0, color=ALARM, ls="--", lw=1)
         (self._score,) = last.plot([], [], lw=1, animated=True)
-        self._said = last.text(0.01, 0.75, "", transform=last.transAxes, animated=True)
+        self._score_text = last.text(0.01, 0.75, "", transform=last.transAxes, animated=True)
         lines = [line for pair in (*self._portrait, *self._lanes) for line in pair]
-        self.artists = [*(dots for _, dots in self._measured), *lines, self._score, self._said]
+        self.artists = [*(dots for _, dots in self._measured), *lines, self._score, self._score_text]
         (truth, guess), samples = self._lanes[0], [dots for _, dots in self._measured[:1]]
         names = ["state", "estimate", "sample"][: 2 + len(samples)]
         right.legend([truth, guess, *samples], names, loc="upper right", ncols=3, frameon=False, markerscale=4)
@@ -222,7 +223,7 @@ def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> A
 
         manager = figure.canvas.manager
         if manager is not None and manager.key_press_handler_id is not None:
-            figure.canvas.mpl_disconnect(manager.key_press_handler_id)  # matplotlib's own keys
+            figure.canvas.mpl_disconnect(manager.key_press_handler_id)  # turns matplotlib's own keys off
         figure.canvas.mpl_connect("key_press_event", lambda event: live.press(event.key))
         animation = FuncAnimation(figure, frame, interval=1000 * FRAME, blit=True, cache_frame_data=False)
         plt.show()
@@ -230,7 +231,7 @@ def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> A
 
 
 def _pair(ax: Any, *styles: str) -> list[list[Any]]:
-    """Lines for the true state and for the estimate, in each of the styles."""
+    """Draw empty lines for the true state and for the estimate, one in each style."""
     looks = ({"color": TRUTH, "lw": 3.5, "ms": 9.0}, {"color": ESTIMATE, "lw": 1.3, "ms": 5.0})
     return [[ax.plot([], [], style, animated=True, **look)[0] for style in styles] for look in looks]
 

@@ -11,7 +11,7 @@ from kkl_gym import KKLMemory
 
 
 class Positions(gym.ObservationWrapper):
-    """The pendulum's cosine and sine with noise, without its rate."""
+    """Shows the pendulum's cosine and sine with noise, and hides its rate."""
 
     def __init__(self, env: gym.Env, noise: float) -> None:
         super().__init__(env)
@@ -19,7 +19,7 @@ class Positions(gym.ObservationWrapper):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
-        """The measured signals."""
+        """Return the measured signals."""
         return (observation[:2] + self.noise * self.np_random.normal(size=2)).astype(np.float32)
 
 
@@ -27,7 +27,7 @@ def main(steps: int = 10_000, noise: float = 0.0, episodes: int = 20, seed: int 
     """Train SAC with and without a memory; returns the mean return of each agent's evaluation episodes.
 
     Args:
-        steps: environment steps of each agent's training, which take half a minute.
+        steps: environment steps of each agent's training; the default takes half a minute.
         noise: standard deviation of the noise added to each measurement.
         episodes: evaluation episodes, which training has not seen.
         seed: seed of all random numbers.

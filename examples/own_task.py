@@ -1,4 +1,4 @@
-"""Your own task, from plant to agent: through a spring, a motor turns a link, which is not measured, to an angle.
+"""Your own task, from plant to agent: a motor turns a link, which is not measured, through a spring to an angle.
 
 The same from the command line, as docs/guides/own_task.md explains::
 
@@ -27,7 +27,7 @@ class FlexibleJoint(kkl_gym.System):
     """A motor turns a link through a spring, under gravity; only the motor's angle is measured. SI units."""
 
     stiffness: float = 10.0  # N m/rad
-    gravity: float = 2.0  # N m, on the level link
+    gravity: float = 2.0  # N m, torque on the level link
     damping: float = 0.2  # N m s/rad, of motor and link
     goal: float = 0.6  # rad
 

@@ -40,7 +40,7 @@ class StirredTank(System):
 
     @property
     def target(self):
-        """Middle equilibrium."""
+        """The middle one of three equilibria."""
         return (0.5, 350.0)
 
     def f(self, x):
@@ -76,7 +76,7 @@ class HeatedTank(System):
 
     @property
     def target(self):
-        """Equilibrium."""
+        """The equilibrium."""
         return ((self.inflow / self.outlet) ** 2, self.T_in + self.power / 4.18e6 / self.inflow)
 
     def f(self, x):

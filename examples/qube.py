@@ -11,15 +11,16 @@ time (s): the twelve free runs that come with Buisson-Fenet, Bahr, Morgenthaler,
 numerical KKL observers" (2023), repository Centre-automatique-et-systemes/learn_observe_KKL, MIT licence.
 docs/results/qube.md has the results.
 
-Two facts about the device are used besides the records: left and right are symmetric, and no angle of the arm is
-special. So the observer learns from each run twice, once mirrored, with the signs of both angles changed. And the map
+Two facts about the device are used besides the records. Left and right are symmetric, so the observer learns from each
+run twice: as recorded, and mirrored, with the signs of both angles changed. No angle of the arm is special, so the map
 sees changes of the arm's angle, not the angle itself.
 
-Eight runs contain few of the possible swings of a pendulum. So a second observer also learns from simulated motions of
-the device's equations, released from random states, with parameters that were fitted to the same eight runs.
+Eight runs contain few of the possible swings of a pendulum. Therefore a second observer also learns from simulated
+motions of the device's equations, released from random states, with parameters that were fitted to the same eight runs.
 
-While the arm sticks, its angle carries no information, and the pendulum swings on by its equation. So a third estimator
-is a Kalman filter with a model whose arm can stick. The second observer starts it, and restarts it when both disagree.
+While the arm sticks, its angle carries no information, and the pendulum swings on by its equation. Therefore a third
+estimator is a Kalman filter with a model whose arm can stick. The second observer starts this filter, and restarts it
+when their estimates disagree.
 
 The recorded velocities are not measurements. They follow exactly from the recorded angles, sample by sample, as
 v_k+1 = 0.8 v_k + 50 (angle_k+1 - angle_k): a derivative after a low-pass filter of 55.79 rad/s. Estimated angles pass
@@ -57,10 +58,11 @@ TRAINING, HELD_OUT = (1, 2, 4, 5, 7, 8, 10, 11), (3, 6, 9, 12)
 # swing less than any training run.
 FOLDS = ((1, 4, 7, 10), (2, 5, 8, 11))
 DT = 0.004  # s, the device's sampling interval
-TRANSIENT = 1.0  # s at the start of each run, which do not count in errors
-RELEASED = 0.5  # s at the start of each run, which the fitted equations do not follow
+TRANSIENT = 1.0  # s; errors before this time of each run do not count
+RELEASED = 0.5  # s; the equations are fitted to each run from this time on
 
-# In 1/s, evenly spaced on a logarithmic scale except for 55.79, the rate of the recorded velocities.
+# Decay rates of the observer's filter in 1/s. They are evenly spaced on a logarithmic scale except for 55.79, the rate
+# of the low-pass filter of the recorded velocities.
 RATES = (2.5, 3.245, 4.212, 5.467, 7.096, 9.21, 11.95, 15.52, 20.14, 26.14, 33.93, 44.04, 55.79, 74.2, 96.3, 125.0)
 
 # Chosen by --cross-validate, on the training runs only.
@@ -73,7 +75,8 @@ SETTINGS = {
     "members": 4,
 }
 
-# First guesses of the fitted parameters. The mass is fixed: without an input, a common factor of all forces is free.
+# First guesses of the fitted parameters. The mass is fixed, because a common factor of all forces and inertias has no
+# effect without an input.
 GUESSES = {
     "arm_length": 0.085,
     "arm_inertia": 5.72e-5,
@@ -87,20 +90,23 @@ GUESSES = {
 ALONE, BOTH = "KKL, recorded states", "KKL, recorded states and the fitted model's motions"
 DIFFERENCES = "finite differences"
 GUIDED = "Kalman filter, fitted model with an arm that sticks, started by the second KKL"
-# Line styles of estimators in the figure.
+# Line styles and colours of the estimators in the figure, in the order of the table.
 LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", ESTIMATE), ("-", RIVAL), ("-", TARGET)
-SHOWN, AVERAGED = 4.0, 125  # s of each run in the figure, and samples over which its errors are averaged
-WINDOW, FITTED = 125, 9.0  # samples of a fitted window; s of each run, after which the pendulum rests
+# The figure shows the first 4 s of each run, with errors averaged over 125 samples.
+SHOWN, AVERAGED = 4.0, 125
+# The equations are fitted to windows of 125 samples, from the first 9 s of each run; afterwards the pendulum rests.
+WINDOW, FITTED = 125, 9.0
 # The simulated motions: their number, chosen by --cross-validate among 8, 24 and 72; their duration in s; and the
 # largest angle of the arm in rad and the largest rates in rad/s at their release. The pendulum's angle is arbitrary.
 # The eight runs begin with the arm up to 0.85 rad from the middle.
 MOTIONS, LASTING, TURNED, MOVING = 24, 11.0, 0.9, (0.3, 0.5)
 ENCODER = 2 * np.pi / 2048  # rad, resolution of both angles
-# For the filter that the observer starts, chosen on the training runs: samples of a window for the fit of its model; s
-# up to which the observer restarts it; its standard deviations then; and the distance of both estimates on the unit
-# circle from which the observer restarts it.
+# Settings of the Kalman filter that the observer starts, chosen on the training runs. LONGER: samples in a window for
+# the fit of its model. STARTED: time in s until which the observer restarts the filter at every sample. SURE: standard
+# deviations of the filter at a restart. APART: the observer also restarts the filter where the distance of their
+# estimates of alpha, as points on the unit circle, is larger.
 LONGER, STARTED, SURE, APART = 250, 0.3, (0.002, 0.3, 1.0, 4.0, 1.0), 0.5
-PUSHED = 1.0  # 0.1 mN m, standard deviation of the unknown torque on the arm
+PUSHED = 1.0  # standard deviation of the unknown torque on the arm, in 0.1 mN m
 
 
 def main(
@@ -118,15 +124,15 @@ def main(
     out
         Folder of the runs, which resume from their checkpoints; receives qube.safetensors, table.md and estimates.png.
     cross_validate
-        Evaluate the settings on the training runs instead: hold out each half of them once, and do not read the tests.
+        Evaluate the settings on the training runs instead: hold out each half of them once; the test runs are not read.
     inverse_steps
         Training batches of each network.
 
     Returns
     -------
     dict of str to ndarray, shape (4,)
-        By estimator, root mean square errors of cos alpha, sin alpha, alpha_dot and theta_dot over their standard
-        deviations, over all runs after the transient; NaN for signals that it does not estimate.
+        For each estimator, root mean square errors of cos alpha, sin alpha, alpha_dot and theta_dot in units of these
+        signals' standard deviations, over all runs after the transient; NaN for signals without an estimate.
     """
     settings = {**SETTINGS, "dt": DT, "held_out": 0.0, "inverse_steps": inverse_steps}
     training = read(path, TRAINING)
@@ -158,13 +164,13 @@ def main(
 
 
 def read(path: Path, runs: Sequence[int]) -> list[Record]:
-    """Records of some runs, resampled at the device's interval."""
+    """Read the records of some runs, and resample them at the device's interval."""
     records = read_records([path / f"run{run:02d}.csv" for run in runs], signals=SIGNALS)
     return [resampled(record, DT) for record in records]
 
 
 def fitted(records: Sequence[Record], model: BothAngles | None = None) -> BothAngles:
-    """The device's model, fitted to windows of the records: half a second, or LONGER samples for a given model."""
+    """Fit the device's model to windows of the records: WINDOW samples, or LONGER for a model that is given."""
     model, window, noise = (
         (BothAngles(), WINDOW, None) if model is None else (model, LONGER, (ENCODER / 2, ENCODER / 2))
     )
@@ -183,7 +189,7 @@ def fitted(records: Sequence[Record], model: BothAngles | None = None) -> BothAn
 
 
 def released(model: BothAngles) -> list[Record]:
-    """Simulated motions of the equations, with signals as the device records them."""
+    """Simulate motions by the equations; their signals are as the device would record them."""
     rng = np.random.default_rng(0)
     theta, alpha = rng.uniform(-TURNED, TURNED, MOTIONS), rng.uniform(0, 2 * np.pi, MOTIONS)
     x0 = np.stack([theta, alpha, *rng.uniform(-1, 1, (2, MOTIONS)) * np.array(MOVING)[:, None]], -1)
@@ -198,12 +204,12 @@ def released(model: BothAngles) -> list[Record]:
 
 
 def learned(records: Sequence[Record], model: BothAngles, settings: dict, out: Path) -> tuple[Artifact, Artifact]:
-    """Two observers: from records only, and from records and simulated motions."""
+    """Train two observers: on records only, and on records and simulated motions."""
     return trained(records, settings, out / "records"), trained([*records, *released(model)], settings, out / "both")
 
 
 def trained(records: Sequence[Record], settings: dict, out: Path) -> Artifact:
-    """An observer from records and their mirror images."""
+    """Train an observer on records and their mirror images."""
     mirrored = [replace(r, name=f"{r.name}, mirrored", y=-r.y, x=r.x * MIRRORED) for r in records]
     both = [*records, *mirrored]
     source = RecordedSource(both, recorded_preset(both, {"tracking": False, **settings}), "qube")
@@ -211,7 +217,7 @@ def trained(records: Sequence[Record], settings: dict, out: Path) -> Artifact:
 
 
 def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> dict[str, list[np.ndarray]]:
-    """Estimates along each training run, by observers and equations learned from the other half of the runs."""
+    """Return estimates along each training run, by observers and equations learned from the other half of runs."""
     found = {}
     for fold in FOLDS:
         kept = [record for run, record in zip(TRAINING, records, strict=True) if run not in fold]
@@ -224,17 +230,17 @@ def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> di
 
 
 def estimates(observer: Artifact, record: Record) -> np.ndarray:
-    """An observer's estimates along a record."""
+    """Return an observer's estimates along a record."""
     return KKLObserver(observer, 0.0).estimate(record.y, record.u)
 
 
 def rest(records: Sequence[Record]) -> float:
-    """Mean angle at which the recorded pendulum comes to rest, in rad from hanging straight down."""
+    """Return the mean angle at which the recorded pendulum comes to rest, in rad from hanging straight down."""
     return float(np.mean([np.arcsin(-record.x[-round(1.0 / DT) :, 1]).mean() for record in records]))
 
 
 def guided(observer: Artifact, model: Sticking, zero: float, records: Sequence[Record]) -> list[np.ndarray]:
-    """Estimates of a Kalman filter that the observer starts, and restarts when both are far apart.
+    """Return estimates of a Kalman filter that the observer starts, and restarts when their estimates are far apart.
 
     The arm's angle is measured, not estimated. ``zero`` is the pendulum's angle at rest, in rad from the vertical.
     """
@@ -260,13 +266,13 @@ def guided(observer: Artifact, model: Sticking, zero: float, records: Sequence[R
 
 
 def padded(values: Sequence[np.ndarray]) -> np.ndarray:
-    """Signals (n, k) of several records as one array; the last samples of shorter records are repeated."""
+    """Return signals (n, k) of several records as one array; the last samples of shorter records are repeated."""
     longest = max(len(each) for each in values)
     return np.stack([np.pad(each, ((0, longest - len(each)), (0, 0)), mode="edge") for each in values], 1)
 
 
 def recorded_signals(angles: np.ndarray, records: Sequence[Record]) -> list[np.ndarray]:
-    """The recorded signals that follow from angles theta and alpha, (n, runs, 2), each as long as its record."""
+    """Return the signals that the device would record for angles theta and alpha (n, runs, 2), run by run."""
     each = [np.unwrap(angles[: len(record.t), i], axis=0).T for i, record in enumerate(records)]
     return [
         np.stack([np.cos(alpha), np.sin(alpha), recorded_velocity(alpha), recorded_velocity(theta)], -1)
@@ -275,9 +281,10 @@ def recorded_signals(angles: np.ndarray, records: Sequence[Record]) -> list[np.n
 
 
 def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
-    """Estimates of an extended Kalman filter; its noise covariances were chosen on the training runs.
+    """Return estimates of an extended Kalman filter, whose noise covariances were chosen on the training runs.
 
-    It starts with a hanging pendulum at rest, with standard deviations of 1.8 rad, and of 4 and 12 rad/s.
+    It starts with a hanging pendulum at rest. The standard deviations are 1.8 rad for the angle of the pendulum, and 4
+    and 12 rad/s for the rates of arm and pendulum.
     """
     y = padded([record.y for record in records])
     kalman_filter = ExtendedKalmanFilter(
@@ -291,13 +298,13 @@ def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
 
 
 def differences(record: Record) -> np.ndarray:
-    """The arm's velocity by the device's own formula; differences of theta do not give the pendulum's signals."""
+    """Return the arm's velocity by the device's formula; differences of theta do not give the pendulum's signals."""
     nothing = np.full(len(record.t), np.nan)
     return np.stack([nothing, nothing, nothing, recorded_velocity(record.y[:, 0])], -1)
 
 
 def recorded_velocity(angle: np.ndarray) -> np.ndarray:
-    """The derivative of an angle, (n,), with the low-pass filter of the recorded velocities."""
+    """Return the derivative of an angle, (n,), with the low-pass filter of the recorded velocities."""
     velocity = np.zeros(len(angle))
     for k in range(1, len(angle)):
         velocity[k] = 0.8 * velocity[k - 1] + 50.0 * (angle[k] - angle[k - 1])
@@ -305,7 +312,7 @@ def recorded_velocity(angle: np.ndarray) -> np.ndarray:
 
 
 def errors(x_hat: Sequence[np.ndarray], records: Sequence[Record]) -> np.ndarray:
-    """Root mean square errors over standard deviations, (4,), over all runs after the transient."""
+    """Return root mean square errors in units of standard deviations, (4,), over all runs after the transient."""
     late = round(TRANSIENT / DT)
     truth = np.concatenate([record.x[late:] for record in records])
     apart = np.concatenate([each[late:] for each in x_hat]) - truth
@@ -318,7 +325,8 @@ def draw(
     """Draw the first seconds of the runs, one in each column: a recorded signal, and the errors of two signals."""
     names, shown, smooth = ("sin(alpha)", "alpha_dot"), slice(0, round(SHOWN / DT)), np.ones(AVERAGED) / AVERAGED
     of = [SIGNALS.hidden.index(name) for name in names]
-    drawn = {name: x_hat for name, x_hat in estimators.items() if name != DIFFERENCES}  # without estimates of alpha
+    # Finite differences give no estimates of alpha.
+    drawn = {name: x_hat for name, x_hat in estimators.items() if name != DIFFERENCES}
     with drawing(path, 2.6 * len(records), 6.5) as figure:
         axes = figure.subplots(1 + len(names), len(records), squeeze=False, sharex=True, sharey="row")
         for column, (record, title) in enumerate(zip(records, titles, strict=True)):

@@ -17,8 +17,8 @@ class Qube(kkl_gym.System):
 
     The defaults are the published model, without dry friction and without the spring of the arm's cable.
 
-    Lengths, masses and inertias are those of Quanser's script qube2_rotpen_param.m; the arm's inertia is its published
-    mass length^2 / 12. The script's damping is much larger than in these runs. So both damping coefficients are those
+    Lengths, masses and inertias are those of Quanser's script qube2_rotpen_param.m; the arm's inertia is that of a rod,
+    mass length^2 / 12. The script's damping is much larger than in these runs, so both damping coefficients are those
     of BlueRiverTech's quanser-openai-driver, file qube_simulator.py. The motor's terminals are open.
     """
 
@@ -33,7 +33,7 @@ class Qube(kkl_gym.System):
     pendulum_inertia: float = 0.024 * 0.129**2 / 3  # kg m^2, about its joint
     pendulum_damping: float = 0.00005  # N m s
     pendulum_friction: float = 0.0  # N m
-    arm_slip: float = 0.1  # rad/s, width of the change of sign of dry friction
+    arm_slip: float = 0.1  # rad/s, the range of rates in which dry friction changes its sign
     pendulum_slip: float = 0.8  # rad/s
 
     name: ClassVar[str] = "qube"
@@ -46,7 +46,7 @@ class Qube(kkl_gym.System):
         return self.moved(*x)
 
     def moved(self, theta, alpha, theta_dot, alpha_dot, torque=0.0):
-        """Lagrange's equations of the two angles, solved for their accelerations, under a torque on the arm in N m."""
+        """Return the state's derivatives by Lagrange's equations of both angles; the torque acts on the arm, in N m."""
         half, sine, cosine = self.pendulum_length / 2, sin(alpha), cos(alpha)
         inertia = self.pendulum_inertia
         coupling = -self.pendulum_mass * self.arm_length * half
@@ -78,7 +78,7 @@ class BothAngles(Qube):
 
 @dataclass(frozen=True)
 class Sticking(BothAngles):
-    """The same model with friction so dry that the arm sticks until it is pushed."""
+    """The same model, but the friction changes its sign so abruptly that the arm sticks until it is pushed."""
 
     arm_slip: float = 0.004
     pendulum_slip: float = 0.2
@@ -92,7 +92,7 @@ class Sticking(BothAngles):
 
 @dataclass(frozen=True)
 class Pushed(Sticking):
-    """The same model with y = theta, and with an unknown torque on the arm for the errors of the friction model.
+    """The same model with y = theta, and with an unknown torque on the arm, which stands for errors of its friction.
 
     The torque is a fifth state, in 0.1 mN m: an Ornstein-Uhlenbeck process.
     """

@@ -18,7 +18,7 @@ import kkl_gym
 
 
 def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
-    """Batched environments with their observer inside: 20 s long, an action every 0.05 s.
+    """Make batched environments with their observer inside: episodes of 20 s, an action every 0.05 s.
 
     RLlib calls this function in each env runner and sends it only names. The runner itself imports kkl_gym and reads
     the observer's file.
@@ -30,12 +30,12 @@ def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
         max_episode_steps=2000,
         autoreset_mode="Disabled",
     )
-    envs = kkl_gym.KKLVectorObservation(envs, config["observer"])  # sees every sample, 0.01 s apart
-    return kkl_gym.VectorActionRepeat(envs, 5)  # resets in the next step, as RLlib expects
+    envs = kkl_gym.KKLVectorObservation(envs, config["observer"])  # the observer sees every sample, 0.01 s apart
+    return kkl_gym.VectorActionRepeat(envs, 5)  # a row resets in the next step, as RLlib expects
 
 
 def configuration(algorithm: Literal["ppo", "sac"]) -> AlgorithmConfig:
-    """The settings of an algorithm."""
+    """Return the settings of an algorithm."""
     if algorithm == "ppo":
         return PPOConfig().training(
             lr=1e-3, gamma=0.99, train_batch_size_per_learner=4096, minibatch_size=512, num_epochs=5

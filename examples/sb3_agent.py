@@ -11,11 +11,11 @@ from training.agents import SB3VecEnv
 
 
 def make_envs(env_id: str, num_envs: int) -> SB3VecEnv:
-    """Batched environments with their observer inside: 20 s long, an action every 0.05 s."""
+    """Make batched environments with their observer inside: episodes of 20 s, an action every 0.05 s."""
     envs = gym.make_vec(
         env_id, num_envs=num_envs, measurement_noise=0.2, max_episode_steps=2000, autoreset_mode="Disabled"
     )
-    envs = kkl_gym.KKLVectorObservation(envs)  # sees every sample, 0.01 s apart
+    envs = kkl_gym.KKLVectorObservation(envs)  # the observer sees every sample, 0.01 s apart
     return SB3VecEnv(kkl_gym.VectorActionRepeat(envs, 5, autoreset_mode="SameStep"))
 
 

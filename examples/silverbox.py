@@ -28,10 +28,14 @@ from training.records import Record
 DT = 2**14 / 1e7  # s
 FILE = "SNLS80mV.csv"
 SAMPLES = 131_072
-FREE = 50  # first samples of each test, for the fit of its start; they do not count
-TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)  # three quarters of the multisine, and the last one
-ARROW, ARROW_INSIDE = (100, 40_575), (100, 32_100)  # the part within the training's range of outputs
-RECORDS, LENGTH = 8, 2_048  # records from the training part; one is held out, to test predictions
+# The start of each test is fitted to this number of first samples; their errors do not count.
+FREE = 50
+# Samples of the first three quarters of the multisine, and of its last quarter.
+TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)
+# Samples of the arrow, and of its part within the range of the training's outputs.
+ARROW, ARROW_INSIDE = (100, 40_575), (100, 32_100)
+# Number and length of the records that are taken from the training part; one is held out, to test predictions.
+RECORDS, LENGTH = 8, 2_048
 LIMITS = {
     "damping": (6.0, 600.0),
     "stiffness": (3e4, 3e6),
@@ -60,7 +64,7 @@ class Silverbox(kkl_gym.System):
     cube: float = 4e5  # 1/(V^2 s^2)
     offset: float = 0.0  # V/s^2
     gain: float = 1.2e5  # 1/s^2
-    before: float = 0.0  # weights of the neighbouring samples; the sample itself has the rest
+    before: float = 0.0  # weights of the neighbouring samples; the sample itself has the rest of 1
     after: float = 0.0
 
     name: ClassVar[str] = "silverbox"
@@ -85,12 +89,12 @@ class Silverbox(kkl_gym.System):
         return (x[0],)
 
     def rate(self, x):
-        """Frequency of small motions about x, in rad/s."""
+        """Return the frequency of small motions about x, in rad/s."""
         return abs(self.stiffness + (2.0 * self.square + 3.0 * self.cube * x[0]) * x[0]) ** 0.5
 
 
 def read(path: Path) -> np.ndarray:
-    """Input and output in V, (131072, 2), from the file or the folder that holds it."""
+    """Read input and output in V, (131072, 2), from the file or the folder that holds it."""
     path = path / FILE if path.is_dir() else path
     data = pd.read_csv(path, usecols=["V1", "V2"])[["V1", "V2"]].to_numpy(float)
     if data.shape != (SAMPLES, 2):
@@ -99,13 +103,13 @@ def read(path: Path) -> np.ndarray:
 
 
 def part(data: np.ndarray, begin: int, end: int) -> Record:
-    """Some samples as a record, with the inputs before, at and after each sample."""
+    """Return a part of the samples as a record, with the inputs before, at and after each sample."""
     u = np.stack([data[begin + shift : end + shift, 0] for shift in (-1, 0, 1)], axis=-1)
     return Record(f"[{begin}:{end}]", DT * np.arange(end - begin), data[begin:end, 1:], u)
 
 
 def simulated(system: Silverbox, record: Record) -> np.ndarray:
-    """Outputs (n,) of a simulation from inputs only; its start is fitted to the first samples."""
+    """Return outputs (n,) of a simulation from inputs only; its start is fitted to the first samples."""
     theta = np.array([system.parameters[name] for name in LIMITS])
     first = {(0, 0): np.array([record.y[0, 0], 0.0])}
     shooting = Shooting(system, DT, LIMITS, np.ones(len(theta)))
@@ -152,7 +156,7 @@ def main(path: Annotated[Path, tyro.conf.Positional], out: Path = Path("runs/sil
 
 
 def draw(path: Path, tests: dict[str, Record], residuals: dict[str, Any]) -> None:
-    """Draw the measured outputs, and their residuals after the simulated ones."""
+    """Draw the measured outputs, and their differences from the simulated outputs."""
     with drawing(path, 10, 5) as figure:
         axes = figure.subplots(2, len(tests), sharex="col", sharey="row")
         for (above, below), (name, record) in zip(axes.T, tests.items(), strict=True):

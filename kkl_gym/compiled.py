@@ -1,9 +1,9 @@
-"""Machine code for a sampling interval, where Numba is installed and can compile a system's equations.
+"""Machine code for the step over a sampling interval, if Numba is installed and can compile a system's equations.
 
 The equations run once on symbols, which record them as a program (:mod:`kkl_gym.tracing`). Numba compiles this program
-within the Runge–Kutta step, in about a second. The compiled step of a single state equals Python's to the last bit and
-takes a tenth of the time. Compilers round powers in their own way, so equations with powers are compiled only for
-batches.
+together with the Runge–Kutta step, in about a second. The compiled step of a single state equals the step in Python to
+the last bit and takes a tenth of its time. Compilers round powers and remainders in their own way, so equations with
+these are compiled only for batches.
 """
 
 import functools
@@ -38,12 +38,14 @@ Values = TypeVar("Values")
 Advance = Callable[[Values, Values, Values, float], Values]
 """Maps (x, u, w, dt) to the next x."""
 
-MAX_OPERATIONS = 500  # longer programs, such as that of a network as f, would take many seconds to compile
-_TRIALS = 200  # states of each kind at which machine code is compared with Python
+# Longer programs, such as a neural network for f, would take many seconds to compile.
+MAX_OPERATIONS = 500
+_TRIALS = 200  # trial states of each kind, at which machine code is compared with Python
 _MAX_TRIAL_SUBSTEPS = 64  # trial states that need more substeps are skipped, because Python is slow there
 _LANES = 32  # rows that are stepped together; they fill a few of the processor's vector registers
-_KEPT = 64  # compiled kernels in the cache
-_kept: dict[Any, Any] = {}  # the kernel of each program, or the reason why it has none
+# Largest number of kernels in the cache, which holds for each program its kernel, or the reason why it has none.
+_KEPT = 64
+_kept: dict[Any, Any] = {}
 
 logger = logging.getLogger("kkl_gym")
 
@@ -56,13 +58,16 @@ class SamplingStep(Generic[Values]):
     obstacle: str | None = None
 
     def __call__(self, x: Values, u: Values, w: Values, dt: float) -> Values:
-        """Return the next state. Shapes: sequences of floats, or arrays (nx, n) and (nu, n) of a batch."""
+        """Return the next state. Values are sequences of floats, or for a batch arrays (nx, n) and (nu, n)."""
         return self.advance(x, u, w, dt)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A system's programs: x' = field(x) + push(u, w) or x' = field(x, u) + push(w), and a formula for its rate."""
+    """A system's programs. If g is constant, x' = field(x) + push(u, w); otherwise, x' = field(x, u) + push(w).
+
+    ``rate`` is the program of the system's rate formula, None if it has no formula.
+    """
 
     field: Program
     push: Program
@@ -71,55 +76,56 @@ class Motion:
 
 
 def single_step(system: System) -> SamplingStep[Components]:
-    """The step of a single state: compiled if Numba is installed and can compile the equations, else in Python.
+    """Return the step of a single state, compiled if Numba is installed and can compile the equations, else in Python.
 
-    A compiled step keeps the present values of globals and other numbers that the equations read.
+    A compiled step keeps the values that globals and other numbers in the equations had when it was compiled.
     """
     return _shared(system, single_kernel, _single, advance, f"single steps of {system.name} stay in Python")
 
 
 def batch_step(system: System) -> SamplingStep[np.ndarray]:
-    """As :func:`single_step` for a batch; machine code and NumPy agree to rounding."""
-    return _shared(system, batch_kernel, _batch, advance_batch, f"{system.name} goes on with NumPy, not compiled")
+    """Return the step of a batch, like :func:`single_step`; machine code and NumPy agree to rounding."""
+    return _shared(system, batch_kernel, _batch, advance_batch, f"batch steps of {system.name} stay in NumPy")
 
 
 def _shared(
     system: System,
     compile_kernel: Callable[[System, Motion], Any],
-    around: Callable[[System, Any], Advance[Values]],
-    otherwise: Callable[..., Values],
-    without: str,
+    wrap: Callable[[System, Any], Advance[Values]],
+    uncompiled: Callable[..., Values],
+    log_line: str,
 ) -> SamplingStep[Values]:
-    """The step of a system; systems with the same programs share one compiled kernel."""
-    plain = functools.partial(otherwise, system)
+    """Return the step of a system; systems with the same programs share one compiled kernel."""
+    plain = functools.partial(uncompiled, system)
     if system.discrete:
-        return SamplingStep(plain, f"{system.name} makes its step itself")
+        return SamplingStep(plain, f"{system.name} is in discrete time and needs no integration")
     try:
         motion: Any = _motion(system)
-    except Exception as error:  # a user's equations may raise anything on symbols
+    except Exception as error:  # a user's equations may raise any exception on symbols
         motion = _reason(error)
-    of = compile_kernel, type(system), motion
-    if of not in _kept:
+    key = compile_kernel, type(system), motion
+    if key not in _kept:
         while len(_kept) >= _KEPT:
             _kept.pop(next(iter(_kept)), None)
         try:
-            _kept[of] = motion if isinstance(motion, str) else compile_kernel(system, motion)
-        except Exception as error:  # the step in Python runs the equations and raises their errors
-            _kept[of] = _reason(error)
-        if isinstance(_kept[of], str):
-            logger.info("%s: %s", without, _kept[of])
-    kernel = _kept[of]
-    return SamplingStep(plain, kernel) if isinstance(kernel, str) else SamplingStep(around(system, kernel))
+            _kept[key] = motion if isinstance(motion, str) else compile_kernel(system, motion)
+        # The error is not raised here: if the equations are at fault, the step in Python raises it.
+        except Exception as error:
+            _kept[key] = _reason(error)
+        if isinstance(_kept[key], str):
+            logger.info("%s: %s", log_line, _kept[key])
+    kernel = _kept[key]
+    return SamplingStep(plain, kernel) if isinstance(kernel, str) else SamplingStep(wrap(system, kernel))
 
 
 def _reason(error: Exception) -> str:
-    """The first informative line of an error; Numba's messages fill a page, in colours."""
+    """Return the first informative line of an error; Numba's messages are a page long and contain colour codes."""
     line = re.search(r"^(?!Failed in ).*\S.*", re.sub(r"\x1b\[\d*m", "", str(error)), re.MULTILINE)
     return f"{type(error).__name__}: {line[0] if line else ''}"
 
 
 def _motion(system: System) -> Motion:
-    """The programs of a system; ValueError if they are too long, or differ from one call to the next."""
+    """Return a system's programs; ValueError if they are too long, or differ from one call to the next."""
     nx, nu, constant = system.nx, system.nu, type(system).g is System.g
 
     def field(x: Any, u: Any = ()) -> Any:
@@ -137,17 +143,17 @@ def _motion(system: System) -> Motion:
     if type(system).rate is not System.rate:
         rate = program(lambda x: (rate_at(system, x),), ("x", nx))
     if len(traced.operations) + len(rate.operations if rate else ()) > MAX_OPERATIONS:
-        raise ValueError(f"{system.name}: the equations are too long to compile in seconds")
+        raise ValueError(f"{system.name}: the equations have more than {MAX_OPERATIONS} operations")
     push = program(lambda u, w: forced(system, u, w)[1], ("u", nu), ("w", nx))
     return Motion(traced, push, rate, per_tolerance(type(system)) + (0.0,) * (len(traced.arguments) - nx))
 
 
 def single_kernel(system: System, motion: Motion) -> Any:
-    """The compiled step of a single state; it returns NaN where equal substeps are not accurate enough."""
+    """Compile the step of a single state; it returns NaN where equal substeps are not accurate enough."""
     import numba
 
     if not (motion.field.exact and motion.push.exact):
-        raise ValueError("there is a power or a remainder; products, such as x * x for x**2, would be compiled")
+        raise ValueError("there is a power or a remainder, and only products are compiled: write x * x for x**2")
     nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
     x, u, w = ([f"{letter}{i}" for i in range(n)] for letter, n in (("x", nx), ("u", nu), ("w", nx)))
     lines = [
@@ -166,8 +172,8 @@ def single_kernel(system: System, motion: Motion) -> Any:
         "        need = n * error**0.1",
         f"    return {in_tuple(['nan'] * nx)}",
     ]
-    jit: Any = functools.partial(numba.njit, error_model="python")  # raises where Python raises
-    # The signature has floats only, so that an input bound given as an integer does not compile the kernel again.
+    jit: Any = functools.partial(numba.njit, error_model="python")  # raises ZeroDivisionError where Python does
+    # The signature has floats only, so that Numba does not compile the kernel again for an integer input bound.
     kernel = jit((numba.float64,) * (nx + nu + nx + 1))(_assembled(motion, lines, jit))
     rng = np.random.default_rng(0)
     u_max, scale = np.array(system.u_max), np.array(system.scale) / system.pace
@@ -179,10 +185,11 @@ def single_kernel(system: System, motion: Motion) -> Any:
                 if not rate_under(system, at, held) * system.dt * PER_RATE <= _MAX_TRIAL_SUBSTEPS:
                     continue
                 end = kernel(*at, *held, *noise, system.dt)
-            except Exception:  # at run time Python then takes the step
+            # Where the kernel raises, the step in Python runs instead, so there is nothing to compare.
+            except Exception:
                 continue
             if end[0] == end[0] and tuple(end) != tuple(advance(system, at, held, noise, system.dt)):
-                raise ValueError(f"it rounds otherwise than Python at x = {list(at)}")
+                raise ValueError(f"the compiled step and Python round differently at x = {list(at)}")
     return kernel
 
 
@@ -190,7 +197,8 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
     def step(x: Components, u: Components, w: Components, dt: float) -> Components:
         try:
             end: Components = kernel(*x, *u, *w, dt)
-        except Exception:  # the step in Python raises an error that names the equation
+        # If the equations are at fault, the step in Python raises an error that names them.
+        except Exception:
             return advance(system, x, u, w, dt)
         return end if end[0] == end[0] else advance(system, x, u, w, dt)
 
@@ -198,11 +206,11 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
 
 
 def batch_kernel(system: System, motion: Motion) -> Any:
-    """The compiled step of a batch: rows that need equally many substeps are stepped in groups."""
+    """Compile the step of a batch: rows that need equally many substeps are stepped in groups."""
     import numba
 
-    # Components and lanes are written out and lie in one array, at offsets that the compiler knows. So it can use the
-    # processor's vector registers.
+    # Each row of a group is a lane. All components of all lanes lie in one array, at offsets that the compiler knows.
+    # It can then use the processor's vector registers.
     nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
     lanes = [f"s[{i * _LANES} + j]" for i in range(size + nx + 3)]
     states, d, (substeps, length, error) = lanes[:size], lanes[size:-3], lanes[-3:]
@@ -257,9 +265,10 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         at = points.T.copy(), u_max * rng.uniform(-1, 1, (nu, n)), scale * rng.uniform(-1, 1, (nx, n)), system.dt
         found, expected = np.empty((nx, n)), equal_substeps(system, *at)[0]
         kernel(*at, found)
-        expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan  # motions that escape may give either
+        # Where a motion escapes, one result may be infinite and the other NaN.
+        expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan
         if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
-            raise ValueError(f"{system.name}: the equations return something else for symbols than for numbers")
+            raise ValueError(f"{system.name}: the equations return other values for symbols than for numbers")
     return kernel
 
 
@@ -267,7 +276,8 @@ def _batch(system: System, kernel: Any) -> Advance[np.ndarray]:
     def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
         out = np.empty(x.shape)
         lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
-        if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):  # NaN stays NaN
+        # Rows that are NaN only after the step need substeps that follow the error.
+        if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):
             out[:, rows] = advance_batch(system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out
 
@@ -275,7 +285,7 @@ def _batch(system: System, kernel: Any) -> Advance[np.ndarray]:
 
 
 def _assembled(motion: Motion, lines: list[str], jit: Callable[..., Any]) -> Any:
-    """The function ``kernel`` that ``lines`` define; they call the compiled programs of a motion."""
+    """Return the function ``kernel`` that ``lines`` define; the lines call the compiled programs of ``motion``."""
     namespace: dict[str, Any] = {"inf": math.inf, "nan": math.nan, "np": np}
     for name, function in vars(elementary).items():
         if on_numbers := getattr(function, "on_numbers", None):
@@ -294,7 +304,7 @@ def _assembled(motion: Motion, lines: list[str], jit: Callable[..., Any]) -> Any
 
 
 def _trial_states(system: System, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """States at which machine code is compared: random ones (400, nx), and corners, integers and starts (600, nx)."""
+    """Return trial states for machine code: random ones (400, nx); bounds, whole numbers and starts (600, nx)."""
     n, (low, high) = _TRIALS, np.array(system.bounds, dtype=float).T
     random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])
     ends = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])

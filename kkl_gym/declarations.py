@@ -15,7 +15,7 @@ _SIZES = {"nx": "X", "nu": "u_max", "ny": "h(x)", "parameters": "the fields"}
 
 
 def complete(cls: Any, base: Any) -> None:
-    """Check a system's class variables, convert their numbers to tuples, and derive those that were not set."""
+    """Check a system's class variables, convert their numbers to tuples, and set the defaults of missing ones."""
     _check_names(cls, base)
     _read_box(cls)
     nx = len(cls.X)
@@ -24,7 +24,8 @@ def complete(cls: Any, base: Any) -> None:
     if cls.discrete and cls.dt is base.dt:
         raise TypeError(f"{cls.__name__} defines step and must set dt, the sampling interval in seconds")
     _check_inputs(cls, base)
-    if "X" in vars(cls):  # otherwise the parent's box applies, with the values derived from it
+    # A subclass without its own X keeps its parent's box, and the values derived from it.
+    if "X" in vars(cls):
         defaults = {
             "scale": tuple((high - low) / 2 for low, high in cls.X),
             "state_names": tuple(f"x{i + 1}" for i in range(nx)),
@@ -61,7 +62,7 @@ def _check_names(cls: Any, base: Any) -> None:
     for name, kind in inspect.get_annotations(cls).items():
         if "ClassVar" not in str(kind) and (name in variables or hasattr(base, name)):
             raise TypeError(
-                f"{cls.__name__}: {name} is annotated as a parameter, but System.{name} is something else: "
+                f"{cls.__name__}: {name} is annotated as a parameter, but System.{name} is not a parameter: "
                 f"write {name}: ClassVar = ..., or give the parameter another name"
             )
     makers = [each for each in cls.__mro__ if "__init__" in vars(each) and each not in (base, object)]
@@ -70,7 +71,8 @@ def _check_names(cls: Any, base: Any) -> None:
             f"{cls.__name__} defines __init__, and a copy would lack what __init__ sets: write the parameters as "
             "annotated fields under @dataclass(frozen=True), and values derived from them as properties"
         )
-    for name in (field.name for field in dataclasses.fields(cls)):  # inherited: the decorator adds its own later
+    # These fields are all inherited, because the dataclass decorator adds the subclass's own fields only later.
+    for name in (field.name for field in dataclasses.fields(cls)):
         first = next((each for each in cls.__mro__ if name in vars(each)), base)
         if first is not base and name not in inspect.get_annotations(first):
             raise TypeError(
@@ -91,7 +93,7 @@ def _read_box(cls: Any) -> None:
         _read(cls, name, pairs, (None, 2))
         for i, (low, high) in enumerate(getattr(cls, name)):
             if not low < high:
-                raise _wrong(cls, f"{name}[{i}]", "(low, high), low before high", (low, high))
+                raise _wrong(cls, f"{name}[{i}]", "(low, high) with low < high", (low, high))
     if not cls.X:
         raise _wrong(cls, "X", pairs)
     if len(cls.bounds) != len(cls.X):
@@ -119,8 +121,8 @@ def _read(
     above: float = -math.inf,
     least: float = -math.inf,
 ) -> None:
-    """Check that a class variable has this shape and lies within these limits, and convert it to tuples."""
-    if isinstance(getattr(cls, name), property):  # derived from others
+    """Check the shape and the limits of a class variable, and convert it to tuples."""
+    if isinstance(getattr(cls, name), property):  # the value is computed from other attributes
         return
     try:
         numbers = _numbers(getattr(cls, name), shape)
@@ -133,7 +135,7 @@ def _read(
 
 
 def _numbers(value: Any, shape: tuple[int | None, ...]) -> Any:
-    """Numbers as nested tuples; ValueError unless they are finite and have this shape (None: any length)."""
+    """Return numbers as nested tuples; ValueError unless they are finite and have this shape (None: any length)."""
     if not shape:
         if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not math.isfinite(value):
             raise ValueError
@@ -150,7 +152,7 @@ def _is_row(value: Any, length: int | None, kind: Any = object) -> bool:
 
 
 def _size(value: Any) -> int:
-    """Number of entries in a value, or in all of its rows."""
+    """Return the number of entries in a value, in all rows together."""
     return np.array(value, dtype=object).size
 
 

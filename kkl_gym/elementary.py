@@ -26,14 +26,15 @@ _SYMPY_NAMES = {"abs": "Abs", "maximum": "Max", "minimum": "Min"}
 
 def _unary(name: str, on_numbers: Callable[[Any], Any], meaning: str) -> Callable[[Any], Any]:
     on_arrays = getattr(np, name)
-    if name in ("exp", "log", "sqrt"):  # the others warn only of infinite arguments, and np.errstate takes time
+    # The other functions warn only of infinite arguments; they do without np.errstate, which takes time.
+    if name in ("exp", "log", "sqrt"):
         on_arrays = np.errstate(all="ignore")(on_arrays)
 
     def function(x: Any) -> Any:
         if isinstance(x, _NUMBERS):
             try:
                 return on_numbers(x)
-            except (ValueError, OverflowError):  # exp(1000), log(0), sin(inf)
+            except (ValueError, OverflowError):  # raised by math for exp(1000), log(0) and sin(inf)
                 with np.errstate(all="ignore"):
                     return float(on_arrays(float(x)))
         if isinstance(x, np.ndarray):
@@ -58,13 +59,14 @@ def _binary(name: str, on_numbers: Callable[[Any, Any], Any], meaning: str) -> C
 
 def _named(function: Any, call: str, meaning: str, on_numbers: Callable[..., Any]) -> Any:
     function.__name__ = function.__qualname__ = call.partition("(")[0]
-    function.on_numbers = on_numbers  # kkl_gym.compiled compiles this one
+    # kkl_gym.compiled compiles this function, which takes numbers only.
+    function.on_numbers = on_numbers
     function.__doc__ = f"{call}, {meaning}, for floats, NumPy arrays, torch tensors and sympy expressions."
     return function
 
 
 def _elsewhere(name: str, *args: Any) -> Any:
-    """Evaluate a function of tensors or symbols with torch or sympy."""
+    """Record a function of symbols, or evaluate it with sympy or torch."""
     for arg in args:
         if isinstance(arg, Symbol):
             return arg.call(name, *args)
@@ -77,13 +79,13 @@ def _elsewhere(name: str, *args: Any) -> Any:
 
 
 def _library(name: str, kind: str, args: tuple[Any, ...]) -> Any:
-    """The library if an argument has its type ``kind``, else None; the library is never imported here."""
+    """Return the library if an argument has its type ``kind``, else None; the library is never imported here."""
     library = sys.modules.get(name)
     return library if library is not None and any(isinstance(arg, getattr(library, kind)) for arg in args) else None
 
 
 def _as_tensors(torch: Any, args: tuple[Any, ...]) -> list[Any]:
-    """Arguments as tensors; numbers take the dtype of the tensors among the arguments."""
+    """Return arguments as tensors; numbers take the dtype of the tensors among the arguments."""
     tensors = [arg for arg in args if isinstance(arg, torch.Tensor)]
     dtype = next((tensor.dtype for tensor in tensors if tensor.is_floating_point()), torch.float64)
     device = tensors[0].device
@@ -95,7 +97,7 @@ def _sign(x: Any) -> float:
 
 
 def _maximum(a: Any, b: Any) -> Any:
-    return a if a >= b or a != a else b  # NaN if one of them is, as for arrays
+    return a if a >= b or a != a else b  # NaN if a or b is NaN, as in np.maximum
 
 
 def _minimum(a: Any, b: Any) -> Any:
@@ -130,12 +132,12 @@ def where(condition: Any, a: Any, b: Any) -> Any:
         A comparison such as ``x[0] > 0``. Combine several by ``&`` and ``|``, each in parentheses. Do not negate by
         ``~``, which is bitwise on Python's True and False: write the opposite comparison.
     a, b : float, array, tensor or sympy expression
-        Both are evaluated everywhere; infinite or NaN values of the one that is not taken do no harm.
+        Both are evaluated everywhere; infinite or NaN values do no harm where they are not selected.
 
     Returns
     -------
     float, array, tensor or sympy expression
-        Of the arguments' type.
+        The selected values, of the arguments' type.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Gymnasium environments over the systems: process noise, measurement noise and a bounded input."""
+"""Gymnasium environments of single systems, with process noise, measurement noise and a bounded input."""
 
 import itertools
 from collections import deque
@@ -25,10 +25,11 @@ from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, Components, System, reward_of
 from observers.checks import integer, mapping, real_array, shown
 
-SOON = 1000  # samples after which the step is compiled; in shorter simulations compiling costs more than it saves
-_KEYS = (("a", "d"), ("s", "w"))  # keyboard keys for the low and the high end of the first two inputs
+# Number of samples after which the step is compiled; in shorter simulations compiling takes more time than it saves.
+SOON = 1000
+_KEYS = (("a", "d"), ("s", "w"))  # keys for the lower and the upper bound of the first two inputs
 _INTEGER, _FLOAT32 = np.dtype(np.int64), np.dtype(np.float32)
-_ACTIONS = (_FLOAT32, np.dtype(np.float64))  # dtypes that a step takes without a conversion
+_ACTIONS = (_FLOAT32, np.dtype(np.float64))  # dtypes of actions that need no conversion
 
 
 class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
@@ -62,15 +63,15 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     Parameters
     ----------
     system : str or System
-        A name, ``"module:Class"``, ``"script.py:Class"``, or a :class:`kkl_gym.System`.
+        A shipped name, ``"module:Class"``, ``"script.py:Class"``, or a :class:`kkl_gym.System`.
     dt : float, optional
-        Sampling interval in seconds. None takes the system's own, 0.01 s for those that ship.
+        Sampling interval in seconds. None takes the system's own, 0.01 s for the shipped ones.
     process_noise : float, optional
         Bound of the uniform noise w, as a multiple of the system's ``scale`` per second:
         \|w_i\| <= process_noise * scale_i. None takes the system's own default.
     measurement_noise : float or sequence of float, length ny, optional
         Standard deviation of the Gaussian noise v on each sample: one for all outputs, or one for each. None takes the
-        system's own: 0.5 for those that ship, and by default 5 % of the range of each output over X.
+        system's own: 0.5 for the shipped ones, else by default 5 % of the range of each output over X.
     observe : {"state", "output"}
         Whether the agent sees the state x or the output y.
     parameters : mapping of str to float, optional
@@ -133,9 +134,10 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         self.observe = observe
         self.observation_space, self.action_space = self.plant.observation_space, self.plant.action_space
 
-        # Every step reads these; Python numbers are faster here than arrays.
+        # Every step reads these attributes; Python numbers are faster here than arrays.
         self._nu = self.system.nu
-        self._sample = self._samples = 0  # samples in this episode, and in earlier ones of this system
+        # Numbers of samples in this episode, and in earlier episodes of the same system.
+        self._sample = self._samples = 0
         self._advance: Callable[..., Components]
         self._exchanged()
         self._bounds, self._u_max = self.system.bounds, self.system.u_max
@@ -144,12 +146,14 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         self._readings = None if self.sensor is None else Readings(self.sensor, self.plant.ny, self.plant.dt, 1)
         self._held: list[float] = []  # the last sample of each output that the sensor delivered
         self._x: tuple[float, ...] | None = None
-        self._u: list[float] | None = None  # kept for rendering, like the trail
+        self._u: list[float] | None = None  # the last input, for rendering
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
-        self.emitted = b""  # the last observation; an observer wrapper compares it with the one that it receives
-        self.drawn_by = 0  # number of the observer wrapper that draws the window; 0: the environment draws it
+        # The last observation. An observer wrapper outside compares it with the observation that it receives.
+        self.emitted = b""
+        # Number of observer wrappers outside. The outermost draws the window; 0: the environment draws it.
+        self.drawn_by = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -216,7 +220,8 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         w, v = self._next_noise()
         x = self._advance(self._x, u, w, self.plant.dt)
         escaped = not self._inside(x)
-        if escaped:  # or the substeps were too coarse: check with finer ones
+        # Substeps that were too coarse may also end outside the bounds, so that finer ones verify the escape.
+        if escaped:
             x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
             escaped = not self._inside(x)
         if not escaped:
@@ -237,7 +242,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return self.draw()
 
     def draw(self, estimates: Collection[Sequence[float]] = ()) -> np.ndarray | None:
-        """Draw the phase portrait, with the estimates so far, in order of time, beside the states."""
+        """Draw the phase portrait with the states and the ``estimates`` so far, in order of time."""
         if self.render_mode is None:
             return None
         if self._x is None:
@@ -264,9 +269,10 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
             self._window = None
 
     def get_keys_to_action(self) -> dict[tuple[int, ...], np.ndarray]:
-        """Keys for :func:`gymnasium.utils.play.play`: a and d for the ends of the first input, s and w for the second.
+        """Return keys for :func:`gymnasium.utils.play.play`.
 
-        Pass ``noop=np.zeros(nu, np.float32)`` to ``play`` as well, the action while no key is pressed.
+        The keys a and d set the first input to its lower and upper bound, s and w the second. Also pass
+        ``noop=np.zeros(nu, np.float32)`` to ``play``, the action while no key is pressed.
         """
         actions = {}
         for ends in itertools.product(*((("", 0), (low, -1), (high, 1)) for low, high in _KEYS[: self._nu])):
@@ -283,7 +289,8 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     def _exchanged(self) -> None:
         self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
-        self._samples = -self._sample  # restart the count: compiling does not pay if the system changes every episode
+        # The next reset adds _sample, which gives 0: a new system is compiled only after SOON samples of its own.
+        self._samples = -self._sample
 
     def _input(self, action: np.ndarray) -> list[float]:
         if type(action) is not np.ndarray or action.dtype not in _ACTIONS:
@@ -320,7 +327,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return True
 
     def _observation(self, info: dict[str, Any]) -> np.ndarray:
-        if self.observe == "state":  # always within the bounds
+        if self.observe == "state":  # the state is always within the bounds
             obs: np.ndarray = info["x"].astype(_FLOAT32)
         else:
             y = self._y if self._readings is None else self._held
@@ -338,7 +345,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         }
 
     def _next_noise(self) -> tuple[list[float], list[float]]:
-        """One sample of (w, v)."""
+        """Return the next sample of the noises (w, v)."""
         if not self._noise:
             w, v = self.plant.noise(*self.plant.draw_noise(self.np_random))
             self._noise = [*zip(w.tolist()[::-1], v.tolist()[::-1], strict=True)]

@@ -16,7 +16,7 @@ from kkl_gym.tracing import Symbol
 from kkl_gym.user_lines import line_of, path_of, steps_within, text_of
 
 METHODS = ("f", "g", "h", "rate", "step", "reward", "terminated")
-_SERVING = "floats, arrays, tensors and symbols"
+_TYPES = "floats, arrays, tensors and symbols"
 # Functions of other modules that fail on some types of numbers, and their names in kkl_gym.elementary.
 _FUNCTIONS = {name: name for name in vars(elementary) if not name.startswith("_")} | {
     "max": "maximum", "fmax": "maximum", "amax": "maximum", "Max": "maximum", "min": "minimum", "fmin": "minimum",
@@ -37,7 +37,7 @@ class EquationError(ValueError):
 
 
 def failed(error: Exception, equations: Equations, *args: Any) -> EquationError:
-    """The error for equations that raised an exception."""
+    """Return the error for equations that raised an exception."""
     what, x = f"{type(error).__name__}: {error}", args[0]
     steps = steps_within(error, code_of(equations))
     if not steps:
@@ -49,42 +49,43 @@ def failed(error: Exception, equations: Equations, *args: Any) -> EquationError:
     frame = steps[0].tb_frame
     local = frame.f_locals.get(next(iter(frame.f_code.co_varnames[1:2]), ""))
     if isinstance(local, tuple | list | np.ndarray) and len(local) == len(x):
-        x = local  # the state where the equations failed, which may lie inside a step
+        # The equations may have failed at a state within a step of integration, which is then their argument.
+        x = local
     return EquationError(
         f"{label(equations)} failed in {line_of(steps[-1])}: {what}; {held(x)}{_hint(error, steps[-1], x)}"
     )
 
 
 def returned(equations: Equations, wanted: str, found: str) -> EquationError:
-    """The error for equations that returned something invalid."""
+    """Return the error for equations that returned an invalid value."""
     return EquationError(f"{_defined(equations)} must return {wanted}; it returned {found}")
 
 
 def label(equations: Equations) -> str:
-    """Name, arguments and system of equations."""
+    """Return name, arguments and system of equations as a text, such as ``f(x) of 'lorenz'``."""
     system = getattr(getattr(equations, "__self__", None), "name", None)
     return signature(equations) + ("" if system is None else f" of {system!r}")
 
 
 def signature(equations: Equations, first: str = "") -> str:
-    """Name and arguments of equations."""
+    """Return name and arguments of equations as a text, such as ``f(x)``; ``first`` goes before the arguments."""
     return f"{name_of(equations)}({first}{'x, u' if name_of(equations) in ('step', 'reward') else 'x'})"
 
 
 def name_of(equations: Equations) -> str:
-    """The name of a method, also if it was assigned from a function with another name."""
+    """Return the name of a method, even if its class assigns it from a function with another name."""
     function, kind = getattr(equations, "__func__", None), type(getattr(equations, "__self__", None))
     names = (name for name in METHODS if function and getattr(kind, name, None) is function)
     return next(names, getattr(equations, "__name__", "equations"))
 
 
 def code_of(equations: Equations) -> CodeType | None:
-    """The code of a function or method, if it is written in Python."""
+    """Return the code of a function or method, or None if it is not written in Python."""
     return getattr(inspect.unwrap(getattr(equations, "__func__", equations)), "__code__", None)
 
 
 def held(x: Any) -> str:
-    """A text with the components of a state."""
+    """Return a text about the components of a state: their numbers, or the type and shape that they have."""
     first = x[0]
     for library, kind, plural in (("torch", "Tensor", "tensors"), ("numpy", "ndarray", "arrays")):
         if is_of(library, kind, first):
@@ -96,14 +97,14 @@ def held(x: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value as text; for an array its shape."""
+    """Return a value as text; for an array, only its shape."""
     if isinstance(value, np.ndarray) or is_of("torch", "Tensor", value):
         return f"an array of shape {tuple(value.shape)}" if value.ndim else repr(value.item())
     return reprlib.repr(value)
 
 
 def is_sequence(value: Any) -> bool:
-    """Whether a value is a sequence of entries; an array of shape () has no length."""
+    """Whether a value is a sequence of entries; an array of shape () is not."""
     if isinstance(value, np.ndarray) or is_of("torch", "Tensor", value):
         return bool(value.ndim)
     return isinstance(value, Sequence) and not isinstance(value, str | bytes)
@@ -124,16 +125,16 @@ def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     on_floats = isinstance(x[0], Real)
     called = re.findall(r"(?:(?:math|cmath|np|numpy|torch|sympy)\.|(?<![\w.]))(\w+)\(", text_of(step))
     known = [_FUNCTIONS[name] for name in called if name in _FUNCTIONS]
-    # math.sqrt(-1) fails on floats, and the hint helps. A TypeError on floats, as of abs(x), has another reason.
+    # On floats the hint is right where math.sqrt(-1) failed, but not for a TypeError, as of abs(x) on the whole state.
     if known and not (on_floats and isinstance(error, TypeError)):
-        return f": use kkl_gym.elementary.{known[0]}, which serves {_SERVING}"
+        return f": use kkl_gym.elementary.{known[0]}, which takes {_TYPES}"
     if "truth value" in str(error) or "Boolean value" in str(error):
         return (
             ", on which `if`, `and`, `or` and `not` cannot decide: use kkl_gym.elementary.where, minimum, maximum "
             "or clip, and combine conditions by & and |"
         )
     if isinstance(error, IndexError) or "unpack" in str(error):
-        return f", {len(x)} of them"
+        return f": x has {len(x)} components"
     if not on_floats and not isinstance(error, NameError | KeyError | ArithmeticError):
-        return f": equations take arithmetic and the functions of kkl_gym.elementary, which serve {_SERVING}"
+        return f": equations take arithmetic and the functions of kkl_gym.elementary, which take {_TYPES}"
     return ""

@@ -1,4 +1,7 @@
-"""Calls of a user's equations that check the returned values; fast loops call :func:`blame` after an error."""
+"""Calls of a user's equations, with checks of the values that they return.
+
+Fast loops leave the checks out, and call :func:`blame` after an error.
+"""
 
 import math
 from numbers import Real
@@ -22,11 +25,11 @@ from kkl_gym.equation_errors import (
 from kkl_gym.tracing import Symbol
 from kkl_gym.user_lines import steps_within, user_line
 
-_POWERS = "take fractional powers of negative numbers by kkl_gym.elementary.sqrt, or of abs(x)"
+_POWERS = "take square roots by kkl_gym.elementary.sqrt, and other fractional powers of abs(x)"
 
 
 def components(equations: Equations, *args: Any) -> Any:
-    """Call a system's f, h or step with nx floats (``step``: and nu), and check the returned components."""
+    """Call a system's f or h with x, or its step with x and u, and check the returned components."""
     values, x = _called(equations, *args), args[0]
     if name_of(equations) in ("f", "step"):
         n, wanted = len(x), f"{len(x)} components, one for each state"
@@ -81,7 +84,7 @@ def check_equations(system: Any) -> None:
         each = [_values(system, name, x, [0.0] * system.nu) for x in map(tuple, starts.tolist())]
         for value in each[0]:
             if isinstance(value, np.floating) and value.itemsize < 8:
-                found = f"{value!r}, whose precision a whole motion would inherit: write constants as Python's numbers"
+                found = f"{value!r}, which makes the whole motion imprecise: write constants as Python's numbers"
                 raise returned(equations, "floats of double precision", found)
         alone = np.array(each, dtype=float)
         wrong = ~np.isfinite(alone).all(1) | ((alone < 0).any(1) if name == "rate" else False)
@@ -94,22 +97,24 @@ def check_equations(system: Any) -> None:
         batch = np.array([np.broadcast_to(value, n) for value in _values(system, name, x, u)]).reshape(-1, n).T
         if u.any() or not np.array_equal(x, starts.T):
             given = "input" if u.any() else "state"
-            found = f"something, and changed the {given} that it was given: write a = a + b in place of a += b"
-            raise returned(equations, "what x makes of it", found)
+            found = f"something, but changed its argument, the {given}: write a = a + b in place of a += b"
+            raise returned(equations, "a value and leave its arguments unchanged", found)
         rounding = 1e-6 * np.abs(alone).max(initial=0.0)
         if batch.shape != alone.shape or not np.allclose(batch, alone, rtol=1e-3, atol=rounding):
-            wanted = "for each state of a batch what it returns for that state alone, and always the same"
+            wanted = "for each state of a batch the value that it returns for this state alone, at every call"
             found = f"{batch[0].tolist()} in a batch and {alone[0].tolist()} alone; {held(starts[0])}"
-            raise returned(equations, wanted, f"{found}: sum, max and norm mix states, use arithmetic on components")
+            fix = "sum, max and norm mix the states of a batch, so use arithmetic on components"
+            raise returned(equations, wanted, f"{found}: {fix}")
     try:
         target_of(system)
     except EquationError as error:
-        if not isinstance(error.__cause__, ValueError):  # there is no target; environments raise this
+        # A ValueError of the system means that it has no target; only environments need one, and raise this error.
+        if not isinstance(error.__cause__, ValueError):
             raise
 
 
 def _values(system: Any, name: str, x: Any, u: Any) -> list[Any]:
-    """All numbers that an equation returns, after checks."""
+    """Call the equation of this name, check the numbers that it returns, and return them as a list."""
     if name == "g":
         return [value for row in input_matrix(system, x) for value in row]
     if name == "rate":
@@ -121,7 +126,7 @@ def _values(system: Any, name: str, x: Any, u: Any) -> list[Any]:
 
 
 def _checked_starts(system: Any) -> np.ndarray:
-    """A few starts, (n, nx)."""
+    """Draw a few starts, (n, nx), and check them."""
     n, low, high = 5, *np.array(system.bounds, dtype=float).T
     try:
         starts = np.asarray(system.draw_starts(np.random.default_rng(0), n))
@@ -161,7 +166,8 @@ def blame(error: Exception, system: Any, *args: Any) -> None:
     for equations in (system.step, system.f, system.g, system.rate):
         if not _is_default(equations) and steps_within(error, code_of(equations)):
             raise failed(error, equations, *args) from error
-    with np.errstate(all="ignore"):  # otherwise a returned value is at fault
+    # None of the equations raised the exception. If one of them returned an invalid value, its check raises here.
+    with np.errstate(all="ignore"):
         if system.discrete:
             components(system.step, *args)
         else:
@@ -173,7 +179,7 @@ def blame(error: Exception, system: Any, *args: Any) -> None:
 
 
 def complex_motion(system: Any, x: Any) -> EquationError:
-    """The error for a motion that became complex, as ``x ** 0.5`` does for negative floats."""
+    """Return the error for a motion that became complex, as ``x ** 0.5`` does for negative floats."""
     found = f"complex ones on the way from {held(x)}: {_POWERS}"
     return returned(system.step if system.discrete else system.f, "real numbers", found)
 
@@ -198,7 +204,7 @@ def _check_components(equations: Any, values: Any, n: int | None, *, like: Any, 
         raise returned(equations, wanted, f"{len(values)} of them: {shown(values)}")
     for i, value in enumerate(values):
         if not _fits(value, like):
-            raise returned(equations, wanted, f"{shown(values)}, of which [{i}] is {_misfit(value, like)}")
+            raise returned(equations, wanted, f"{shown(values)}, whose entry [{i}] is {_misfit(value, like)}")
 
 
 def _fits(value: Any, like: Any) -> bool:

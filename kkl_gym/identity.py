@@ -18,22 +18,22 @@ Env = gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]
 
 
 def source_of(env: Any) -> str:
-    """The name of an environment in messages: its id, or its class."""
+    """Return an environment's name for messages: its id, or else its class."""
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
 
 
 def check_autoreset(env: Any) -> None:
-    """Raise ValueError if a wrapper inside starts the next episode by itself, at a step."""
+    """Raise ValueError if there is a wrapper Autoreset inside, which starts the next episode at a step."""
     base = env.unwrapped
     for one in base.envs if isinstance(base, gym.vector.SyncVectorEnv) else [env]:
         while isinstance(one, gym.Wrapper):
             if isinstance(one, gym.wrappers.Autoreset):
-                raise ValueError("Autoreset inside hides where episodes begin: put it outside")
+                raise ValueError("the wrapper Autoreset inside hides where episodes begin: put it outside")
             one = one.env
 
 
 def identity(env: Env) -> dict[str, Any]:
-    """Id and arguments of an environment."""
+    """Return id and arguments of an environment; ValueError if the rows of a vector differ in them."""
     base: Any = env.unwrapped
     specs = base.get_attr("spec") if _of_rows(base) else [env.spec]
     found = [_identity(spec, env) for spec in specs]
@@ -46,7 +46,7 @@ def identity(env: Env) -> dict[str, Any]:
 def _identity(spec: Any, env: Env) -> dict[str, Any]:
     if spec is None:
         raise ValueError(
-            f"{shown(env)} has no specification, and only that identifies an environment: register it, and make it by "
+            f"{shown(env)} has no specification, by which environments are identified: register it, and make it by "
             "gym.make(ID)"
         )
     kwargs = {name: value for name, value in spec.kwargs.items() if name not in APPEARANCE}
@@ -61,7 +61,7 @@ def _identity(spec: Any, env: Env) -> dict[str, Any]:
 
 
 def sampling_interval(env: Env) -> float:
-    """Seconds between the samples of an environment: its attribute ``dt``, or 1 without this attribute."""
+    """Return the seconds between samples of an environment: its attribute ``dt``, or 1 without this attribute."""
     base: Any = env.unwrapped
     if _of_rows(base):
         dt = base.get_attr("dt")[0] if all(base.call("has_wrapper_attr", "dt")) else None
@@ -71,12 +71,12 @@ def sampling_interval(env: Env) -> float:
 
 
 def _of_rows(base: Any) -> bool:
-    """Whether an environment is a vector whose environments can be called one by one."""
+    """Whether an environment is a Sync or Async vector, whose environments can be called one by one."""
     return isinstance(base, gym.vector.SyncVectorEnv | gym.vector.AsyncVectorEnv)
 
 
 def check_identity(artifact: Artifact, env: Env) -> None:
-    """Raise ArtifactError unless an observer was made for an environment."""
+    """Raise ArtifactError unless an observer was made for this environment."""
     made: Mapping[str, Any] = artifact.environment or {}
     found = identity(env)
 
@@ -96,8 +96,8 @@ def check_identity(artifact: Artifact, env: Env) -> None:
 
 
 def how_to_make_one(name: str) -> str:
-    """The commands that make an observer for an environment, for messages."""
+    """Return a text for messages: the commands that make an observer for an environment."""
     return (
         f"an observer is learned by `kkl-gym record {name} --measured ... --hidden ...` and `kkl-gym train NAME --data "
-        "minari:DATASET`; kkl_gym.KKLMemory needs none"
+        "minari:DATASET`; kkl_gym.KKLMemory needs no observer"
     )

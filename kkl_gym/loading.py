@@ -25,7 +25,8 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
         (class_name,) = own
     found = getattr(module, class_name, None)
     if found is None:
-        lacks = f"defines no {class_name}" if class_name else f"needs one class, named as in {where}:Class"
+        one = f"does not define exactly one class: name one, as in {where}:Class"
+        lacks = f"defines no {class_name}" if class_name else one
         raise ValueError(f"{failure}: {where} {lacks}; it defines {', '.join(own) or 'none'}")
     if not (inspect.isclass(found) and issubclass(found, base) and found is not base):
         package = base.__module__.rpartition(".")[0]
@@ -34,7 +35,7 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
 
 
 def load_function(name: str) -> Callable[..., Any]:
-    """Load a function."""
+    """Load a function from ``module:name`` or ``script.py:name``."""
     where, _, called = name.rpartition(":")
     failure = f"cannot load the function {name!r}"
     function = getattr(_imported(where, failure), called, None)
@@ -44,7 +45,7 @@ def load_function(name: str) -> Callable[..., Any]:
 
 
 def _is_own(value: Any, base: type, module: str) -> bool:
-    """Whether a value is a subclass that a module, or a submodule of it, defines itself."""
+    """Whether a value is a subclass of ``base`` that a module or one of its submodules defines."""
     return (
         inspect.isclass(value)
         and issubclass(value, base)
@@ -68,7 +69,8 @@ def _module(where: str) -> Any:
             raise ImportError(f"{where!r} is not an absolute module name")
         with _importing_from(Path.cwd()):
             found = importlib.import_module(where)
-        vars(found).setdefault("__kkl_gym_script__", where)  # worker processes load the same file
+        # System.__reduce__ reads this attribute, by which worker processes load the same module.
+        vars(found).setdefault("__kkl_gym_script__", where)
         return found
     path = Path(where).resolve()
     key = f"_kkl_gym_script_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"

@@ -11,11 +11,15 @@ import numpy as np
 from observers import LinearFilter
 from observers.checks import real_array, shown
 
-SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
-CLOSEST = 1.5  # least ratio of successive time constants; closer ones would give coordinates of rounding errors
-IMAGINED = 64  # steps before the first output in which the outputs are assumed to have changed
-SMALL = 200  # coordinates up to which one matrix product advances one memory faster than several NumPy calls
-FILLED = 20  # after so many of the longest time constants, the past before the reset counts only e^-20
+SHORTEST, LONGEST = 0.5, 10_000.0  # limits of time constants, in steps
+# Least ratio of successive time constants. Closer ones would give coordinates that are mostly rounding errors.
+CLOSEST = 1.5
+# Number of steps before the first output over which the outputs are assumed to have changed.
+IMAGINED = 64
+# Up to this number of coordinates, one matrix product advances a single memory faster than several NumPy calls.
+SMALL = 200
+# After this multiple of the longest time constant, the past before the reset has the weight e^-20 and is neglected.
+FILLED = 20
 TURN = 2 * math.pi
 
 
@@ -23,23 +27,25 @@ class Memory:
     """Exact first-order filters of signals, in coordinates that are uncorrelated and as large as the signals.
 
     For each output y and time constant tau, the low-pass filter z' = (y - z) / tau is integrated exactly, with y linear
-    between samples. The memory uses w = y - z, which is 0 where y rests, whatever its value:
+    between samples. The memory uses w = y - z, which tends to 0 while y is constant:
     w_k+1 = decay w_k + rise (y_k+1 - y_k). For each input u and time constant of inputs, the memory uses the low-pass
     filter v' = (u - v) / tau itself, with u held between samples.
 
-    The past before the first output is unknown. The memory assumes that y rested until 64 steps before it, and from
-    then on changed at the mean rate of the steps since, as each filter weights them. After k steps this assumption
-    multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also assumes that no input acted.
+    The past before the first output is unknown. The memory assumes that y was constant until 64 steps before the first
+    output. From then on, y is assumed to have changed at its mean rate since the first output, as each filter weights
+    it. After k steps this assumption multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also assumes that
+    no input acted before the first output.
 
-    For a slow signal every w is nearly tau times its rate. So the memory returns combinations: the slowest w first, and
-    of each faster one the part that the slower ones do not explain. These coordinates are uncorrelated and as large as
-    y if y is an Ornstein-Uhlenbeck process with a correlation time from twice the shortest time constant to eight times
-    the longest. In the long run they amplify white noise on y at most threefold. At first they rest on few samples and
-    amplify noise more: with the default time constants 22-fold in the first step, and fourfold in the fifth.
+    Every w of a slow signal is nearly tau times the signal's rate, so that all w would carry the same information. The
+    memory therefore returns combinations: first the w of the slowest filter, and of each faster filter the part of w
+    that the slower ones do not predict. These coordinates are uncorrelated and as large as y if y is an
+    Ornstein-Uhlenbeck process with a correlation time from twice the shortest time constant to eight times the longest.
+    In the long run they amplify white noise on y at most threefold. At first they rest on few samples and amplify noise
+    more: with the default time constants 22-fold in the first step, and fourfold in the fifth.
 
     If an angle is measured by its cosine and its sine, the memory filters the unwrapped angle itself. It assumes that
-    the angle turns by less than half a turn from one sample to the next, and rests where cosine and sine are both 0.
-    Memories of angles come after those of the other outputs.
+    the angle turns by less than half a turn from one sample to the next, and that it does not change where cosine and
+    sine are both 0. Memories of angles come after those of the other outputs.
 
     Shapes: ``angles``, indices of cosines and sines, (number of angles, 2); ``decay``, ``rise`` (m,), ``mixing``
     (m, m), ``input_decay`` (k,); outputs, inputs and the coordinates returned (..., ny), (..., nu), (..., size).
@@ -71,11 +77,15 @@ class Memory:
         with np.errstate(under="ignore"):
             self._with_past = (1 - self.decay ** (ages + IMAGINED)) / (1 - self.decay ** np.maximum(ages, 1))
         self._y: np.ndarray | None = None  # (..., ny); w has the shape (m, ..., signals), v (k, ..., nu)
-        self._row: np.ndarray | None = None  # a single small memory's [signals, w, v], then views of it
+        # For a single small memory, [signals, w, v] in one array; the separate attributes are then views of it.
+        self._row: np.ndarray | None = None
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
-        """The matrices of a step, from [signals, w, v, next signals, u] to the next [signals, w, v], and of mixing."""
+        """Two matrices that multiply rows from the right.
+
+        The first makes a step of [signals, w, v, next signals, u], and the second mixes [signals, w, v].
+        """
         n, m, nu, of_inputs = len(self._signals), len(self.decay), self._nu, len(self.input_decay)
         each, rise = np.eye(n), np.kron(self.rise, np.eye(n))
         sizes = np.cumsum([n, m * n, of_inputs * nu, n, nu])
@@ -88,7 +98,7 @@ class Memory:
         return update, combine
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Begin with outputs ``y0`` (..., ny), as if they had rested there and no input had acted."""
+        """Begin with outputs ``y0`` (..., ny), as if they had been constant and no input had acted."""
         self._y = y0.copy()
         self._signals = self._read(self._y, 0.0)
         self._w = np.zeros((len(self.decay), *self._signals.shape))
@@ -138,14 +148,14 @@ class Memory:
             raise RuntimeError("reset the environment before its first step")
 
     def _read(self, y: np.ndarray, before: np.ndarray | float) -> np.ndarray:
-        """The signals that are filtered: first the outputs that measure no angle, then the angles."""
+        """Return the signals to filter: first the outputs that are no cosine or sine of an angle, then the angles."""
         if not len(self._cosines):
             return y
         angles = turned(y.take(self._cosines, -1), y.take(self._sines, -1), before)
         return np.concatenate((y.take(self._others, -1), angles), axis=-1)
 
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Outputs, their memory and that of the inputs, (..., size), in all rows or some."""
+        """Return outputs, their memory and the memory of the inputs, (..., size), in all rows or some."""
         self._check_begun()
         w, filled = self._w, len(self._with_past)
         if self._row is not None:
@@ -166,18 +176,20 @@ class Memory:
 
 
 def turned(cosines: np.ndarray, sines: np.ndarray, before: np.ndarray | float) -> np.ndarray:
-    """Unwrapped angles in rad, within half a turn of those before; unchanged where cosine and sine are both 0."""
+    """Return unwrapped angles in rad, within half a turn of ``before``; ``before`` where cosine and sine are both 0."""
     angles = np.arctan2(sines, cosines)
     nearest = angles - TURN * np.rint((angles - before) / TURN)
     return np.where((cosines == 0) & (sines == 0), before, nearest)
 
 
 def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """The matrix that orthonormalises w, slowest first, under its covariance averaged over correlation times of y."""
+    """Return the matrix that orthonormalises w, slowest first, under a covariance averaged over correlation times."""
     covariance = np.zeros((len(decay), len(decay)))
     for correlation in np.geomspace(2 * time_constants[0], 8 * time_constants[-1], 6):
-        forgotten = -math.expm1(-1 / correlation)  # the share of y, of variance 1, that decorrelates in a step
-        with_y = rise * forgotten / (1 - decay * (1 - forgotten))  # E[w y]; E[w (y_k+1 - y_k)] is -forgotten times this
+        # y has the variance 1, and the autocorrelation 1 - forgotten after a step.
+        forgotten = -math.expm1(-1 / correlation)
+        # This is E[w y], and E[w (y_k+1 - y_k)] is -forgotten times E[w y].
+        with_y = rise * forgotten / (1 - decay * (1 - forgotten))
         crossed = np.outer(decay * with_y, rise)
         # From w_k+1 = decay w_k + rise (y_k+1 - y_k), where E[(y_k+1 - y_k)^2] = 2 forgotten:
         covariance += forgotten * (2 * np.outer(rise, rise) - crossed - crossed.T) / (1 - np.outer(decay, decay))
@@ -189,24 +201,24 @@ def output_time_constants(name: str, values: Any) -> tuple[float, ...]:
     """Return time constants of outputs as floats; ValueError unless :class:`Memory` takes them."""
     found = _time_constants(name, values)
     if not found:
-        raise ValueError(f"{name} must name at least one, in steps, such as (1, 2, 4, 8)")
+        raise ValueError(f"{name} must hold at least one number of steps, such as (1, 2, 4, 8)")
     return found
 
 
 def _time_constants(name: str, values: Any) -> tuple[float, ...]:
-    """Time constants as floats, or ValueError."""
+    """Return time constants as floats, or raise ValueError."""
     array = real_array(name, values)
     if array.ndim != 1:
         raise ValueError(f"{name} must be a sequence of numbers of steps, such as (1, 2, 4, 8), got {shown(values)}")
     found = tuple(array.tolist())
     for value in found:
-        if not SHORTEST <= value <= LONGEST:  # true for NaN
+        if not SHORTEST <= value <= LONGEST:  # also true for NaN
             raise ValueError(f"{name} must be from {SHORTEST:g} to {LONGEST:,.0f} steps each, got {value:g}")
     for one, next_one in pairwise(found):
         if next_one < (1 - 1e-9) * CLOSEST * one:
             raise ValueError(
                 f"{name} must rise, each at least {CLOSEST} times the one before, got {one:g} and {next_one:g}: closer "
-                "ones would hold the same"
+                "ones would give the same memory"
             )
     return found
 

@@ -20,7 +20,7 @@ _INFO = re.compile(r"info\[([^\[\]]+)\](?:\[(\d+)\])?")
 
 
 def observed(space: Space) -> tuple[str, ...]:
-    """Names of the entries of a flattened observation."""
+    """Return the names of the entries of a flattened observation."""
     if not isinstance(space, spaces.Dict):
         return tuple(f"obs[{i}]" for i in range(_size(space)))
     sizes = {key: _size(part) for key, part in space.items()}
@@ -28,19 +28,19 @@ def observed(space: Space) -> tuple[str, ...]:
 
 
 def acting(space: Space) -> tuple[str, ...]:
-    """Names of the inputs of a flattened action, ``action[0]`` and so on; discrete actions count as one-hot."""
+    """Return the names of the entries of a flattened action, ``action[0]`` and so on; discrete actions are one-hot."""
     return tuple(f"action[{i}]" for i in range(_size(space)))
 
 
 def _size(space: Space) -> int:
     try:
         return spaces.flatdim(space)
-    except (NotImplementedError, ValueError):  # graphs and sequences
+    except (NotImplementedError, ValueError):  # graph and sequence spaces
         return 0
 
 
 def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str) -> tuple[str, ...]:
-    """Full names of signals, as in ``obs[2]`` for 2; ValueError if one is unknown."""
+    """Return the full names of signals, such as ``obs[2]`` for 2; ValueError if a name is unknown."""
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise ValueError(f"{role} must be a sequence of names or indices, such as [0, 1], got {shown(names)}")
     there, found = observed(space), list[str]()
@@ -51,15 +51,15 @@ def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str
             known = textwrap.shorten(", ".join(there), 200, placeholder=" ...") or "no numbers"
             ask = "" if not entries else ": name one entry of it"
             raise ValueError(
-                f"{role} names {name!r}, but an observation of {source} is {known}{ask}; an index stands for its entry "
-                "(2 for obs[2]), and info[KEY] for an entry of info"
+                f"{role} names {name!r}, but an observation of {source} holds {known}{ask}; an index stands for its "
+                "entry (2 for obs[2]), and info[KEY] for an entry of info"
             )
         found += [f"{function[1]}({entry})" for entry in entries] if function else entries
     return tuple(found)
 
 
 def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]:
-    """The entries that a name without cos or sin stands for; empty if it names no entry."""
+    """Return the entries that a name without cos or sin stands for; empty if it names no entry."""
     if name in there or _INFO.fullmatch(name):
         return (name,)
     if index := _INDEX.fullmatch(name):
@@ -71,7 +71,7 @@ def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]
 
 
 class Reader:
-    """Reads named signals from observations and ``info``; NaN is allowed with ``missing``. Shapes: ``low`` (n,)."""
+    """Reads n named signals from observations and ``info``; ``missing`` allows NaN. Shapes: ``low``, ``high`` (n,)."""
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str, missing: bool = False) -> None:
         there, self._source = observed(space), source
@@ -84,7 +84,8 @@ class Reader:
         columns = [there[i] for i in chosen]
         self._outputs = None
         low, high = np.zeros(0), np.zeros(0)
-        if chosen and isinstance(space, spaces.Dict):  # only the keys that are read: others may be images
+        # Of a Dict only the keys with chosen entries are read, because others may be images.
+        if chosen and isinstance(space, spaces.Dict):
             owners = [key for key, part in space.items() for _ in range(_size(part))]
             read = spaces.Dict({key: space[key] for key in dict.fromkeys(owners[i] for i in chosen)})
             space, chosen = read, [observed(read).index(column) for column in columns]
@@ -103,7 +104,7 @@ class Reader:
             self.low[i], self.high[i] = -1.0, 1.0
 
     def __call__(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The signals. Shapes: returns (*batch, n)."""
+        """Return the signals, (*batch, n)."""
         parts = [] if self._outputs is None else [self._outputs(observation, batch)]
         parts += [self._of_info(info, entry, batch) for entry in self._infos]
         y = np.concatenate(parts, axis=-1)[..., self._take]
@@ -127,7 +128,7 @@ class Reader:
 
 
 def _info(entry: str) -> tuple[str, int | None]:
-    """The key in ``info``, and the index within its value, or None."""
+    """Return an entry's key in ``info``, and its index within the value of this key, None without an index."""
     found = _INFO.fullmatch(entry)
     if found is None:
         raise ValueError(f"there is no entry {entry!r}")
@@ -145,7 +146,7 @@ class InputReader:
         self._take = np.array([there.index(name) for name in names], dtype=int)
 
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The inputs, (*batch, n): bounded boxes scaled to [-1, 1] and clipped, discrete actions one-hot."""
+        """Return the inputs, (*batch, n): bounded boxes scaled to [-1, 1] and clipped, discrete actions one-hot."""
         return self._inputs(action, batch)[..., self._take]
 
 

@@ -14,8 +14,10 @@ from kkl_gym.system import Box, Components, System
 from kkl_gym.systems import get_system
 from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
-_MOST_POINTS = 1000  # points of each kind, on a grid and random, at which h is evaluated to bound the outputs
-NOISE_BLOCK = 256  # samples whose noise is drawn at once, because single draws cost more than the simulation
+# Number of random states at which h is evaluated to bound the outputs; a grid has about as many states at most.
+_MOST_POINTS = 1000
+# The noise of this number of samples is drawn at once, because single draws take longer than the simulation.
+NOISE_BLOCK = 256
 
 
 class Plant:
@@ -65,8 +67,8 @@ class Plant:
     def draw_noise(
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw samples, (NOISE_BLOCK, nx) and (NOISE_BLOCK, nv), which :meth:`noise` scales."""
-        # A sensor draws from its own generator, so that a seed gives the same motions and noise with and without it.
+        """Draw w (NOISE_BLOCK, nx) and v (NOISE_BLOCK, nv), which :meth:`noise` scales."""
+        # A sensor draws from its own generator, so that a seed gives the same motions and noise without a sensor.
         n, ny = NOISE_BLOCK, self.ny
         w = rng.random((n, len(self._w_range)), out=w)
         if not self._random:
@@ -77,18 +79,18 @@ class Plant:
         return w, v
 
     def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Scale draws (..., nx) and (..., nv) to noise."""
+        """Scale draws of w (..., nx) and v (..., nv) to the noise levels."""
         return (drawn_w - 0.5) * self._w_range, drawn_v * self._v_scale
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
-        """A random start, (nx,): uniform in ``start_box``, or by the system's ``draw_starts`` if no box was given."""
+        """Draw a start, (nx,): uniform in ``start_box``, or by the system's ``draw_starts`` if no box was given."""
         if self._draws:
             return self.start(self.system.draw_starts(rng, 1)[0])
         low, high = self.start_box
         return rng.uniform(low, high)
 
     def start(self, x0: Any) -> np.ndarray:
-        """A start that the user gave, after a check. Shapes: ``x0`` (nx,); returns (nx,)."""
+        """Check a start ``x0`` (nx,) that the user gave, and return it as an array."""
         start = real_array("x0", x0)
         low, high = np.array(self.system.bounds).T
         if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():
@@ -97,7 +99,7 @@ class Plant:
 
 
 class OfPlant:
-    """Base of single and vector environments: their plant and its properties."""
+    """Base class of single and vector environments: holds their plant and its properties."""
 
     plant: Plant
     _reward: Callable[[Components, Components], Any]
@@ -124,7 +126,7 @@ class OfPlant:
         raise NotImplementedError
 
     def _judged(self, x: Components, u: Components) -> tuple[Any, Any]:
-        """Rewards of intervals that ended at x under u, and whether episodes end at x; takes floats or arrays."""
+        """Return rewards of intervals under u that ended at x, and whether episodes end at x, as numbers or arrays."""
         system = self.plant.system
         try:
             reward, ended = self._reward(x, u), system.terminated(x)
@@ -148,16 +150,19 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
         raise ValueError(f"start_box must be (low, high) for each of {system.nx} states, got {shown(box)}")
     if not ((low <= ends[:, 0]) & (ends[:, 0] <= ends[:, 1]) & (ends[:, 1] <= high)).all():
         raise ValueError(
-            f"start_box must lie within the declared bounds {system.bounds}, low before high, got {shown(box)}"
+            f"start_box must lie within the declared bounds {system.bounds}, with low <= high, got {shown(box)}"
         )
     return ends[:, 0], ends[:, 1]
 
 
 def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of h(x) over the declared bounds of the state; exact if h is monotone in each state."""
-    # h is evaluated at random states, and on the grid of low, middle and high values, where it must not be NaN. With
-    # more than six states, only a part of this grid is taken. It includes, for each output, the two corners towards
-    # which the output rises and falls from the centre.
+    """Return bounds of h(x) over the declared bounds of the state, widened by ``margin``.
+
+    Before they are widened, they are exact if h is monotone in each state.
+    """
+    # h is evaluated at random states, and on the grid of each state's low, middle and high values, on which it must not
+    # be NaN. With more than six states, only a part of the grid is taken. This part includes, for each output, the two
+    # corners towards which the output rises and falls from the centre.
     low, high = np.array(system.bounds, dtype=float).T
     rng, nx = np.random.default_rng(0), system.nx
     if 3**nx <= _MOST_POINTS:
@@ -174,7 +179,7 @@ def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarra
         y = system.output(x)
     lost = np.isnan(y).any(1) & (np.arange(len(x)) < len(marked))
     if lost.any():
-        found = f"{y[lost][0].tolist()}; {held(x[lost][0])}: tighten the bounds to where there is an output"
+        found = f"{y[lost][0].tolist()}; {held(x[lost][0])}: tighten the bounds to where h(x) is defined"
         raise returned(system.h, "numbers everywhere within the bounds", found)
     return np.nanmin(y, axis=0) - margin, np.nanmax(y, axis=0) + margin
 

@@ -8,16 +8,18 @@ import numpy as np
 from kkl_gym.memory import Memory
 from observers.checks import real_array
 
-CHANCE = 3.0  # least variance of a combination to keep, in multiples of the variance that a fit to noise would have
-SAMPLES = 10  # least number of samples for each feature of the fit
+# Predictions are kept if their variance exceeds this multiple of the variance that a fit to white noise would have.
+CHANCE = 3.0
+# The fit needs this number of samples for each feature.
+SAMPLES = 10
 
 
 class PredictiveMemory(Memory):
     """A memory that returns the outputs expected in the next step, and predictions of later ones.
 
-    The filters are those of :class:`Memory`, over all outputs and angles. They include cosine and sine themselves, on
-    which a torque may depend. ``weights``, (features, width), multiply the features [signals, w, v, 1]. Their first
-    columns give the expected change of each output or angle, the others the further predictions.
+    The filters are those of :class:`Memory`, of all outputs and angles. Cosine and sine of an angle are filtered too,
+    because a torque may depend on them. ``weights``, (features, width), multiply the features [signals, w, v, 1]. The
+    first columns give the expected change of each output or angle, the others the further predictions.
     """
 
     def __init__(
@@ -31,16 +33,16 @@ class PredictiveMemory(Memory):
         if self.weights.ndim != 2 or len(self.weights) != features or self.weights.shape[1] < len(self._targets):
             raise ValueError(
                 f"weights must be {features} rows of {len(self._targets)} numbers or more, got the shape "
-                f"{self.weights.shape}: take what learn_weights() of KKLMemory with the same other arguments returns"
+                f"{self.weights.shape}: pass the result of learn_weights() of a KKLMemory with the same other arguments"
             )
         self.size = ny + self.weights.shape[1] - len(self._targets)
 
     def features(self) -> np.ndarray:
-        """Signals, filters and a constant 1. Shapes: returns (..., features)."""
+        """Return signals, filters and a constant 1, (..., features)."""
         return np.concatenate([self._signals, *self._w, *self._v, np.ones((*self._ages.shape, 1))], axis=-1)
 
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """The expected outputs and the further predictions, (..., size), of all rows or some."""
+        """Return the expected outputs and the further predictions, (..., size), of all rows or some."""
         self._check_begun()
         predicted = self.features() @ self.weights
         n, plain = len(self._targets), len(self._plain)
@@ -63,8 +65,8 @@ class PredictiveMemory(Memory):
         n, features = x.shape
         if n < SAMPLES * features:
             raise ValueError(
-                f"{n} samples are followed by {last} more in their episode, {SAMPLES * features} are needed: take more "
-                "steps or shorter time constants"
+                f"{n} samples are followed by {last} more in their episode, and {SAMPLES * features} are needed: take "
+                "more steps or shorter time constants"
             )
         signals = [episode[:, self._targets] for episode in episodes]
         following = [np.concatenate([s[h : len(s) - last + h] for s in signals if len(s) > last]) for h in horizons]
@@ -74,7 +76,8 @@ class PredictiveMemory(Memory):
         weights = np.linalg.lstsq(x / size, change, rcond=1e-9)[0] / size[:, None]
         to_next, to_later = weights[:, : len(self._targets)], weights[:, len(self._targets) :]
         predicted = x @ to_later
-        floor = np.maximum(1e-9 * later.var(0), 1e-12)  # least error variance, for exact predictions
+        # This least variance keeps the covariance of the errors invertible where predictions are exact.
+        floor = np.maximum(1e-9 * later.var(0), 1e-12)
         error = np.atleast_2d(np.cov((later - predicted).T, bias=True)) + np.diag(floor)
         to_white = to_later @ np.linalg.inv(np.linalg.cholesky(error)).T
         mean = (x @ to_white).mean(0)

@@ -10,15 +10,15 @@ import numpy as np
 from kkl_gym.system import Box, System
 from observers.checks import shown
 
-ESTIMATE, TARGET = "C3", "C2"  # colours of matplotlib's cycle; states have the colour of text
-TRAIL = 1000  # samples that a phase portrait shows
+ESTIMATE, TARGET = "C3", "C2"  # in matplotlib's colour cycle; states have the colour of text
+TRAIL = 1000  # most samples that a phase portrait shows
 FRAMES = 100  # most frames a second in a video; players can hardly show more
 DRAWN = 50  # most frames a second in a window, which runs in real time
 ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 
 
 def render_metadata(dt: float, modes: Collection[str], render_mode: str | None = None) -> dict[str, Any]:
-    """Metadata with the modes and the real-time frame rate; ValueError if ``render_mode`` is not among the modes."""
+    """Return metadata with the modes and the real-time frame rate; ValueError if ``render_mode`` is not a mode."""
     if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
         raise ValueError(f"render_mode must be None or one of {[*modes]}, got {shown(render_mode)}")
     return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
@@ -39,7 +39,7 @@ class Trails:
 
 
 class Canvas:
-    """A phase portrait of two of a system's states: target, true trail, estimates, and the input as a bar."""
+    """A phase portrait of two states of a system, with the target, the estimates, and a bar for each input."""
 
     def __init__(
         self, system: System, estimates: bool = False, box: Box | None = None, *, title: str | None = None
@@ -98,7 +98,7 @@ class Canvas:
 
 
 class Window:
-    """A window that shows a motion in real time; it skips frames that a screen could not show."""
+    """A window that shows a motion in real time, at no more than ``DRAWN`` frames a second."""
 
     def __init__(self, title: str, dt: float) -> None:
         try:
@@ -111,7 +111,7 @@ class Window:
         self._clock = pygame.time.Clock()
 
     def show(self, frame: np.ndarray) -> None:
-        """Show a frame (height, width, 3) when it is due; the first call opens the window."""
+        """Wait until a frame (height, width, 3) is due, and show it; the first call opens the window."""
         pygame = self._pygame
         if not self._open():
             pygame.display.init()
@@ -134,5 +134,5 @@ class Window:
 
 
 def samples_a_frame(dt: float) -> int:
-    """Number of sampling intervals of ``dt`` seconds between two frames of a window."""
+    """Return the number of sampling intervals of ``dt`` seconds between two frames of a window."""
     return max(1, math.ceil(1.0 / (dt * DRAWN) - 1e-9))

@@ -11,7 +11,8 @@ import numpy as np
 from kkl_gym.equation_errors import is_sequence
 from observers.checks import integer, is_finite, noise_level, shown
 
-MAX_SAMPLES = 10_000  # largest delay and gap between samples, in steps; each environment stores a delay's samples
+# Largest delay and largest gap between samples, in steps; each environment stores the samples of its delay.
+MAX_SAMPLES = 10_000
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class Sensor:
                 raise ValueError(f"the sensor's saturation must be (low, high), got {shown(self.saturation)}")
             ends = tuple(_each(f"the sensor's saturation[{i}]", end, _finite) for i, end in enumerate(self.saturation))
             if len({len(end) for end in ends if isinstance(end, tuple)}) < 2 and not np.all(np.less(ends[0], ends[1])):
-                raise ValueError(f"the sensor's saturation must be (low, high), low before high, got {ends}")
+                raise ValueError(f"the sensor's saturation must be (low, high) with low < high, got {ends}")
             object.__setattr__(self, "saturation", ends)
 
     @property
@@ -99,7 +100,7 @@ class Sensor:
         return bool(np.any(self.coloured_noise) or np.any(self.drop_out))
 
     def columns(self, ny: int) -> dict[str, np.ndarray]:
-        """All parameters by name, (ny, 1) each. By default limits are infinite, and time constants are 1."""
+        """Return all parameters by name, each (ny, 1). By default limits are infinite, and time constants are 1."""
         low, high = (-math.inf, math.inf) if self.saturation is None else self.saturation
         given = vars(self) | {"low": low, "high": high, "time_constant": self.time_constant or 1.0}
         del given["saturation"]
@@ -112,7 +113,7 @@ class Sensor:
         return {name: np.broadcast_to(np.array(value), ny)[:, None] for name, value in given.items()}
 
     def bounds(self, low: np.ndarray, high: np.ndarray, noise: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of y for bounds (ny,) of h(x), widened by six standard deviations of the total noise."""
+        """Return bounds of y for bounds (ny,) of h(x), widened by six standard deviations of the total noise."""
         of = {name: column[:, 0] for name, column in self.columns(len(low)).items()}
         ends = of["gain"] * np.stack([low, high]) + of["bias"]
         margin = 6.0 * np.hypot(noise, of["coloured_noise"]) + of["quantum"] / 2
@@ -120,7 +121,7 @@ class Sensor:
 
 
 def sensor_of(value: Any) -> Sensor | None:
-    """A Sensor from a Sensor, a mapping of its parameters, or None."""
+    """Return a Sensor from a Sensor or from a mapping of its parameters; None stays None."""
     if value is None or isinstance(value, Sensor):
         return value
     names = [field.name for field in dataclasses.fields(Sensor)]
@@ -146,7 +147,7 @@ class Readings:
         self._age = np.zeros(n, dtype=np.int64)  # steps since reset
         self._kept = np.zeros((int(of["delay"].max()) + 1, ny, n))  # ring buffer of the latest samples
 
-    @np.errstate(over="ignore", invalid="ignore")  # states that escaped may overflow
+    @np.errstate(over="ignore", invalid="ignore")  # outputs of states that escaped may overflow
     def read(self, h: np.ndarray, v: np.ndarray, rows: np.ndarray | None = None, *, start: bool) -> np.ndarray:
         """Return the samples (ny, m) of ``rows`` (m,) at an episode's start or its next step, NaN where missing.
 

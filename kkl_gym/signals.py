@@ -1,4 +1,4 @@
-"""Measured outputs and inputs as rows of real numbers, from values of Gymnasium's spaces, single or in batches."""
+"""Outputs and inputs as rows of real numbers, read from observations and actions, single or in batches."""
 
 import copy
 import math
@@ -18,7 +18,8 @@ Entries = Sequence[int] | Sequence[str]
 Angles = Sequence[int | Sequence[int]] | Sequence[str | Sequence[str]]
 """Entries that are angles, and pairs of entries that are the cosine and the sine of an angle."""
 TURN = 2 * math.pi
-UNITS = 1.0, 2.0, 4.0  # widths of bounds that leave the unit unclear: turns, half turns or rad
+# If the bounds of an angle are this far apart, its unit is unclear: it may be turns, half turns or rad.
+UNITS = 1.0, 2.0, 4.0
 
 
 class Outputs:
@@ -71,36 +72,37 @@ class Outputs:
             taken = _positions("measured", self.measured, owners)
         each = [angle if isinstance(angle, tuple) else (angle,) for angle in self.angles]
         if keys and each and not isinstance(each[0][0], str):
-            raise ValueError(f"angles must be keys, as those of measured are, got {self.angles}")
+            raise ValueError(f"angles must be keys, because measured holds keys, got {self.angles}")
         at = [tuple(_positions("angles", (entry,), owners) for entry in angle) for angle in each]
         if not {i for angle in at for entry in angle for i in entry} <= set(taken):
             raise ValueError(f"angles must be among the measured entries, {self.measured}, got {self.angles}")
         plain = [i for angle in at if len(angle) == 1 for i in angle[0]]
         if period is not None and not plain:
-            raise ValueError(f"period = {period:g} is a turn of entries that are angles, and angles names none")
+            raise ValueError(f"period = {period:g} has no effect: no entry of angles is an angle itself")
         units = {i: TURN / (self.period or self._period_of(low[i], high[i], self._names[i])) for i in plain}
         self._take = np.repeat(taken, [1 + (i in units) for i in taken])
         self._whole = self._take.tolist() == list(range(len(owners)))
         self._sines = np.flatnonzero(np.isin(self._take, plain))[1::2]
         self._cosines = self._sines - 1
         self._units = np.array([units[i] for i in self._take[self._sines]])  # rad per unit of each angle
-        self.pairs = list(zip(self._cosines.tolist(), self._sines.tolist()))  # cosines and sines among the outputs
+        self.pairs = list(zip(self._cosines.tolist(), self._sines.tolist()))  # indices of cosines and sines
         place = self._take.tolist().index
         for angle, names in zip(at, each):
             if len(angle) == 2:
                 if len(angle[0]) != len(angle[1]):
                     raise ValueError(
-                        f"a cosine and a sine of angles must be equally many, got {names}, which are {len(angle[0])} "
-                        f"and {len(angle[1])} entries"
+                        f"keys of cosines and sines must have equally many entries, got {names} with {len(angle[0])} "
+                        f"and {len(angle[1])}"
                     )
                 self.pairs += [(place(cosine), place(sine)) for cosine, sine in zip(*angle)]
         self.low, self.high = low[self._take], high[self._take]
         for side in (self._cosines, self._sines):
             self.low[side], self.high[side] = -1.0, 1.0
-        self.unseen = np.sort([*self._cosines, *self._sines]).astype(int)  # outputs that are not in the keys
+        # Cosines and sines that replace an angle are outputs, but in no key of a Dict.
+        self.unseen = np.sort([*self._cosines, *self._sines]).astype(int)
 
     def _period_of(self, low: float, high: float, name: str) -> float:
-        """The length of a turn in an angle's own unit, from the angle's bounds."""
+        """Return the length of a turn in an angle's unit, as it follows from the angle's bounds."""
         width = high - low
         if np.isinf(width) or (width < 2.01 * TURN and width not in UNITS):
             return TURN
@@ -112,7 +114,7 @@ class Outputs:
         )
 
     def flat(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """An observation, or its measured keys, flattened. Shapes: returns (*batch, entries)."""
+        """Return an observation, or its measured keys, flattened to (*batch, entries)."""
         parts = [
             _signals(self._source, part, observation if key is None else observation[key], batch)
             for key, part in self._parts.items()
@@ -120,11 +122,11 @@ class Outputs:
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
 
     def __call__(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The outputs in an observation. Shapes: returns (*batch, ny)."""
+        """Return the outputs in an observation, (*batch, ny)."""
         return self.of_flat(self.flat(observation, batch))
 
     def of_flat(self, y: np.ndarray) -> np.ndarray:
-        """The outputs in flat observations. Shapes: ``y`` (..., entries), returns (..., ny)."""
+        """Return the outputs (..., ny) in flat observations ``y`` (..., entries)."""
         if not self._whole:
             y = y[..., self._take]
         if not all_finite(np.where(np.isnan(y), 0.0, y) if self._missing else y):
@@ -140,7 +142,7 @@ class Outputs:
         return y
 
     def kept(self, observation: Any, flat: np.ndarray) -> dict[str, Any]:
-        """The keys that an agent sees: boxes from the flat observation, and copies of all others."""
+        """Return the keys that an agent sees: boxes from the flat observation, and copies of all other values."""
         kept, at = {key: copy.deepcopy(observation[key]) for key in self.keys or ()}, 0
         for key, part in self._parts.items():
             end = at + spaces.flatdim(part)
@@ -151,7 +153,7 @@ class Outputs:
 
 
 class Inputs:
-    """Inputs from an environment's actions: bounded boxes scaled to [-1, 1], Discrete actions one-hot."""
+    """The inputs in an environment's actions: bounded boxes scaled to [-1, 1], Discrete actions one-hot."""
 
     def __init__(self, space: Space, *, source: str) -> None:
         self._space, self._source = space, f"the action of {source}"
@@ -166,7 +168,7 @@ class Inputs:
         self.low[scaled], self.high[scaled] = -1.0, 1.0
 
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The inputs in an action. Shapes: returns (*batch, nu)."""
+        """Return the inputs in an action, (*batch, nu)."""
         u = _signals(self._source, self._space, action, batch)
         if not all_finite(u):
             raise ValueError(f"{self._source} must hold numbers within ±{LARGEST:g}, got {shown(action)}")
@@ -180,7 +182,7 @@ def _is_sequence(values: Any) -> bool:
 
 
 def _entries(name: str, values: Any) -> tuple[Any, ...]:
-    """Indices or keys as a tuple, or ValueError."""
+    """Return indices or keys as a tuple, or raise ValueError."""
     if not _is_sequence(values):
         raise ValueError(f"{name} must be a sequence of indices or of keys, such as [0, 2], got {shown(values)}")
     keys = [value for value in values if isinstance(value, str)]
@@ -193,7 +195,7 @@ def _entries(name: str, values: Any) -> tuple[Any, ...]:
 
 
 def angle_entries(values: Any) -> tuple[Any, ...]:
-    """Entries, and pairs of entries as tuples, or ValueError."""
+    """Return a tuple of entries and of pairs of entries, or raise ValueError."""
     if not _is_sequence(values):
         raise ValueError(
             "angles must be a sequence of indices or of keys, or of pairs of them, such as [2] or [(0, 1)], got "
@@ -217,7 +219,7 @@ def _check_keys(name: str, keys: Collection[str], known: Collection[Any]) -> Non
 
 
 def _positions(name: str, chosen: tuple[Any, ...], owners: list[Any]) -> list[int]:
-    """Positions of the chosen entries in the flat observation, whose entries have the keys ``owners``."""
+    """Return the indices of chosen entries in a flat observation; ``owners`` are the keys of all its entries."""
     if chosen and isinstance(chosen[0], str):
         _check_keys(name, chosen, dict.fromkeys(owners))
         return [i for i, key in enumerate(owners) if key in chosen]
@@ -230,7 +232,7 @@ def _positions(name: str, chosen: tuple[Any, ...], owners: list[Any]) -> list[in
 
 
 def _leaves(space: Space) -> Iterator[Space]:
-    """The elementary spaces within a space, in the order of the flattened value."""
+    """Yield the elementary spaces within a space, in the order of a flattened value."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         for part in space.values() if isinstance(space, spaces.Dict) else space:
             yield from _leaves(part)
@@ -247,8 +249,8 @@ def _check(space: Space, source: str) -> None:
     for leaf in _leaves(space):
         if _is_image(leaf):
             raise ValueError(
-                f"{source} is an image, {leaf}: let an encoder turn it into a vector inside, with "
-                "gymnasium.wrappers.TransformObservation, or name the entries measured beside it by measured=[...]"
+                f"{source} is an image, {leaf}: turn it into a vector by an encoder inside, with "
+                "gymnasium.wrappers.TransformObservation, or name only other entries in measured=[...]"
             )
         if not isinstance(leaf, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
             raise ValueError(
@@ -258,7 +260,7 @@ def _check(space: Space, source: str) -> None:
 
 
 def _limits(space: Space) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of a space's signals."""
+    """Return the bounds of a space's signals."""
     if spaces.flatdim(space) == 0:  # Gymnasium cannot flatten an empty space to a box
         return np.zeros(0), np.zeros(0)
     flat: Any = spaces.flatten_space(space)
@@ -266,18 +268,18 @@ def _limits(space: Space) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _signals(source: str, space: Space, value: Any, batch: tuple[int, ...]) -> np.ndarray:
-    """A value, or each row of a batch, as :func:`gymnasium.spaces.flatten` would flatten it."""
+    """Flatten a value, or each row of a batch, like :func:`gymnasium.spaces.flatten`."""
     try:
         return _read(space, value, batch)
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        many = f", {batch[0]} times," if batch else ""
-        raise ValueError(f"{source} must be of {space}{many or ','} got {shown(value)}") from error
+        values = f"{batch[0]} values" if batch else "a value"
+        raise ValueError(f"{source} must be {values} of {space}, got {shown(value)}") from error
 
 
 def _read(space: Space, value: Any, batch: tuple[int, ...]) -> np.ndarray:
     if isinstance(space, spaces.Box) and space.dtype != np.bool_:
         return real_array("it", value).reshape(*batch, space.low.size)
-    if isinstance(space, spaces.Box | spaces.MultiBinary):  # MultiBinary holds flags
+    if isinstance(space, spaces.Box | spaces.MultiBinary):  # a Box of bool, or MultiBinary
         array = value if isinstance(value, np.ndarray) else np.asarray(value)
         flags = array.astype(np.int8) if array.dtype == np.bool_ else value
         return real_array("it", flags).reshape(*batch, spaces.flatdim(space))

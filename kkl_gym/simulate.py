@@ -1,7 +1,8 @@
 """Simulation of sampling intervals by a sixth-order Runge–Kutta method, in 1, 2, 4, ... substeps of equal length.
 
-The system's own ``rate(x)``, or else an estimate of the error, sets their number. Single states on Python floats
-(:func:`advance`) and batches on arrays (:func:`advance_batch`) agree to rounding, 1e-13 of the state in each step.
+The system's own ``rate(x)``, or else an estimate of the error, sets the number of substeps. Single states on Python
+floats (:func:`advance`) and batches on arrays (:func:`advance_batch`) agree to rounding, 1e-13 of the state in each
+step.
 """
 
 import functools
@@ -19,19 +20,22 @@ from observers.checks import check_dt
 # shipped system, from anywhere in twice its training box, keeps the error after 10 s below 1e-5 of the motion's size
 # (tests/kkl_gym/test_simulate.py).
 RATE_STEP = 0.4
-# A millionth less, so that rates on both sides of a power of two, which differ only by rounding, get equal substeps.
+# This is a millionth less than 1 / RATE_STEP. Without this margin, two rates that differ only by rounding could get
+# different numbers of substeps where rate * dt / RATE_STEP is a power of two.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
-# Largest accepted estimate of a substep's error, in half-widths of X; the error itself is a thousand times smaller.
-# With TOLERANCE, stiff systems and the shipped ones without their rate formulas keep the same 1e-5. ROUGH overrules a
-# rate formula that fails, as at an ignition; it is a hundred times the largest estimate of the shipped systems.
+# Largest accepted estimates of a substep's error, in half-widths of X; errors are a thousand times smaller. TOLERANCE
+# is for systems without a rate formula. With it, stiff systems, and the shipped ones without their formulas, also keep
+# the error below 1e-5. ROUGH is for systems with a rate formula, and detects where the formula fails, as at an
+# ignition. It is a hundred times the largest estimate of the shipped systems.
 TOLERANCE, ROUGH = 3e-6, 0.1
-ATTEMPTS = 3  # with equal substeps; after them, or beyond MOST_EQUAL substeps, the step length follows the error
+# Number of attempts with equal substeps. After them, or beyond MOST_EQUAL substeps, the step length follows the error.
+ATTEMPTS = 3
 MOST_EQUAL = 1 << 10
 MAX_SUBSTEPS = 1 << 16
-REPORTED = 50  # intervals between two reports
+REPORTED = 50  # sampling intervals between two reports
 
 # Butcher's explicit sixth-order method with seven stages (J. C. Butcher, Numerical Methods for Ordinary Differential
-# Equations, sec. 31). Order four needs four times as many evaluations for the same error on Lorenz.
+# Equations, sec. 31). A method of order four needs four times as many evaluations for the same error on Lorenz.
 STAGES = (
     (),
     (1 / 3,),
@@ -43,10 +47,10 @@ STAGES = (
 )
 WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
 # The error estimate is h times the difference between two stages' slopes at mid-step, of order h^5. This difference is
-# zero where the derivative depends only on time. So 1/256 of the fourth divided difference over the interval is added,
-# whose coefficients are (1, 0, -9, -9, 16, 0, 1).
+# zero where the derivative depends only on time. Therefore 1/256 of the fourth divided difference over the interval is
+# added; its coefficients are (1, 0, -9, -9, 16, 0, 1).
 ERROR = (1 / 256, 0, -9 / 256, -9 / 256, 16 / 256 - 1, 1, 1 / 256)
-# Coefficients of the state, of a constant slope and of the slopes of the earlier stages.
+# For each stage and for the result: coefficients of the state, of a constant slope and of the earlier slopes.
 _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
 _ERROR = np.array(ERROR)
 
@@ -63,7 +67,7 @@ class SubstepsError(ValueError):
 
 @functools.cache
 def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, float, int, Components], tuple[Any, float]]:
-    """A function for the Runge–Kutta steps of ``STAGES`` and ``WEIGHTS``; its unrolled loops are several times faster.
+    """Return a function that makes the Runge–Kutta steps of ``STAGES`` and ``WEIGHTS``, in unrolled loops for speed.
 
     It takes f, x, constants that are added to f, the length h and the number n of steps, and 1 / tolerance of each
     state, (nx,). It returns the state after n steps and the largest squared error of a step, in units of tolerance.
@@ -90,7 +94,7 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, float
         weighted = " + ".join(f"{c!r} * k{j}_{i}" for j, c in enumerate(ERROR) if c)
         lines += [f"        e{i} = h * s{i} * ({weighted})"]
     lines += ["        e = " + " + ".join(f"e{i} * e{i}" for i in components)]
-    lines += ["        if not e <= error:", "            error = e"]  # also if it is NaN
+    lines += ["        if not e <= error:", "            error = e"]  # also if e is NaN
     lines += [f"    return ({unpacked('x')}), error"]
     namespace: dict[str, Any] = {}
     exec("\n".join(lines), namespace)
@@ -114,17 +118,17 @@ def forced(system: System, u: Components, w: Components) -> tuple[VectorField, C
 
 
 def _per_tolerance(kind: type[System], tolerance: float | None = None) -> tuple[float, ...]:
-    """1 / tolerance of each state's error, (nx,), for a class of systems."""
+    """Return 1 / tolerance of each state's error, (nx,), for a class of systems."""
     if tolerance is None:
         tolerance = TOLERANCE if kind.rate is System.rate else ROUGH
     return tuple(2.0 / (high - low) / tolerance for low, high in kind.X)
 
 
-per_tolerance: Callable[..., tuple[float, ...]] = functools.lru_cache(maxsize=256)(_per_tolerance)  # used at every step
+per_tolerance: Callable[..., tuple[float, ...]] = functools.lru_cache(maxsize=256)(_per_tolerance)
 
 
 def advance(system: System, x: Components, u: Components, w: Components, dt: float) -> Components:
-    """The state after one sampling interval, from a single state, on Python floats."""
+    """Return the state after one sampling interval, from a single state, on Python floats."""
     try:
         try:
             if system.discrete:
@@ -155,7 +159,7 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
 
 def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: float) -> Components | None:
-    """The next state, computed on arrays, in which `where` may discard infinite values; None if that fails."""
+    """Return the next state, computed on arrays, on which ``where`` can discard infinite values; None if that fails."""
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
         end: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
@@ -165,9 +169,9 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
-    """The state after one interval, with substeps whose length follows the error; ``end`` if x leaves the bounds."""
-    # This serves motions that accelerate, as at an ignition. It also verifies an escape: equal substeps may have been
-    # too long at its end and have left the bounds only by their error.
+    """Return the state after an interval by substeps whose length follows the error; ``end`` if x leaves the bounds."""
+    # Motions that accelerate, as at an ignition, need such substeps. They also verify an escape, because equal substeps
+    # that were too long at the end of the interval may have left the bounds only by their error.
     if system.discrete:
         return end
     left, h, field, d = dt, dt, *forced(system, u, w)
@@ -183,7 +187,7 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
             if error <= 1.0:
                 x = moved
                 left -= h
-            elif h < 1e-15 * dt:  # steps of any length give NaN
+            elif h < 1e-15 * dt:  # even the shortest steps give NaN
                 return end
             h *= 0.9 * max(1e-6, min(1e8, error)) ** -0.1
     except ArithmeticError:
@@ -198,7 +202,7 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
 
 
 def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
-    """The states after one interval, from states (nx, n), each with the substeps that :func:`advance` would take."""
+    """Return the states after one interval, from ``x`` (nx, n), each with the substeps that :func:`advance` takes."""
     try:
         if system.discrete:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -215,7 +219,7 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
 
 def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
-    """The next states (nx, n) by equal substeps, NaN in rows whose error is too large, and whether any is NaN."""
+    """Return the next states (nx, n) by equal substeps, NaN where the error is too large, and whether any is NaN."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need: Any = 1.0 if type(system).rate is System.rate else system.rate(x) * dt * PER_RATE
         if np.all(need <= 1):
@@ -239,7 +243,7 @@ def equal_substeps(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, 
 
 
 def _powers(need: np.ndarray) -> np.ndarray:
-    """The least powers of two that are at least ``need`` (n,), or 0 where they exceed MOST_EQUAL; returns (n,)."""
+    """Return the least powers of two (n,) that are at least ``need`` (n,), or 0 where they exceed MOST_EQUAL."""
     mantissa, exponent = np.frexp(np.where(need <= MOST_EQUAL, np.maximum(need, 1), 1))
     return np.where(need <= MOST_EQUAL, 1 << (exponent - (mantissa == 0.5)), 0)
 
@@ -247,7 +251,7 @@ def _powers(need: np.ndarray) -> np.ndarray:
 def _substeps(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: np.ndarray, n: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The states (nx, m) after n (m,) >= 1 substeps of length h (m,), and each row's largest error."""
+    """Return the states (nx, m) after n (m,) >= 1 substeps of length h (m,), and each row's largest squared error."""
     out, error = _step_batch(system, x, u, w, h)
     for k in range(2, n.max(initial=1) + 1):
         rows = np.flatnonzero(n >= k)
@@ -262,7 +266,8 @@ def followed_rows(
     """Return ``end`` (nx, n), in which :func:`followed` has replaced the ``rows`` (m,) that start within bounds."""
     if len(rows):
         low, high = np.array(system.bounds, dtype=float).T[..., None]
-        with np.errstate(all="ignore"):  # equations may use NumPy even for a single state
+        # Equations may use NumPy even on the floats of a single state, and NumPy would warn.
+        with np.errstate(all="ignore"):
             for row in rows[((x[:, rows] >= low) & (x[:, rows] <= high)).all(0)]:
                 start = [values[:, row].tolist() for values in (x, u, w)]
                 end[:, row] = followed(system, *start, dt=dt, end=end[:, row])
@@ -270,8 +275,8 @@ def followed_rows(
 
 
 def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> tuple[np.ndarray, np.ndarray]:
-    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,), and its squared errors, (n,)."""
-    # Each stage is one product of its coefficients with x, d and the slopes so far: a few large operations are fast.
+    """Make a Runge–Kutta step of length h, a number or (n,); returns states (nx, n) and squared errors (n,)."""
+    # Each stage is one product of its coefficients with x, d and the slopes so far; few large operations are fast.
     field, d = forced(system, u, w)
     rows = np.empty((2 + len(STAGES), *x.shape))
     rows[0] = x
@@ -301,7 +306,7 @@ def simulate(
     step: Step | None = None,
     report: Callable[[int], object] | None = None,
 ) -> np.ndarray:
-    """Trajectories (steps + 1, n, nx) from starts (n, nx), under ``u`` (steps, n, nu) or a policy, and noise ``w``."""
+    """Return trajectories (steps + 1, n, nx) from starts (n, nx), NaN after an escape; ``u`` are inputs or a policy."""
     x0 = np.asarray(x0, dtype=float)
     if x0.ndim != 2 or x0.shape[1] != system.nx or not np.isfinite(x0).all():
         raise ValueError(f"x0 must be finite with shape (n, {system.nx}), got shape {x0.shape}")

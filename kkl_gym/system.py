@@ -23,7 +23,8 @@ Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol fo
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 DT = 0.01  # s, the default where it suits a system's rate
-# (limit, new) each: DT suits where rate * DT lies between both limits. Beyond one, rate * dt = new gives the default.
+# DT suits a system if rate * DT lies between both limits. Beyond a limit, the default dt follows from rate * dt =
+# target. Each pair is (limit, target).
 SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)
 PROCESS_NOISE = 0.05  # default bound, in multiples of a system's scale per time unit (``pace``)
 NOISE_SHARE = 0.05  # default measurement noise as a share of an output's range
@@ -92,11 +93,12 @@ class System:
     G: ClassVar[tuple[tuple[float, ...], ...]] = ()
     scale: ClassVar[tuple[float, ...]] = ()
     portrait: ClassVar[tuple[int, int]] = (0, -1)
-    discrete: ClassVar[bool] = False  # whether the subclass defines step; environments read it at every step
+    discrete: ClassVar[bool] = False  # whether the subclass defines step
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if not vars(cls).keys() <= EMPTY:  # cloudpickle makes an empty class, and then sets complete attributes
+        # An empty class is left alone: cloudpickle makes one, and then sets attributes that are already complete.
+        if not vars(cls).keys() <= EMPTY:
             complete(cls, System)
 
     def __post_init__(self) -> None:
@@ -112,7 +114,7 @@ class System:
             object.__setattr__(self, name, float(value))
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        # Another process loads a class of a user's script by the script's path.
+        # Another process finds a class in a user's script by the script's path.
         script = getattr(sys.modules.get(type(self).__module__), "__kkl_gym_script__", None)
         return _restored, (f"{script}:{type(self).__qualname__}" if script else type(self), self.parameters)
 
@@ -150,7 +152,7 @@ class System:
         """
         try:
             rate = self.typical_rate
-        except ValueError:  # a rate of 0, as of an integrator, suits any interval
+        except ValueError:  # the rate is 0, as for an integrator, and any interval suits
             return DT
         (least, slow), (most, fast) = SHORT_STEP, LONG_STEP
         if least <= rate * DT <= most:
@@ -192,9 +194,10 @@ class System:
         return typical_rate(self, _starts(self))
 
     def f(self, x: Components) -> Components:
-        """Drift f(x): takes nx components and returns nx, each a number or of the type of the components of ``x``.
+        """Drift f(x): nx components, from the nx components of ``x``.
 
-        Components are floats, arrays, tensors or symbols. Every subclass defines this method or :meth:`step`.
+        Components of ``x`` are floats, arrays, tensors or symbols. Returned components are numbers, or of the same type
+        as those of ``x``. Every subclass defines this method or :meth:`step`.
         """
         if not self.discrete:
             raise NotImplementedError(f"{type(self).__name__} does not define f")
@@ -202,10 +205,10 @@ class System:
         return [(after - before) / self.dt for before, after in zip(x, moved, strict=True)]
 
     def step(self, x: Components, u: Components) -> Components:
-        """The next state of a system in discrete time, one sampling interval after x under the held input u.
+        """Return the next state of a system in discrete time, a sampling interval after x, under the held input u.
 
         A system with this method needs no f and g, must set ``dt``, and is not integrated. Process noise adds w dt to
-        the next state. f is then the mean derivative over the interval without input. Components are those of
+        the next state. f is then the mean derivative over the interval without input. Components are as for
         :meth:`f`.
         """
         raise NotImplementedError(f"{type(self).__name__} is integrated from f; it defines no step")
@@ -213,17 +216,17 @@ class System:
     def draw_starts(self, rng: np.random.Generator, n: int, factor: float = 1.0) -> np.ndarray:
         """Draw ``n`` starts, (n, nx), within ``factor`` times X; default: uniform in that box.
 
-        Override it where not every point of X is a state, as for an angle given by its cosine and sine. Starts must lie
-        within the bounds. Such a system also sets ``process_noise = 0.0``, because noise would leave the set of states.
+        Override it where not every point of X is a state, as for an angle given by its cosine and sine; such a system
+        also sets ``process_noise = 0.0``, because noise would leave the set of states. Starts lie within the bounds.
         """
         return rng.uniform(*self.box(factor), (n, self.nx))
 
     def g(self, x: Components) -> Sequence[Components]:
-        """Input matrix g(x), nx rows of nu entries, from the components of :meth:`f`; default: the constant ``G``."""
+        """Input matrix g(x): nx rows of nu entries, from components as for :meth:`f`. The default is ``G``."""
         return self.G or ((),) * self.nx
 
     def h(self, x: Components) -> Components:
-        """Output map h(x): ny components, from the components of :meth:`f`. Every subclass defines it."""
+        """Output map h(x): ny components, from components as for :meth:`f`. Every subclass defines it."""
         raise NotImplementedError(f"{type(self).__name__} does not define h")
 
     def reward(self, x: Components, u: Components) -> Any:
@@ -247,7 +250,7 @@ class System:
         return nearness(goal_of(self), x, u)
 
     def terminated(self, x: Components) -> Any:
-        """Whether an episode ends at x, from the components of :meth:`f`; it ends beyond ``bounds`` in any case."""
+        """Whether an episode ends at x, with components as for :meth:`f`. Beyond ``bounds`` it ends in any case."""
         return False
 
     @property
@@ -266,9 +269,9 @@ class System:
     def rate(self, x: Components) -> Any:
         """How fast f changes along a motion, in 1/s: a norm of df/dx. The default ``dt`` follows from it.
 
-        The default differentiates f numerically, with each state in units of X's half-width, so that the rate does not
-        depend on the user's units. An estimate of the error then sets the number of substeps. A formula that overrides
-        this method sets this number: a substep then lasts at most 0.4 / rate. That helps where f jumps.
+        By default it is a numerical derivative, with each state in units of X's half-width, so that the rate does not
+        depend on the user's units. An estimate of the error then sets the number of substeps. If a subclass overrides
+        this method, its rate sets the number of substeps: each lasts at most 0.4 / rate. This helps where f jumps.
         """
         return slope(self.f, x, self.X)
 
@@ -292,12 +295,12 @@ class System:
 
 
 def goal_of(system: System) -> list[tuple[float, float]]:
-    """The target of each state, and the weight of its squared distance in the default reward's cost, nx pairs."""
+    """Return nx pairs for the default reward: each state's target, and the weight of its squared distance."""
     return [(t, 1.0 / (system.nx * size * size)) for t, size in zip(target_of(system), system.scale, strict=True)]
 
 
 def nearness(goal: Iterable[tuple[float, float]], x: Components, u: Components) -> Any:
-    """The default reward, as :meth:`System.reward` defines it."""
+    """Return the default reward, as :meth:`System.reward` defines it."""
     cost = 0.0
     for xi, (target, weight) in zip(x, goal):
         cost = cost + weight * ((xi - target) * (xi - target))
@@ -305,14 +308,14 @@ def nearness(goal: Iterable[tuple[float, float]], x: Components, u: Components) 
 
 
 def nearness_of_rows(target: np.ndarray, weight: np.ndarray, x: np.ndarray, u: Components) -> np.ndarray:
-    """The default reward of a batch. Shapes: ``target`` and ``weight`` (nx,), ``x`` (nx, n)."""
+    """Return the default reward of a batch. Shapes: ``target`` and ``weight`` (nx,), ``x`` (nx, n)."""
     deviation = x - target[:, None]
     deviation *= deviation
     return 1.0 / (1.0 + 4.0 * (weight @ deviation))
 
 
 def reward_of(system: System, *, rows: bool = False) -> Callable[[Any, Components], Any]:
-    """The reward function for one state or for a batch; for the default, the target is read only once, here."""
+    """Return the reward function for one state or for a batch; the default reads the target only once, here."""
     if type(system).reward is not System.reward:
         return system.reward
     goal = goal_of(system)
@@ -326,29 +329,30 @@ def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> n
 
 
 def inner_state(system: System) -> tuple[float, ...]:
-    """A state in X for a first call of the equations; not the centre, where some divide by zero."""
+    """Return a state in X for a first call of the equations. At the centre, some equations divide by zero."""
     return tuple(low + (high - low) * ((0.5 + 0.618 * i) % 1.0) for i, (low, high) in enumerate(system.X, 1))
 
 
 def _starts(system: System) -> np.ndarray:
-    """A thousand starts (1000, nx), the same at every call."""
+    """Draw a thousand starts (1000, nx), the same at every call."""
     return system.draw_starts(np.random.default_rng(0), 1000)
 
 
 def dot(row: Iterable[Any], u: Components) -> Any:
-    """A row of the input matrix times u. Shapes: ``row``, ``u`` of length nu."""
-    total = 0.0  # sum() rounds in another way from Python 3.12 on
+    """Return a row of the input matrix times u. Shapes: ``row``, ``u`` of length nu."""
+    total = 0.0  # not sum(), which rounds in another way from Python 3.12 on
     for gij, uj in zip(row, u, strict=True):
         total = total + gij * uj
     return total
 
 
 def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
-    """A norm of a vector field's numerical derivative, with states in units of X's half-widths."""
+    """Return a norm of a vector field's numerical derivative, with states in units of X's half-widths."""
     units = [5e-7 * (high - low) for low, high in X]  # a millionth of the half-widths
     fx, total = field(x), 0.0
     for j, unit in enumerate(units):
-        step = max(unit, 2e-8 * max(map(abs, X[j])))  # larger where X lies so far from 0 that floats hardly resolve it
+        # The step is larger where X lies so far from 0 that floats hardly resolve a millionth of its half-width.
+        step = max(unit, 2e-8 * max(map(abs, X[j])))
         moved = field([*x[:j], x[j] + step, *x[j + 1 :]])
         ratios = ((b - a) / other * (unit / step) for a, b, other in zip(fx, moved, units, strict=True))
         total = total + sum(ratio**2 for ratio in ratios)
@@ -356,18 +360,18 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
 
 
 def rate_under(system: System, x: Components, u: Components) -> Any:
-    """How fast f(x) + g(x) u changes under a held input, in 1/s; ``rate(x)`` if g is constant or rate is a formula."""
+    """Return the rate of f(x) + g(x) u for a held u, in 1/s; ``rate(x)`` if g is constant or ``rate`` is overridden."""
     if type(system).g is System.g or type(system).rate is not System.rate:
         return system.rate(x)
     return slope(lambda x: [fi + dot(row, u) for fi, row in zip(system.f(x), system.g(x), strict=True)], x, system.X)
 
 
 def typical_rate(system: System, starts: np.ndarray) -> float:
-    """Median rate of f over some starts. Shapes: ``starts`` (n, nx)."""
+    """Return the median rate of f(x) + g(x) u over ``starts`` (n, nx), under the largest input."""
     rate_at(system, starts.T)  # raises an EquationError if ``rate`` fails
     rate = float(np.median(np.broadcast_to(rate_under(system, starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:
-        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it with how fast f changes")
+        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it by a formula for how fast f changes")
     return rate
 
 

@@ -19,8 +19,8 @@ class ReverseDuffing(System):
     """Reverse Duffing oscillator (paper, sec. 8, eq. rev_duff), y = x1, input on x2.
 
     x1' = a x2^3, x2' = -b x1 + u. Without input a x2^4/4 + b x1^2/2 is constant, so motions are periodic; small ones
-    have long periods. Dimensionless. The origin is a degenerate equilibrium whose linearisation cannot be stabilised.
-    The paper has no parameters; a = b = 1 is its system.
+    have long periods. All quantities are dimensionless. The origin is a degenerate equilibrium whose linearisation
+    cannot be stabilised. The paper has no parameters; a = b = 1 is its system.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class ReverseDuffing(System):
 
     def f(self, x: Components) -> Components:
         x1, x2 = x
-        return self.a * (x2 * x2 * x2), -self.b * x1  # exact at the paper's a = b = 1
+        return self.a * (x2 * x2 * x2), -self.b * x1  # at a = b = 1 equal to the paper's equations to the last bit
 
     def h(self, x: Components) -> Components:
         return (x[0],)
@@ -59,7 +59,7 @@ class VanDerPol(System):
     """Van der Pol oscillator (paper, sec. 8, eq. vdp), y = x1, input on x2.
 
     x1' = x2, x2' = mu (1 - x1^2) x2 - x1 + u. Dimensionless; the origin is unstable and every other motion tends
-    to the limit cycle. Stiff far from it: d(x2')/d(x2) = -297 at x1 = 10.
+    to the limit cycle. Far from the limit cycle the system is stiff: d(x2')/d(x2) = -297 at x1 = 10.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class Rossler(System):
     b : float
         Constant part of x3'.
     c : float
-        The x1 above which x3 grows.
+        Value of x1 above which x3 grows.
     """
 
     a: float = 0.2
@@ -114,7 +114,8 @@ class Rossler(System):
 
     name: ClassVar[str] = "rossler"
     X: ClassVar[Box] = ((-10, 10), (-10, 10), (0, 20))
-    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # the paper multiplies the corners of the box
+    # Multiples of X are about the origin, because the paper multiplies the corners of the box.
+    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)
     bounds: ClassVar[Box] = ((-50, 50), (-70, 70), (-5, 500))
     u_max: ClassVar[tuple[float, ...]] = (2.0,)
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,), (0.0,), (0.0,))
@@ -136,7 +137,7 @@ class Rossler(System):
 
     @property
     def target(self) -> tuple[float, ...]:
-        # x1 = -a x2, x3 = -x2 and a x2^2 + c x2 + b = 0; the root near zero is the inner equilibrium.
+        # At equilibria x1 = -a x2, x3 = -x2 and a x2^2 + c x2 + b = 0; the root near zero gives the inner equilibrium.
         discriminant = self.c**2 - 4 * self.a * self.b
         if discriminant < 0 or self.c <= 0:
             raise ValueError(f"no inner equilibrium at a={self.a}, b={self.b}, c={self.c}: need c > 0, c^2 >= 4ab")
@@ -168,7 +169,7 @@ class Lorenz(System):
 
     name: ClassVar[str] = "lorenz"
     X: ClassVar[Box] = ((-20, 20), (-30, 30), (0, 50))
-    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # as for Rössler
+    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # the origin, as for Rössler
     bounds: ClassVar[Box] = ((-60, 60), (-120, 120), (-50, 160))
     u_max: ClassVar[tuple[float, ...]] = (10.0,)
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,), (0.0,))
@@ -204,7 +205,7 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
     Parameters
     ----------
     system : str, System or type of System
-        A shipped name (``"van_der_pol"``, ``"VanDerPol"`` or ``"KKLVanDerPol-v0"``), a class of the user's as
+        A shipped name (``"van_der_pol"``, ``"VanDerPol"`` or ``"KKLVanDerPol-v0"``), a user's class as
         ``"package.module:Class"`` or ``"path/to/script.py:Class"``, a script that defines one system, or a
         :class:`System` (class or instance) itself.
     parameters : mapping of str to float, optional
@@ -232,10 +233,10 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
             )
         try:
             system = system()
-        except TypeError as error:  # it lacks @dataclass
+        except TypeError as error:  # the class lacks @dataclass
             raise ValueError(str(error)) from error
     if not isinstance(system, System) or type(system) is System:
-        hint = "; in a spec's JSON write it as 'script.py:Class'" if isinstance(system, Mapping) else ""
+        hint = "; in the JSON of a specification write it as 'script.py:Class'" if isinstance(system, Mapping) else ""
         raise ValueError(f"the system must be a name or a kkl_gym.System, got {shown(system)}{hint}")
     found = system.replace(mapping("parameters", parameters))
     if type(found) not in SYSTEMS.values():

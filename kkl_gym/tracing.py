@@ -13,7 +13,7 @@ _COMPARISONS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": 
 
 
 class Tape:
-    """The operations recorded so far. They are exact if machine code rounds each of them as Python does."""
+    """The operations recorded so far; ``exact`` means that machine code rounds each of them as Python does."""
 
     def __init__(self) -> None:
         self.names: dict[str, str] = {}  # names of results, by operation
@@ -28,7 +28,8 @@ class Tape:
 class Symbol:
     """A number without a value. Arithmetic on it is recorded on its tape."""
 
-    __array_ufunc__ = None  # NumPy's numbers then call the operators below
+    # NumPy's numbers leave arithmetic with a Symbol to the operators below.
+    __array_ufunc__ = None
     __hash__ = None  # type: ignore[assignment]
 
     def __init__(self, tape: Tape, name: str) -> None:
@@ -78,7 +79,7 @@ for _name in ("add", "sub", "mul", "truediv", "mod", "and", "or"):
 
 
 def text(value: Any) -> str:
-    """The text of a symbol or a number in a program."""
+    """Return the text of a symbol or a number in a program."""
     if isinstance(value, Symbol):
         return value.name
     if isinstance(value, bool | np.bool_):
@@ -91,7 +92,7 @@ def text(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Program:
-    """A function as a list of operations on named arguments."""
+    """A function as a list of operations on named arguments; ``exact`` as for :class:`Tape`."""
 
     arguments: tuple[str, ...]
     operations: tuple[str, ...]
@@ -99,7 +100,7 @@ class Program:
     exact: bool
 
     def lines(self, name: str, zeros: int = 0) -> list[str]:
-        """Python code of the function: it takes a tuple, and returns its results followed by ``zeros`` zeros."""
+        """Return Python code of the function, which takes a tuple and returns its results, then ``zeros`` zeros."""
         return [
             f"def {name}(values):",
             f"    {in_tuple(self.arguments)} = values",
@@ -109,12 +110,12 @@ class Program:
 
 
 def in_tuple(values: Iterable[str]) -> str:
-    """Python code of a tuple."""
+    """Return Python code of a tuple."""
     return "(" + "".join(f"{value}, " for value in values) + ")"
 
 
 def program(function: Callable[..., Any], *letters: tuple[str, int]) -> Program:
-    """Run a function on groups of symbols; each group has a letter and a number of components."""
+    """Record a function by a call on groups of symbols; each group has a letter and a number of components."""
     tape = Tape()
     groups = [[Symbol(tape, f"{letter}{i}") for i in range(n)] for letter, n in letters]
     results = tuple(map(text, function(*groups)))

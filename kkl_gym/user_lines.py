@@ -5,37 +5,37 @@ import sys
 from pathlib import Path
 from types import CodeType, TracebackType
 
-# These are recognised by name; other installed packages by their folder.
+# Libraries that are recognised by name. Other installed packages are recognised by their folder.
 _LIBRARIES = sys.stdlib_module_names - {"__main__"} | {"kkl_gym", "observers", "training"}
 _LIBRARIES |= {"mpmath", "numba", "numpy", "sympy", "torch"}
 
 
 def user_line(error: BaseException) -> str | None:
-    """The last line of the traceback that is not in a library."""
+    """Return the last line of an exception's traceback that is not in a library, or None."""
     outside = [step for step in _steps(error) if not _of_library(step)]
     return line_of(outside[-1]) if outside else None
 
 
 def steps_within(error: BaseException, code: CodeType | None) -> list[TracebackType]:
-    """The traceback's entries in a function, and in the user's code that it called."""
+    """Return the traceback's last entry in a function, and the entries in user's code that this call ran."""
     steps = _steps(error)
     at = [i for i, step in enumerate(steps) if step.tb_frame.f_code is code]
     return [steps[at[-1]], *(step for step in steps[at[-1] + 1 :] if not _of_library(step))] if at else []
 
 
 def line_of(step: TracebackType) -> str:
-    """File, number and text of a traceback entry's line."""
+    """Return file, number and text of a traceback entry's line."""
     text = text_of(step)
     return f"{path_of(step.tb_frame.f_code)}, line {step.tb_lineno}" + (f" (`{text}`)" if text else "")
 
 
 def text_of(step: TracebackType) -> str:
-    """Text of a traceback entry's line; empty if there is no source."""
+    """Return the text of a traceback entry's line; empty if there is no source."""
     return linecache.getline(step.tb_frame.f_code.co_filename, step.tb_lineno).strip()
 
 
 def path_of(code: CodeType) -> str:
-    """The file of some code, relative to the current folder if it lies there."""
+    """Return the file of some code, relative to the current folder if it lies there."""
     path = Path(code.co_filename)
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 

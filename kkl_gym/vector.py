@@ -21,17 +21,17 @@ from observers.checks import bool_array, choice, integer, mapping, real_array, s
 Infos = dict[str, Any]
 Rows = np.ndarray | slice
 ALL = slice(None)  # all rows; indexing by this slice gives a view
-ROWS_AT_ONCE = 64  # rows whose noise is drawn and transposed together; they fit the processor's cache
-MANY_ROWS = 128  # rows from which on compiling saves more seconds than it takes
+# The noise of this number of rows is drawn and transposed together, which fits the processor's cache.
+ROWS_AT_ONCE = 64
 MOST_ENVS = 1_000_000  # each stores 256 samples of noise, about 10 kB
 
 
 class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """``num_envs`` copies of :class:`KKLEnv` with equal parameters, simulated as one batch.
 
-    Row i behaves like a :class:`KKLEnv` under a time limit with the same seed: it has the same starts and noise, and
-    the same states to rounding. ``info`` holds the same keys, as arrays with a row for each environment. For each key a
-    mask ``_key`` marks the rows that reported it, as in Gymnasium's own vector environments.
+    Each row behaves like a :class:`KKLEnv` with the row's seed and the same time limit: starts and noise are the same,
+    and states agree to rounding. ``info`` holds the same keys, as arrays with a row for each environment. For each key
+    a mask ``_key`` marks the rows that reported it, as in Gymnasium's own vector environments.
 
     **Autoreset modes.** ``NEXT_STEP``: the step after an episode's end ignores that row's action and resets it.
     ``SAME_STEP``: the row is reset at once; ``info["final_obs"]`` and ``info["final_info"]`` hold the episode's last
@@ -85,7 +85,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         **options: Any,
     ) -> None:
         num_envs = integer("num_envs", num_envs, 1, MOST_ENVS)
-        if max_episode_steps == -1:  # never, as in gym.make
+        if max_episode_steps == -1:  # no time limit, as in gym.make
             max_episode_steps = None
         if max_episode_steps is not None:
             max_episode_steps = integer("max_episode_steps", max_episode_steps, 1)
@@ -107,7 +107,8 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._exchanged()
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
-        # A block of unscaled noise for each row, and the number of samples used of it; at first all are used.
+        # A block of unscaled noise for each row, and the number of its samples that are used. At first all count as
+        # used, so that the first step draws a block.
         self._w, self._v = (np.empty((NOISE_BLOCK, width, num_envs)) for width in (nx, self.plant.nv))
         self._used = np.full(num_envs, NOISE_BLOCK)
         self._everyone = np.arange(num_envs)
@@ -116,8 +117,9 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._sample = np.zeros(num_envs, dtype=np.int64)
         self._escaped, self._terminated, self._truncated = np.zeros((3, num_envs), dtype=bool)
         self._ready = False
-        self.emitted = b""  # the last observations; an observer outside compares them with those that it receives
-        self._u = np.zeros((self.system.nu, num_envs))  # kept for rendering, like the trails
+        # The last observations. An observer wrapper outside compares them with the observations that it receives.
+        self.emitted = b""
+        self._u = np.zeros((self.system.nu, num_envs))
         self._trails = None if render_mode is None else Trails(self.num_envs)
         self._canvas: Canvas | None = None
 
@@ -134,7 +136,8 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         Parameters
         ----------
         seed : int or sequence of int or None, length num_envs, optional
-            One for each row, or one number n for n, n + 1, ...; None continues with the present generators.
+            One seed for each row, or a number n for the seeds n, n + 1, ...; None continues with the present
+            generators.
         options : mapping, optional
             ``"x0"`` is the start, shape (nx,) for all rows or (num_envs, nx). By default starts are drawn in
             ``start_box``. ``"reset_mask"``, boolean of shape (num_envs,), marks the rows to reset; by default all.
@@ -161,7 +164,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             many = real_array("x0", x0)
             if many.ndim > 1 and many.shape != (self.num_envs, self.system.nx):
                 raise ValueError(
-                    f"x0 must be {self.system.nx} numbers, or that for each of {self.num_envs} environments; got shape "
+                    f"x0 must have the shape ({self.system.nx},) or ({self.num_envs}, {self.system.nx}), got shape "
                     f"{many.shape}"
                 )
             starts = np.array([self.plant.start(many[row] if many.ndim > 1 else many) for row in rows])
@@ -249,7 +252,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return tuple(self._seeds)
 
     def _spread(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        """A seed for each row."""
+        """Return a seed for each row, None for rows without one."""
         if seed is None:
             return [None] * self.num_envs
         if isinstance(seed, np.ndarray):
@@ -293,10 +296,12 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
         escaped = self._outside(x)
-        if escaped.any():  # or the substeps were too coarse: check with finer ones
+        # Substeps that were too coarse may also end outside the bounds, so that finer ones verify the escape.
+        if escaped.any():
             x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(escaped))
             escaped = self._outside(x)
-        if escaped.any():  # these rows keep the last state and output inside the bounds
+        # Rows that escaped keep the last state and output inside the bounds.
+        if escaped.any():
             x = np.where(escaped, before, x)
             y = np.where(escaped, self._y[:, rows], self._measure(x, v, rows, start=False))
         else:
@@ -322,13 +327,13 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return u
 
     def _noise(self, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-        """One sample of w, (nx, rows), and of v, (ny, rows)."""
+        """Return the next sample of the noises w (nx, rows) and v (nv, rows)."""
         used, drawn = self._used[rows].copy(), self._everyone[rows]
         if used.max() == NOISE_BLOCK:
             self._draw(drawn[used == NOISE_BLOCK])
             used[used == NOISE_BLOCK] = 0
         self._used[rows] = used + 1
-        if rows is ALL and (used == used[0]).all():  # the usual case, without copies
+        if rows is ALL and (used == used[0]).all():  # the usual case needs no copies
             w, v = self.plant.noise(self._w[used[0]].T, self._v[used[0]].T)
         else:
             w, v = self.plant.noise(self._w[used, :, drawn], self._v[used, :, drawn])
@@ -346,7 +351,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
                 block[:, :, at] = drawn[: len(some)].transpose(1, 2, 0)
 
     def _measure(self, x: np.ndarray, v: np.ndarray, rows: Rows, *, start: bool) -> np.ndarray:
-        # This is System.output with the component first; it takes a third of the time.
+        # This is System.output with the component first, and takes a third of its time.
         white = v if self._readings is None else np.zeros((self.plant.ny, x.shape[1]))
         try:
             y = np.array([hi + vi for hi, vi in zip(self.system.h(x), white, strict=True)])
@@ -389,14 +394,14 @@ def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any]
 
 
 def autoreset_mode_of(mode: str | AutoresetMode) -> AutoresetMode:
-    """Gymnasium's autoreset mode from itself or its name, or ValueError."""
+    """Return Gymnasium's autoreset mode, given as such or by its name, or raise ValueError."""
     if isinstance(mode, AutoresetMode):
         return mode
     return AutoresetMode(choice("autoreset_mode", mode, [known.value for known in AutoresetMode]))
 
 
 def last_of_episodes(obs: np.ndarray, info: Infos, ended: np.ndarray) -> Infos:
-    """``final_obs`` and ``final_info`` of the rows ``ended`` (n,), with masks, as Gymnasium's vectors report them."""
+    """Return ``final_obs`` and ``final_info`` of the rows ``ended`` (n,), with masks, as Gymnasium's vectors do."""
     final_obs = np.full(len(ended), None, dtype=object)
     for row in np.flatnonzero(ended):
         final_obs[row] = obs[row].copy()

@@ -1,1 +1,1 @@
-"""Comparisons and results of kkl-gym's pages: methods, agents, speed. It runs only in a clone."""
+"""The comparisons behind the pages of results: observers, agents, speed. They run only in a clone."""

@@ -1,4 +1,4 @@
-"""``python -m examples.research``: the table of its commands, with the command line of ``kkl-gym``."""
+"""``python -m examples.research``: its commands, on the command line of ``kkl-gym``."""
 
 from training.cli import main
 
@@ -11,7 +11,9 @@ COMMANDS = {
     "speed": ("examples.research.speed.speed", "Speed"),
     "torch": ("examples.research.speed.torch_steps", "TorchSpeed"),
 }
-GOES_ON: dict[tuple[str, ...], str] = {(name,): "the same command goes on" for name in ("benchmark", "agents", "kinds")}
+GOES_ON: dict[tuple[str, ...], str] = {
+    (name,): "the same command continues" for name in ("benchmark", "agents", "kinds")
+}
 
 if __name__ == "__main__":
     main(prog="python -m examples.research", commands=COMMANDS, after_interruption=GOES_ON)

@@ -9,7 +9,7 @@ import numpy as np
 from kkl_gym.equations import components
 from kkl_gym.system import Components
 
-# Functions that some releases of sympy cannot print for NumPy, or print for arrays of one shape only.
+# NumPy's form of functions that some releases of sympy cannot print, or print for arrays of one shape only.
 _IN_NUMPY = {
     "largest": lambda *values: functools.reduce(np.maximum, values),
     "smallest": lambda *values: functools.reduce(np.minimum, values),
@@ -18,10 +18,10 @@ _IN_NUMPY = {
 
 
 def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
-    """Derivatives of f or h: for each component, its nonzero derivatives by the index of the state.
+    """Return derivatives of f or h: for each component, its nonzero derivatives by the index of the state.
 
-    At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of both sides; at a jump it is that of the
-    neighbourhood.
+    At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of the derivatives on both sides; at a jump it is
+    the derivative beside the jump.
     """
     import sympy  # imported here, because it takes half a second
 

@@ -1,7 +1,8 @@
 """Draw the figures of the pages, on a light and on a dark background: ``make figures``.
 
-The data are files in docs/results, or simulations of seconds. The functions are those of the commands. NAME-dark.png
-is written beside NAME.png, and so are animations; docs/site/hooks.py shows readers the one of their theme.
+The data are files in docs/results, or simulations that take seconds. The commands draw with the same functions. Each
+figure and animation is written twice, as NAME.png and NAME-dark.png; docs/site/hooks.py shows the one of the reader's
+theme.
 ``python -m examples.research.figures figures/portraits.gif`` draws a single figure.
 
 docs/figures/qube.png is not drawn here and has only a light version: it needs a training (examples/qube.py) and records
@@ -48,16 +49,16 @@ if TYPE_CHECKING:
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 RESULTS = DOCS / "results"
 Draw = Callable[[Path], object]
-COLOURS = 256  # colours in a picture, which reduce its size to a third
-SEED = 7  # of the animations
+COLOURS = 256  # colours in a picture; so few reduce its size to a third
+SEED = 7  # seed of the animations
 DT = 0.01  # s, of the shipped systems
 EKF = "EKF with the exact equations"
-RIVALS = {"ekf": "tuned EKF", "ukf": "tuned UKF", "gru": "GRU"}  # of the benchmark, in the figure of noise
+RIVALS = {"ekf": "tuned EKF", "ukf": "tuned UKF", "gru": "GRU"}  # methods in the figure of noise levels
 BAND = 0.9  # share of errors within a band
-THRESHOLDS = (0.5, 100.0)  # range of the monitor's score in the figure of faults
+THRESHOLDS = (0.5, 100.0)  # range of scores in the figure of faults
 LEVELS = (0.0, 0.5)  # measurement noise in the figure of errors over time
 SMALLEST = 0.01  # lower end of the error axis in %, under noise, in the same figure
-QUANTILES = (0.1, 0.5, 0.9)  # over the runs, in the figure of errors over time
+QUANTILES = (0.1, 0.5, 0.9)  # quantiles over runs in the same figure
 AGENTS = {"the agent sees the noisy output y": "van_der_pol-y", "the agent sees the estimate": "van_der_pol"}
 FIRST = 1.0  # s at the start, in which bands may exceed their panels
 # Colours of docs/figures/kkl.svg, and their replacements on a dark background.
@@ -69,19 +70,19 @@ DARK = {
 
 
 def estimates(duration: float = 15.0) -> Draw:
-    """States and estimates of all systems: ``kkl-gym demo --duration 15``."""
+    """Return the drawing of ``kkl-gym demo --duration 15``: states and estimates of all systems."""
     episodes = [demo.play(one, round(duration / one.system.dt), None, seed=0) for one in shown(None, None)]
     return lambda path: demo.draw(path, episodes)
 
 
 def portraits(name: str | None = None, duration: float = 12.0) -> Draw:
-    """Animated phase portraits of one system or all: ``kkl-gym demo --gif --seed 7 --duration 12``."""
+    """Return the animation of ``kkl-gym demo --gif --seed 7 --duration 12``: phase portraits of one system or all."""
     episodes = [demo.play(one, round(duration / one.system.dt), None, seed=SEED) for one in shown(name, None)]
     return lambda path: demo.animate(path, episodes)
 
 
 def agents() -> tuple[Task, Mapping[str, Episodes]]:
-    """The first episode of ``kkl-gym agent evaluate`` for two agents: one sees y, the other an estimate."""
+    """Play the first episode of ``kkl-gym agent evaluate`` with two agents: one sees y, the other an estimate."""
     played = {}
     for title, name in AGENTS.items():
         agent = Agent.read(find(name))
@@ -91,19 +92,19 @@ def agents() -> tuple[Task, Mapping[str, Episodes]]:
 
 
 def agents_moving() -> Draw:
-    """Animated phase portraits of both agents."""
+    """Return the animation of both agents' phase portraits."""
     task, played = agents()
     return lambda path: picture.animate(task, played, path)
 
 
 def agents_over_time() -> Draw:
-    """States, outputs and inputs of both agents."""
+    """Return the drawing of both agents' states, outputs and inputs."""
     task, played = agents()
     return lambda path: picture.draw(task, played, path)
 
 
 def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
-    """Each state, its estimate and the band of 90 % of the errors, in the run of ``kkl-gym demo``."""
+    """Return the drawing of states, estimates and bands of 90 % of the errors, in the run of ``kkl-gym demo``."""
     (environment,) = shown(name, None)
     episode = demo.play(environment, round(duration / environment.system.dt), None, seed=0)
     observer = load(name, environment.system.measurement_noise)
@@ -136,7 +137,7 @@ def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
 
 
 def noise_levels() -> Draw:
-    """Errors by noise level for the shipped maps and some of the benchmark's observers."""
+    """Return the drawing of errors by noise level, for shipped maps and some of the benchmark's observers."""
     files = RESULTS / "accuracy.csv", RESULTS / "tracking" / "accuracy.csv"
     ours = pd.concat(map(pd.read_csv, files))
     rivals = pd.read_csv(RESULTS / "benchmark" / "results.csv")
@@ -170,9 +171,9 @@ def noise_levels() -> Draw:
 def errors_of_runs(
     level: float, *, trajectories: int = 100, duration: float | None = None
 ) -> dict[str, list[np.ndarray]]:
-    """Errors in % by system, (steps, n) for the default map and for an EKF, in the runs of ``kkl-gym evaluate``.
+    """Return errors in % by system, (steps, n) for the default map and for an EKF, in runs of ``kkl-gym evaluate``.
 
-    The runs start in X. The tables of the pages contain their means.
+    The runs start in X. The tables of the pages contain the means of these errors.
     """
     errors = {}
     for name, kind in SYSTEMS.items():
@@ -182,13 +183,13 @@ def errors_of_runs(
             estimates_of(Artifact.read(resolve(name)), system, runs, **how)[0],
             estimates_of(None, system, runs, **how)[0],
         )
-        rows = 1, -1, system.nx  # errors at each step
+        rows = 1, -1, system.nx  # each step is a run of its own for smape
         errors[name] = [smape(runs.x.reshape(rows), x_hat.reshape(rows)).reshape(x_hat.shape[:2]) for x_hat in x_hats]
     return errors
 
 
 def errors_over_time(**sizes: Any) -> Draw:
-    """Medians and bands of errors at each step for observers and Kalman filters, by system and noise level."""
+    """Return the drawing of medians and bands of errors over time, for observers and Kalman filters."""
     errors = {level: errors_of_runs(level, **sizes) for level in LEVELS}
 
     def draw(path: Path) -> None:
@@ -221,7 +222,7 @@ def _set_logarithmic(ax: "Axes", lowest: float) -> None:
 
 
 def draw_faults(path: Path, runs: pd.DataFrame) -> None:
-    """Draw the share of runs, without and with faults, whose score exceeds a threshold in time."""
+    """Draw the share of runs, without and with faults, whose score exceeds a threshold within the deadline."""
     observers = list(runs.observer.unique())
     with drawing(path, max(5.0, 2.5 * len(observers)), 3.2) as figure:
         axes: Any = figure.subplots(1, len(observers), sharey=True, squeeze=False)[0]
@@ -260,7 +261,7 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
 
 
 def in_theme(name: str, theme: Theme) -> str:
-    """The file name of a figure in a theme."""
+    """Return the file name of a figure in a theme."""
     return name if theme == "light" else str(Path(name).with_stem(f"{Path(name).stem}-dark"))
 
 

@@ -1,4 +1,4 @@
-"""``python -m examples.research hyperkkl``: HyperKKL's protocol (arXiv 2603.29744) with the default training."""
+"""``python -m examples.research hyperkkl``: default observers under HyperKKL's protocol (arXiv 2603.29744)."""
 
 # ruff: noqa: D102 - System documents the methods that each system defines
 
@@ -28,7 +28,7 @@ RANGES: dict[str, dict[bool, tuple[tuple[float, float], tuple[float, float]]]] =
     "square": {False: ((0.1, 1.0), (0.5, 2.0)), True: ((1.0, 2.0), (2.0, 4.0))},
 }
 SETTLING = 5.0  # s at the start, in which errors do not count
-# The paper's best SMAPE in % for each system, by input, within the distribution.
+# The best SMAPE in % that HyperKKL's paper prints for each system and each of INPUTS, within the distribution.
 PRINTED: dict[str, tuple[float, float, float, float]] = {
     "duffing": (5.6, 21.1, 22.7, 21.3),
     "van_der_pol": (5.0, 26.0, 15.5, 17.9),
@@ -38,7 +38,10 @@ PRINTED: dict[str, tuple[float, float, float, float]] = {
 
 
 class Driven:
-    """Base of all systems: one input within [-1, 1], samples every 0.05 s, trials of 50 s, noise 0 or ``noise``."""
+    """Base of all systems: one input within [-1, 1], and samples every 0.05 s.
+
+    ``trial`` is the duration of a trial in s, ``noise`` the noise of noisy trials, ``seen`` the measured state's index.
+    """
 
     u_max: ClassVar[tuple[float, ...]] = (1.0,)
     dt: ClassVar[float] = 0.05
@@ -142,7 +145,7 @@ class HyperKKL:
     """
 
     systems: tuple[str, ...] = tuple(SYSTEMS)
-    """Some of the six systems."""
+    """Names of systems."""
     trials: int = 100
     """Number of starts for each input, by Latin hypercube sampling."""
     seed: int = 0
@@ -151,8 +154,8 @@ class HyperKKL:
     """Folder of results."""
 
     def run(self, console: Console) -> "pd.DataFrame":
-        """Train and evaluate."""
-        import pandas as pd  # imported here, because --help need not wait a second
+        """Train and evaluate the observers."""
+        import pandas as pd  # imported here, so that --help does not wait for it
 
         from training.diagnosis import check
 
@@ -184,7 +187,7 @@ class HyperKKL:
         return Artifact.read(path)
 
     def _measured(self, system: Any, artifact: "Artifact") -> Iterator[dict[str, Any]]:
-        """Mean SMAPE after settling for the observer, its T_inv alone, and a Kalman filter with the equations."""
+        """Yield mean SMAPEs after settling: of the observer, its T_inv alone, and a Kalman filter."""
         from scipy.stats.qmc import LatinHypercube
 
         from kkl_gym.simulate import simulate
@@ -213,7 +216,7 @@ class HyperKKL:
 
 
 def inputs(kind: Input, beyond: bool, n: int, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Inputs held over each sample, (steps, n, 1); each trial has its own amplitude, frequency and phase."""
+    """Return inputs held over each sample, (steps, n, 1); each trial has its own amplitude, frequency and phase."""
     if kind == "zero":
         return np.zeros((len(t), n, 1))
     amplitude, frequency = (rng.uniform(*span, n) for span in RANGES[kind][beyond])
@@ -227,7 +230,7 @@ def inputs(kind: Input, beyond: bool, n: int, t: np.ndarray, rng: np.random.Gene
 
 
 def page(frame: "pd.DataFrame") -> str:
-    """The results as a Markdown table with a row for each system and input."""
+    """Return a Markdown table with a row for each system and input; errors of T_inv alone are in brackets."""
     rows = []
     for (name, kind), group in frame.groupby(["system", "input"], sort=False):
         cells = group.set_index(["beyond", "noise"])

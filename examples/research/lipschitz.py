@@ -16,11 +16,11 @@ from training.evaluation.levels import Level, beyond, level_for
 from training.maps.networks import from_mlp
 from training.trajectories.motions import filter_states
 
-# Least and largest slope of each activation, rounded outwards. x sigmoid(x) has them at the zeros of its second
-# derivative, |x| = 2.39936.
+# Least and largest slope of each activation, rounded outwards. Those of silu, x sigmoid(x), are at the zeros of its
+# second derivative, |x| = 2.39936.
 SLOPES = {"tanh": (0.0, 1.0), "silu": (-0.0998393202, 1.0998393202)}
-STEPS = 150  # in the search for the certificate
-TRIALS, EVERY = 50, 20  # number of motions for Jacobians, and samples between two of these
+STEPS = 150  # optimisation steps of the search for the certificate
+TRIALS, EVERY = 50, 20  # number of motions along which Jacobians are computed, and samples between two Jacobians
 CHUNK = 4096  # points whose Jacobians are computed together
 
 
@@ -28,7 +28,8 @@ CHUNK = 4096  # points whose Jacobians are computed together
 class Lipschitz:
     """Bound the Lipschitz constant of T_inv: |x_hat(z + d) - x_hat(z)| <= constant |d| for all z and d.
 
-    T_inv is that of free motion, long after the reset. The lower bound is the largest Jacobian along unseen motions.
+    T_inv is the map for motion without input, long after the reset. The lower bound is the largest norm of a Jacobian
+    along unseen motions.
     """
 
     observers: Observers
@@ -55,7 +56,7 @@ class Lipschitz:
 
 
 def decoder(artifact: Artifact, measurement_noise: Level) -> MLP:
-    """T_inv of free motion long after reset as a network from z to x, in physical units and double precision."""
+    """Return T_inv for motion without input, long after reset, as a network from z to x in physical units."""
     inverse = (artifact.free_inverse or artifact.inverse).part(slice(artifact.nx))
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
     features = inverse.noise_features(measurement_noise, 0.0)
@@ -65,14 +66,14 @@ def decoder(artifact: Artifact, measurement_noise: Level) -> MLP:
     biases = [np.asarray(bias, float) for bias in inverse.mlp.biases]
     first, modes = weights[0], len(whiten)
     biases[0] = biases[0] - first[:, :modes] @ whiten @ inverse.z_offset + first[:, modes:] @ np.array(features)
-    weights[0] = np.zeros((len(first), artifact.filter.size))  # z_u is 0
+    weights[0] = np.zeros((len(first), artifact.filter.size))  # z_u is 0 without input
     weights[0][:, : whiten.shape[1]] = first[:, :modes] @ whiten
     weights[-1], biases[-1] = inverse.x_scale[:, None] * weights[-1], inverse.x_offset + inverse.x_scale * biases[-1]
     return MLP(weights, biases, inverse.mlp.activation)
 
 
 def along_motions(artifact: Artifact, system: System) -> np.ndarray:
-    """Filter states (n, nz) of unseen motions without noise, after the transient."""
+    """Return filter states (n, nz) of unseen motions without noise, after the transient."""
     linear, duration = artifact.filter, system.duration
     x = unseen_trajectories(system, linear.dt, n=TRIALS, duration=duration, seed=0).x
     ages = np.arange(len(x) // 5, len(x), EVERY)
@@ -81,14 +82,14 @@ def along_motions(artifact: Artifact, system: System) -> np.ndarray:
 
 
 def lipschitz_lower(mlp: MLP, z: np.ndarray) -> float:
-    """Lower bound of a network's Lipschitz constant, from its Jacobians at points (n, inputs)."""
+    """Return a lower bound of a network's Lipschitz constant, from its Jacobians at points (n, inputs)."""
     network = from_mlp(mlp, dtype=torch.float64)
     derivative = torch.func.vmap(torch.func.jacrev(network), chunk_size=CHUNK)
     return float(torch.linalg.matrix_norm(derivative(torch.as_tensor(z, dtype=torch.float64)), 2).max())
 
 
 def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
-    """Global upper bound of a network's Lipschitz constant, by a quadratic certificate for each layer.
+    """Return a global upper bound of a network's Lipschitz constant, by a quadratic certificate for each layer.
 
     M. Fazlyab et al., "Efficient and accurate estimation of Lipschitz constants for deep neural networks", NeurIPS
     2019, layer by layer as in Y. Xu and S. Sivaranjani, "ECLipsE", NeurIPS 2024.
@@ -97,8 +98,8 @@ def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
         return norm_product(mlp)
     low, high = SLOPES[mlp.activation]
     weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in mlp.weights]
-    # D is a scaling of M's diagonal, times the least factor with D >= M, times 1 + e^margin, so it is admissible.
-    # Zeros are a good start: for diagonal M they give D = 2 M, which is optimal.
+    # The certificate holds for every diagonal matrix D > M. Here D is a scaled diagonal of M, times the least factor
+    # with D >= M, times 1 + e^margin. Zeros are a good start: for diagonal M they give D = 2 M, which is optimal.
     shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
     margins = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in weights[:-1]]
 
@@ -125,10 +126,10 @@ def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
         optimiser.step()
         schedule.step()
     best = min(best, float(squared().detach()))
-    return min(float(np.sqrt(best)) * (1.0 + 1e-9), norm_product(mlp))  # margin for rounding
+    return min(float(np.sqrt(best)) * (1.0 + 1e-9), norm_product(mlp))  # the factor covers rounding
 
 
 def norm_product(mlp: MLP) -> float:
-    """Product of the layers' spectral norms and the activations' largest slopes, a simple upper bound."""
+    """Return the product of the layers' spectral norms and the activations' largest slopes, a simple upper bound."""
     slope = max(abs(value) for value in SLOPES[mlp.activation])
     return float(np.prod([np.linalg.norm(weight, 2) for weight in mlp.weights])) * slope ** (len(mlp.weights) - 1)

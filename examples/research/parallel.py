@@ -32,7 +32,8 @@ class Engine:
         attempt = delayed(partial(_attempt, run, Path.cwd()))
         while todo:
             suspects = {index: job for index, job in todo.items() if lost[index]}
-            # Each worker has one job, so a dead worker had one of the first jobs. Each of these then runs by itself.
+            # Each worker has one job at a time, so the job of a dead worker is among the first ones that are not done.
+            # Each of these suspects then runs by itself.
             handed = 1 if suspects else workers
             # With one worker, joblib would run jobs in this process, and a job could kill it.
             parallel = Parallel(max(2, workers), return_as="generator_unordered", batch_size=1, pre_dispatch=handed)
@@ -71,7 +72,7 @@ def engine(workers: int) -> Iterator[Engine]:
 
 
 def _end_with(parent: int) -> None:
-    """End this worker soon after its parent is killed; loky's workers would finish their jobs."""
+    """End this worker soon after its parent is killed; otherwise loky's workers finish their jobs."""
 
     def watch() -> None:
         while os.getppid() == parent:

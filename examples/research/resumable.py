@@ -15,7 +15,7 @@ from training.progress import LOG, ProgressBars, progress_bars
 
 @dataclass(frozen=True)
 class Workers:
-    """The worker processes."""
+    """Options of the worker processes."""
 
     jobs: int = 2
     """Number of simultaneous jobs, each in a process with one thread."""
@@ -55,7 +55,7 @@ class Job(ABC):
 
 def run_job(job: Job) -> None:
     """Run a job in one thread, unless it is done."""
-    import torch  # imported here, because --help need not wait for torch
+    import torch  # imported here, so that --help does not wait for torch
 
     torch.set_num_threads(1)
     with claimed_job(job.folder, job.identity, job.other):
@@ -72,7 +72,7 @@ def run_and_report(
     what: str,
     report: Callable[[ProgressBars], None],
 ) -> None:
-    """Run the missing jobs, and report on the results, also after an interruption."""
+    """Run the missing jobs, and report on the results, even if the run is interrupted."""
     failures = list[str]()
     try:
         with progress_bars(console, out / LOG) as progress:

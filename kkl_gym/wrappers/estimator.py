@@ -17,7 +17,7 @@ from observers.names import resolve
 
 
 class Estimates:
-    """Adapts any state estimator to the calls of :class:`VectorEstimate`; known starts are ignored."""
+    """Adapts any state estimator to the calls of :class:`VectorEstimate`; it ignores true starts ``x0``."""
 
     def __init__(self, estimator: Estimator[Any], space: gym.spaces.Box) -> None:
         self._running, self.space = Running(estimator), space
@@ -32,11 +32,11 @@ class Estimates:
         self._running.restart(y0, rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """The entries to add to ``info``. Shapes: ``rows`` (n,); returns (number of rows, ...)."""
+        """Return the entries to add to ``info``. Shapes: ``rows`` (n,); returns (number of rows, ...)."""
         return {"x_hat": self._running.decode(rows)}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The observation from a report. Shapes: returns (number of rows, width)."""
+        """Return the observations in a report, (number of rows, width)."""
         return report["x_hat"]
 
 
@@ -81,7 +81,7 @@ class KKLEstimator:
         uncertainty: bool = False,
         **how: Any,
     ) -> "KKLEstimator":
-        """An observer that was learned for a plant, at the plant's noise levels; ValueError if it does not fit."""
+        """Return an observer for a plant, by default at the plant's noise levels; ValueError if it does not fit."""
         choice("estimate", estimate, ("x", "z"))
         uncertainty, system = flag("uncertainty", uncertainty), plant.system
         if observer is None and system.name not in shipped():
@@ -115,7 +115,7 @@ class KKLEstimator:
         self.observer.replace(self.asked(observer))
 
     def asked(self, observer: str | os.PathLike[str] | Artifact) -> Artifact:
-        """The artifact that :meth:`replace` would use; ValueError if an option asks for more than it holds."""
+        """Return the artifact that :meth:`replace` would use; ValueError if it lacks a part that an option needs."""
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
         if self._known_start:
             artifact.require_known_start()  # raises now instead of at the first reset
@@ -126,7 +126,7 @@ class KKLEstimator:
         return artifact
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
-        """The input, or None if the map has no inputs. Shapes: ``u`` (..., nu)."""
+        """Return the input ``u`` (..., nu), or None if the map has no inputs."""
         if not self._blind:
             return u
         if not self._ignore_input and u.any():
@@ -149,7 +149,7 @@ class KKLEstimator:
         self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """The entries to add to ``info``. Shapes: ``rows`` (...,)."""
+        """Return the entries to add to ``info``. Shapes: ``rows`` (...,)."""
         found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
         if self.estimate == "x":
             found["x_hat"] = self.observer.decode(rows)
@@ -164,13 +164,13 @@ class KKLEstimator:
         return found
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The observation from a report. Shapes: returns (..., width)."""
+        """Return the observations in a report, (..., width)."""
         if self._uncertainty:
             return np.concatenate([report["x_hat"], standard_deviations(report["x_cov"])], axis=-1)
         return report["x_hat" if self.estimate == "x" else "z"]
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
-        """As :meth:`shown`, for a single sample; lists are faster than NumPy for so few numbers."""
+        """Return the same as :meth:`shown` for a single sample; a list is faster than NumPy for so few numbers."""
         values: list[float] = report["x_hat" if self.estimate == "x" else "z"].tolist()
         if self._uncertainty:
             variances = report["x_cov"].ravel().tolist()[:: len(values) + 1]
@@ -179,7 +179,7 @@ class KKLEstimator:
 
 
 def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
-    """Values (..., width) as observations: float32, clipped to their space."""
+    """Return values (..., width) as observations: float32, clipped to their space."""
     with np.errstate(over="ignore"):  # values beyond float32 become infinite
         out = values.astype(np.float32)
     np.maximum(out, space.low, out=out)
@@ -202,13 +202,13 @@ def check_untouched(obs: Any, emitted: bytes, env: Any, inside: Any) -> None:
 
 
 def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds (2 nx,) of states and of their standard deviations, which are at most the width of the bounds."""
+    """Return bounds (2 nx,) of states and their standard deviations; these are at most ``high`` - ``low``."""
     with np.errstate(over="ignore"):  # widths beyond float32 become infinite
         return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
 
 
 def _estimate_space(plant: Plant, nx: int) -> gym.spaces.Box:
-    """Bounds of the estimates: those of the states, and infinite ones for further estimates, such as a bias."""
+    """Return the space of estimates, with the bounds of the states; other estimates, as of a bias, are unbounded."""
     space, others = plant.state_space, np.full(max(0, nx - plant.system.nx), np.inf, dtype=np.float32)
     low, high = np.concatenate([space.low, -others]), np.concatenate([space.high, others])
     return gym.spaces.Box(low, high, dtype=np.float32)

@@ -23,7 +23,7 @@ Weights = Sequence[Sequence[float]] | np.ndarray
 
 
 class _Remembering:
-    """The memory within both wrappers, for one environment or a batch; its arguments are those of the wrappers."""
+    """The memory within both wrappers, for one environment or a batch; it takes the arguments of the wrappers."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class _Remembering:
         sizes = (len(low), len(self.inputs.low), self.outputs.pairs)
         how: dict[str, Any] = {"time_constants": time_constants, "input_time_constants": input_time_constants}
         self.memory = Memory(*sizes, **how) if weights is None else PredictiveMemory(*sizes, weights, **how)
-        # Checked arguments, in types that the environment's specification can store
+        # These are the checked arguments, in types that the environment's specification can store.
         self.arguments: dict[str, Any] = {
             "measured": self.outputs.measured,
             "angles": self.outputs.angles,
@@ -58,14 +58,16 @@ class _Remembering:
             "input_time_constants": self.memory.input_time_constants,
         }
         unbounded, keys = np.full(self.memory.size - len(low), np.inf), self.outputs.keys
-        if weights is not None:  # expected outputs may exceed the bounds of outputs
+        if weights is not None:  # predictions of outputs may exceed the bounds of outputs
             high = np.where(np.isin(range(len(low)), self.outputs.pairs), 1.0, np.inf)
             low = -high
         low, high = np.append(low, -unbounded), np.append(high, unbounded)
         self._beside = [] if keys is None else [*self.outputs.unseen, *range(len(self.outputs.low), self.memory.size)]
         if keys is not None:
             if weights is not None or "memory" in keys:
-                raise ValueError(f"{source}: weights, or a key named memory, need indices of entries: measured=[0, 1]")
+                raise ValueError(
+                    f"{source}: with weights or a key named memory, measured must hold indices, such as [0, 1]"
+                )
             low, high = low[self._beside], high[self._beside]
         with np.errstate(over="ignore"):  # bounds beyond float32 become infinite
             flat = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
@@ -77,7 +79,7 @@ class _Remembering:
         return np.where(np.isnan(flat), before, flat) if self._hold and before is not None else flat
 
     def show(self, obs: Any, flat: np.ndarray, shown: np.ndarray) -> Any:
-        """The observation: the memory's row, or the keys of a Dict with the memory beside them."""
+        """Return the observation: a row of the memory, or the keys of a Dict with the memory beside them."""
         return self.outputs.kept(obs, flat) | {"memory": shown[..., self._beside]} if self._beside else shown
 
 
@@ -92,7 +94,8 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     u has a running mean for each input and time constant. The cosine and sine of an angle share one memory, that of
     the unwrapped angle. Once the memory has filled, its numbers are about as large as y, see
     :class:`kkl_gym.memory.Memory`. At reset it assumes that y was constant and that no input acted. From the first step
-    on, it assumes that y changed in the 64 steps before the reset at its mean rate since then. ``info`` is unchanged.
+    on, it assumes that y changed in the 64 steps before the reset at the mean rate that it has had since the reset.
+    ``info`` is unchanged.
 
     A Dict stays a Dict with the same keys; the new key ``"memory"`` holds the memory, and the cosine and sine of
     angles. Images are not remembered.
@@ -165,7 +168,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._flat = np.empty(0)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and the memory. Returns the measured entries, with the memory of an output at rest."""
+        """Reset the environment and the memory. Returns the measured entries, with the memory of constant outputs."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._flat = self._of.read(obs)
         return self._of.show(obs, self._flat, self._of.memory.reset(self._of.outputs.of_flat(self._flat))), info
@@ -200,7 +203,8 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         ValueError
             If the episodes have too few samples for the fit.
         """
-        env = KKLMemory(self.env, **self._of.arguments | {"weights": ()})  # records the features
+        # With empty weights, a memory computes the features of the fit.
+        env = KKLMemory(self.env, **self._of.arguments | {"weights": ()})
         memory, actions = cast(PredictiveMemory, env._of.memory), copy.deepcopy(self.action_space)
         actions.seed(seed)
         env.reset(seed=seed)
@@ -289,12 +293,13 @@ class KKLVectorMemory(VectorWrapper):
         u = of.inputs(actions, batch)
         obs, reward, terminated, truncated, info = self.env.step(actions)
         ended, same = terminated | truncated, self.autoreset_mode is AutoresetMode.SAME_STEP
-        resting = self.autoreset_mode is AutoresetMode.DISABLED  # ended rows wait for a reset
+        resting = self.autoreset_mode is AutoresetMode.DISABLED  # rows that have ended then wait for a reset
         fresh = ended if same else before & (not resting)
         last, flat = self._flat, of.read(obs, batch, np.where(fresh[:, None], np.nan, self._flat))
         self._flat, self._ended = flat, ended & (not same)
         y = of.outputs.of_flat(flat)
-        if same and ended.any():  # first the last outputs of these episodes, then the first outputs of the next
+        # The memory takes the last outputs of these episodes, and then restarts with the first outputs of the next.
+        if same and ended.any():
             rows, final, ends = np.flatnonzero(ended), np.full(self.num_envs, None, dtype=object), flat.copy()
             for row in rows:
                 ends[row] = of.read(info["final_obs"][row], before=last[row])

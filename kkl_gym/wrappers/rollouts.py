@@ -71,18 +71,19 @@ class NamedEstimator(KKLEstimator):
         self._held = np.where(np.isnan(self._y), self._held, self._y)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """The entries to add to ``info``: those of :class:`KKLEstimator`, and the measured ``y``, NaN where missing."""
+        """Return the entries that :class:`KKLEstimator` adds to ``info``, and the measured ``y``, NaN where missing."""
         return super().report(rows) | {"y": self._y.copy() if rows is None else self._y[rows]}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The observation from a report: y, with its last value where it is missing, then x_hat or z."""
+        """Return the observations in a report: y, with its last value where it is missing, then x_hat or z."""
         y = report["y"]
-        if np.isnan(y).any():  # never in restarted rows, whose first sample is complete
+        # A report of restarted rows alone holds no NaN, because their first sample is complete.
+        if np.isnan(y).any():
             y = np.where(np.isnan(y), self._held, y)
         return np.concatenate([y, super().shown(report)], axis=-1)
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
-        """As :meth:`shown`, for a single sample."""
+        """Return the same as :meth:`shown` for a single sample, as a list."""
         return [*self._held.tolist(), *super().listed(report)]
 
 
@@ -101,7 +102,10 @@ class Samples:
         self.count = 0
 
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Outputs and hidden signals after a reset, NaN if not shown; adds the keys of a KKLEnv to ``info``."""
+        """Return outputs and hidden signals after a reset; hidden signals that the environment does not show are NaN.
+
+        Adds the keys of a KKLEnv to ``info``.
+        """
         self.count = 0
         y, x = self.outputs(observation, info), self.states(observation, info)
         info.pop("x", None)  # the environment's own key may mean something else
@@ -109,7 +113,7 @@ class Samples:
         return y, x.get("x", self._nothing)
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Outputs after a step and the inputs that led to them; adds the keys of a KKLEnv to ``info``."""
+        """Return outputs after a step and the inputs that led to them; adds the keys of a KKLEnv to ``info``."""
         y, u = self.outputs(observation, info), self.inputs(action)
         x = self.states(observation, info)
         info.pop("x", None)
@@ -117,17 +121,18 @@ class Samples:
         return y, u
 
     def states(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> dict[str, np.ndarray]:
-        """The true hidden signals as ``{"x": ...}``; empty if the environment does not show them."""
+        """Return the true hidden signals as ``{"x": ...}``; empty if the environment does not show them."""
         if self.hidden is None:
             return {}
         try:
             return {"x": self.hidden(observation, info, batch)}
-        except ValueError:  # a wrapper inside blanks them, or info lacks them at this step
+        # A wrapper inside replaces them by NaN, or ``info`` lacks them at this step.
+        except ValueError:
             return {}
 
 
 def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) -> Reader | None:
-    """The reader of the hidden signals, or None if the environment does not show them."""
+    """Return the reader of the hidden signals, or None if the environment does not show them."""
     try:
         return Reader(space, resolved(names, space, role="hidden", source=source), source=source)
     except ValueError:
@@ -135,7 +140,7 @@ def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) 
 
 
 def _check_actions(env: Any, space: gym.Space[Any]) -> None:
-    """Raise ValueError if a wrapper inside changes the scale of actions, as ClipAction does, whose box is unbounded."""
+    """Raise ValueError if a wrapper inside changes the scale of actions, as ClipAction does by an unbounded box."""
     base, source = env.unwrapped, source_of(env)
     own = base.single_action_space if isinstance(base, gym.vector.VectorEnv) else base.action_space
     here, there = (Inputs(one, source=source) for one in (space, own))
@@ -147,7 +152,7 @@ def _check_actions(env: Any, space: gym.Space[Any]) -> None:
 
 
 def _bounds(artifact: Artifact, space: gym.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the hidden signals from the observation space; infinite if they are not in it."""
+    """Return the bounds of the hidden signals in the observation space; infinite for signals outside it."""
     low, high = np.full(artifact.nx, -np.inf), np.full(artifact.nx, np.inf)
     there = observed(space)
     for i, name in enumerate((artifact.signals or {})["hidden"]):

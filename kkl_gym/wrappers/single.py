@@ -18,7 +18,8 @@ from observers import Artifact
 from observers.checks import choice, flag, integer, shown
 from observers.names import resolve
 
-_FEW = 8  # numbers up to which comparisons one by one are faster than np.clip
+# Up to this length of an observation, comparisons one by one are faster than np.clip.
+_FEW = 8
 _FLOAT32 = np.dtype(np.float32)
 
 
@@ -32,13 +33,13 @@ class _SystemSamples:
             self._inside = self._inside.env
 
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Output and state after a reset; ValueError if a wrapper inside changes observations."""
+        """Return output and state after a reset; ValueError if a wrapper inside changes observations."""
         check_untouched(observation, self._inside.emitted, self._env, self._inside)
         self.count = int(info["sample"])
         return info["y"], info["x"]
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Output after a step, and the input that led to it; ValueError if a sample was skipped or changed."""
+        """Return output after a step, and the input that led to it; ValueError if a sample was skipped or changed."""
         sample = int(info["sample"])
         if sample != self.count + 1:
             raise ValueError(
@@ -58,7 +59,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     (nx,). Both are float64 and not clipped. With ``monitor`` it gains ``score``, an array of shape (). The score is
     above 1 where the samples do not fit the estimates, as with a faulty sensor or far outside the map's training.
 
-    With ``estimate="z"`` neither the network nor the tracking runs, unless there is a monitor or the start is known.
+    With ``estimate="z"`` neither the inverse map nor the tracker runs, unless there is a monitor or the start is known.
     There is then no ``x_hat``, and :meth:`render` shows no estimate.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
@@ -147,7 +148,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 f"KKLObservation needs a gymnasium.Env (for vectors: KKLVectorObservation), got {shown(env)}"
             )
         base, artifact = env.unwrapped, None if observer is None else Artifact.read(resolve(observer))
-        # Checked arguments, in types that the environment's specification can store
+        # These are the checked arguments, in types that the environment's specification can store.
         how: dict[str, Any] = {
             "estimate": choice("estimate", estimate, ("x", "z")),
             "measurement_noise": measurement_noise,
@@ -179,8 +180,10 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self.observer = self._estimator.observer
         self.estimate = estimate
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # estimates
-        self._rendering = env.render_mode is not None  # stored, because reading it passes through every wrapper
-        self._draws = 0  # position among the observers around the environment, from inside; the outermost draws
+        # The result is stored, because reading render_mode passes through every wrapper.
+        self._rendering = env.render_mode is not None
+        # Observers around the environment are numbered from inside; the outermost, which has the last number, draws.
+        self._draws = 0
         if isinstance(base, KKLEnv):
             base.drawn_by += 1
             self._draws = base.drawn_by
@@ -219,12 +222,12 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         ValueError
             If the noise level is beyond the new maps' range, or they have no limits for the monitor in use.
         observers.ArtifactError
-            If A, B, dt or the signals differ, or the file is missing or damaged.
+            If the filters' A, B or dt or the signals differ, or the file is missing or damaged.
         """
         self._estimator.replace(observer)
 
     def render(self) -> np.ndarray | None:
-        """Draw the phase portrait with states and estimates so far; other environments render as without observer."""
+        """Draw the phase portrait with states and estimates so far; other environments render themselves as usual."""
         base = self.unwrapped
         return base.draw(self._trail) if isinstance(base, KKLEnv) else self.env.render()  # type: ignore[return-value]
 
@@ -235,7 +238,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             self._trail.append(report["x_hat"].tolist())
         if self._rendering and self.render_mode == "human":
             base = self.unwrapped
-            if isinstance(base, KKLEnv) and base.drawn_by == self._draws:  # the outermost observer
+            if isinstance(base, KKLEnv) and base.drawn_by == self._draws:  # only the outermost observer draws
                 base.animate(self._trail)
         if len(self._low) <= _FEW:
             values = self._estimator.listed(report)
@@ -247,14 +250,15 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         return self._emit(observation(self._estimator.shown(report), self._estimator.space))
 
     def _emit(self, obs: np.ndarray) -> np.ndarray:
-        self.emitted = obs.tobytes()  # an observer outside compares it with the one that it receives
+        # An observer wrapper outside compares this with the observation that it receives.
+        self.emitted = obs.tobytes()
         return obs
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
     """Holds each action for ``repeat`` steps and sums their rewards; put it outside :class:`KKLObservation`.
 
-    The observer then sees every sample, while the agent acts more slowly. The repeat stops early if the episode ends.
+    The observer then sees every sample, while the agent acts less often. The repeat stops early if the episode ends.
 
     Parameters
     ----------

@@ -44,11 +44,11 @@ class VectorEstimate(VectorWrapper):
         self._sample = np.zeros(env.num_envs, dtype=np.int64)
         self.emitted = b""  # the last observations, as in KKLVectorEnv
         # The environment or observer that emits the observations; None for a Sync or Async vector.
-        self._inside: Any = None if isinstance(env, _Telling) else env
+        self._inside: Any = None if isinstance(env, _SignalsInInfo) else env
         while self._inside is not None and not isinstance(self._inside, KKLVectorEnv | VectorEstimate):
             self._inside = getattr(self._inside, "env", None)
         rendering = isinstance(env.unwrapped, KKLVectorEnv) and env.render_mode is not None
-        self._trails = Trails(env.num_envs) if rendering else None  # estimates
+        self._trails = Trails(env.num_envs) if rendering else None  # trails of the estimates
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -85,7 +85,7 @@ class VectorEstimate(VectorWrapper):
         disabled = self.autoreset_mode is AutoresetMode.DISABLED
         expected = self._sample + 1
         over = bool(before.any())
-        if over:  # rows that were reset in this step, or stay at their end
+        if over:  # these rows were reset in this step, or stay at their end
             expected[before] = self._sample[before] if disabled else 0
         self._check(expected, info["sample"], before)
         if over and disabled:
@@ -100,13 +100,13 @@ class VectorEstimate(VectorWrapper):
         return obs, reward, terminated, truncated, info
 
     def _show_and_restart(self, info: Infos, ended: np.ndarray) -> np.ndarray:
-        """In SAME_STEP, process the last samples of the episodes that ended, and then the first ones of the next."""
+        """In SAME_STEP, process the last samples of the episodes that ended, and then the first samples of the next."""
         final = info["final_info"]
         expected = self._sample + 1
         self._check(expected, np.where(ended, final["sample"], info["sample"]), np.zeros_like(ended))
         y, u = (np.where(ended[:, None], final[key], info[key]) for key in ("y", "u"))
         self._estimator.advance(y, u)
-        y0 = info["y"][ended]  # the estimates may replace y in info
+        y0 = info["y"][ended]  # a copy, because the report may replace y in info
         shown = self._show(info, np.ones_like(ended))
         for row in np.flatnonzero(ended):
             info["final_obs"][row] = shown[row].copy()
@@ -149,7 +149,7 @@ class VectorEstimate(VectorWrapper):
         """Raise ValueError if a wrapper inside changes observations; for Sync and Async vectors only at resets."""
         if self._inside is not None:
             check_untouched(obs, self._inside.emitted, self.env, self._inside)
-        elif at_reset and not isinstance(self.env, _Telling):
+        elif at_reset and not isinstance(self.env, _SignalsInInfo):
             base: Any = self.env.unwrapped
             check_untouched(obs, b"".join(base.get_attr("emitted")), self.env, base)
 
@@ -163,8 +163,8 @@ class VectorEstimate(VectorWrapper):
         return obs
 
 
-class _Telling(VectorWrapper):
-    """Adds the keys of a KKLVectorEnv to the ``info`` of any vector environment: y, u, sample and, if shown, x."""
+class _SignalsInInfo(VectorWrapper):
+    """Adds the keys of a KKLVectorEnv to the ``info`` of any vector environment: y, u, sample and, if known, x."""
 
     def __init__(self, env: VectorEnv, samples: Samples) -> None:
         super().__init__(env)
@@ -183,7 +183,7 @@ class _Telling(VectorWrapper):
         options, mask = with_mask(options, self.num_envs)
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         if not isinstance(info, dict):
-            return obs, info  # the observers raise an error that names the cause
+            return obs, info  # the observers then raise an error that names the cause
         self._ended, self._count = self._ended & ~mask, np.where(mask, 0, self._count)
         signals = {"y": self._read.outputs(obs, info, (self.num_envs,)), "sample": self._count.copy()}
         signals |= self._states(obs, info)
@@ -217,7 +217,7 @@ class _Telling(VectorWrapper):
         return obs, reward, terminated, truncated, info | signals
 
     def _states(self, obs: Any, info: Infos) -> dict[str, np.ndarray]:
-        """The true hidden signals, and a mask of the rows that show them; empty if none does."""
+        """Return the true hidden signals, and a mask of the rows that show them; empty if no row does."""
         found = self._read.states(obs, info, (self.num_envs,))
         if found:
             known = np.ones(self.num_envs, dtype=bool)
@@ -230,7 +230,7 @@ class _Telling(VectorWrapper):
 
 
 def _states(info: Infos, rows: np.ndarray) -> np.ndarray:
-    """True states in some rows; without columns if ``info`` does not hold them."""
+    """Return true states in some rows, or an array without columns if ``info`` does not hold them."""
     return info["x"][rows] if "x" in info else np.full((int(rows.sum()), 0), np.nan)
 
 
@@ -289,7 +289,7 @@ class KKLVectorObservation(VectorEstimate):
         if artifact is not None and artifact.environment is not None and isinstance(env, gym.vector.VectorEnv):
             flag("ignore_input", options.pop("ignore_input", False))
             estimator = NamedEstimator(env, env.single_observation_space, env.single_action_space, artifact, **options)
-            env = _Telling(env, estimator.samples)
+            env = _SignalsInInfo(env, estimator.samples)
         else:
             estimator = KKLEstimator.of_plant(plant_of(env), artifact, **options)
             _check_process_noise(env, estimator.observer.artifact)
@@ -316,7 +316,7 @@ class VectorActionRepeat(VectorWrapper):
     """:class:`kkl_gym.ActionRepeat` for :class:`kkl_gym.KKLVectorEnv`, bare or under :class:`KKLVectorObservation`.
 
     It holds each action for ``repeat`` steps and sums the rewards. If a row's episode ends on the way, the row stays at
-    its end for the rest of the repeat, so that its next episode begins with its own action. Therefore the environment
+    its end for the rest of the repeat, so that its next episode begins with a new action. Therefore the environment
     inside must leave resets to this wrapper (``autoreset_mode="Disabled"``). The wrapper itself offers every mode.
 
     Parameters
@@ -353,8 +353,8 @@ class VectorActionRepeat(VectorWrapper):
             inside = inside.env
         if not isinstance(inside, KKLVectorEnv) or autoreset_mode_in(env) is not AutoresetMode.DISABLED:
             raise ValueError(
-                'VectorActionRepeat needs a KKLVectorEnv made with autoreset_mode="Disabled" and resets rows itself; '
-                "put other wrappers outside, and for Sync and Async vectors ActionRepeat into each environment; got "
+                'VectorActionRepeat resets rows itself, and needs a KKLVectorEnv made with autoreset_mode="Disabled": '
+                "put other wrappers outside; in Sync and Async vectors put ActionRepeat into each environment; got "
                 f"{shown(env)}"
             )
         super().__init__(env)
@@ -374,7 +374,7 @@ class VectorActionRepeat(VectorWrapper):
 
     def step(self, actions: np.ndarray) -> Step:
         """Hold actions for ``repeat`` steps. Returns each row's sum of rewards, and all else from its last step."""
-        waiting = self._ended  # rows that ended in an earlier step and stay unchanged in this one
+        waiting = self._ended  # these rows ended in an earlier step, and stay unchanged in this one
         total, info = np.zeros(self.num_envs), Infos()
         for _ in range(self.repeat):
             obs, reward, terminated, truncated, new = self.env.step(actions)
@@ -396,7 +396,7 @@ class VectorActionRepeat(VectorWrapper):
 
 
 def _merged(old: Infos, new: Infos) -> Infos:
-    """The entries of ``new``, and those of ``old`` in rows where ``new`` has none."""
+    """Return the entries of ``new``, and in rows where ``new`` has no entry those of ``old``."""
     out = dict(old)
     for key, mask in new.items():
         if key.startswith("_") and key[1:] in new:
@@ -414,7 +414,7 @@ def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
-    """The autoreset mode in the metadata of a vector environment, or ValueError without one."""
+    """Return the autoreset mode in the metadata of a vector environment; ValueError without one."""
     mode = env.metadata.get("autoreset_mode")
     if not isinstance(mode, AutoresetMode):
         raise ValueError(
@@ -425,7 +425,7 @@ def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
 
 
 def plant_of(env: VectorEnv, *also: str) -> Plant:
-    """The plant that all rows of a vector environment share; ValueError if they differ in it or in ``also``."""
+    """Return the plant that all rows of a vector environment share; ValueError if they differ in it or in ``also``."""
     base: Any = env.unwrapped if isinstance(env, gym.vector.VectorEnv) else env
     if isinstance(base, KKLVectorEnv):
         return base.plant
@@ -435,7 +435,7 @@ def plant_of(env: VectorEnv, *also: str) -> Plant:
         raise ValueError(
             "KKLVectorObservation needs a vector of kkl_gym environments, or an observer from rollouts, got "
             f"{shown(base)}; "
-            f"{how_to_make_one('ENV_ID')} (KKLVectorMemory here)"
+            f"{how_to_make_one('ENV_ID')} (for vectors: KKLVectorMemory)"
         ) from None
     first = plants[0]
     for plant in plants:

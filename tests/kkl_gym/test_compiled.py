@@ -158,7 +158,7 @@ def compared(unit, second):
     (batch_step, compared(1.0, 1e-9), "symbols"),
     (batch_step, variant(lambda self, x: (np.where(x[0] > 0, x[0], 0.0),)), "use kkl_gym.elementary.where"),
     (batch_step, variant(lambda self, x: (np.random.default_rng().random() + x[0],)), "differ from one call"),
-    (batch_step, variant(lambda self, x: (sum(sin(i + x[0]) * x[0] for i in range(200)),)), "too long"),
+    (batch_step, variant(lambda self, x: (sum(sin(i + x[0]) * x[0] for i in range(200)),)), "500 operations"),
     (single_step, variant(lambda self, x: (x[0] ** 3,)), "there is a power or a remainder"),
     (single_step, variant(lambda self, x: (math.sin(x[0]),)), "use kkl_gym.elementary.sin"),
 ])  # fmt: skip

@@ -69,7 +69,7 @@ def test_scripts_without_mistake(tank):
     ("x[1], -math.sin(x[0])", ["TypeError", "x held arrays of shape", "use kkl_gym.elementary.sin"]),
     ("x[1], math.sqrt(-x[0])", ["ValueError", "x = (", "use kkl_gym.elementary.sqrt"]),
     ("x[1], self.kk * x[0]", ["AttributeError: 'Tank' object has no attribute 'kk'; x = ("]),
-    ("x[2], x[0]", ["IndexError", ", 2 of them"]),
+    ("x[2], x[0]", ["IndexError", "x has 2 components"]),
 ])  # fmt: skip
 def test_an_equation_that_raises(tank, f, texts):
     path = tank(f=f)
@@ -84,11 +84,11 @@ def test_an_equation_that_raises(tank, f, texts):
 @pytest.mark.parametrize(("changes", "match"), [
     ({"f": "x[1]"}, r"^f\(x\) of 'tank' \(.*, line \d+\) must return 2 components, .*; it returned -"),
     ({"f": "x[1], x[0], 0.0"}, "must return 2 components, .* 3 of them"),
-    ({"f": "x[0], (-x[0]) ** 0.5"}, "which is complex: take fractional powers"),
+    ({"f": "x[0], (-x[0]) ** 0.5"}, "which is complex: take square roots"),
     ({"f": "x[1], 1e400 * x[0]"}, "must return finite numbers within X"),
-    ({"f": "x[1], np.sum(x)"}, "sum, max and norm mix states"),
+    ({"f": "x[1], np.sum(x)"}, "sum, max and norm mix the states of a batch"),
     ({"h": "x[0]"}, r"^h\(x\) of 'tank' .* must return its components in a sequence"),
-    ({"f": "x[1], np.float32(-2.0) * x[0]"}, "whose precision a whole motion would inherit: write constants as"),
+    ({"f": "x[1], np.float32(-2.0) * x[0]"}, "which makes the whole motion imprecise: write constants as"),
     ({"more": "def f(self, x):\n return x[1], -friction(x[1])"}, r"\(`return math.tanh\(v\)`\).*elementary.tanh"),
     ({"more": "def f(x):\n return x"}, r"must be defined as f\(self, x\)"),
     ({"more": "def g(self, x):\n return (0.0,),"}, "must return 2 rows, one for each state, of 1 components"),
@@ -180,7 +180,7 @@ def test_a_component_too_many_is_named_where_a_loop_meets_it():
 
 def test_equations_that_write_to_the_state(tank):
     path = tank(more="def g(self, x):\n    a, b = x\n    a *= 0.0\n    return (a,), (1.0 + a,)", h="(x[0] + 0.0,)")
-    with pytest.raises(EquationError, match=r"g\(x\) of 'tank' .* changed the state that it was given: write a = a"):
+    with pytest.raises(EquationError, match=r"g\(x\) of 'tank' .* changed its argument, the state: write a = a"):
         KKLEnv(f"{path}:Tank")
 
 

@@ -30,7 +30,7 @@ def test_keys_of_a_dict_stand_for_all_of_their_entries():
 
 @pytest.mark.parametrize("wrong", ["4", "obs[9]", "-1", "speed", "cos(7)", "tan(0)", "info[]"])
 def test_an_entry_that_is_not_there_is_named(wrong):
-    with pytest.raises(ValueError, match=r"measured names .*Env-v0 is obs\[0\], obs\[1\].*an index stands for"):
+    with pytest.raises(ValueError, match=r"measured names .*Env-v0 holds obs\[0\], obs\[1\].*an index stands for"):
         names(wrong)
 
 

@@ -109,7 +109,7 @@ MIXED = spaces.Dict(camera=IMAGE, place=spaces.Box(-1, 1, (2,)), word=spaces.Tex
     (THREE, [0, 0], (), r"each entry once, got \[0, 0\]"),
     (THREE, ["x"], (), "no keys: name indices"),
     (THREE, [0, 1], [(0, 2)], r"angles must be among the measured entries, \(0, 1\), got"),
-    (UNEVEN, None, [("a", "b")], "1 and 2 entries"),
+    (UNEVEN, None, [("a", "b")], "with 1 and 2"),
     (MIXED, [1], (), "X-v0, 'camera', is an image"),
     (MIXED, ["word"], (), "holds Text"),
     (MIXED, ["speed"], (), "has keys 'camera', 'place', 'word'"),

@@ -23,10 +23,9 @@ from kkl_gym import (
 )
 from kkl_gym.plant import NOISE_BLOCK
 from kkl_gym.simulate import advance_batch
-from kkl_gym.vector import MANY_ROWS
 
 modes = pytest.mark.parametrize("mode", list(AutoresetMode))
-N = 4
+N, MANY_ROWS = 4, 128
 ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler, within a few steps
 
 

@@ -160,7 +160,7 @@ def test_impossible_benchmarks(tmp_path):
     for wrong, message in (
         ("--systems lorentz", "unknown system 'lorentz'"),
         ("--methods kalman", "unknown method 'kalman'"),
-        ("--methods ekf ekf", "twice"),
+        ("--methods ekf ekf", "name each .* once"),
         ("--report", "does not exist; run the benchmark first"),
     ):
         with pytest.raises(SystemExit, match=message):

@@ -41,13 +41,13 @@ class Compare:
     information: Annotated[
         tuple[Kind, ...] | None, tyro.conf.arg(help_behavior_hint="(default: those of the published tables)")
     ] = None
-    """Information that agents see (docs/guides/agents.md); ekf serves only systems."""
+    """Information that agents see (docs/guides/agents.md); ekf exists only for systems."""
     seeds: int = comparison.SEEDS
-    """Number of agents of each kind. On systems there are at most 3 recurrent agents, which take longest, and 1 at the
-    second noise level."""
+    """Number of agents of each kind. On systems there are at most 3 recurrent agents, which take longest, and
+    only 1 at the second noise level."""
     episodes: int = 100
     """Number of evaluation episodes of each agent."""
-    timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None
+    timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: from the hyperparameters)")] = None
     """Number of actions in a training, over all environments."""
     measurement_noise: Annotated[
         NoiseLevels, tyro.conf.arg(help_behavior_hint="(default: the task's own, on Van der Pol also 0.2, on Lorenz 2)")
@@ -77,7 +77,7 @@ class Compare:
             raise ValueError("compare agents either on systems or in environments, in separate folders")
         (on_systems,) = systems
         if not on_systems and {"ekf", "x_hat_std"} & set(self.information or ()):
-            raise ValueError("agents in environments are not compared by ekf, x_hat_std")
+            raise ValueError("agents in environments cannot be compared by ekf and x_hat_std")
         out = self.out or Path("runs/agents") / ("comparison" if on_systems else "environments")
         kinds = self.information
         how: dict[str, Any] = {
@@ -108,7 +108,7 @@ class Compare:
         run_and_report(agents, out, console, workers=self.workers, what="agents", report=report)
 
     def _tasks(self, name: str) -> list[Task]:
-        """The task at each noise level."""
+        """Return the task at each noise level."""
         own = self.options.task(name)
         levels: list[Level] = list(self.measurement_noise or (own.measurement_noise,))
         if self.measurement_noise is None and own.name in comparison.SECOND_NOISE:
@@ -116,7 +116,7 @@ class Compare:
         return [self.options.task(name, level) for level in levels]
 
     def _observers(self, tasks: list[Task]) -> dict[str, str]:
-        """Observers by the name of their system; ValueError if one is missing."""
+        """Return the observers by the name of their system; ValueError if one is missing."""
         observers: dict[str, str] = {}
         systems = {task.name: task.system for task in tasks if task.system is not None}
         for observer in self.observers:

@@ -26,7 +26,7 @@ from training.files import write
 if TYPE_CHECKING:
     import pandas as pd
 
-# An information set, possibly with another source of estimates or another algorithm.
+# A kind of agents: an information set, possibly with another source of estimates or another algorithm.
 Kind = Literal[
     "state",
     "ekf",
@@ -43,20 +43,20 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 ON_SYSTEMS: tuple[Kind, ...] = ("state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state")
 IN_ENVIRONMENTS: tuple[Kind, ...] = ("state", "x_hat", "z", "stacked", "recurrent", "y")
 IDLE: Literal["random"] = "random"  # no action on systems, random actions elsewhere; its normalised score is 0
-SEEN: dict[str, Information] = {
-    "ekf": "x_hat",
-    "recurrent-state": "state",
-}  # the information set of kinds with another name
-CONCERNED = {  # the kinds for which a setting of a task matters
+# The information set of kinds that have another name.
+SEEN: dict[str, Information] = {"ekf": "x_hat", "recurrent-state": "state"}
+# The kinds for which a setting of a task matters.
+CONCERNED = {
     "time_constants": ("z", "traces"),
     "frames": ("stacked",),
     "past_actions": ("z", "traces", "stacked"),
     "angles": ("z",),
     "weights": ("z",),
 }
-SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # second noise level of these tasks
+SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # a second noise level for these tasks
 SEEDS = 5
-RECURRENT_SEEDS, SECOND_NOISE_RECURRENT_SEEDS = 3, 1  # at most, on systems, because their trainings take longest
+# Most recurrent agents on a system, whose trainings take longest; the second number is for the second noise level.
+RECURRENT_SEEDS, SECOND_NOISE_RECURRENT_SEEDS = 3, 1
 COLUMNS = {
     "results.csv": ["environment", "noise", "shown", "seed", "return", "success", "seconds"],
     "curves.csv": ["environment", "noise", "shown", "steps", "seconds", "return"],
@@ -112,7 +112,7 @@ class ComparedAgent(Job):
 
     @property
     def _observer(self) -> str | None:
-        """The observer with which the agent begins, or None."""
+        """Return the observer with which the agent begins, or None."""
         if self.task.system is None or self.kind not in OBSERVED:
             return None
         return self.observer or observer_of(get_system(self.task.system))
@@ -142,7 +142,7 @@ class ComparedAgent(Job):
             from training.agents.observing import OBSERVER
 
             show = show_filtered if self.kind == "ekf" else make
-            fitted = task.system is None and self.kind == "x_hat"  # an observer is learned from hidden signals
+            fitted = task.system is None and self.kind == "x_hat"  # the observer is learned from hidden signals
             agent = learn(
                 task,
                 self._information,
@@ -186,7 +186,7 @@ def planned(
     observers: dict[str, str] | None = None,
     **how: Any,
 ) -> list[ComparedAgent]:
-    """All agents of a comparison, ordered by seed; in environments, noise levels share the agents without noise."""
+    """Return the agents of a comparison, by seed; in environments, all noise levels share the agents without noise."""
     agents: dict[Path, ComparedAgent] = {}
     for seed in range(seeds):
         for task in tasks:
@@ -204,12 +204,12 @@ def planned(
 
 
 def seeds_in(out: Path) -> int:
-    """Number of seeds in the agents' folders, OUT/jobs/TASK/KIND/SEED."""
+    """Return the number of seeds in the agents' folders, OUT/jobs/TASK/KIND/SEED."""
     return 1 + max((int(path.name) for path in out.glob("jobs/*/*/*") if path.name.isdigit()), default=-1)
 
 
 def collect(agents: Sequence[ComparedAgent]) -> "pd.DataFrame":
-    """Results of agents that are done, a row for each."""
+    """Return the results of agents that are done, a row for each."""
     import pandas as pd
 
     rows = []
@@ -224,14 +224,14 @@ def collect(agents: Sequence[ComparedAgent]) -> "pd.DataFrame":
 
 
 def read_results(folder: Path) -> "pd.DataFrame":
-    """Rows of a comparison's results.csv."""
+    """Read a comparison's results.csv."""
     import pandas as pd
 
     return pd.read_csv(folder / "results.csv", index_col=False).reindex(columns=COLUMNS["results.csv"])
 
 
 def unusual_settings(tasks: Sequence[Task]) -> str:
-    """A sentence with the changed settings of memories and stacks; empty if all are the defaults."""
+    """Return a sentence with the changed settings of memories and stacks; empty if all are the defaults."""
     changed = []
     for field in fields(Task):
         values = {getattr(task, field.name) for task in tasks} if field.name in CONCERNED else set()

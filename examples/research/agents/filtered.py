@@ -10,11 +10,12 @@ from training.agents.information import FeatureObservation, Information
 from training.agents.tasks import Task, deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 
-PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of the pace
+# White process noise that the filters assume, in multiples of each state's scale per square root of the pace.
+PROCESS_NOISE = 1e-2
 
 
 def kalman_filters(env: VectorEnv) -> Estimates:
-    """Extended Kalman filters that know the model, noise level and input, in the form for VectorEstimate."""
+    """Make extended Kalman filters for VectorEstimate, which know the model, the noise level and the input."""
     plant = plant_of(env)
     system = plant.system
     Q = np.diag((PROCESS_NOISE * np.array(system.scale)) ** 2 / system.pace)

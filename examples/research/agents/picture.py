@@ -14,9 +14,9 @@ from training.agents.tasks import Task
 from training.evaluation.levels import show_level
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, drawing, save_moving, style
 
-FRAMES = 150  # largest number in an animation
+FRAMES = 150  # most frames in an animation
 SECONDS = 10.0  # length of an animation
-WIDTH = 4.6  # inches, of a column
+WIDTH = 4.6  # width of a column in inches
 
 
 def draw(task: Task, played: Mapping[str, Episodes], path: Path) -> None:
@@ -55,7 +55,7 @@ def _system(task: Task) -> System:
 
 
 def _numbered(symbol: str, number: int) -> list[str]:
-    """Names of signals: y for a single one, else y1, y2 and so on."""
+    """Return names of signals: y for a single one, else y1, y2 and so on."""
     return [symbol] if number == 1 else [f"{symbol}{i + 1}" for i in range(number)]
 
 
@@ -76,6 +76,6 @@ def animate(task: Task, played: Mapping[str, Episodes], path: Path) -> None:
 
 
 def _frame(canvas: Canvas, episodes: Episodes, k: int) -> np.ndarray:
-    """The frame with the samples before index k."""
+    """Draw the frame with the samples before index k."""
     estimates = () if episodes.x_hat is None else episodes.x_hat[:k, 0]
     return canvas.draw(episodes.signals("x")[:k, 0], estimates, episodes.signals("u")[k - 1, 0])

@@ -8,18 +8,18 @@ import scipy
 
 
 def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
-    """Scores on a scale with 0 for idle agents and 1 for the best agents."""
+    """Return scores on a scale with 0 for idle agents and 1 for the best agents."""
     span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
     return np.asarray((scores - idle) / span)
 
 
 def middle(values: np.ndarray, axis: int = -1) -> Any:
-    """Interquartile mean along an axis."""
+    """Return the interquartile mean along an axis."""
     return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
 def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, float, float]:
-    """Interquartile mean of the normalised scores of agents, with a bootstrap 95 % interval.
+    """Return the interquartile mean of agents' normalised scores, with a bootstrap 95 % interval.
 
     With only five agents the interval covers the true value in about nine of ten cases.
 
@@ -33,7 +33,7 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
     if min(len(values), len(best)) < 3 or np.isnan(score):
         return score, np.nan, np.nan
     samples = (values,) if values is best else (values, best)
-    with warnings.catch_warnings():  # intervals are NaN if a resample of the best is not better than idle
+    with warnings.catch_warnings():  # an interval is NaN if a resample of the best is not better than idle
         warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
         resampled = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0)
     ends = resampled.confidence_interval

@@ -37,8 +37,8 @@ LABELS_IN_ENVIRONMENTS = LABELS | {
     "stacked": "stacked y and actions",
 }
 PANELS_IN_A_ROW = 3
-NARROWEST = 7.0  # inches, of a figure with its title
-POINTS = 60  # in a learning curve
+NARROWEST = 7.0  # least width in inches of a figure with its title
+POINTS = 60  # points of a learning curve
 WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 
 
@@ -46,7 +46,7 @@ WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 class Cell:
     """Agents of one kind in one task.
 
-    Shapes: ``values``, ``scores`` (n,). ``scores`` and ``interval`` are normalised, NaN if the task has no scale.
+    Shapes: ``values``, ``scores`` (n,). ``scores`` and ``interval`` are normalised, NaN without idle or best agents.
     """
 
     values: np.ndarray
@@ -57,18 +57,18 @@ class Cell:
 
 
 def on_systems(results: "pd.DataFrame") -> bool:
-    """Whether results are those of systems, which have success rates."""
+    """Whether results are of agents on systems, which have success rates."""
     return bool(results.success.notna().any())
 
 
 def tasks_in(results: "pd.DataFrame") -> list[tuple[str, Any]]:
-    """Environments and noise levels in order, without those that have only agents on the full state."""
+    """Return environments and noise levels in order, without those that have only agents on the full state."""
     partly = results[~results.shown.isin(["state", IDLE])]
     return list(partly[["environment", "noise"]].drop_duplicates().itertuples(index=False, name=None))
 
 
 def _kinds_in(results: "pd.DataFrame") -> list[str]:
-    """Kinds of agents in the table's order; the default kinds for systems are listed even without results."""
+    """Return kinds of agents in the table's order; the default kinds for systems are listed even without results."""
     systems = on_systems(results)
     there = {*results.shown} | ({*ON_SYSTEMS} if systems else set())
     order = KINDS if systems else dict.fromkeys((*IN_ENVIRONMENTS, *KINDS))
@@ -81,7 +81,7 @@ def _labels(results: "pd.DataFrame") -> dict[str, str]:
 
 
 def _task_name(environment: str, noise: float | str) -> str:
-    """A task's title; ``noise`` is a number, or a text with a level for each output."""
+    """Return a task's title; ``noise`` is a number, or a text with a level for each output."""
     try:
         level = f"{float(noise):g}"
     except ValueError:
@@ -90,7 +90,7 @@ def _task_name(environment: str, noise: float | str) -> str:
 
 
 def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
-    """Rows with their task and its idle return; agents on the full state without noise count for all noise levels."""
+    """Return rows with task and idle return; in environments, agents on the full state count for all noise levels."""
     import pandas as pd
 
     tasks = []
@@ -106,7 +106,7 @@ def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def cells(rows: "pd.DataFrame") -> dict[tuple[str, str], Cell]:
-    """Cells by task and kind, from the rows of :func:`in_tasks`."""
+    """Return cells by task and kind, from the rows of :func:`in_tasks`."""
     by_kind = {}
     for (task, kind), group in rows.groupby(["task", "shown"], sort=False):
         values, idle = group["return"].to_numpy(), float(group.idle.iloc[0])
@@ -226,7 +226,7 @@ def _draw_panel(ax: "Axes", row: Sequence[Cell | None]) -> None:
 
 
 def curves(agents: Sequence[ComparedAgent]) -> "pd.DataFrame":
-    """Learning curves: returns of training episodes by steps, averaged over a twentieth of the training."""
+    """Return learning curves: returns of training episodes by steps, averaged over a twentieth of the training."""
     import pandas as pd
 
     groups: dict[tuple[str, Any, str], list[pd.DataFrame]] = {}

@@ -1,6 +1,6 @@
 """The budgets of trainings and the test protocols behind ``--budget`` and ``--quick``.
 
-Times are those of systems with a pace of 1 s; other systems have equally many samples.
+Times are for systems with a pace of 1 s; all systems have equally many samples.
 """
 
 import math
@@ -12,7 +12,7 @@ from kkl_gym.system import System
 
 BUDGETS = {
     "cpu": Budget("cpu", trajectories=2000, duration=50.0, samples=200, cpu_seconds=300.0),
-    # The number of batches does not depend on the machine, so that results are reproducible.
+    # These trainings end after a number of batches, not of seconds, so that results do not depend on the machine.
     "quick": Budget(
         "quick", trajectories=200, duration=20.0, samples=50, cpu_seconds=math.inf, width=64, depth=2, steps=300
     ),
@@ -26,11 +26,11 @@ SEARCH = 0.2  # share of the budget's CPU seconds for the training of each compa
 
 
 def paced_budget(budget: Budget, system: System) -> Budget:
-    """The budget in units of a system's pace."""
-    dt = float(f"{budget.dt * system.pace:.12g}")  # removes the rounding of the product
+    """Return the budget with times scaled by a system's pace."""
+    dt = float(f"{budget.dt * system.pace:.12g}")  # removes the rounding error of the product
     return replace(budget, duration=budget.duration * system.pace, dt=dt)
 
 
 def paced_protocol(protocol: Protocol, system: System) -> Protocol:
-    """The protocol in units of a system's pace."""
+    """Return the protocol with times scaled by a system's pace."""
     return replace(protocol, duration=protocol.duration * system.pace)

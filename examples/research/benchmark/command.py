@@ -54,7 +54,7 @@ class Benchmark:
 
     def run(self, console: Console) -> Path:
         """Run the missing jobs, then report."""
-        from examples.research.benchmark.results import check_results, collect, report  # imports pandas, slowly
+        from examples.research.benchmark.results import check_results, collect, report  # imports pandas, which is slow
 
         name = "quick" if self.quick else self.budget
         out = self.out or Path("runs") / "benchmark" / name
@@ -83,7 +83,7 @@ class Benchmark:
 
     def jobs(self, name: str, out: Path) -> "list[Training]":
         """Make the jobs of a budget; ValueError if an option is invalid."""
-        from examples.research.benchmark import budgets  # imported here, because --help need not wait for torch
+        from examples.research.benchmark import budgets  # imported here, so that --help does not wait for torch
         from examples.research.benchmark.jobs import Training
         from examples.research.methods import METHODS, get_method
 
@@ -94,7 +94,7 @@ class Benchmark:
         named = [[get_system(name).name for name in self.systems], [get_method(name).name for name in methods]]
         for names in (*named, [show_level(level) for level in levels or ()]):
             if len(set(names)) < len(names):
-                raise ValueError(f"{names} has one of them twice")
+                raise ValueError(f"name each system, method and noise level once, got {names}")
         protocol = replace(budgets.QUICK_PROTOCOL if self.quick else budgets.PROTOCOL, seed=self.seed)
         budget = budgets.BUDGETS[name]
         search = None if self.quick else budgets.SEARCH * budget.cpu_seconds

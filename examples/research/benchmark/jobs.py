@@ -26,9 +26,9 @@ REVISION = 9  # increased with every change of the shipped methods, so that olde
 
 
 def seconds_spent(folder: Path) -> float:
-    """CPU seconds of all stages with checkpoints in a folder, including those before interruptions."""
+    """Return the CPU seconds of all stages with checkpoints in a folder, including those before interruptions."""
     spent = 0.0
-    for path in sorted(folder.glob(f"[!.]*{run.CHECKPOINT}")):  # complete ones only
+    for path in sorted(folder.glob(f"[!.]*{run.CHECKPOINT}")):  # names of unfinished files begin with a dot
         checkpoint = run.load_checkpoint(path)
         with run.restoring(path):
             spent += float(checkpoint["seconds"])
@@ -100,7 +100,7 @@ class Training(Job):
         write(self.folder / self.result, errors.to_csv(index=False, float_format="%.4g"))
 
     def _chosen(self) -> tuple[Configuration, list[float]]:
-        """The configuration with the least validation error after a short training, and the errors of all."""
+        """Return the configuration with the least validation error after a short training, and all errors."""
         method, system = get_method(self.method), get_system(self.system)
         configurations = method.configurations(system)
         if not 1 <= len(configurations) <= 3:

@@ -16,9 +16,9 @@ from training.evaluation.levels import Level, as_cell, multiple
 from training.evaluation.metrics import by_state, nrmse, smape
 from training.seeds import Stream, generator
 
-UNTIMED, TIMED = 100, 400  # samples of each round; observers converge in the first ones
+UNTIMED, TIMED = 100, 400  # samples of each round; observers converge during the untimed ones
 LOST = 50.0  # a trajectory with a larger SMAPE in % after the transient counts as lost
-SETTLED = 0.1  # largest settled error, over a trajectory's root mean square
+SETTLED = 0.1  # limit of settled errors, as a share of a trajectory's root mean square
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Protocol:
 def with_shared_noise(
     system: System, runs: UnseenTrajectories, *, measurement_noise: Level, n: int, seed: tuple[Stream, *tuple[int, ...]]
 ) -> np.ndarray:
-    """Outputs with noise on every sample; every method gets the same noise.
+    """Return outputs with noise on every sample, the same noise for every method.
 
     Shapes: ``measurement_noise`` of length ny; returns (steps + 1, trajectories inside bounds, ny).
     """
@@ -46,18 +46,18 @@ def with_shared_noise(
 
 
 def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Mean of each component's SMAPE, (n,), as the paper's notebooks print it after 20 % of the steps."""
+    """Return the mean of the components' SMAPEs, (n,); the paper's notebooks print it for the last 80 % of steps."""
     return np.mean([smape(x[..., [i]], x_hat[..., [i]], skip) for i in range(x.shape[-1])], axis=0)
 
 
 def rmse(x: np.ndarray, x_hat: np.ndarray) -> np.ndarray:
-    """Root of the mean of |x - x_hat|^2 over the steps, (n,)."""
+    """Return the root of the mean of |x - x_hat|^2 over the steps, (n,)."""
     error = np.where(np.isfinite(x_hat), x - x_hat, np.inf)
     return np.asarray(np.sqrt((error**2).sum(-1).mean(0)))
 
 
 def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
-    """Times (n,) in seconds after which |x - x_hat| stays below a tenth of the root mean square of |x|."""
+    """Return times (n,) in seconds after which |x - x_hat| stays below a tenth of the root mean square of |x|."""
     limit = SETTLED * np.sqrt((x**2).sum(-1).mean(0))
     outside = ~(np.linalg.norm(x - x_hat, axis=-1) <= limit)
     last = len(x) - 1 - outside[::-1].argmax(0)
@@ -95,12 +95,12 @@ def measure(method: Method[Any], trained: Any, system: System, *, dt: float, pro
 
 
 def tuned_for(method: Method[Any], system: System) -> tuple[Level, ...] | None:
-    """Noise levels for the comparison of a method's configurations; None for those of the test."""
+    """Return noise levels for the comparison of a method's configurations; None for those of the test."""
     return None if method.tuned_for is None else tuple(multiple(system, factor) for factor in method.tuned_for)
 
 
 def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
-    """The error of a configuration on validation trajectories from X."""
+    """Return the median SMAPE on validation trajectories from X, as a geometric mean over noise levels."""
     n = protocol.trajectories
     runs = unseen_trajectories(
         system,
@@ -125,7 +125,7 @@ def validate(method: Method[Any], trained: Any, system: System, *, dt: float, pr
 def step_time(
     method: Method[Any], trained: Any, *, system: System, dt: float, batch: int, seconds: float = 0.3
 ) -> float:
-    """CPU seconds of a step of a whole batch, along motions from X, after the observer's transient."""
+    """Return the CPU time in µs of a step of a whole batch, along motions from X, after the observer's transient."""
     observer = Running(method.observer(trained, system, dt, system.measurement_noise))
     x = simulate(system, starts(system, "X", batch, np.random.default_rng(0)), UNTIMED + TIMED, dt)
     y = np.nan_to_num(system.output(x))

@@ -41,7 +41,7 @@ def collect(out: Path, beside: Path | None = None) -> None:
                 }
             )
     if len(benchmarks := {(cost["budget"], cost["seed"]) for cost in costs}) > 1:
-        raise ValueError(f"{out} holds jobs of several benchmarks, {sorted(benchmarks)}; remove those of one")
+        raise ValueError(f"{out} holds jobs of several benchmarks, {sorted(benchmarks)}; keep only those of one")
     for name, frame in zip(FILES, (pd.concat(errors), pd.DataFrame(costs))):
         rows = _as_written(StringIO(frame.to_csv(index=False, float_format="%.4g")))
         if beside is not None:
@@ -56,7 +56,7 @@ def _as_written(source: Path | StringIO) -> pd.DataFrame:
 
 
 def _joined(rows: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
-    """Rows of jobs in the columns of the earlier rows, and the unchanged earlier rows of other observers."""
+    """Return the rows of jobs in the columns of earlier rows, and unchanged the earlier rows of other observers."""
     here, there = (_conditions(frame, set(rows.system) & set(earlier.system)) for frame in (rows, earlier))
     if here != there:
         raise ValueError(
@@ -68,7 +68,7 @@ def _joined(rows: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
 
 
 def _conditions(frame: pd.DataFrame, systems: set[str]) -> set[str]:
-    """The conditions in which all rows of a benchmark agree."""
+    """Return the conditions that all rows of a benchmark share."""
     if "budget" in frame:
         return {f"budget {budget}, seed {seed}" for budget, seed in zip(frame.budget, frame.seed)}
     cases = frame[frame.system.isin(systems)][["system", "starts", "noise"]].drop_duplicates()
@@ -76,7 +76,7 @@ def _conditions(frame: pd.DataFrame, systems: set[str]) -> set[str]:
 
 
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows sorted: shipped systems and methods first, then the user's; the rows of an observer keep their order."""
+    """Sort rows: shipped systems and methods first, then the user's; the rows of an observer keep their order."""
     places = [
         {name: place for place, name in enumerate(dict.fromkeys([*shipped, *sorted(set(column))]))}
         for shipped, column in ((SYSTEMS, rows.system), (ABLATION | METHODS, rows.method))
@@ -106,7 +106,7 @@ def draw_results(out: Path, path: Path) -> None:
 
 
 def _read(out: Path) -> tuple[pd.DataFrame, pd.DataFrame, str]:
-    """Results, methods, and a note on the conditions."""
+    """Read results and methods, and return them with a note on the conditions."""
     check_results(out)
     results, methods = (pd.read_csv(out / name) for name in FILES)
     note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."

@@ -17,9 +17,9 @@ from training.files import table, write
 PAPERS_MEASURE = "The paper's measure: median ± half the interquartile range [bootstrap 95 % interval of the median]."
 # Columns of results.csv, and their titles.
 MEASURES = (("smape", "SMAPE in %, all steps"), ("smape_late", "SMAPE in % after the first 20 %"))
-NRMSE = re.compile(r"nrmse\d+")  # columns of results.csv
+NRMSE = re.compile(r"nrmse\d+")  # columns of results.csv, one for each state
 NEVER = 1e12  # replaces infinite times and errors, so that quantiles exist
-NARROWEST = 7.0  # inches, of a figure with its title
+NARROWEST = 7.0  # least width in inches of a figure with its title
 DOMAINS = {"X": "starts in X", "1.5X": "starts in 1.5X \\ X", "2X": "starts in 2X \\ X"}
 
 # SMAPE in % in the paper's released notebooks, by system and method.
@@ -32,7 +32,7 @@ PRINTED = {
 
 
 def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Median, half the interquartile range and the median's bootstrap 95 % interval for each cell."""
+    """Return median, half the interquartile range and the median's bootstrap 95 % interval for each cell."""
     from scipy.stats import bootstrap  # imported here, because it takes half a second
 
     rows = []
@@ -63,7 +63,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         for case in cases:
             lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", PAPERS_MEASURE, ""]
             lines += _by_method(methods, partial(_spread, summary, case))
-    states = [column for column in results if NRMSE.fullmatch(column)]  # the published results.csv has none
+    states = [column for column in results if NRMSE.fullmatch(column)]  # the published results.csv has no such columns
     if states:
         medians = results[results.escaped == 0].groupby(["starts", "noise", "system", "method"])[states].median()
         for case in cases:
@@ -98,7 +98,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
 
 
 def _by_method(methods: pd.DataFrame, cell: Callable[[tuple[str, str]], str]) -> list[str]:
-    """Lines of a Markdown table with a cell for each (system, method)."""
+    """Return lines of a Markdown table with a cell for each (system, method)."""
     systems = list(dict.fromkeys(methods.system))
     there = set(zip(methods.system, methods.method, strict=True))
     rows = [
@@ -109,18 +109,18 @@ def _by_method(methods: pd.DataFrame, cell: Callable[[tuple[str, str]], str]) ->
 
 
 def _by_text_of_noise(results: pd.DataFrame) -> pd.DataFrame:
-    """The same frame with noise levels as text, for one level or one for each output."""
+    """Return the frame with noise levels as text, for one level or one for each output."""
     texts = {noise: show_level(read_level(str(noise))) for noise in results.noise.unique()}
     return results.assign(noise=results.noise.map(texts))
 
 
 def _size(noise: str) -> list[float]:
-    """Sort key of noise levels."""
+    """Return the sort key of a noise level."""
     return np.atleast_1d(read_level(noise)).tolist()
 
 
 def _each_state(medians: pd.DataFrame, case: tuple[str, str], job: tuple[str, str]) -> str:
-    """The figures of the system's states; a constant state has none."""
+    """Return the cell with a number for each of the system's states, or a dash for a constant state."""
     if (*case, *job) not in medians.index:
         return "–"
     row = medians.loc[(*case, *job)].to_numpy()
@@ -136,7 +136,7 @@ def _spread(summary: pd.DataFrame, case: tuple[str, str], job: tuple[str, str]) 
 
 
 def _number(value: float) -> str:
-    """A number with three significant digits."""
+    """Return a number with three significant digits as text."""
     if value >= NEVER / 4:
         return "∞"
     return f"{value:.3g}" if value >= 0.001 or value == 0 else "<0.001"
@@ -204,7 +204,7 @@ def _write_cell(ax: Any, at: tuple[int, int], median: float, half_iqr: float) ->
 
 
 def _labels(methods: pd.DataFrame) -> dict[str, str]:
-    """Labels by method; a label includes the number of trajectories if it differs from the others."""
+    """Return labels by method; a label includes the number of trajectories if it differs from the others."""
     most = methods.trajectories.max()
     return {
         row.method: row.label if row.trajectories == most else f"{row.label} ({row.trajectories} runs)"

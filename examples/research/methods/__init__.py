@@ -28,7 +28,7 @@ SHIPPED = METHODS | ABLATION | AS_SHIPPED
 
 
 def get_method(name: str) -> Method[Any]:
-    """A method of the benchmark, or the user's own as module:Class or script.py:Class."""
+    """Return a method of the benchmark, or the user's own as module:Class or script.py:Class."""
     if name in SHIPPED:
         return SHIPPED[name]
     if ":" not in name:

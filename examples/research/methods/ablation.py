@@ -1,6 +1,6 @@
-"""The gain of each idea: pipelines that differ from the next one in a few settings, trained for equal times.
+"""Ablation: series of pipelines, each of which differs from the next in a few settings, trained for equal times.
 
-One series of steps leads from the paper's SPINN to the package's, the other from inverses without T to the default.
+One series leads from the paper's SPINN to the package's, the other from inverses without T to the default.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ from training.spectrum import papers_spectrum
 
 Settings = Mapping[str, Any]
 
-NO_NOISE = 0.02  # largest noise in the training of noise-free inverses, over the system's own
+NO_NOISE = 0.02  # largest noise in the training of noise-free inverses, as a share of the system's own
 # A single inverse for free and driven motion, with the same sampling for all systems.
 TOGETHER: Settings = {
     "free_inverse": False,
@@ -57,7 +57,7 @@ class Ablation(KKLMethod):
         self.changes, self.pipeline = changes, pipeline
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
-        """The package's pipeline."""
+        """Train by the package's pipeline."""
         size: Size = "large" if self.pipeline == "input-aware" else "default"
         config = within(preset(task.system, self.pipeline, size=size), task.budget, task.seed)
         config = replace(config, **self.changes(task))
@@ -65,20 +65,20 @@ class Ablation(KKLMethod):
 
 
 def papers_modes(task: Task) -> Settings:
-    """The paper's spectrum."""
+    """Return the paper's spectrum."""
     return {"eigenvalues": papers_spectrum(task.system), "pairs": ()}
 
 
-def _without(given_back: tuple[str, ...]) -> Callable[[Task], Settings]:
-    """The paper's settings, without those that are replaced by the preset's."""
-    return lambda task: {key: value for key, value in {**papers_modes(task), **PAPERS}.items() if key not in given_back}
+def _without(replaced: tuple[str, ...]) -> Callable[[Task], Settings]:
+    """Return a function for the paper's settings, without those that the preset's replace."""
+    return lambda task: {key: value for key, value in {**papers_modes(task), **PAPERS}.items() if key not in replaced}
 
 
 def _spinn() -> list[Ablation]:
-    methods, given_back = list[Ablation](), tuple[str, ...]()
+    methods, replaced = list[Ablation](), tuple[str, ...]()
     for name, label, more in SPINN_STEPS:
-        given_back += more
-        methods.append(Ablation(name, label, _without(given_back), "spinn"))
+        replaced += more
+        methods.append(Ablation(name, label, _without(replaced), "spinn"))
     return methods
 
 

@@ -71,7 +71,7 @@ def simulated(system: System, n: int, *, duration: float, samples: int, dt: floa
 
 @dataclass(frozen=True)
 class Task:
-    """One training."""
+    """One training of a method: its system, budget, folder and seed."""
 
     system: System
     budget: Budget
@@ -80,7 +80,7 @@ class Task:
 
     @cached_property
     def data(self) -> Data:
-        """Training trajectories, simulated at the first call."""
+        """The training trajectories, which are simulated at the first call."""
         budget = self.budget
         return simulated(
             self.system,
@@ -115,12 +115,12 @@ class Method(ABC, Generic[Trained]):
     tuned_for: ClassVar[tuple[float, ...] | None] = None
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Propose one to three; the benchmark takes the one with the least error on validation trajectories."""
+        """Propose one to three configurations; the benchmark takes that with the least validation error."""
         return ({},)
 
     @abstractmethod
     def train(self, task: Task, configuration: Configuration) -> Trained:
-        """Train."""
+        """Train for a task; the result is the argument ``trained`` of the other methods."""
 
     @abstractmethod
     def observer(self, trained: Trained, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:

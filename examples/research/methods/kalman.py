@@ -18,7 +18,7 @@ DIFFUSION = (1e-4, 1e-3, 1e-2)
 
 
 def diffusion_intensity(trained: Arrays, system: System) -> np.ndarray:
-    """Q, (nx, nx), per second, for the chosen level of diffusion."""
+    """Return Q, (nx, nx), per second, for the chosen level of diffusion."""
     return np.diag((trained["diffusion"] * np.array(system.scale)) ** 2 / system.pace)
 
 
@@ -33,7 +33,7 @@ class EKF(Method[Arrays]):
     filter: ClassVar[type[ExtendedKalmanFilter]] = ExtendedKalmanFilter
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Three levels of diffusion, in multiples of the scale per square root of the pace."""
+        """Return three levels of diffusion, in multiples of the scale per square root of the pace."""
         return tuple({"diffusion": level} for level in DIFFUSION)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
@@ -41,7 +41,7 @@ class EKF(Method[Arrays]):
         return {"diffusion": np.array([configuration["diffusion"]])}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
-        """The filter for a noise level."""
+        """Return the filter for a noise level."""
         Q = diffusion_intensity(trained, system)
         R = measurement_covariance(system, noise)
         return self.filter(system, dt, Q=Q, R=R)

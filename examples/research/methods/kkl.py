@@ -25,7 +25,7 @@ SMOOTH_SPECTRA = ((-3.0, -1.5), (-20.0, -2.0), (-40.0, -6.0))
 
 
 def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...]:
-    """2 nx + 1 logarithmically spaced eigenvalues for each output."""
+    """Return 2 nx + 1 logarithmically spaced eigenvalues for each output."""
     return evenly_spaced(2 * system.nx + 1, slowest / system.pace, fastest / system.pace)
 
 
@@ -33,7 +33,7 @@ class KKLMethod(Method[Artifact]):
     """A method that trains an artifact."""
 
     def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
-        """The package's observer for a noise level, limited to the highest of its training, without process noise."""
+        """Return the observer without process noise; its noise level is at most the highest of its training."""
         return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0).estimator
 
     def save(self, trained: Artifact, path: Path) -> None:
@@ -41,12 +41,12 @@ class KKLMethod(Method[Artifact]):
         trained.save(path)
 
     def load(self, path: Path) -> Artifact:
-        """The artifact."""
+        """Read the artifact."""
         return Artifact.read(path)
 
 
 def within(config: Config, budget: Budget, seed: int) -> Config:
-    """A configuration with the benchmark's data, networks and limit of CPU time, and without tracking."""
+    """Return a configuration with the benchmark's data, networks and limit of CPU time, and without tracking."""
     return replace(
         config,
         tracking=False,
@@ -72,17 +72,17 @@ def trained(task: Task, config: Config) -> Artifact:
 class Default(KKLMethod):
     """The package's method: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
 
-    It simulates its own trajectories, as many as every method has for each of its two inverses: driven ones, and free
-    ones, of which some start where inputs have led from X. Each inverse has half of the time, although the benchmark
-    uses only that of free motion. The only configuration is the preset, which was chosen during the package's
-    development.
+    It simulates its own trajectories. For each of its two inverses these are as many as every method has: driven ones
+    for the first, and for the second free ones, of which some start at states that inputs have reached from X. Each
+    inverse has half of the time, although the benchmark uses only the inverse of free motion. The only configuration is
+    the preset, which was chosen during the package's development.
     """
 
     name: ClassVar[str] = "default"
     label: ClassVar[str] = "T_inv alone"
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
-        """The package's pipeline."""
+        """Train by the package's pipeline."""
         config = within(preset(task.system, size="large"), task.budget, task.seed)
         return trained(task, config)
 
@@ -115,7 +115,7 @@ class ShippedLarge(Shipped):
     suffix: ClassVar[str] = "-large"
 
     def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
-        """T_inv of the large map, without a model."""
+        """Return T_inv of the large map, without a model."""
         return super().observer(replace(trained, motion=None), system, dt, measurement_noise)
 
 
@@ -129,11 +129,11 @@ class SPINN(KKLMethod):
     label: ClassVar[str] = "SPINN"
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Three spectra."""
+        """Return three spectra."""
         return tuple({"spectrum": list(interval)} for interval in SMOOTH_SPECTRA)
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
-        """The package's pipeline."""
+        """Train by the package's pipeline."""
         fastest, slowest = configuration["spectrum"]
         changes = {"eigenvalues": spectrum(task.system, fastest, slowest), "pairs": (), "box_factor": 1.0}
         config = within(preset(task.system, "spinn", changes=changes), task.budget, task.seed)

@@ -1,4 +1,4 @@
-"""Learned diagonal spectrum, T_inv trained through the filter (Miao and Gatsis, 2023)."""
+"""The method of Miao and Gatsis (2023): a diagonal filter and T_inv are trained together."""
 
 from typing import ClassVar
 
@@ -20,11 +20,11 @@ from training.trajectories.motions import filter_states
 
 TRAJECTORIES_PER_BATCH = 128
 AGES_PER_BATCH = 32
-SOFT_FLOOR = 1e-4  # components of z below this share of the largest are not scaled up further
-# The loss is the absolute error, and quadratic below this share of a state's standard deviation. Peaks would dominate a
-# quadratic loss: Rössler's x3 rests near 0.02 between spikes of 20.
+SOFT_FLOOR = 1e-4  # directions of z with less than this share of the largest variation are not scaled up further
+# The loss is absolute, and quadratic only for errors below this share of a state's standard deviation. Peaks would
+# dominate a quadratic loss: Rössler's x3 stays near 0.02 between peaks of 20.
 ROUNDING = 0.01
-SPECTRUM_PACE = 0.1  # learning rate of the spectrum over that of the decoder, which has to follow it
+SPECTRUM_PACE = 0.1  # ratio of the spectrum's learning rate to that of the network, which has to follow it
 LEARNING_RATE = 1e-2
 
 
@@ -42,7 +42,7 @@ class NODE(KKLMethod):
     """Standard deviation of the noise added to y in training, in multiples of the system's own."""
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Three initial spectra."""
+        """Return three initial spectra."""
         return tuple({"spectrum": list(interval)} for interval in SPECTRA)
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
@@ -79,10 +79,10 @@ class NODENoise(NODE):
 
 
 class _Problem(nn.Module):
-    """T_inv, and the logarithms of the rates -theta, which all outputs share.
+    """The trained parts: T_inv, and the logarithms of the rates -theta, which all outputs share.
 
-    The components of z are nearly collinear. Its principal directions under the initial spectrum are scaled to unit
-    variance, down to ``SOFT_FLOOR`` of the largest. Full whitening would have to follow the learned spectrum.
+    The components of z are nearly collinear. The principal directions of z under the initial spectrum are scaled to
+    unit variance, down to ``SOFT_FLOOR`` of the largest. Full whitening would have to follow the learned spectrum.
     """
 
     def __init__(self, task: Task, noise: float, fastest: float, slowest: float) -> None:
@@ -107,11 +107,11 @@ class _Problem(nn.Module):
         self._noise = tensor(np.broadcast_to(multiple(system, noise), system.ny), cpu)
 
     def theta(self) -> torch.Tensor:
-        """Eigenvalues in 1/s, (nz / ny,)."""
+        """Return the eigenvalues in 1/s, (nz / ny,)."""
         return -(self._log_rates + SPECTRUM_PACE * self.change).exp()
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Error of the scaled estimate at random ages of random trajectories, from z0 = -A^-1 B y0."""
+        """Return the error of the scaled estimate at random ages of random trajectories, from z0 = -A^-1 B y0."""
         rows = torch.randint(len(self._y), (TRAJECTORIES_PER_BATCH,), generator=generator)
         chosen = torch.randperm(len(self._ages), generator=generator)[:AGES_PER_BATCH].sort().values
         ages = self._ages[chosen.numpy()]
@@ -124,7 +124,7 @@ class _Problem(nn.Module):
         def block(values: torch.Tensor) -> torch.Tensor:
             return torch.kron(eye, values[:, None])
 
-        hold = torch.expm1(s) / self.theta()  # as in observers.LinearFilter: first-order hold on y
+        hold = torch.expm1(s) / self.theta()  # first-order hold on y, as in observers.LinearFilter
         late = (torch.expm1(s) - s) / (self.theta() * s)
         z0 = y[:, 0] @ block(-1.0 / self.theta()).T
         transition = torch.kron(eye, torch.diag(s.exp()))
@@ -152,11 +152,11 @@ def rollout(
     gaps = np.diff(ages, prepend=0)
     powers = torch.eye(len(transition), dtype=transition.dtype)[None]
     square = transition
-    while len(powers) <= gaps.max():  # I, F, F^2, ... by doubling
+    while len(powers) <= gaps.max():  # all powers of the transition, by doubling
         powers = torch.cat([powers, powers @ square])
         square = square @ square
     # w = z - late y follows w_k+1 = transition w_k + (early + transition late) y_k, with one sample of y in each step.
-    response = (powers @ (early + transition @ late)).flip(0).transpose(1, 2)  # the oldest sample comes first
+    response = (powers @ (early + transition @ late)).flip(0).transpose(1, 2)  # oldest sample first
     w, out, age = z0 - y[:, 0] @ late.T, [], 0
     for gap, jump in zip(gaps.tolist(), powers[torch.as_tensor(gaps)].mT.unbind(), strict=True):
         if gap:

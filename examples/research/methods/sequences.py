@@ -21,8 +21,8 @@ ROWS, CHUNK = 64, 100  # rows of a batch, and samples of truncated back-propagat
 WIDTH = 64  # width of features and hidden vectors
 LEARNING_RATE = 3e-3
 READOUT = 128  # neurons of the layer between the hidden vector and the estimate
-FAINT_NOISE = 0.01  # share of the system's own level, below which the noise feature is linear; above, it is logarithmic
-ROUNDING = 1e-3  # share of a state's standard deviation, below which the error's length is smoothed
+FAINT_NOISE = 0.01  # levels below this share of the system's own enter linearly, higher ones logarithmically
+ROUNDING = 1e-3  # errors shorter than this share of a state's standard deviation are smoothed
 
 
 class Cell(nn.Module):
@@ -34,11 +34,11 @@ class Cell(nn.Module):
 
     @abstractmethod
     def start(self, n: int) -> torch.Tensor:
-        """The state before the first sample."""
+        """Return the state before the first sample."""
 
     @abstractmethod
     def forward(self, features: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Hidden vectors (samples, n, width), and the state after the last sample."""
+        """Return hidden vectors (samples, n, width), and the state after the last sample."""
 
 
 class GRUCell(Cell):
@@ -49,11 +49,11 @@ class GRUCell(Cell):
         self.gru = nn.GRU(width, width)
 
     def start(self, n: int) -> torch.Tensor:
-        """Zero."""
+        """Return zeros."""
         return torch.zeros(n, self.width)
 
     def forward(self, features: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """One layer."""
+        """Apply one layer."""
         hidden, last = self.gru(features, state[None])
         return hidden, last[0]
 
@@ -63,7 +63,7 @@ class LRUCell(Cell):
 
     blocks: ClassVar[int] = 2
     decay: ClassVar[tuple[float, float]] = (0.003, 0.3)  # initial range per sample, logarithmically spaced
-    turn: ClassVar[float] = 0.3  # rad per sample, initially the largest
+    turn: ClassVar[float] = 0.3  # rad per sample, the largest initial angle
 
     def __init__(self, width: int) -> None:
         super().__init__(width)
@@ -75,11 +75,11 @@ class LRUCell(Cell):
         self.gates = nn.ModuleList(nn.Linear(3 * width, 2 * width) for _ in range(self.blocks))
 
     def start(self, n: int) -> torch.Tensor:
-        """Zeros, with real and imaginary parts side by side."""
+        """Return zeros, with real and imaginary parts side by side."""
         return torch.zeros(n, self.blocks, self.width, 2)
 
     def forward(self, features: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """All blocks."""
+        """Apply all blocks."""
         after = []
         for i, (norm, inlet, gate) in enumerate(zip(self.norms, self.inlets, self.gates, strict=True)):
             decay = self.log_decay[i].exp()
@@ -119,7 +119,7 @@ class TransformerCell(Cell):
         )
 
     def start(self, n: int) -> torch.Tensor:
-        """Keys and values of zero."""
+        """Return keys and values of zero."""
         return torch.zeros(n, self.blocks, self.window, 2 * self.width)
 
     def forward(self, features: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -159,7 +159,7 @@ class Model(nn.Module):
         self.x_scale: torch.Tensor
 
     def forward(self, y: torch.Tensor, noise: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Scaled estimates (samples, n, nx) and the state after y (samples, n, ny), 0 where a sample is missing."""
+        """Return scaled estimates (samples, n, nx) and the state after y (samples, n, ny); a missing sample is 0."""
         scaled = torch.nan_to_num((y - self.y_offset) / self.y_scale)
         hidden, state = self.cell(self.inlet(torch.cat([scaled, noise.expand_as(scaled)], -1)), state)
         return self.readout(hidden), state
@@ -168,9 +168,9 @@ class Model(nn.Module):
 class SequenceMethod(Method[Arrays]):
     """A method that trains a cell by truncated back-propagation along trajectories.
 
-    Rows have random ages, so that every batch has transients and settled motion. Half of the trajectories have no
-    noise, the others a random level up to the system's own; the level is an input of the network. The loss is the mean
-    length of the scaled error, because transients would dominate its square.
+    The rows of a batch have random ages, so that every batch has transients and settled motion. Half of the
+    trajectories have no noise, the others a random level up to the system's own; the level is an input of the network.
+    The loss is the mean length of the scaled error, because transients would dominate its square.
     """
 
     kind: ClassVar[type[Cell]]
@@ -183,7 +183,7 @@ class SequenceMethod(Method[Arrays]):
         return {key: value.detach().numpy() for key, value in problem.model.state_dict().items()}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
-        """The network as an observer, one sample at a time."""
+        """Return the network as an observer that takes one sample at a time."""
         own = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
         level = np.minimum(np.divide(noise, own, out=np.zeros(system.ny), where=own > 0), 1.0)
         model = Model(self.kind, WIDTH, system.ny, system.nx)
@@ -218,7 +218,7 @@ class Transformer(SequenceMethod):
 class _Problem(nn.Module):
     """The model, and the positions of rows along the trajectories, which are buffers for the checkpoint.
 
-    A row follows a random part of a trajectory from its start, and then begins another one.
+    A row follows a trajectory from its start to a random age, and then begins another one.
     """
 
     def __init__(self, kind: type[Cell], task: Task) -> None:
@@ -243,7 +243,7 @@ class _Problem(nn.Module):
         self.state: torch.Tensor
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean error at the recorded samples of the next chunk."""
+        """Return the mean error at the recorded samples of the next chunk."""
         (length, trajectories, _), (_, age, end) = self._y.shape, self.places
         fresh = (age >= end) | (age + len(self._steps) > length)
         zero = torch.zeros(ROWS, dtype=torch.long)
@@ -268,7 +268,7 @@ class _Problem(nn.Module):
 
 
 def level_feature(level: torch.Tensor) -> torch.Tensor:
-    """The networks' input for noise levels, which are in multiples of the system's own."""
+    """Return the networks' input for noise levels, which are in multiples of the system's own."""
     return torch.asinh(level / FAINT_NOISE)
 
 
@@ -286,17 +286,17 @@ class SequenceObserver:
         self._model, self._noise = model, noise
 
     def start(self, n: int) -> Memory:
-        """Rows before their first sample."""
+        """Return the memory of n rows before their first sample."""
         return Memory(self._model.cell.start(n).numpy(), np.zeros((n, len(self._model.x_scale))))
 
     @torch.no_grad()
     def advance(self, state: Memory, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> Memory:
-        """One sample."""
+        """Process one sample of each row."""
         sample = torch.as_tensor(y, dtype=torch.float32)[None]
         x_hat, after = self._model(sample, self._noise, torch.as_tensor(state.state))
         x = self._model.x_offset + self._model.x_scale * x_hat[0]
         return Memory(after.numpy(), x.double().numpy())
 
     def estimate(self, state: Memory) -> Estimate:
-        """The model's."""
+        """Return the model's estimates."""
         return Estimate(state.x_hat)

@@ -1,4 +1,4 @@
-"""Tasks that return the CPU seconds of a step: of environments, observers and Kalman filters."""
+"""Tasks that time steps of environments, observers and Kalman filters in CPU seconds."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -18,8 +18,8 @@ from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
 
-BATCHES = 10  # batches of one step, for filters that take one sample at a time
-FEWER = 10  # divides the number of samples for single steps in Python
+BATCHES = 10  # timed steps of a batch for the Kalman filters, which are slow
+FEWER = 10  # single steps in Python are timed on fewer samples by this factor
 
 
 Name = TypeVar("Name", bound=Hashable)
@@ -40,14 +40,14 @@ def in_turns(
 
 
 def seconds_of(task: Callable[[], object], count: int) -> float:
-    """CPU seconds of a task, divided by its number of steps."""
+    """Run a task; returns its CPU seconds divided by its number of steps."""
     began = time.process_time()
     task()
     return (time.process_time() - began) / count
 
 
 def environment_task(env: Any, actions: Sequence[np.ndarray]) -> Callable[[], float]:
-    """A task of an environment's steps; vector environments reset by themselves."""
+    """Return a task that times an environment's steps; vector environments reset by themselves."""
     single = isinstance(env, gym.Env)
 
     def steps() -> None:
@@ -64,7 +64,7 @@ def environment_task(env: Any, actions: Sequence[np.ndarray]) -> Callable[[], fl
 
 
 def observer_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
-    """Tasks of steps of an observer and of extended Kalman filters, along the same samples of motions from X.
+    """Return tasks that time an observer and extended Kalman filters, on the same samples of motions from X.
 
     The first half of an observer's steps is not timed, because a tracker may still evaluate T_inv at each sample.
     Single steps in Python, by far the slowest, are timed on fewer samples.
@@ -102,7 +102,7 @@ def observer_tasks(artifact: Artifact, system: System, *, rows: int, steps: int)
 
 
 def record_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
-    """Tasks of estimates along records, in seconds per sample: the observer and, if installed, dynamax's EKF.
+    """Return tasks that time estimates along records: of the observer and, if installed, of dynamax's EKF.
 
     Both use the equations of the observer's tracker.
     """
@@ -117,7 +117,7 @@ def record_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -
 
 
 def noisy_samples(artifact: Artifact, system: System, rows: int, steps: int, u: np.ndarray | None = None) -> np.ndarray:
-    """Noisy samples of motions from X, (steps + 1, rows, ny)."""
+    """Return noisy samples of motions from X, (steps + 1, rows, ny)."""
     rng = np.random.default_rng(0)
     low, high = np.transpose(system.X)
     starts = rng.uniform(low, high, (rows, system.nx))
@@ -201,7 +201,7 @@ class _Filterpy:
         found.P = found.F @ found.P @ found.F.T + found.Q
         found.x = np.array(advance(system, state, u.tolist(), self._w, self._dt))
         found.update(y, lambda x: self._matrix(self._h, x.tolist()), lambda x: np.array(system.h(x)))
-        if not ((self._low <= found.x) & (found.x <= self._high)).all():  # the samples do not follow a motion
+        if not ((self._low <= found.x) & (found.x <= self._high)).all():  # the estimate has diverged
             found.x, found.P = (np.array(each) for each in self._start)
 
     def _matrix(self, rows: Any, x: list[float]) -> np.ndarray:

@@ -22,7 +22,8 @@ from training.progress import ProgressBars, progress_bars
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
 OTHERS = ("large",)  # kinds of shipped maps besides the default ones
-HOUR = 72  # length of records over a turn of an environment: an hour at 100 Hz by default
+# Ratio of the length of records to the steps of a turn; by default, records are an hour long at 100 Hz.
+HOUR = 72
 
 Tasks = Mapping[str, Callable[[], float]]
 
@@ -32,8 +33,8 @@ class Speed:
     """Time environments, bare and with an observer, against Gymnasium's Pendulum-v1 and batched CartPole-v1.
 
     Actions are drawn before the timing. The environments run in turns, because a shared machine's speed drifts: each
-    ratio is the median over turns of the ratio to the reference in the same turn. Your own system has rows with an
-    observer if you name one. The references are also timed with the memory of `kkl_gym.KKLMemory`.
+    ratio is the median over turns of the ratio to the reference in the same turn. An observer for your own system
+    is timed if you name its file. The references are also timed with the memory of `kkl_gym.KKLMemory`.
 
     Times are CPU times of this process, which other processes hardly affect: run it with one thread. Further tables
     compare observers without an environment with extended Kalman filters on the same samples.
@@ -101,7 +102,7 @@ class Speed:
         counts: Mapping[int, int],
         progress: ProgressBars,
     ) -> None:
-        """Time observers and Kalman filters without environments; ``counts`` has the number of samples by rows."""
+        """Time observers and Kalman filters without environments; ``counts`` are samples by number of rows."""
         lines = []
         for name, system in systems.items():
             artifact = Artifact.read(resolve(name))
@@ -129,11 +130,11 @@ def _print(titles: Sequence[str], rows: Sequence[Sequence[str]], progress: Progr
 def variants(
     one: Shown, make: Callable[[], Any], observe: Callable[..., Any], *, with_z: bool = False
 ) -> dict[str, Any]:
-    """Variants of a system's environment by name: bare, and with each available observer."""
+    """Make variants of a system's environment by name: bare, and with each available observer."""
     wrapped: dict[str, dict[str, Any]] = {}
     if one.observed:
         artifact = Artifact.read(resolve(_default(one)))
-        default = {"observer": one.observer, "ignore_input": not artifact.nu}  # the estimates do not matter here
+        default = {"observer": one.observer, "ignore_input": not artifact.nu}  # only times matter here
         if with_z:
             wrapped["z"] = {**default, "estimate": "z"}
         wrapped["x_hat"] = default
@@ -149,7 +150,7 @@ def _default(one: Shown) -> str:
 
 
 def _others(one: Shown) -> dict[str, str]:
-    """Shipped maps of a system besides its default, by kind."""
+    """Return the shipped maps of a system besides its default, by kind."""
     names = {kind: f"{one.system.name}-{kind}" for kind in OTHERS}
     there = shipped_maps() if one.observer is None and one.observed else {}
     return {kind: name for kind, name in names.items() if name in there}

@@ -94,7 +94,9 @@ def test_a_script_with_one_system_needs_no_class(tmp_path):
     one.write_text(text)
     two.write_text(f"{text}\n\nclass Other(Pendulum):\n    name = 'other'\n")
     assert get_system(str(one)).name == "pendulum"
-    with pytest.raises(ValueError, match=r"two.py needs one class, named as in .*two.py:Class; it defines P"):
+    with pytest.raises(
+        ValueError, match=r"two.py does not define exactly one class: name one, as in .*two.py:Class; it"
+    ):
         get_system(str(two))
 
 

@@ -109,9 +109,12 @@ def test_equations_on_tensors_are_those_on_arrays(system):
 @pytest.mark.parametrize(
     ("equations", "message"),
     [
-        (Late().f, "; x held tensors of shape (4,): use kkl_gym.elementary.sin, which serves"),
+        (Late().f, "; x held tensors of shape (4,): use kkl_gym.elementary.sin, which takes"),
         (Branching().f, "; x held tensors of shape (4,), on which `if`, `and`, `or` and `not` cannot decide: use"),
-        (lambda x: (x[0], x[1].reshape(2, 2)), "of which [1] is of shape (2, 2), where the components of x have shape"),
+        (
+            lambda x: (x[0], x[1].reshape(2, 2)),
+            "whose entry [1] is of shape (2, 2), where the components of x have shape",
+        ),
         (lambda x: torch.complex(x[0], x[1])[None], "which is complex"),
     ],
 )
