@@ -190,20 +190,14 @@ def policy_of(model: Any, *, deterministic: bool = True) -> Callable[[np.ndarray
 
 
 class _Clock:
-    """CPU seconds of this process since the clock was made, without those of evaluations."""
+    """CPU seconds of this process since ``start``."""
 
     def __init__(self) -> None:
-        self._began = time.process_time()
+        self.start = time.process_time()
 
     @property
     def seconds(self) -> float:
-        return time.process_time() - self._began
-
-    def without(self, work: Callable[[], None]) -> None:
-        """Run an evaluation."""
-        seconds = self.seconds
-        work()
-        self._began = time.process_time() - seconds
+        return time.process_time() - self.start
 
 
 def _budget(clock: _Clock, until: float, evaluate: Callable[[float], None] | None = None) -> Any:
@@ -216,7 +210,8 @@ def _budget(clock: _Clock, until: float, evaluate: Callable[[float], None] | Non
         def _on_step(self) -> bool:
             seconds = clock.seconds
             if evaluate and seconds >= self.due:
-                clock.without(lambda: evaluate(seconds))
+                evaluate(seconds)
+                clock.start = time.process_time() - seconds  # without the evaluation
                 self.due = min(until, seconds + until / EVALUATIONS)
             return seconds < until
 
@@ -282,8 +277,6 @@ class Kinds:
 def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
     """Interquartile means of returns at the end and at equal steps, with bootstrap intervals over seeds."""
     agents = rows.groupby(["environment", "kind", "shown", "seed"], sort=False)
-    last = agents.last()
-    seconds = f"{rows.seconds.max():.0f} CPU seconds"
     partial = f" Partial: {missing} agents are missing." if missing else ""
     lines = [
         "# Kinds of partial observability",
@@ -293,10 +286,10 @@ def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
         "",
     ]
     equal = agents.apply(lambda curve: np.interp(STEPS, curve.steps, curve["return"]))
-    for title, values in ((f"After {seconds}:", last["return"]), (f"After {STEPS:,} steps:", equal)):
-        lines += [title, "", *_by_kind(values, _returns), ""]
-    lines += [f"Thousands of steps in {seconds}:", "", *_by_kind(last.steps, _thousands)]
-    return lines
+    seconds = f"After {rows.seconds.max():.0f} CPU seconds:"
+    for title, values in ((seconds, agents["return"].last()), (f"After {STEPS:,} steps:", equal)):
+        lines += [title, "", *_by_kind(values), ""]
+    return lines[:-1]
 
 
 def _trained_in(kind: str, shown: str) -> str:
@@ -304,14 +297,14 @@ def _trained_in(kind: str, shown: str) -> str:
     return "masked" if shown == "state" and kind not in OF_STATE else kind
 
 
-def _by_kind(values: "pd.Series", cells: Callable[[dict[str, np.ndarray]], dict[str, str]]) -> list[str]:
+def _by_kind(values: "pd.Series") -> list[str]:
     """A table with a row for each environment and kind, and a column for each kind of information."""
     shown = [name for name in get_args(Shown) if name in values.index.unique("shown")]
     groups = dict(iter(values.groupby(["environment", "kind", "shown"])))
     lines = list[list[str]]()
     for env_id, kind in values.index.droplevel(["shown", "seed"]).unique():
         keys = {name: (env_id, _trained_in(kind, name), name) for name in shown}
-        text = cells({name: groups[key].to_numpy() for name, key in keys.items() if key in groups})
+        text = _returns({name: groups[key].to_numpy() for name, key in keys.items() if key in groups})
         lines.append([f"`{env_id}`, {kind}", *(text.get(name, "–") for name in shown)])
     return files.table(["", *shown], lines)
 
@@ -354,7 +347,3 @@ def _returns(row: dict[str, np.ndarray]) -> dict[str, str]:
         interval = f" [{ends[name][0]:.4g}, {ends[name][1]:.4g}]" if len(values) > 2 else ""
         text[name] = f"{mean}{interval}, {len(values)}"
     return text
-
-
-def _thousands(row: dict[str, np.ndarray]) -> dict[str, str]:
-    return {name: f"{steps.mean() / 1000:.0f}" for name, steps in row.items()}
