@@ -22,10 +22,10 @@ from training.trajectories.motions import filter_states
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # measurement noise, in multiples of the largest level in training
 # Times since reset, in units of the source's ``pace``.
 AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)
-# Each run gives several samples around each age, as all motions may be in phase at a single one.
+# Samples of each run around each age (four times as many at the last), as all motions may be in phase at one age.
 PER_AGE = 6
 FEWEST = 50  # least number of errors for a covariance or a quantile
-LEAST_VARIANCE = 1e-6  # added to each state's variance, as a fraction of its squared range
+LEAST_VARIANCE = 1e-6  # added to the variance of each state's error, as a fraction of the state's squared range
 WINDOW, WARM_UP = 0.5, 5.0  # the monitor's averaging window and its warm-up, in units of the pace
 MARGIN = 1.05  # factor on the limits, because only finitely many motions determine them
 
@@ -119,7 +119,7 @@ class _Calibration:
         return replace(artifact, limits=self.limits(extremes)) if monitored else artifact
 
     def groups(self) -> Iterator[tuple[int, dict[str, Any], np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield (index of the measurement noise, both noise levels, mask (n,) of the runs with them, their y, u)."""
+        """Yield (index in ``LEVELS``, both noise levels, mask (n,) of runs with this process noise, their y and u)."""
         runs, rng = self.runs, np.random.default_rng(0)
         for i, level in enumerate(self.levels):
             y = runs.y + level * rng.standard_normal(runs.y.shape)
@@ -151,7 +151,7 @@ class _Calibration:
         return replace(artifact, inverse=with_table(artifact.inverse, finite), free_inverse=free)
 
     def followed(self, artifact: Artifact, report: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Run the observer; return its errors' squared distances (levels, ages, n) and its residuals' extremes."""
+        """Run the observer; return errors' squared Mahalanobis distances (levels, ages, n) and residuals' extremes."""
         from scipy.signal import lfilter  # takes half a second to import
 
         runs, pace = self.runs, self.source.pace
@@ -175,17 +175,17 @@ class _Calibration:
         return distances, extremes
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
-        """Apply ``find`` to the values (ages, n, ...) around each knot, or around the nearest knot with enough."""
+        """Apply ``find`` to the values (ages, n, ...) around each knot, or the nearest knot with ``FEWEST`` of them."""
         finite = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
         cells = [np.isin(self.ages, span)[:, None] & finite for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
         if not enough:
-            raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record more, or hold more out")
+            raise TooFewRunsError(f"fewer than {FEWEST} samples to calibrate on: record, hold out or simulate more")
         entries = {i: find(values[cells[i]]) for i in enough}
         return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
     def limits(self, extremes: np.ndarray) -> Limits:
-        """Return limits; a fault-free motion exceeds each of them with the probability false_alarms / (6 ny)."""
+        """Return limits; a fault-free motion crosses each of them with the probability false_alarms / (6 ny)."""
         share, sound = self.false_alarms / (6 * self.artifact.ny), self.noisy if self.noisy.any() else ~self.noisy
         largest, low, high = extremes[:, :, sound]
         mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))

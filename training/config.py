@@ -34,7 +34,7 @@ Biases = Annotated[
     frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 )
 class Config:
-    """The settings of a training; by default those of the preset "fast" for input-aware maps.
+    """The settings of a training; the preset "fast" for input-aware maps keeps the defaults unless systems differ.
 
     Raises
     ------
@@ -44,8 +44,8 @@ class Config:
 
     pipeline: Pipeline
     """How the observer is learned. input-aware: T_inv(z_y, z_u) is fitted along noisy trajectories with inputs, and
-    T_inv(z_y) along trajectories without, transients included. spinn: as in the paper, a physics-informed network
-    learns T, and T_inv is fitted on z' = T(x'), without inputs."""
+    T_inv(z_y) along those without inputs, transients included. spinn: as in the paper, a physics-informed network
+    learns T, and T_inv is fitted on z' = T(x') (see ``transients``), without inputs."""
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
     """Real eigenvalues of A, in 1/s; B is all ones for each output."""
     pairs: tuple[tuple[Annotated[float, Field(lt=0)], Positive], ...] = ()
@@ -75,13 +75,13 @@ class Config:
     inverse_steps: Count = 1500
     """Batches for each inverse map."""
     collocation: Literal["motions", "box"] = "motions"
-    """Points x' at which the forward map's equation must hold (spinn). box: uniform in X, as in the paper."""
+    """Points x' at which the forward map's equation must hold (spinn): states of motions, or uniform in the box X."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
     """Most trajectories start in this multiple of the training box X, the others in X (spinn)."""
     solved_output_layer: bool = True
     """Whether least squares determine the forward map's output layer after its training (spinn)."""
     transients: bool = True
-    """Whether T_inv is fitted at all times since reset and all noise levels (spinn); otherwise to z' = T(x')."""
+    """Whether T_inv is fitted to z at all times since reset and all noise levels (spinn), not only to z' = T(x')."""
     scaling: Scaling = "relative"
     """How states are scaled. relative: by their standard deviation; errors of T_inv count relative to the state's size.
     range: by half their range; all errors count alike."""
@@ -100,7 +100,7 @@ class Config:
     """Before some trajectories without inputs, inputs lead the start out of X: constant inputs, up to this multiple of
     their bounds, for 20 times the system's pace; with 0, random inputs within their bounds for 10 times the pace."""
     process_noise_share: Share = 0.35
-    """Share of trajectories with process noise (input-aware); with 0, the noise level is not an input of T_inv."""
+    """Share of trajectories with process noise (input-aware); with 0, its level is not an input of T_inv."""
     measurement_noise_max: Levels = 1.0
     """Largest standard deviation of the measurement noise in training, one for all outputs or one for each."""
     noise_free_share: Share = 0.2
@@ -113,20 +113,20 @@ class Config:
     members: Count = 1
     """Number of networks with different seeds, averaged into one wide network, as they extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()
-    """Measured signals with an arbitrary zero, as of an encoder; T_inv uses only their changes (recorded motions)."""
+    """Measured signals with an arbitrary zero, like an encoder's; T_inv uses only their changes (recorded motions)."""
     held_out: Annotated[float, Field(ge=0, lt=1)] = 0.2
     """Share of the records that is held out to calibrate on and to measure errors: whole records if there are five or
     more, otherwise the end of each record."""
     tracking: bool = True
-    """Whether a Kalman filter, initialised by T_inv, tracks by the equations or by a learned flow (not with spinn)."""
+    """Whether a Kalman filter that T_inv initialises tracks the state, by the equations or a flow (not with spinn)."""
     flow_steps: Count = 5000
     """Batches for a flow, which replaces equations that are unknown or that an artifact cannot hold."""
     runs: Annotated[int, Field(ge=100)] = 400
     """Number of simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability of an alarm in a fault-free motion as long as those of calibration (systems: 20 times the pace)."""
+    """Probability of an alarm in a fault-free motion of the calibration's length (systems: 20 times the pace)."""
     truncation: Positive = 1e-6
-    """epsilon: the forward map's data begins when this share of the filter's start is left (spinn; paper, sec. 5.2)."""
+    """epsilon: the forward map's data begins once the filter's start adds at most this to z (spinn, paper sec. 5.2)."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name, with their largest relative
     deviations; "all" stands for each that is not named. Some motions keep the system's own values."""
@@ -161,7 +161,7 @@ class Config:
                 f"inputs = {self.inputs}"
             )
         if (self.pipeline == "spinn") != (self.forward_steps > 0):
-            raise ValueError(f"pipeline {self.pipeline!r} does not go with forward_steps = {self.forward_steps}")
+            raise ValueError(f"forward_steps = {self.forward_steps} must be > 0 for 'spinn', 0 for 'input-aware'")
         own = {name: getattr(self, name) for name in ("collocation", "box_factor", "solved_output_layer", "transients")}
         changed = [f"{name} = {value!r}" for name, value in own.items() if value != getattr(Config, name)]
         if changed and self.pipeline != "spinn":

@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from observers.storage import UNFINISHED, replacing
 
-CHECKPOINTS = "[!.]*.checkpoint.*"  # files of a run or an agent; unfinished ones begin with a dot
+CHECKPOINTS = "[!.]*.checkpoint.*"  # checkpoints of a run or an agent; names of unfinished files begin with a dot
 ABANDONED = 3600.0  # seconds since the last write after which a temporary file counts as abandoned
 
 
@@ -67,7 +67,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterator[None]:
-    """Lock a job's folder and write the job's identity; ValueError if the folder holds another job."""
+    """Lock a job's folder and write the job's identity; raise ValueError if the folder holds another job."""
     with locked(folder):
         check_identity(folder / "job.json", described, what)
         write(folder / "job.json", json.dumps(described, indent=2) + "\n")
@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a run's folder and write its configuration; ValueError if checkpoints there must not be resumed."""
+    """Lock a run's folder and write its configuration; raise ValueError if checkpoints there must not be resumed."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)

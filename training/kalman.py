@@ -18,7 +18,7 @@ NOISE_FLOOR = 0.002  # least measurement noise that a filter assumes, in multipl
 
 
 def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
-    """Return the covariance (ny, ny) of the measurement noise that a filter assumes, at least ``NOISE_FLOOR``."""
+    """Return the covariance (ny, ny) of the noise that a filter assumes on y, at levels of at least ``NOISE_FLOOR``."""
     least = NOISE_FLOOR * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
@@ -44,7 +44,7 @@ class ExtendedKalmanFilter:
     its predicted mean leaves the system's bounds or its covariance is no longer finite. It skips outputs that are NaN,
     or for which h is undefined at the mean.
 
-    Shapes: ``Q`` (nx, nx), ``R`` (ny, ny) or (n, ny, ny), ``start`` (nx,) and (nx, nx).
+    Shapes: ``Q`` (nx, nx), ``R`` (ny, ny) or (n, ny, ny), ``start`` (nx,) and (nx, nx), by default from unknown_start.
     """
 
     def __init__(

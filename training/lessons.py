@@ -30,8 +30,8 @@ from training.spectrum import Spectrum, check_continuous
 
 # Size and training of the flow's network.
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
-LEAST = 0.01  # added to a scaled increment's mean square, by which the loss divides, so that tiny ones do not dominate
-LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, over the rms of the increments
+LEAST = 0.01  # added to a scaled residual's mean square, by which the loss divides, lest tiny residuals dominate
+LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, as a fraction of the increments' rms
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Result:
     artifact : Artifact
         The observer.
     losses : dict of str to list of (int, float)
-        For each stage that trained a network, pairs of a number of batches and the error after them.
+        For each stage that trained a network, pairs of a number of batches and the mean error of the last 100 or less.
     seconds : dict of str to float
         CPU seconds of each stage.
     """
@@ -159,7 +159,7 @@ class Maps:
 def learn_map(source: Source, run: Run) -> Maps:
     """Learn T_inv along motions of a source, transients and all noise levels included.
 
-    A simulated system with inputs has two maps: one for driven motion, and one without u, used until an input acts. The
+    By default, a simulated system with inputs has two maps: T_inv(z_y, z_u), and T_inv(z_y) until an input acts. The
     pipeline "spinn" follows the paper: it learns T from motions and T's equation, and then T_inv from z = T(x).
 
     Parameters
@@ -280,7 +280,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
     parts = {"x_offset": learned.x.mean(0), "x_scale": spread(learned.x)} | parts
-    offset, scale = parts["x_offset"], parts["x_scale"]  # the source's scale, if any, is its process noise's unit
+    offset, scale = parts["x_offset"], parts["x_scale"]  # a source's own scale is the unit of its process noise
     u_scale = np.abs(learned.u).max(0, initial=0.0)
     u_scale = np.where(u_scale > 0, u_scale, 1.0)
     inputs = np.column_stack([(learned.x - offset) / scale, learned.u / u_scale])

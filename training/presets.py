@@ -86,8 +86,8 @@ PROFILES: dict[str, Profile] = {
             "noise_free_share": 0.2,
             "high_noise_emphasis": 4.5,
         },
-        # High noise levels are drawn more often, as they make the phase hard to estimate. Inputs within the bound
-        # cannot lead the oscillator out of X, so that stronger ones lead starts out of it.
+        # High noise levels are drawn more often, as they make the phase hard to estimate. Inputs within their bound
+        # cannot drive the oscillator out of X, so stronger inputs drive the starts there.
         settings={"lead_in_input": 4.0, "noise_free_share": 0.05, "high_noise_emphasis": 4.0},
         # Without a tracker, slow complex modes at frequencies of y average the noise of y.
         large_settings={
@@ -100,7 +100,7 @@ PROFILES: dict[str, Profile] = {
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
         # Under noise, real modes hardly distinguish the three parameters, but slow pairs at frequencies of y do: two
-        # pairs reduce the best decoder's error from 2.3 to 1.9 % (parameters 10 % off); longer training gains 3 % more.
+        # reduced the best decoder's error from 2.3 to 1.9 % (parameters 10 % off), and longer training by another 3 %.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
@@ -113,7 +113,7 @@ PROFILES: dict[str, Profile] = {
     "lorenz": Profile(
         eigenvalues=_spaced(13, -1.5, -25.0),  # this system is faster than the others
         spinn_settings={"eigenvalues": _spaced(9, -9.0, -40.0)},
-        settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
+        settings={"measurement_noise_max": 3.0},  # its output is the largest of the four systems'
         large_settings={"inverse_steps": 24_000},
         fault_deadline=2.0,
     ),
@@ -173,7 +173,7 @@ def preset(
     size : {"default", "large"}
         Size of an input-aware T_inv; "large" is for use without a tracker.
     changes : mapping of str to object, optional
-        Settings to replace; None keeps a setting. Eigenvalues that are not given follow from the other settings.
+        Settings to replace; None keeps a setting. Eigenvalues not given follow from the system and the other settings.
 
     Returns
     -------

@@ -71,7 +71,7 @@ class ProgressBars(Progress):
             self._write(f"ended by {type(error).__name__}{': ' if str(error) else ''}{error}", printed=False)
 
     def tell(self) -> None:
-        """Write a line for each task that has ended, or whose next line is due."""
+        """Write a line for each task whose next line is due, or that has ended after at least a minute."""
         with self._lock:
             for task in self.tasks:
                 passed = task.elapsed or 0.0

@@ -35,7 +35,7 @@ Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
 
 @dataclass
 class Run:
-    """A running training; ``with Run.begin(config) as run`` makes one for single lessons.
+    """A running training; ``with Run.begin(config) as run`` makes one for :func:`training.learn_map` or ``learn_flow``.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Run:
     resume : bool
         Whether stages resume from their checkpoints.
     losses : dict of str to list of (int, float)
-        For each stage, pairs of a number of batches and the error after them.
+        For each stage, pairs of a number of batches and the mean error of the last 100 or less.
     seconds : dict of str to float
         CPU seconds of each stage.
     samples : dict of str to int
@@ -171,7 +171,7 @@ def optimise(
             raise FloatingPointError(f"the error of stage {stage.name!r} is NaN at step {stage.step}")
         total.zero_()
         stage.history.append((stage.step, mean))
-        expected = round(stage.step / done)  # total number of batches, as the limit of CPU time may end the stage
+        expected = round(stage.step / done)  # total number of batches, which the limit of CPU time may reduce
         progress.update(task, completed=stage.step, total=expected, description=f"{stage.name} (error {mean:.3g})")
         if done >= 1 or time.monotonic() - saved_at > CHECKPOINT_SECONDS:
             state = {name: part.state_dict() for name, part in parts.items()} | {"generator": generator.get_state()}

@@ -1,4 +1,4 @@
-"""The eigenvalues of A: the filter that they define, and a test before any training of whether T is smooth for them."""
+"""The eigenvalues of A: the filter that they define, and a test, before any training, whether T is smooth for them."""
 
 import functools
 from collections.abc import Iterable, Iterator
@@ -21,10 +21,10 @@ ASKING = 40  # number of motions whose states are compared with neighbours on th
 SAMPLES = 160  # number of states along a motion
 FAR = 64  # rank of the far neighbour, with which the nearest one is compared
 FEWEST_STATES = 1000  # least number of states for an exponent
-FOLLOWED = 300.0  # length of motions after the transient, in multiples of 1 / rate
-FINEST = 0.05  # least sampling interval, in multiples of 1 / rate; finer ones only cost time
+FOLLOWED = 300.0  # length of motions after the transient, in multiples of 1 / System.typical_rate
+FINEST = 0.05  # least sampling interval, in multiples of 1 / System.typical_rate; shorter intervals only cost time
 AT_REST = 1e-6  # a state that varies less, in half-widths of X, counts as constant
-SLOWEST, FASTEST = 1 / 6, 8.0  # slow end of the first and of the last interval of eigenvalues, over the rate
+SLOWEST, FASTEST = 1 / 6, 8.0  # slow ends of the first and last interval of eigenvalues, in units of typical_rate
 STEP = 2**0.5  # ratio of the slow ends of consecutive intervals
 FORGOTTEN = 30.0  # a filter has forgotten its start after this multiple of 1 / |slow end|
 SPREAD = 4.0  # ratio of an interval's fast end to its slow end
@@ -114,7 +114,7 @@ def _exponents(system: System, *, x: np.ndarray, z: np.ndarray, settled: np.ndar
     closer = np.sqrt(((distances[:, :1] / reach) ** 2).mean(0))
     first, last = np.sqrt(((differences / reach[..., None]) ** 2).mean(0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(last > 0, np.log(first / last) / np.log(closer), 1.0)  # 1 for a constant output
+        return np.where(last > 0, np.log(first / last) / np.log(closer), 1.0)  # 1 for a constant component of z
 
 
 def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spectrum]:
@@ -129,7 +129,7 @@ def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spect
 
 @functools.cache
 def smooth_spectrum(system: System, dt: float, duration: float = np.inf) -> Spectrum:
-    """Choose the slowest of the :func:`intervals` for which T is smooth, or else the one with the largest exponents."""
+    """Choose the slowest of the :func:`intervals` with a smooth T, or else the one whose least exponent is largest."""
     spectra, least = intervals(system, dt, duration), list[float]()
     for spectrum, exponents in zip(spectra, smoothness(system, spectra, dt), strict=True):
         least.append(float(np.nan_to_num(exponents, nan=-np.inf).min()))

@@ -39,7 +39,7 @@ def test_settings_that_do_not_go_with_the_pipeline():
             replace(preset(Oscillator(), "spinn", "fast"), **wrong)
     with pytest.raises(ValueError, match="policy = 'controller' needs"):
         replace(preset(Oscillator(), "spinn", "fast"), policy="controller")
-    with pytest.raises(ValueError, match="does not go with"):
+    with pytest.raises(ValueError, match="forward_steps = 10 must be"):
         replace(preset(Oscillator(), "input-aware", "fast"), forward_steps=10)
     with pytest.raises(ValueError, match=r"box_factor = 2.0, transients = False: settings of the pipeline 'spinn'"):
         replace(preset(Oscillator(), "input-aware", "fast"), box_factor=2.0, transients=False)

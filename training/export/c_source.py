@@ -19,7 +19,7 @@ from training.export.exported import Exported, output_expression, tracker_arrays
 _POWERS = 8  # integer exponents up to this value are written as products
 _CONDITIONS = {**{name: f"{{0}} {name} {{1}}" for name in ("<", "<=", ">", ">=")}, "not": "!{0}"}
 _CONDITIONS |= {"and": "{0} && {1}", "or": "{0} || {1}"}
-_OPERATIONS = _CONDITIONS | {  # with NumPy's results; each argument is a variable or a number
+_OPERATIONS = _CONDITIONS | {  # C code with the results of NumPy's functions; each argument is a variable or a number
     **{name: f"{name}({{0}})" for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "floor")},
     **{name: f"{{0}} {name} {{1}}" for name in ("+", "*")},
     "abs": "fabs({0})",

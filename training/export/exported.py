@@ -92,7 +92,7 @@ def output_expression(artifact: Artifact) -> Expression | None:
 
 
 def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
-    """Return the weights of the sigma points, and the constants of divergence detection."""
+    """Return the weights of the sigma points, and the constants of relinearisation and of divergence detection."""
     watch = Supervision.of(motion, dt)
     weights = dict(zip(("middle", "middle_squares", "other"), sigma_weights(motion.nx), strict=True))
     others = {"trend_gain": watch.trend_gain, "inflation": INFLATION, "relinearisations": RELINEARISATIONS}

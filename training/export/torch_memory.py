@@ -14,7 +14,7 @@ from training.export.torch_parts import Module
 class TorchMemory(Module):
     """The memory of :class:`kkl_gym.KKLMemory` as a module of Torch: batched, differentiable, on any device.
 
-    A state row of zeros marks a start: the next outputs are its first outputs. :meth:`start` returns such rows, and
+    A state row of zeros marks a start: the next outputs are the row's first. :meth:`start` returns such rows, and
     ``state * ~done[:, None]`` restarts the rows of finished episodes.
 
     Parameters
@@ -101,7 +101,7 @@ class TorchMemory(Module):
         return torch.cat([age + 1.0, signals, w.flatten(1), v], 1), shown
 
     def _signals(self, y: Tensor, before: Tensor) -> Tensor:
-        """Return the signals to filter: the other outputs, then angles, unwrapped to at most half a turn per step."""
+        """Return the signals to filter: plain outputs, then angles, unwrapped to steps of at most half a turn."""
         cosine, sine, before = y[:, self.cosines], y[:, self.sines], before[:, len(self.others) :]
         known = cosine**2 + sine**2 > 0
         angle = torch.atan2(sine, torch.where(known, cosine, 1.0))

@@ -18,7 +18,7 @@ class TorchObserver(Module):
 
     The caller keeps the state: ``state, x_hat = observer(state, y, u)`` does for n rows what
     :meth:`observers.KKLObserver.step` does, without monitor, gate, delay and known initial states. A state row of zeros
-    marks a start: the next sample is its first, in which no output may be missing. :meth:`start` returns such rows, and
+    marks a start: the next sample is the first, in which no output may be missing. :meth:`start` returns such rows, and
     ``state * ~done[:, None]`` restarts the rows of finished episodes. In later samples, NaN marks missing outputs.
 
     The whole step is differentiable, also with respect to the weights. The filter's state and the tracker's covariance
@@ -178,7 +178,7 @@ class TorchObserver(Module):
         return torch.minimum(level, self.driven.measurement_noise_max), process_level
 
     def _of_map(self, z: Tensor, method: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
-        """Return values (n, m) of a map's method: of the free map in rows without input since their start."""
+        """Return values (n, m): the free map's in rows without input since their start, the driven map's elsewhere."""
         driven = method(self.driven, z, *arguments)
         if self.free is None:
             return driven
@@ -211,7 +211,7 @@ class TorchMap(Module):
         return self.x_offset + self.x_scale * self.network(torch.cat(inputs, 1))
 
     def share(self, level: Tensor) -> Tensor:
-        """Return noise levels (n, 1) in multiples of the largest in training: those of the noisiest output."""
+        """Return the noisiest output's measurement noise (n, 1), in multiples of its largest level in training."""
         return (level / self.measurement_noise_max).amax(1, keepdim=True)
 
     def covariance(self, _: Tensor, age: Tensor, level: Tensor) -> Tensor:

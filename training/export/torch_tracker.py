@@ -63,7 +63,7 @@ class TorchTracker(Module):
     def advance(
         self, state: Tensor, y: Tensor, u: Tensor, begins: Tensor, measurement_noise: Tensor, process_noise: Tensor
     ) -> tuple[Tracked, Tensor]:
-        """Predict, correct by y (ny, n), NaN if missing; return the state, its NIS infinite on failure, and outputs."""
+        """Predict, correct by y (ny, n; missing: NaN); return the state (on failure NIS = inf) and expected outputs."""
         Q = self.eye * ((process_noise.clamp(min=self.least_process_noise) * self.process_noise) ** 2 + self.error**2)
         R = self.eye_y * torch.maximum(measurement_noise, self.least_measurement_noise) ** 2
         numbers, (x0, P0, nis, square, seen, trend) = self.numbers, self._unpacked(state)
@@ -97,7 +97,7 @@ class TorchTracker(Module):
     def supervise(self, tracked: Tracked, x_hat: Tensor, covariance: Callable[[Tensor], Tensor]) -> Tensor:
         """Use T_inv's estimates (nx, n) after a divergence, and in the first window if their covariance is smaller."""
         x, P, nis, square, seen, trend = tracked
-        # The linear filter has taken at least as many samples as the tracker.
+        # The cause of a divergence may have disturbed z, too: the age of T_inv's covariance is at most a window.
         learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)
         lost, learned = ~(nis <= self.numbers["limit"]), learned.reshape(P.shape) / self.units
         of_learned, own = (eliminated(each)[0].diagonal().log().sum(1) for each in (learned, P))
@@ -122,7 +122,7 @@ class TorchTracker(Module):
     def _relinearised(
         self, x: Tensor, P: Tensor, prediction: Prediction, new: Tensor, y: Tensor, u: Tensor, Q: Tensor, R: Tensor
     ) -> Prediction:
-        """Predict again in the first window, the motion linearised about the last state, smoothed by the sample."""
+        """In the first window, predict again: linearise the motion about the last state as smoothed by the sample."""
         nx, (mean, S, across, sound) = self.nx, prediction
         V, white, _, known = self._corrected(mean, S, y, R)
         rows, solvable = eliminated(S, across, V.transpose(0, 1))
@@ -132,7 +132,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return V and white, for the corrected mean + V white and P - V V^T; expected outputs; whether V is valid."""
+        """Return V and white (corrected: mean + V white, P - V V^T), the expected outputs, and whether V is valid."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)
@@ -149,7 +149,7 @@ class TorchTracker(Module):
     def _transformed(
         self, x: Tensor, L: Tensor, function: Callable[[Tensor, Tensor], Tensor], u: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return mean and covariance of a function of x ~ N(mean, L L^T) by sigma points, and E: L E^T = cov(x, .)."""
+        """Return mean and covariance of a function of s ~ N(x, L L^T) by sigma points, and E: L E^T = cov(s, .)."""
         middle, far, count = x[:, None], self.far * L, 1 + 2 * self.nx
         to = function(torch.cat([middle, middle + far, middle - far], 1).flatten(1), u.repeat(1, count))
         to = to.reshape(len(to), count, -1)

@@ -9,8 +9,8 @@ import scipy
 from observers import LinearFilter
 from training.config import Scaling
 
-SMALLEST_MODE = 1e-7  # directions of z with smaller singular values, over the largest, hold only rounding errors
-STILL = 1e-12  # a smaller standard deviation, over the component's size, is rounding error
+SMALLEST_MODE = 1e-7  # least ratio of a singular value of z to the largest; directions below it are rounding errors
+STILL = 1e-12  # least ratio of a component's standard deviation to its largest value; less is rounding error
 SETTLED = np.log(1e3)  # number of time constants after which a thousandth of a filter's start is left
 LEAST = 0.1  # added to a scaled state's mean square, by which the loss divides, so that small states do not dominate
 
@@ -35,7 +35,7 @@ class Coordinates:
 
 
 def coordinates(z: np.ndarray, noise: np.ndarray, silent: np.ndarray | None = None) -> Coordinates:
-    """Find coordinates for ``z`` (n, size) and noise of covariance ``noise`` that ignore directions ``silent``."""
+    """Find coordinates for ``z`` (n, size) and noise with covariance ``noise``, without the directions ``silent``."""
     if silent is not None and silent.size:
         projection = np.eye(len(silent)) - silent @ np.linalg.pinv(silent)
         rest = coordinates(z @ projection.T, projection @ noise @ projection.T)
@@ -93,7 +93,7 @@ def root(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StateScale:
-    """Scales states to (x - offset) / scale, (n,) each; weights of errors depend on the first ``nx`` states."""
+    """Scales states to (x - offset) / scale, both (n,); errors are weighted by the first ``nx`` states, or by all."""
 
     offset: np.ndarray
     scale: np.ndarray
@@ -102,7 +102,7 @@ class StateScale:
 
     @classmethod
     def of(cls, x: np.ndarray, scaling: Scaling, *, nx: int | None = None) -> Self:
-        """Determine offset and scale from states (..., nx)."""
+        """Determine offset and scale from states (..., n)."""
         axes = tuple(range(x.ndim - 1))
         if scaling == "relative":
             offset, scale = x.mean(axes), x.std(axes)
@@ -113,11 +113,11 @@ class StateScale:
         return cls(offset, np.where(moves, scale, 1.0), scaling == "relative", nx)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Scale states (..., nx)."""
+        """Scale states (..., n)."""
         return np.asarray((x - self.offset) / self.scale)
 
     def weight(self, x: np.ndarray) -> np.ndarray:
-        """Return the weights (...,) of the square errors at states (..., nx)."""
+        """Return the weights (...,) of the square errors at states (..., n)."""
         if not self.relative:
             return np.ones(x.shape[:-1])
         return np.asarray(1.0 / (((x / self.scale)[..., : self.nx] ** 2).mean(-1) + LEAST))

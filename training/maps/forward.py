@@ -15,8 +15,8 @@ from training.config import Config
 from training.maps.coordinates import StateScale, spread
 from training.maps.networks import Network, compiled, tensor
 
-SOLVED = 20_000  # number of pairs, and of points, in the least squares for the output layer
-RIDGE = 1e-5  # ridge of these least squares, over the root mean square column norm of their matrix
+SOLVED = 20_000  # largest number of pairs, and of points, in the least squares for the output layer
+RIDGE = 1e-5  # ridge of the least squares, as a fraction of the root mean square column norm of their matrix
 
 
 def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
@@ -142,7 +142,7 @@ class ForwardProblem(nn.Module):
 
 
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:
-    """Return the first sample k* at which at most ``epsilon`` of the filter's start is left along every trajectory.
+    """Return the first sample k* from which the filter's start changes z by at most ``epsilon`` along every trajectory.
 
     t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, which prints the logarithm's argument inverted).
     """

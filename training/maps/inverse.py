@@ -20,12 +20,12 @@ from training.maps.coordinates import (
 from training.maps.networks import Network, compiled, tensor
 from training.trajectories.motions import Pairs
 
-MEASUREMENT_NOISE_UNIT = 0.04  # unit in the noise feature log(1 + sigma_v / unit), over the system's default noise
+MEASUREMENT_NOISE_UNIT = 0.04  # unit in the noise feature log(1 + sigma_v / unit), in multiples of the default noise
 AGE_UNIT = 5  # unit in the age feature log(1 + t / unit), in samples
 # With several outputs, the share of samples in which all outputs have the same fraction of their largest noise levels.
 ALIKE = 0.5
 SAMPLES = 100_000  # largest number of samples of z that determine its coordinates
-PROCESS_NOISE_UNIT = 0.1  # unit in the process noise feature log(1 + level / unit), over the highest level
+PROCESS_NOISE_UNIT = 0.1  # unit in the process noise feature log(1 + level / unit), in multiples of the highest level
 
 
 class Batch(NamedTuple):
@@ -41,8 +41,8 @@ class Sampler(Protocol):
     """Draws batches for T_inv, in cells that count equally in the loss, and makes an inverse map of a network."""
 
     cells: int = 1
-    kinds_of_plant: int = 1
-    parameters: int = 0
+    kinds_of_plant: int = 1  # 2 if motions with the system's own parameters have separate cells
+    parameters: int = 0  # number of estimated parameters, which follow the states in x
     _map: dict[str, Any]
 
     def __call__(self, generator: torch.Generator) -> Batch:
@@ -63,7 +63,7 @@ class TrajectorySampler(Sampler):
     ``cells`` of similar age and noise, and the loss divides a sample's square error by the recent mean of its cell.
     Motions with the system's own parameters, whose errors can be smaller, have separate cells.
 
-    Shapes: ``error`` (size, size), ``silent`` (size, k).
+    Shapes: ``error`` (size, size), the covariance of z's error; ``silent`` (size, k), directions of z to ignore.
     """
 
     AGES_PER_BATCH = 32
@@ -227,7 +227,7 @@ class ForwardMapSampler(Sampler):
 
 
 class InverseProblem(nn.Module):
-    """Trains the inverse network, and keeps a running mean square error for each cell."""
+    """An inverse network's training problem: its loss, with a running mean square error for each cell."""
 
     def __init__(self, network: Network, sampler: Sampler, device: torch.device) -> None:
         super().__init__()
@@ -251,7 +251,7 @@ class InverseProblem(nn.Module):
         square = weight * apart[:, :nx].mean(-1)
         if self.sampler.parameters:  # in separate cells, as parameters can be hard to estimate where states are not
             square = torch.cat([square, apart[:, nx:].mean(-1)])
-            # All plants share these cells; otherwise the map would return the system's own parameters for similar ones.
+            # All plants share these cells, lest the map return the system's own parameters for similar plants.
             cell = torch.cat([cell, self.sampler.cells + cell // self.sampler.kinds_of_plant])
         detached = square.detach()
         count = torch.zeros_like(self.error).index_add_(0, cell, torch.ones_like(detached))

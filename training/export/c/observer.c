@@ -135,8 +135,8 @@ static void move(const double at[NX], const real *u, double next[NX])
 // end equations
 }
 
-/* Computes the outputs of scaled states. Sigma points may lie where an output is undefined: its value is then that at
-   the states limited to their bounds. */
+/* Computes the outputs of scaled states. Sigma points may lie where an output is undefined: then its value is
+   computed at the states limited to their bounds. */
 static void measure(const double s[NX], const real *u, double y[NY])
 {
     double x[2][NX], near[NY];
@@ -287,7 +287,7 @@ static correction correct(prediction *p, const real y[NY])
     return c;
 }
 
-/* Predicts again, with the motion linearised about the last state, smoothed by the sample. */
+/* Predicts again, with the motion linearised about the last state, which the sample smooths. */
 static void relinearise(NAME_observer *observer, prediction *p, const real y[NY], const real *u)
 {
     correction c = correct(p, y);

@@ -44,7 +44,7 @@ typedef struct {
     double nis; /* running mean square of the whitened innovations */
     double trend[MACRO_NY]; /* running mean of the whitened innovations */
     double trend_square; /* scaled running mean square of the trend, on average 1 if the innovations are white */
-    unsigned long seen; /* samples with at least one output, counted up to the window */
+    unsigned long seen; /* samples with at least one output, counted up to the averaging window of nis */
 // end tracks
 } NAME_observer;
 
