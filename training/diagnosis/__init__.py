@@ -1,4 +1,4 @@
-"""Diagnosis before a training: whether a system, records or an environment can be observed and learned."""
+"""Diagnosis before a training: whether an observer for a system, records or an environment can be learned."""
 
 from collections.abc import Callable, Iterator, Sequence
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-RESOLUTION = 1e-3  # error with which a network reads z, in standard deviations; it remains even without noise
+RESOLUTION = 1e-3  # error, in standard deviations of z, with which a network reads its input z even without noise
 
 Verdict = Literal["ok", "note", "problem"]
 
@@ -19,8 +19,8 @@ class Finding:
 
 
 def percent(share: float) -> str:
-    """Format a share in percent, with two digits."""
-    return (f"{100 * share:.0f}" if abs(share) >= 1 else f"{100 * share:.2g}") + " %"
+    """Format a share in percent: with two digits, or from 99.5 % on as a whole number."""
+    return (f"{100 * share:.0f}" if abs(share) >= 0.995 else f"{100 * share:.2g}") + " %"
 
 
 def error(share: float) -> str:

@@ -41,7 +41,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
             continue
         exact = errors[0, :, i]
         first = int((exact <= max(DETERMINED, AS_GOOD * exact.min())).argmax())
-        shares = [f"{error(least[0, i])} without noise (determined after {first * subject.dt:.3g} s)"]
+        shares = [f"{error(least[0, i])} without noise (reached after {first * subject.dt:.3g} s)"]
         shares += [f"{error(one[i])} at noise {show_level(level)}" for level, one in zip(subject.noise, least[1:])]
         text = f"{name}: at best an error of {', '.join(shares)}, in its standard deviations"
         if least[0, i] > VAGUE:
@@ -84,7 +84,7 @@ def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], F
             involved = np.flatnonzero(np.abs(direction) > INVOLVED)
             states = [names[i] for i in involved]
             of = states[0] if len(states) == 1 else f"a combination of {' and '.join(states)}"
-            advice = f"let h measure {' or '.join(states)} too, or leave it out of the state"
+            advice = f"let h measure {' or '.join(states)} too, or leave that state out"
             findings[tuple(involved.tolist())] = (
                 Finding("observability", "problem", f"y does not determine {of}", advice)
                 if share > UNSEEN

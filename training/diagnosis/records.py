@@ -24,16 +24,16 @@ from training.spectrum import Spectrum
 
 STEPS = 10_000  # number of steps played in an environment by default
 MAX_QUERIES, MAX_OTHERS = 500, 40_000  # largest numbers of samples to predict, and of their possible neighbours
-QUERY_SHARE = 0.2  # share of the records with samples to predict; neighbours come from the others
+QUERY_SHARE = 0.2  # share of the records (of each if they are few) to predict; neighbours come from the rest
 MIN_QUERIES = 50  # least number of samples to predict
 MIN_OTHERS = 5  # least number of possible neighbours for each coordinate of z
 NOISE_SHARES = 0.01, 0.1  # default noise levels, in standard deviations of the output
 MIN_NEIGHBOURS = 32  # least number of neighbours; a z of many coordinates needs more, to determine a plane
-ROUNDING = 1e-9  # ridge of the linear regression on z, about the relative rounding of z
+ROUNDING = 1e-9  # ridge of the linear regression on z, about the relative rounding error of z
 # Largest error of a determined signal and least error of an undetermined one, in the signal's standard deviations.
 DETERMINED, UNDETERMINED = 0.05, 0.8
 AS_GOOD = 1.1  # a window whose error is at most this multiple of the least error is as good as the best
-SEEN = 0.1  # a signal is known up to a constant if its changes have at most this share of its own error
+SEEN = 0.1  # a signal is known up to a constant if the error of its changes is at most this share of its value's error
 
 # Severity and advice by the first word of the verdict on a signal.
 VERDICTS: dict[str, tuple[Verdict, str]] = {
@@ -47,7 +47,7 @@ VERDICTS: dict[str, tuple[Verdict, str]] = {
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict on one hidden signal, with its best window in steps and its errors by noise level."""
+    """The verdict on one hidden signal, its shortest good window in steps, if any, and its errors by noise level."""
 
     signal: str
     verdict: str
@@ -75,7 +75,7 @@ class Observability:
         Errors of the best estimates by noise level and window.
     changes : ndarray, shape (m, nx)
         Errors of the best estimates of each signal's change over the window, without noise, in standard deviations of
-        that change; NaN for signals that do not change, and for windows whose start the filter has forgotten.
+        that change; NaN for signals that do not change, and for windows longer than the filter's slowest time constant.
     warnings : tuple of str
         Reports of results for which there are too few data.
     """
@@ -159,8 +159,8 @@ def observability(
     env_kwargs : mapping of str to object, optional
         Arguments of the environment.
     measurement_noise : sequence of (float or tuple of float), optional
-        Standard deviations of the noise on y to compare with 0, each for all outputs or by output; by default 1 % and
-        10 % of the outputs' standard deviations.
+        Standard deviations of the noise on y, in addition to 0; each is one number, or a tuple with a number for each
+        output. By default 1 % and 10 % of the outputs' standard deviations.
     seed : int
         Seed of the rollouts and of the comparison.
     console : rich.console.Console or ProgressBars, optional
@@ -174,7 +174,7 @@ def observability(
     Raises
     ------
     ValueError
-        If an argument is invalid, or the play is too short to judge the signals.
+        If an argument is invalid, or the rollouts are too short to judge the signals.
     """
     if not hidden:
         raise ValueError("name the hidden signals, as in hidden=[2]")
@@ -191,7 +191,7 @@ def of_records(
     """Find which recorded states the recorded outputs and inputs determine.
 
     For a window of k steps, the KKL filter that a training on these records would use starts k steps before a sample.
-    The filter's state z at the sample is compared with similar z in other records, with the noise that z then has.
+    At each noise level, its state z at the sample is compared with similar z at other samples, all with noise.
     """
     integer("seed", seed, 0)
     check_signals(records)
@@ -211,7 +211,7 @@ def of_records(
         if compared is None:
             break
         errors.append(compared[0])
-        # After windows longer than this, the filter has forgotten its start.
+        # After the filter's slowest time constant, z has lost most of its start.
         remembered = window <= settled / SETTLED
         changes.append(np.where(remembered, compared[1], np.nan))
     if not errors:
@@ -239,7 +239,7 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
 
 
 def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return z (n, size) at evenly spread samples, ``steps`` after the filter's start, and x and its changes there."""
+    """Return z (n, size) of filters started ``steps`` before evenly spread samples, and x and its changes since."""
     rows = windows.rows(steps)
     rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
     rows = evenly(rows, min(most, len(rows)))
@@ -271,9 +271,9 @@ def left_by(z: np.ndarray, x: np.ndarray, others_z: np.ndarray, others_x: np.nda
     """Return the errors (nx,) of x given z, in standard deviations, by comparing samples with others of similar z.
 
     Weights are chosen so that the weighted mean of the neighbours' z is the sample's z. The weighted mean of their x
-    misses the sample's x for two reasons. First, z does not determine x. The variance of this error is the sought one
-    times 1 + the sum of squared weights, so that squares are divided by this factor. Second, x is no linear function of
-    z. This error falls with the square of the distance. With one neighbour of weight 1, this is the Delta test.
+    misses the sample's x for two reasons. First, z may not determine x; the variance of this error is the sought
+    variance times (1 + the sum of squared weights), and is divided by this factor. Second, x may not be linear in z;
+    this error falls with the square of the distance. One neighbour of weight 1 would make the method the Delta test.
 
     Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
     """

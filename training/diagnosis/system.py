@@ -20,7 +20,7 @@ COMPARED = 100  # number of points of X, and of 2X, at which the equations are e
 POINTS = 1000  # number of points of X at which outputs are evaluated
 MOTIONS = 100  # number of motions, half of which are driven if the system has inputs
 MANY = 0.5  # a larger share of motions that leave the bounds is a problem
-# Change of y in one sample, over y's standard deviation: a problem above COARSE, a note above JERKY, SMOOTH is advised.
+# Change of y in one sample, in standard deviations of y: a problem above COARSE, a note above JERKY, SMOOTH is advised.
 COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1
 STILL = 1e-9  # an output whose range is a smaller share of its size does not move
 
@@ -126,7 +126,7 @@ def equations(subject: Subject) -> Iterator[Finding]:
             if bad.any():
                 shares = f"{percent(bad[:COMPARED].mean())} of X and {percent(bad[COMPARED:].mean())} of 2X"
                 point = ", ".join(f"{value:.3g}" for value in x[bad][0])
-                text = f"f or h is not a finite number in {shares}, such as at x = ({point})"
+                text = f"the equations are not finite in {shares}, such as at x = ({point})"
                 advice = "choose X and the bounds where the equations hold, or change the equations"
                 yield Finding("equations", "problem", text, advice)
             for j in range(0 if system.discrete else system.nu):
@@ -167,14 +167,14 @@ def bounds(subject: Subject) -> Iterator[Finding]:
     (x, _), lost = subject.motions, ~subject.stay
     followed = f"{len(lost)} motions of {subject.duration:g} s from X"
     if not lost.any():
-        yield Finding("bounds", "ok", f"all of {followed}, {' and '.join(subject.kinds)}, stay within them")
+        yield Finding("bounds", "ok", f"all of {followed}, {' and '.join(subject.kinds)}, stay within the bounds")
         return
     counts = np.split(lost, len(subject.kinds))
     parts = [f"{one.sum()} of {len(one)} {kind}" for one, kind in zip(counts, subject.kinds)]
     when = subject.dt * np.median(np.isfinite(x[:, lost]).all(-1).sum(0))
-    text = f"of {followed}, {' and '.join(parts)} leave them, after {when:.3g} s at the median"
+    text = f"of {followed}, {' and '.join(parts)} leave the bounds, after {when:.3g} s at the median"
     verdict: Verdict = "problem" if max(one.mean() for one in counts) > MANY else "note"
-    advice = "widen the bounds, shrink X, or take a policy that holds the system from all of X (--policy)"
+    advice = "widen the bounds, shrink X, or take a policy that holds the system (--policy)"
     yield Finding("bounds", verdict, text, advice)
 
 
@@ -206,5 +206,5 @@ def outputs(subject: Subject) -> Iterator[Finding]:
             continue
         if moving.size:
             along = f", {np.ptp(moving[..., i]):.3g} along motions"
-        noise = f"noise {level:.3g} by default, {percent(level / size)} of that in X"
+        noise = f"noise {level:.3g} by default, {percent(level / size)} of the range in X"
         yield Finding("output", "ok", f"{name} ranges over {size:.3g} in X{along}; {noise}")

@@ -1,4 +1,4 @@
-"""Parameters of a plant from records of its outputs, by multiple shooting, and an observer for it.
+"""Identification of a plant from records of its outputs by multiple shooting, and training of its observer.
 
 :mod:`motions` simulates windows of the records, :mod:`shooting` fits parameters on windows of one length, and
 :mod:`windows` lengthens the windows. :mod:`identifiability` finds parameters and signs that the outputs do not

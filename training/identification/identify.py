@@ -15,10 +15,10 @@ from training.identification.windows import LEAST_USED, MORE_COST, Prediction, f
 from training.progress import ProgressBars
 from training.records import Record, check_signals, pieces
 
-HELD_OUT = 10  # one record in ten is held out of the fit
-KEPT_RATIOS = 100.0  # cost of a change in the ratios of unidentifiable parameters, over the cost of a common factor
-BACK = (1.0, 0.5, 0.25)  # shares of the way to the nearest parameters, tried in turn until a fit explains the windows
-UNSCALED = 0.05  # a state that changes by more, relative to the parameters' change, has no identifiable scale
+HELD_OUT = 10  # of the pieces of records without a gap, the 6th, 16th, 26th, ... are held out of the fit
+KEPT_RATIOS = 100.0  # prior variance of the log of a common factor, relative to that of each parameter's own factor
+BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(), tried in turn until a fit is about as good as the first one
+UNSCALED = 0.05  # a state whose relative change is a larger share of the parameters' has no identifiable scale
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
 HIDDEN = 0.05  # a parameter with a larger component of an unidentifiable direction is unidentifiable
 
@@ -76,7 +76,7 @@ class Identified:
             only = ", ".join(f"{one.text} = {one.value:.6g} +- {one.standard_error:.2g}" for one in known)
             lines.append(f"not identifiable from the outputs: {', '.join(hidden)}" + (f"; only {only}" if only else ""))
             used = ", ".join(f"{name} = {values[name]:.6g}" for name in hidden)
-            lines.append(f"the observer uses {used}: of all values that fit, those nearest to the first guesses")
+            lines.append(f"the observer uses {used}: of all values that fit, values near the first guesses")
             if self.unscaled_states:
                 lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: these values fix it")
         lines += [
@@ -95,15 +95,15 @@ def estimate_parameters(
 ) -> Identified:
     """Estimate unknown parameters of a system from records of its outputs.
 
-    Multiple shooting fits parameters and starts on windows of growing length (:func:`fit_windows`). Along
-    unidentifiable directions the parameters then return towards the first guesses.
+    Multiple shooting fits the parameters, and the windows' initial states, on windows of growing length
+    (:func:`fit_windows`). Along unidentifiable directions the parameters then return towards the first guesses.
     """
     _check_unknown(system, unknown)
     check_signals(records, system)
     least = SAMPLES_PER_STATE * system.nx
     whole = [record for record in pieces(records) if len(record.t) > least]
     if not whole:
-        raise ValueError(f"no record has more than {least} samples without a gap: a fit of its start needs more")
+        raise ValueError(f"no record has more than {least} samples without a gap: a fit of an initial state needs more")
     held_out = whole[HELD_OUT // 2 :: HELD_OUT] if len(whole) >= HELD_OUT // 2 else []
     fitted = [record for record in whole if not any(record is other for other in held_out)]
     rng, dt = np.random.default_rng(seed), float(records[0].t[1] - records[0].t[0])
@@ -118,9 +118,9 @@ def estimate_parameters(
 
 
 def _check_unknown(system: System, unknown: Limits) -> None:
-    """Raise ValueError if a parameter is unknown to the system, or its first guess is not between finite limits."""
+    """Raise ValueError unless parameters are named, the system has them, and finite limits enclose their values."""
     if not unknown:
-        raise ValueError("name an unknown parameter, as in --unknown mu=1.5")
+        raise ValueError("name an unknown parameter, as in --unknown mu=1.5 or unknown={'mu': (0.15, 15)}")
     for name, (low, high) in unknown.items():
         if name not in system.parameters:
             known = ", ".join(system.parameters) or "no parameters"
@@ -131,12 +131,12 @@ def _check_unknown(system: System, unknown: Limits) -> None:
 
 
 def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Return the parameters nearest to the given ones among all that explain the outputs equally well.
+    """Return the parameters nearest to ``given`` among all that explain the outputs as well as ``values`` do.
 
-    A parameter without any influence on the outputs keeps its given value. For the other parameters, the distance
-    grows mainly with changes of their ratios, because a faster plant may have all parameters larger by one factor.
+    Parameters without influence on the outputs take their given values; parameters with another sign than given keep
+    theirs. The others' distance grows mainly with changes of ratios: a faster plant may have all larger by one factor.
 
-    Shapes: ``values`` (p,), ``given`` (p,), ``hidden`` (p, k); returns (p,).
+    Shapes: ``values`` (p,), ``given`` (p,), unidentifiable directions ``hidden`` (p, k); returns (p,).
     """
     silent = (hidden**2).sum(1) > 1.0 - HIDDEN**2
     if silent.any():
@@ -155,7 +155,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
 
 
 def _brought_back(fit: Fit, given: np.ndarray) -> Fit:
-    """Return a fit that explains the records equally well with parameters nearer to the given ones, else ``fit``."""
+    """Return a fit about as good as ``fit`` with parameters nearer to ``given``, or ``fit`` itself."""
     shooting, values, hidden = fit.shooting, fit.theta, unidentifiable_directions(fit.relative_information)
     if not hidden.size:
         return fit

@@ -24,8 +24,8 @@ from training.records import Record, check_signals, resampled, sampling_interval
 from training.records import check_dt as check_steps
 from training.trajectories.equations import describe
 
-NOISE_RANGE = 2.0  # largest noise level in the observer's training, over that of the records
-LEAST_NOISE = 0.002  # lower bound of this largest noise level, over the output's range
+NOISE_RANGE = 2.0  # largest noise level in the observer's training, in multiples of the records' noise level
+LEAST_NOISE = 0.002  # lower bound of this largest noise level, as a share of the output's range
 OBSERVER_FOLDER = "observer"
 
 
@@ -52,7 +52,7 @@ def identify(
     """Identify parameters of a plant from records of its outputs, and train an observer for it.
 
     No recorded state is needed. :func:`training.identification.identify.estimate_parameters` fits the parameters. The
-    observer is trained on simulated motions of the identified plant, for noise up to twice that of the records.
+    observer is trained on simulated motions of the identified plant, for noise up to twice the records' noise.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def identify(
     folder : Path
         Folder for parameters.json, identification.png, SYSTEM.safetensors, checkpoints and log.txt.
     dt : float, optional
-        Sampling interval of the observer in seconds; by default that of the records.
+        Sampling interval of the observer in seconds; by default the records' interval.
     settings : mapping of str to object, optional
         Settings of :class:`training.Config` for the observer.
     seed : int
@@ -83,7 +83,7 @@ def identify(
     Raises
     ------
     ValueError
-        If the records, or the parameters' names or limits, are invalid.
+        If an argument is invalid, the folder holds another run, or the model explains no window of the records.
     """
     check_signals(records, system)
     interval = sampling_interval(*records) if dt is None else check_dt(dt)
@@ -124,9 +124,9 @@ def adapt(
     resume: bool = False,
     console: Console | ProgressBars | None = None,
 ) -> Learned:
-    """Identify a plant that differs from an observer's model, and train the observer again for this plant.
+    """Identify a plant that differs from an observer's model, and train a new observer for this plant.
 
-    The training uses the observer's own settings, including its noise levels.
+    The training uses the given observer's settings, including its noise levels.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def adapt(
     unknown : mapping of str to (float, float)
         (low, high) limits of each parameter that may differ.
     settings : mapping of str to object, optional
-        Settings of :class:`training.Config` to change from those of the observer.
+        Settings of :class:`training.Config` that replace the observer's.
     resume : bool
         Whether to resume from checkpoints in the folder.
     console : Console or ProgressBars, optional

@@ -64,7 +64,7 @@ class Shooting:
     def derivatives(
         self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
     ) -> np.ndarray:
-        """Return derivatives (steps + 1, n, ny, nx + p) by starts, in half-widths of X, and parameters, in ``unit``."""
+        """Return derivatives (steps + 1, n, ny, d) by starts in half-widths of X and, if asked, parameters in units."""
         n, nx = x0.shape
         size = np.concatenate([self.half, self.unit]) * STEP
         moved = len(size) if parameters else nx
@@ -82,7 +82,7 @@ def _with_parameters(system: System, ranges: tuple[tuple[str, tuple[float, float
 
 @dataclass
 class Motions:
-    """Motions from ``x0`` (n, nx): ``y``, residuals ``r`` (steps + 1, n, ny), and mean squares ``each`` (n,)."""
+    """Motions from ``x0`` (n, nx): ``y``, residuals ``r`` (steps + 1, n, ny), weighted mean squares ``each`` (n,)."""
 
     x0: np.ndarray
     y: np.ndarray
@@ -126,7 +126,7 @@ class Problem:
         return H, np.einsum("knya,kny->na", Jw, at.r[:, rows], optimize=True)
 
     def derivatives(self, theta: np.ndarray, at: Motions, rows: np.ndarray, *, parameters: bool = True) -> np.ndarray:
-        """Return J (steps + 1, m, ny, d) of some windows, which is zero where an output is missing."""
+        """Return J (steps + 1, m, ny, d) of some windows, which is zero where an output is missing or J not finite."""
         u = self.windows.u[:, rows]
         J = self.shooting.derivatives(theta, at.x0[rows], u, y=at.y[:, rows], parameters=parameters)
         there = self.there[:, rows][..., None] & np.isfinite(J).all(-1, keepdims=True)

@@ -13,7 +13,7 @@ SHOWN = 3  # number of held-out records in the figure
 
 
 def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
-    """Return the autocorrelation (lags,) of residuals (steps + 1, n) from lag 1 on."""
+    """Return the autocorrelation of residuals (steps + 1, n) at lags from 1 to at most ``lags``."""
     r = residuals - np.nanmean(residuals)
     products = [np.nanmean(r[lag:] * r[:-lag]) for lag in range(1, min(lags, len(r) - 1) + 1)]
     return np.array(products) / max(np.nanmean(r**2), 1e-300)

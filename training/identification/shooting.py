@@ -1,4 +1,4 @@
-"""Multiple shooting: fits parameters and starts of a system to measured outputs by Gauss-Newton steps."""
+"""Multiple shooting: Gauss-Newton steps fit a system's parameters and initial states to measured outputs."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,15 +9,15 @@ from training.identification.identifiability import PART, identifiable_direction
 from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped
 
 RESETTLING = 3  # largest number of steps that refit a start if its window fits worse after a step of the parameters
-NONLINEAR = 0.3  # largest rms error of linearised outputs, over the noise, if parameters change by a standard error
+NONLINEAR = 0.3  # largest rms error, in units of the noise, of outputs linearised over one standard error
 ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
 SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square by less is slow; three slow steps in a row end the fit
 SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit
-EXACT = 1e-16  # a smaller mean square of residuals, over the outputs' variances, ends the fit
-ROUNDING = 1e-14  # lower bound of the noise, over an output's standard deviation
+EXACT = 1e-16  # a smaller mean square of residuals, relative to the outputs' variances, ends the fit
+ROUNDING = 1e-14  # lower bound of the noise, relative to an output's standard deviation
 MOST_DAMPING = 1e9
 CLUSTERS = 20  # least number of windows whose scatter gives standard errors
-COLOURED = 1.5  # ratio of standard errors from scatter to those for white noise; chance stays below in 20 windows
+COLOURED = 1.5  # largest ratio of standard errors by scatter to those for white noise that chance gives in 20 windows
 OUTLIER = 9.0  # a window is left out if its mean square is so many median absolute deviations above the median
 
 
@@ -27,11 +27,11 @@ class UnexplainedError(ValueError):
 
 @dataclass(frozen=True)
 class Fit:
-    """A least-squares fit: ``curvature`` is J'WJ, ``white`` and ``scattered`` are covariances of the gradient.
+    """A least-squares fit: ``curvature`` is J'WJ, ``white`` and ``scattered`` are covariances of the gradient J'Wr.
 
-    ``cost`` is the residuals' mean square, and ``left`` the length of the next Gauss-Newton step in standard errors.
-    Shapes: ``theta`` (p,), ``residuals`` (steps + 1, n, ny), ``noise`` (ny,), ``curvature``, ``white``, ``scattered``
-    (p, p), ``used`` (n,), ``starts_by_parameters`` (number used, nx, p).
+    J has the outputs' derivatives by parameters, with refitted starts; ``cost`` is the mean of W r^2, ``left`` the next
+    Gauss-Newton step's length in standard errors. Shapes: ``theta`` (p,), ``residuals`` (steps + 1, n, ny), ``noise``
+    (ny,), ``curvature``, ``white``, ``scattered`` (p, p), ``used`` (n,), ``starts_by_parameters`` (number used, nx, p).
     """
 
     shooting: Shooting
@@ -48,9 +48,9 @@ class Fit:
     starts_by_parameters: np.ndarray
 
     def errors(self, directions: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Return standard errors along directions: the larger of those for white noise and those by scatter of windows.
+        """Return standard errors along directions: for white noise or by scatter of windows, whichever is larger.
 
-        Correlated residuals, such as those of process noise, make parameters less certain than white residuals of equal
+        Residuals that process noise correlates make parameters less certain than white residuals of equal
         size. The scatter of the gradients of at least CLUSTERS windows accounts for the correlation (the sandwich
         estimator for clustered data). ``known`` spans the identifiable directions.
 
@@ -146,8 +146,8 @@ def shoot(
     """Fit parameters, and starts of windows of one length, by least squares; ``report`` receives the share done.
 
     Windows that the model explains much worse than most are left out. If the model is accurate for some motions and
-    rough for others, as models of friction are, pass the standard deviations of the ``noise`` instead: each window then
-    has the weight 1 / (1 + c), where c is the mean square of its residuals over the noise.
+    rough for others, as models of friction are, pass the standard deviations of the ``noise``: all windows then have
+    weights 1 / (1 + c), with c their residuals' mean square in units of the noise; only ``Fit.used`` leaves some out.
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):
@@ -248,7 +248,7 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
 
 
 def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return J'WJ (n, p, p) of outputs with refitted starts, this J, and the starts' derivatives (n, nx, p)."""
+    """Return, with starts refitted to the parameters, J'WJ (n, p, p), J, and the starts' derivatives (n, nx, p)."""
     H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
     by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
     beyond = J[..., nx:] + np.einsum("knyx,nxp->knyp", J[..., :nx], by_parameters)

@@ -12,11 +12,11 @@ from training.identification.shooting import CLUSTERS, Fit, UnexplainedError, pr
 from training.records import Record
 
 FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows; all lengths are fitted in turn
-MORE_NOISE = 1.5  # largest standard deviation of the first windows' residuals, over the noise level
-SMALL = 0.01  # the same limit over the output's standard deviation; the larger limit counts
+MORE_NOISE = 1.5  # largest standard deviation of the first windows' residuals, in multiples of the noise level
+SMALL = 0.01  # limit of these residuals in multiples of the output's standard deviation; the larger limit counts
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
-GAIN = 0.7  # standard errors after a doubling of the length, over those before; larger ratios end the growth
-MORE_COST = 2.0  # largest mean square of the residuals after a doubling, over that before
+GAIN = 0.7  # if a doubling of the length leaves a larger share of every standard error, it is the last
+MORE_COST = 2.0  # largest factor by which a doubling may increase the residuals' mean square
 LEFT = 0.4  # in standard errors: longest Gauss-Newton step that may remain after a fit
 APART = 0.5  # in standard errors: largest distance between the two fits of longer windows
 MOST_SAMPLES = 6400  # largest number of samples in a window
@@ -44,7 +44,7 @@ def fit_windows(
     say: Callable[[str], object] = lambda line: None,
     report: Callable[[float], object] = lambda part: None,
 ) -> Fit:
-    """Fit parameters and starts on windows of growing length; ``report`` receives the share done.
+    """Fit parameters and initial states on windows of growing length; ``report`` receives the share done.
 
     Long windows give smaller standard errors, short ones converge from rougher guesses. Chaos and process noise limit
     the length: the residuals of longer windows are not white, and their squares have many minima. Longer windows are
@@ -118,7 +118,7 @@ def _first_fit(
     lengths: Sequence[int],
     fitted: Callable[[Shooting, np.ndarray, Windows], Fit],
 ) -> Fit:
-    """Return the fit of the longest first windows that the model explains, after a search of random starts in X."""
+    """Search starts in X; return the fit of the longest first windows with small residuals, else of the shortest."""
     spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
     expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
     theta, best, problem = shooting.given, None, UnexplainedError("")
@@ -162,7 +162,7 @@ class Prediction:
 
 
 def predict(fit: Fit, records: Sequence[Record], rng: np.random.Generator) -> list[Prediction]:
-    """Predict the outputs in the first window of each record, from a start fitted to the window's first half."""
+    """Predict outputs in the first windows of long enough records, from starts fitted to each window's first half."""
     length, theta = len(fit.windows.u), fit.theta
     chosen = [record for record in records if len(record.y) > length]
     if not chosen:

@@ -124,7 +124,7 @@ def test_what_makes_no_sense():
         ({"stiffness": (5.0, 6.0)}, [free], "= 4 must lie between finite limits, got 5.0 and 6.0"),
         ({"stiffness": (0.0, float("inf"))}, [free], "between finite limits, got 0.0 and inf"),
         (stiffness, [], "no records are given"),
-        (stiffness, [doubled], "spring has 1 measured, but the columns are y1, y2"),
+        (stiffness, [doubled], "the measured columns are y1, y2, but spring has 1"),
         (stiffness, [free, driven], "inputs are columns u1, but none in"),
     ):
         with progress_bars(None) as progress, pytest.raises(ValueError, match=message):
