@@ -67,8 +67,8 @@ class Artifact:
     versions : mapping of str to str, optional
         Versions of the libraries that the training used.
     signals : mapping of str to sequence of str, optional
-        For an observer that was learned from recorded states, without equations: the names of the columns "measured"
-        (y), "inputs" (u) and "hidden" (x).
+        For an observer that was learned from recorded states, without equations: the names of the columns
+        under the keys "measured" (y), "inputs" (u) and "hidden" (x).
     environment : mapping of str to object, optional
         For an observer that was learned from rollouts of an environment: the "id" of that environment and its arguments
         "kwargs". The observer fits only that environment. An observer from other records fits no environment.
@@ -192,7 +192,7 @@ class Artifact:
             raise ArtifactError(f"an artifact for the environment {environment['id']} needs signals, too")
 
     def _check_ranges(self) -> None:
-        """Raise ArtifactError unless parameters lie in their ranges, estimated ones have ranges, and nx is positive."""
+        """Raise ArtifactError unless parameters are in range, estimated parameters have ranges, and nx is positive."""
         for name, ends in self.parameter_ranges.items():
             if not isinstance(ends, list | tuple) or len(ends) != 2 or not all(map(is_finite, ends)):
                 raise ArtifactError(f"the range of the parameter {name} must be two finite numbers, got {shown(ends)}")
@@ -238,7 +238,7 @@ class Artifact:
     def output(self, x: np.ndarray) -> np.ndarray:
         """Return h(x); NaN or infinite where h is undefined. Shapes: ``x`` (..., nx); returns (..., ny).
 
-        Raises ArtifactError if the artifact holds no h.
+        Raises ArtifactError if the artifact holds neither C nor h.
         """
         if self.C is not None:
             return x @ self.C.T
@@ -254,8 +254,8 @@ class Artifact:
     def require_forward(self) -> ForwardMap:
         """Return T, or raise ArtifactError if the artifact has no T."""
         return self.forward or self._lacks(
-            "holds no forward map T; the shipped maps SYSTEM-spinn hold one, and so do maps that kkl-gym train SYSTEM "
-            "--pipeline spinn makes"
+            "holds no forward map T; the shipped maps SYSTEM-spinn hold one, and kkl-gym train SYSTEM "
+            "--pipeline spinn makes one"
         )
 
     def require_known_start(self) -> None:
@@ -324,7 +324,7 @@ class Artifact:
                 differ(f"the number of {what}", own, given)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the artifact atomically: an interrupted write leaves no partial file.
+        """Write the artifact atomically: an interrupted write leaves ``path`` unchanged.
 
         Parameters
         ----------

@@ -11,8 +11,8 @@ from observers.filter import LinearFilter
 from observers.tracker import Tracker
 
 _LANES = 8  # rows of the batch that the kernel steps together
-MOST_OPERATIONS = 400  # of an expression; longer ones, such as a network as f, take many seconds to compile
-MOST_ROWS = 32  # of a covariance; eight larger ones, one for each lane, would exceed a thread's stack
+MOST_OPERATIONS = 400  # in an expression; longer expressions, such as a network for f, take many seconds to compile
+MOST_ROWS = 32  # of a covariance; eight larger covariances, one for each lane, would exceed a thread's stack
 
 
 class CompiledStep:
@@ -48,7 +48,7 @@ class CompiledStep:
         self._code = functools.cache(self._compiled)
 
     def _compiled(self, W: int) -> Any:
-        """Return the kernel for groups of W rows, which already has the addresses of the compiled motion and output."""
+        """Return the kernel for groups of W rows, with the addresses of the compiled motion and output filled in."""
         from observers import kernel, kernel_functions
 
         (nx, ny, nu), equations, addresses = self._sizes, self._motion.equations, [0, 0]

@@ -13,7 +13,7 @@ from observers.checks import is_finite
 MOST_LEVELS = 24  # levels of nested expressions
 MOST_PARTS = 2000  # numbers, states, inputs and functions in all components together
 _POWERS = 8  # integer exponents up to this value compile to products
-_MOST_NESTED = 16  # arguments of one function beyond which the source combines them in halves
+_MOST_NESTED = 16  # number of a function's arguments beyond which the source combines them in halves
 
 
 class _Rule(NamedTuple):
@@ -50,9 +50,9 @@ class Expression:
     """A function of the state and the input, as nested lists that JSON can store.
 
     A component is a number, a state ``["x", index]``, an input ``["u", index]``, or a list of a name and its arguments,
-    such as ``["*", 2.0, ["sin", ["x", 0]]]``. Names are arithmetic operators (``+``, ``*``, ``**``, ``%``), functions
-    of ``kkl_gym.elementary``, and comparisons (``<``, ``<=``, ``>``, ``>=``, ``and``, ``or``, ``not``) for the first
-    argument of ``where``. Raises ValueError if a component has another form.
+    such as ``["*", 2.0, ["sin", ["x", 0]]]``. Names are arithmetic operators (``+``, ``*``, ``**``, ``%``), ``floor``,
+    functions of ``kkl_gym.elementary`` except ``clip``, and, for the first argument of ``where``, comparisons and logic
+    (``<``, ``<=``, ``>``, ``>=``, ``and``, ``or``, ``not``). Raises ValueError if a component has another form.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def _checked(part: Any, condition: bool, levels: int, left: list[int]) -> Any:
         known = [known for known in _RULES if _RULES[known].gives == condition]
         raise ValueError(f"{reprlib.repr(name)} must be one of these functions: {' '.join(known)}")
     if len(arguments) < len(rule.takes) or (len(arguments) > len(rule.takes) and not rule.more):
-        raise ValueError(f"{name} takes {len(rule.takes)} arguments, got {len(arguments)}")
+        raise ValueError(f"{name} takes {'at least ' * rule.more}{len(rule.takes)} arguments, got {len(arguments)}")
     kinds = (*rule.takes, *rule.takes[-1:] * (len(arguments) - len(rule.takes)))
     return name, *(_checked(each, kind, levels - 1, left) for each, kind in zip(arguments, kinds, strict=True))
 
@@ -157,7 +157,7 @@ def _source(part: Any) -> str:
 
 
 def _joined(source: str, sources: list[str], arity: int) -> str:
-    """Return source that applies a function of ``arity`` arguments to more; halving limits how deep it is nested."""
+    """Return source that applies a function of ``arity`` arguments to more arguments; halving keeps the nesting low."""
     if len(sources) > _MOST_NESTED:
         half = len(sources) // 2
         sources = [_joined(source, sources[:half], arity), _joined(source, sources[half:], arity)]

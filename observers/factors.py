@@ -22,7 +22,7 @@ def _check_grid(levels: np.ndarray, ages: np.ndarray) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Factors:
-    """Calibration factors of a filter's covariance P. Raises ArtifactError if they are invalid.
+    """Calibration factors of a Kalman filter's covariance P. Raises ArtifactError if they are invalid.
 
     After P is multiplied by its factor, 90 % of errors have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of
     chi-square with nx degrees of freedom. Between levels and ages, factors are interpolated; beyond, they are constant.
@@ -95,12 +95,12 @@ class ErrorCovariance:
         return type(self)(np.zeros(1), self.ages, interpolated(level, self.levels, self.covariance)[None])
 
     def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
-        """Return the covariances (..., nx, nx) of the first level at ages (...,), which broadcast to ``shape``."""
+        """Return the first level's covariances (..., nx, nx) at ages that broadcast to ``shape`` (...), if given."""
         return interpolated(np.broadcast_to(age, shape or np.shape(age)), self.ages, self.covariance[0])
 
 
 def interpolated(at: np.ndarray | float, points: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate values (k, ...) at rising points (k,) linearly; they are constant beyond the ends."""
+    """Interpolate linearly at ``at`` between values (k, ...) at rising points (k,); constant beyond the ends."""
     last = len(points) - 1
     i = np.clip(np.searchsorted(points, at, side="right"), min(1, last), last)
     before = np.maximum(i - 1, 0)

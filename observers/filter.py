@@ -16,8 +16,8 @@ class LinearFilter:
 
     Here 1 is a vector of ones. The integration takes the output as linear between samples, a first-order hold. This is
     causal, because z_k+1 is computed when y_k+1 is known; a zero-order hold would delay the output by half a sample.
-    The input is constant between samples. A filter of output and input is the functional KKL observer (Buisson-Fenet
-    et al., TMLR 2023). For u = 0 it is the filter of Niazi et al. (2025, eq. 7). Raises ValueError if A, B, dt or nu is
+    The input is constant between samples. With inputs, this is the filter of the functional KKL observer (Buisson-Fenet
+    et al., TMLR 2023); without, the filter of Niazi et al. (2025, eq. 7). Raises ValueError if A, B, dt or nu is
     invalid.
 
     The filter's state is ``z = [z_y, z_u of the first input, ...]``, of size ``nz * (1 + nu)``, and

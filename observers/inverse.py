@@ -160,7 +160,7 @@ class InverseMap:
         return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, error_covariance=None)
 
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        """Return levels of measurement noise, limited to the largest in training; a float if all are equal.
+        """Return noise levels, limited to the largest in training if the map takes them; a float if all are equal.
 
         Raises ValueError if the levels of several outputs differ and the map takes one level for all outputs.
         """

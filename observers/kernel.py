@@ -395,7 +395,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     ) -> None:  # fmt: skip
         """Advance rows of the state (n, width) by samples y (steps, n, ny) and inputs u (steps, n, nu).
 
-        At each sample, ``record`` (steps, n, width) stores the row, (steps, n, nx) the estimate, (steps, n, 0) nothing.
+        ``record`` receives each sample's rows, (steps, n, width), estimates, (steps, n, nx), or nothing, (1, 0, 0).
         """
         nz, widest, substeps = flags
         h, samples, dt, limit = numbers[:4]

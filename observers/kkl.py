@@ -47,7 +47,7 @@ class KKL(Estimator[np.ndarray]):
     """The estimator inside :class:`observers.KKLObserver`, for n rows.
 
     A row of the state holds z (size), the last output (ny), the age, and then the values of tracker and monitor.
-    The age is the number of samples since reset, NaN before the first sample.
+    The age is the time since reset in sampling intervals: NaN before the first sample, infinite after a start at T(x0).
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class KKL(Estimator[np.ndarray]):
     def _predicted(
         self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, state: np.ndarray, linear: LinearFilter
     ) -> np.ndarray:
-        """Return samples whose gaps hold h(T_inv(z)), first of the last z, then of the next z that results from it."""
+        """Fill gaps by h(T_inv(z)) at the next z, which the filter predicts with h(T_inv(z)) at the last z."""
         z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
         following, age = z, age * self.artifact.filter.dt
         for ahead in (0.0, linear.dt):

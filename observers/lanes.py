@@ -100,7 +100,7 @@ def stack(typing: Any, count: Any, rows: Any) -> Any:
 
 @_intrinsic
 def offset(typing: Any, memory: Any, count: Any) -> Any:
-    """Return a pointer to entry ``count`` of an array or of other memory; slices would count references, slowly."""
+    """Return a pointer to entry ``count`` of an array or of other memory, without a slice's slow reference counting."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         start = arguments[0]

@@ -21,7 +21,7 @@ class Limits:
     ----------
     levels : ndarray, shape (k,) or (k, ny)
         Standard deviations of the measurement noise, one for all outputs or one for each, rising from 0. With one for
-        each, all outputs in a row have the same share of their largest level. Limits are interpolated between levels.
+        each, every row is a multiple of the last row. Limits are interpolated between levels.
     mean : ndarray, shape (k, ny)
         Limits of the absolute value of the residual's running mean.
     low, high : ndarray, shape (k, ny)
@@ -56,7 +56,7 @@ class Limits:
         if self.levels[0].any() or not (np.diff(self.levels, axis=0) > 0).all():
             raise ValueError(f"levels must rise from 0, got {self.levels}")
         if not ((self.mean > 0) & (self.low >= 0) & (self.high > self.low)).all():
-            raise ValueError("mean and high must be positive, and low from 0 to below high")
+            raise ValueError(f"limits need mean > 0 and high > low >= 0, got {shown((self.mean, self.low, self.high))}")
         if not all((limit <= _LARGEST).all() for limit in (self.levels, self.mean, self.high)):
             raise ValueError(f"limits and their levels must be finite, and not beyond {_LARGEST:g}")
         for name in ("window", "warm_up", "false_alarms", "duration"):
@@ -73,10 +73,10 @@ class Limits:
         """Return the limits at a noise level.
 
         Some outputs may be noisier than others, relative to the largest levels. Their noise reaches the estimate, and
-        so every residual: all outputs then have the upper limits at the relative level of the noisiest output.
+        so every residual: the upper limits of all outputs are those at the noisiest output's relative level.
 
         Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each. Mean squares
-        and squared means are linear in the squared level. Raises ValueError if a level is invalid or beyond the last.
+        and squared means are interpolated in the squared level. Raises ValueError if a level is invalid or too large.
         """
         ny = self.mean.shape[1]
         level = noise_levels("the noise level", level, ny)

@@ -151,7 +151,7 @@ class Motion:
         check_shapes(self, dict.fromkeys(("x_scale", "low", "high", "mean", "error", "process_noise"), (nx,)))
         check_shapes(self, {"covariance": (nx, nx)})
         if self.least_measurement_noise.ndim != 1:
-            raise ArtifactError("least_measurement_noise must have shape (ny,)")
+            raise ArtifactError(f"least_measurement_noise must be (ny,), got {self.least_measurement_noise.shape}")
         for name in ("x_scale", "least_measurement_noise"):
             if not (getattr(self, name) > 0).all():
                 raise ArtifactError(f"{name} of a motion must be positive, got {getattr(self, name)}")

@@ -39,7 +39,7 @@ def load(
     Raises
     ------
     ArtifactError, ImportError, ValueError
-        If there is no such name or file, the file is damaged or of another kind, or :class:`KKLObserver` raises one.
+        If no such name or file exists, the file is damaged or of another kind, or KKLObserver rejects an argument.
     """
     return KKLObserver(
         Artifact.read(resolve(name_or_path)),
@@ -83,7 +83,7 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
 
 
 def matching(text: str, names: Iterable[str]) -> str | None:
-    """Return the name that matches a text, or None; capitals, underscores, "KKL" and "-v0" do not count."""
+    """Return the name that matches a text, or None; case, underscores, prefix "KKL" and suffix "-v0" do not matter."""
     return {_plain(name): name for name in names}.get(_plain(text.removeprefix("KKL").removesuffix("-v0")))
 
 

@@ -40,7 +40,7 @@ class MLP:
     biases : sequence of ndarray, shape (outputs,) each
         The biases of each layer.
     activation : {"tanh", "silu", "relu"}
-        The activation after every layer but the last.
+        The activation after every layer except the last.
     """
 
     weights: Sequence[np.ndarray]
@@ -112,10 +112,10 @@ class MLP:
         return h
 
     def packed(self, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Return the layers from ``first`` on in the form that :func:`observers.kernel_functions.evaluate` takes.
+        """Return the layers from ``first`` on, in the form that :func:`observers.kernel_functions.evaluate` takes.
 
-        One array holds all biases and weights, padded with rows of zeros to a multiple of UNROLLED; the other holds the
-        index of the activation and all widths.
+        One array holds the bias and weights of each layer, the weights with rows of zeros up to a multiple of UNROLLED.
+        The other array holds the activation's index, and the widths from the input of layer ``first`` on.
         """
         layers, (outputs, inputs) = self.layers[first:], np.shape(self.weights[max(first - 1, 0)])
         padded = [(bias, np.pad(weight, ((0, -len(weight) % UNROLLED), (0, 0)))) for weight, bias in layers]

@@ -36,7 +36,7 @@ class KKLObserver(RecordEstimates):
 
     If the artifact holds a motion model, the observer tracks: a Kalman filter predicts the estimate by the system's
     equations, or by a learned flow, and corrects it by each sample (:class:`observers.tracker.Tracker`). T_inv's
-    estimate replaces the tracker's soon after a reset if its covariance is smaller, and after a divergence.
+    estimate replaces the tracker's after a divergence, and soon after a reset if T_inv's covariance is smaller.
 
     Parameters
     ----------
@@ -59,10 +59,10 @@ class KKLObserver(RecordEstimates):
         False uses NumPy. The first process on a machine compiles for some seconds; later processes read the machine
         code from disk. Numba and NumPy agree to rounding.
     gate : float, optional
-        Largest innovation, in multiples of its standard deviation. The observer rejects outputs with larger
-        innovations: it treats them as missing, and :attr:`rejected` counts them. In the first window, half a second for
-        the maps that ship, it accepts all outputs. After a divergence, and for an output beyond the gate for a whole
-        window, it accepts outputs until they fit again, so a lasting jump is accepted. A gate needs a map that tracks.
+        Largest innovation, in multiples of its standard deviation. The observer treats outputs with larger innovations
+        as missing; :attr:`rejected` counts them. In the first window (:attr:`Motion.window`, 0.5 s for the maps that
+        ship) after a reset without ``x0``, it accepts all outputs. After a divergence, or a whole window beyond the
+        gate, it accepts outputs until they fit again, so a lasting jump is accepted. A gate needs a map that tracks.
     delay : int, default 0
         Samples by which outputs arrive late. ``step(y, u)`` takes the output of ``delay`` samples ago and the input
         held since the last sample; the motion model then predicts the current state. A delay needs a map that tracks.
@@ -73,8 +73,8 @@ class KKLObserver(RecordEstimates):
         If ``compiled`` is True and Numba is not installed.
     ValueError
         If an argument has the wrong type, a noise level is negative or beyond 1e12, the measurement noise is beyond
-        the map's range, it differs between outputs but the map takes one level for all, or the artifact holds no
-        limits for a monitor.
+        the map's range, it differs between outputs but the map takes one level for all, or the artifact lacks the
+        motion or the limits that an argument needs.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class KKLObserver(RecordEstimates):
 
     @property
     def gate(self) -> float | None:
-        """Largest innovation of an accepted output, in multiples of its standard deviation; None accepts all."""
+        """Largest accepted innovation of an output, in multiples of its standard deviation; None accepts any output."""
         return self._gate
 
     @gate.setter
@@ -204,9 +204,9 @@ class KKLObserver(RecordEstimates):
         y0 : array_like, shape (..., ny)
             The sample; its shape sets the batch.
         x0 : array_like, shape (..., nx), optional
-            The state, if it is known. The filter then starts at z_y = T(x0) and z_u = 0, as if it had always followed
-            a motion without input: there is no transient. An observer that tracks starts at x0 itself, limited to the
-            bounds of the states, with or without T. If x0 is known in some rows only, pass it to :meth:`restart`.
+            The state, if it is known. With T, the filter then starts at z_y = T(x0) and z_u = 0, as if it had always
+            followed a motion without input, so without transient. An observer that tracks starts at x0 itself, limited
+            to the states' bounds, with or without T. If x0 is known in some rows only, pass it to :meth:`restart`.
 
         Returns
         -------
@@ -237,10 +237,10 @@ class KKLObserver(RecordEstimates):
     def score(self) -> np.ndarray:
         """How badly the samples since reset fit the estimates, shape (...,): above 1 a fault is likely.
 
-        The score is the largest of the running means and mean squares of y - h(x_hat), each relative to its limit. It
-        is 0 in the warm-up after a reset, and missing outputs do not change it. Biased, frozen and dead sensors raise
-        the score, and so do states outside the training. :class:`observers.Limits` gives the rate of false alarms.
-        Raises RuntimeError before :meth:`reset`, or without ``monitor=True``.
+        The score is the largest ratio of a running mean or mean square of y - h(x_hat) to its upper limit, or of a
+        lower limit to a mean square. It is 0 in the warm-up after a reset, and missing outputs do not change it.
+        Biased, frozen and dead sensors raise it, and so do states outside the training. :class:`observers.Limits` gives
+        the rate of false alarms. Raises RuntimeError before :meth:`reset`, or without ``monitor=True``.
         """
         if self._kkl.monitor is None or self._state is None:
             raise RuntimeError("score needs an observer made with monitor=True, and reset(y0)")

@@ -31,7 +31,7 @@ class RecordEstimates:
         y : array_like, shape (steps, ..., ny)
             Outputs; the first row is y_0. Missing outputs in later rows are NaN.
         u : array_like, shape (steps - 1, ..., nu), optional
-            The input held after each row but the last, by default zero. An additional last row is ignored.
+            The input held after each row except the last, by default zero. An additional last row is ignored.
         x0 : array_like, shape (..., nx), optional
             The state at y_0, if it is known, as for :meth:`reset`.
         t : array_like, shape (steps,), optional

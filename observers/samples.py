@@ -18,7 +18,7 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tr
     if not isinstance(artifact, Artifact):
         raise ValueError(f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names")
     if flag("monitor", monitor) and artifact.limits is None:
-        parts = "limits" if artifact.knows_output else "limits, and with the output h(x), which this one lacks, too"
+        parts = "limits" if artifact.knows_output else "limits and with the output h(x), which it lacks, too"
         raise ValueError(
             f"this artifact for {artifact.system!r} holds no limits for a monitor; training.calibrate(artifact, "
             f"system) returns an artifact with {parts}"
@@ -65,14 +65,14 @@ def check_replacement(artifact: Artifact, other: Artifact) -> None:
         if here != there[what]:
             raise ArtifactError(
                 f"the observer in use has {what} {shown(here)}, the replacement {shown(there[what])}: only their maps "
-                "may differ; make a new wrapper instead"
+                "may differ; make a new observer or wrapper instead"
             )
     for name in ("A", "B", "dt"):
         mine, others = (np.asarray(getattr(each.filter, name)) for each in (artifact, other))
         if mine.shape != others.shape or not np.allclose(mine, others, rtol=1e-9, atol=0.0):
             raise ArtifactError(
                 f"the filters differ in {name}, so the replacement cannot continue from the current state: train it "
-                "with the eigenvalues and dt of the observer in use, or make a new wrapper"
+                "with the eigenvalues and dt of the observer in use, or make a new observer or wrapper"
             )
 
 
@@ -164,7 +164,7 @@ def intervals(t: np.ndarray, steps: int) -> np.ndarray:
 
 
 def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:
-    """Raise a ValueError that names the first entry that is not finite or too large."""
+    """Raise a ValueError that names the first entry that is too large or not finite."""
     if not all_finite(values):
         at = tuple(np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist())
         entry = f"{name}[{', '.join(map(str, at))}] = {values[at]}"

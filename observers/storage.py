@@ -31,7 +31,7 @@ _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype
 
 @contextmanager
 def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Add the name of the written file to errors that name no file, such as that of a full disk."""
+    """Let OSErrors name the written file, ``path``, where they name the temporary file or, on a full disk, no file."""
     try:
         yield
     except OSError as problem:
@@ -46,7 +46,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary file is in the same folder, which is created if missing. It has the same suffix, from which some
     writers choose a format, and the permissions that the umask allows. After an exception it is deleted, and ``path``
-    is unchanged. If the process is killed, the temporary file stays (:func:`training.files.clear_unfinished`).
+    is unchanged. If the process is killed, it stays until :func:`training.files.clear_unfinished` removes it.
     """
     target = Path(path)
     temporary = target.with_name(f"{UNFINISHED}{secrets.token_hex(4)}-{target.stem}{target.suffix}")
@@ -94,7 +94,7 @@ def save(
 def read(
     path: str | os.PathLike[str], *, key: str, error: type[Exception], what: str
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return arrays and description from a file of :func:`save`, or raise ``error``, which calls the file ``what``."""
+    """Return arrays and description from a file of :func:`save`, or raise ``error``; ``what`` is the kind of file."""
     content = _content(path, error)
     try:
         views: list[tuple[str, dict[str, Any]]] = deserialize(content)  # type: ignore[no-untyped-call]
@@ -179,7 +179,7 @@ def _is_deeper(value: Any, levels: int) -> bool:
 
 @contextmanager
 def explained(path: str | os.PathLike[str], error: type[ValueError]) -> Iterator[None]:
-    """Convert any exception from the use of a file's contents into an error that names the file."""
+    """Convert exceptions from invalid contents of a file into an error that names the file."""
     try:
         yield
     except KeyError as problem:

@@ -12,12 +12,12 @@ from observers.motion import Motion
 from observers.unscented import add, factor, shift, solved, transformed, whitened
 
 # The two limits of Supervision follow from these quantiles of the normal distribution. A NIS beyond its limit discards
-# the estimate; a trend beyond its limit only inflates the covariance. Running means are more skewed than the chi-square
-# distribution that the limits assume: white innovations exceed the trend's limit with probability 2e-4 (not 1e-5).
+# the estimate; a trend (mean innovation) beyond its limit only inflates the covariance. Running means are more skewed
+# than the assumed chi-square distribution: white innovations exceed the trend's limit with probability 2e-4 (not 1e-5).
 _DIVERGED = 6.0  # for the NIS, with tail probability 1e-9
 _COLOURED = 4.265  # for the mean square of the trend, with tail probability 1e-5
-_TREND = 0.25  # time constant of the trend, the innovations' running mean, in windows
-_LONG = 4.0  # time constant of the mean square of the trend, in windows
+_TREND = 0.25  # time constant of the trend, the innovations' running mean, in multiples of Motion.window
+_LONG = 4.0  # time constant of the mean square of the trend, in multiples of Motion.window
 INFLATION = 10.0  # factor by which the covariance grows if innovations are not white
 RELINEARISATIONS = 2  # of each step in the first window; with 0, noise-free errors are 40 to 80 % larger
 KNOWN = 1e-3  # assumed standard deviation of a known initial state, in scaled states
@@ -25,7 +25,7 @@ KNOWN = 1e-3  # assumed standard deviation of a known initial state, in scaled s
 
 @dataclass(frozen=True)
 class Supervision:
-    """Limits of the innovations' running statistics, and the share of a new sample in each, at any noise level."""
+    """Limits of the innovations' running statistics at any noise level, and a new sample's share in each statistic."""
 
     window: int
     share: float
@@ -64,9 +64,9 @@ def _limit(freedom: float, quantile: float) -> float:
 class Tracker:
     """An unscented Kalman filter on the system's equations, or on a learned flow, with one estimate in each row.
 
-    It starts from the mean and covariance of the initial states in training, corrected by the first sample. In the
-    first window after a reset, each step is repeated twice: the sample corrects the state before the step, too, and the
-    motion is linearised about this smoothed state (Kullberg, Skog and Hendeby, 2023).
+    It starts from the initial states' mean and covariance in training, corrected by the first sample, or from a known
+    state as if past the first window. In this window each step is repeated twice: the sample corrects the state before
+    the step, too, and the motion is linearised about this smoothed state (Kullberg, Skog and Hendeby, 2023).
 
     The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's in
     two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The

@@ -49,9 +49,9 @@ def _scale(nx: int) -> float:
 def whitened(
     innovation: np.ndarray, S: np.ndarray, across: np.ndarray, missing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return V (n, nx, ny) and whitened innovations ``white`` (n, ny): the corrections are x + V white and P - V V^T.
+    """Return V (n, nx, ny) and whitened innovations ``white`` (n, ny): x and P become x + V white and P - V V^T.
 
-    ``S`` (n, ny, ny) is the covariance of innovations (n, ny), and ``across`` (n, nx, ny) that of states and outputs.
+    ``S`` (n, ny, ny) is the innovations' covariance, and ``across`` (n, nx, ny) the covariance of states and outputs.
     """
     if missing.any():
         innovation = np.where(missing, 0.0, innovation)
