@@ -142,7 +142,7 @@ class Agent:
         return act
 
     def make(self, num_envs: int = 1, *, trusted: str | None = None, observer: str | None = None) -> VectorEnv:
-        """Make environments of the agent's task; ``observer`` is the path of the agent's observer, if this has moved.
+        """Make environments of the agent's task; ``observer`` is the path of the agent's observer if that has moved.
 
         The agent's file may be untrusted, and making its environment may import a module or script that this file
         names. An environment that neither Gymnasium nor kkl_gym ships is therefore made only if ``trusted`` names it.

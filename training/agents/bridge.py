@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 
 class SB3VecEnv(VecEnv):
-    """A stable-baselines3 ``VecEnv`` around any Gymnasium ``VectorEnv`` that resets in the same step.
+    """A stable-baselines3 ``VecEnv`` around any Gymnasium ``VectorEnv`` with ``autoreset_mode`` SAME_STEP.
 
     ``VecMonitor``, ``VecNormalize`` and ``VecFrameStack`` may wrap it. A row is one environment of the vector. When a
     row's episode ends, its info has ``terminal_observation`` (the last one before the reset), ``TimeLimit.truncated``
@@ -85,7 +85,7 @@ class SB3VecEnv(VecEnv):
         return [None] * self.num_envs if frames is None else list(frames)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute for each row: that of the wrapper that has it, else that of the environment inside."""
+        """Return an attribute for each row, from the wrapper that has it, else from the environment inside."""
         rows = list(self._get_indices(indices))
         owner = self._owner(attr_name)
         if owner is not None:

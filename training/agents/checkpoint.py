@@ -25,16 +25,16 @@ _ARRAYS = ("t", "y", "u", "x")  # arrays of a record
 class Checkpoint(BaseCallback):
     """Writes a checkpoint and the learning curve at the end of a training and, at intervals, between two rollouts.
 
-    A checkpoint holds networks, optimisers, counters, the scaling of observations, the replay buffer, the learning
-    curve, the memory's weights and the steps from which an observer is learned. It holds neither the environments nor
-    the random generators: a resumed training begins new episodes with other random numbers. The learning curve has a
+    A checkpoint holds networks, optimisers, counters, the scaling of observations and returns, the replay buffer, the
+    learning curve, the memory's weights and the steps from which an observer is learned. It holds neither environments
+    nor random generators: a resumed training begins new episodes with other random numbers. The learning curve has a
     row for each episode: steps, CPU seconds and return.
     """
 
     def __init__(self, path: Path, fingerprint: str, *, resume: bool) -> None:
         super().__init__()
         self.path, self._fingerprint, self._curve_path = path, fingerprint, path.with_name(CURVE)
-        self.resumed = self.restarts = 0
+        self.resumed = self.restarts = 0  # resumptions of the training, and restarts of its episodes
         self.spent = 0  # number of random steps before the algorithm's first step
         self.privileged = False  # whether the agent sees true hidden signals instead of estimates
         self.records: Callable[[], Sequence[Record]] = list  # returns the records to save
@@ -45,7 +45,7 @@ class Checkpoint(BaseCallback):
         self.weights = (self.saved or {}).get("weights")  # the memory's weights
 
     def restore(self, model: BaseAlgorithm, steps: int) -> None:
-        """Restore the saved training, if there is one; ``steps`` is the length of the whole training."""
+        """Restore the saved training, if there is one; the algorithm learns until it has made ``steps`` steps."""
         if (saved := self.saved) is None:
             return
         with run.restoring(self.path):
@@ -126,7 +126,7 @@ def _moments(scaling: VecNormalize | None) -> dict[str, Any]:
 
 
 def _buffer(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    """Return the filled part of the replay buffer, and SAC's entropy coefficient."""
+    """Return the filled part of the replay buffer, and the entropy coefficient if SAC or TQC learns it."""
     buffer, weight = model.replay_buffer, getattr(model, "log_ent_coef", None)
     assert buffer is not None
     rows = buffer.size()

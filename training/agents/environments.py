@@ -26,9 +26,9 @@ def vector(
     *,
     each: Callable[[], gym.Env[Any, Any]] | None = None,
 ) -> VectorEnv:
-    """Make a task's environments, which reset in the same step.
+    """Make a task's environments, with autoreset mode SAME_STEP.
 
-    ``wrap`` wraps them inside the action repeat. If the task has no system, ``each`` makes one of them.
+    ``wrap`` wraps them inside the action repeat. Without a system, each call of ``each`` makes one environment.
     """
     if task.system is None:
         side_by_side = SyncVectorEnv([each or partial(single, task)] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)

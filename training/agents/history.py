@@ -13,10 +13,10 @@ from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 
 
 class History(VectorWrapper):
-    """Shows the state of linear filters: after s comes ``keep`` s + ``take`` [y, u], if the action u leads to y.
+    """Shows the state s of linear filters: an action u and the next observation y make it ``keep`` s + ``take`` [y, u].
 
-    An episode begins with each filter at the first observation and a zero action. The environment must reset in the
-    same step. Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.
+    Filters begin an episode at the first observation and a zero action; without ``actions``, u is left out. The
+    autoreset mode must be SAME_STEP. Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.
     """
 
     def __init__(self, env: VectorEnv, keep: np.ndarray, take: np.ndarray, *, actions: bool = True) -> None:
@@ -62,7 +62,7 @@ class History(VectorWrapper):
 
 
 def stacked(env: VectorEnv, frames: int, *, actions: bool = True) -> History:
-    """Show the last ``frames`` observations in order of time, each with the action that led to it."""
+    """Show the last ``frames`` observations in order of time, with ``actions`` each with the action that led to it."""
     return History(env, np.eye(frames, k=1), np.eye(frames)[-1], actions=actions)
 
 

@@ -69,12 +69,12 @@ class FeatureObservation(VectorWrapper):
 
 
 def make(task: Task, information: Information, num_envs: int, *, observer: str | None = None) -> VectorEnv:
-    """Make environments that show ``information``; signals of a system are scaled deviations from its target."""
+    """Make environments that show ``information``; x, y and x_hat of a system are scaled deviations from its target."""
     choice("information", information, INFORMATION)
     if observer is not None and information not in OBSERVED:
         raise ValueError(f"an agent that sees {information!r} has no use for the observer {observer!r}")
     if information in (ESTIMATED if task.system is None else OBSERVED) and observer is None:
-        raise ValueError(f"an agent that sees {information!r} needs an observer")
+        raise ValueError(f"an agent that sees {information!r} needs an observer: name it (--observer FILE)")
     if observer is not None:
         return estimates(task, information, num_envs, observer)
     if information == "state" and task.system is None:
@@ -112,7 +112,7 @@ def _memory(task: Task) -> dict[str, Any]:
 
 
 def estimates(task: Task, information: Information, num_envs: int, observer: str) -> VectorEnv:
-    """Show an observer's x_hat (after y, if y is noise-free), also with standard deviations, or the observer's z."""
+    """Show x_hat of an observer, x_hat with standard deviations, or z, as ``information`` names it."""
     artifact = Artifact.read(resolve(observer))
     options: dict[str, Any] = {
         "observer": observer,
@@ -124,11 +124,11 @@ def estimates(task: Task, information: Information, num_envs: int, observer: str
     system = None if task.system is None else get_system(task.system)
     if information == "z":
         return _modes(env, artifact, system)
-    # Under noise the observer estimates the outputs too, and agents do not see y.
+    # Without a system, x_hat comes after y; under noise, the observer estimates y too, and agents do not see y itself.
     first = len(task.measured) if task.measurement_noise else 0
     last = len(task.measured) + artifact.nx
     if system is not None and artifact.nx > system.nx:
-        raise ValueError(f"the observer {observer} estimates a bias too, which agents do not see: take one without")
+        raise ValueError(f"the observer {observer} estimates a bias, which agents do not see: take one without a bias")
     scale = 1.0 if system is None else np.array(system.scale)
     width = artifact.nx if system is not None else last - first
 
@@ -162,7 +162,7 @@ def output_deviation(system: System) -> Feature:
 
 
 def _modes(env: VectorEnv, artifact: Artifact, system: System | None) -> VectorEnv:
-    """Show z and any age as T_inv's network reads them: as deviations from a system's target, else after y."""
+    """Show z in T_inv's scale (less z at a system's target; without a system after y), and T_inv's age input if any."""
     inverse, linear, inside = artifact.inverse, artifact.filter, env
     while not isinstance(inside, KKLVectorObservation):
         inside = inside.env  # type: ignore[attr-defined]

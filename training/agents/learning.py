@@ -38,10 +38,10 @@ from training.progress import ProgressBars, progress_bars
 from training.run import CHECKPOINT
 
 RECURRENT = "ppo_lstm"
-# A training begins without estimates. If there is no noise, this phase takes this share of all steps, and the agent
-# learns from true states: later estimates are so accurate that its policy suits them, too.
+# A training that learns an observer begins without estimates. Without noise, this first phase takes this share of all
+# steps, and the agent learns from true hidden signals: later estimates are so accurate that its policy suits them, too.
 PRIVILEGED = 0.9
-WANDERED = 0.1  # the same share if there is noise; the agent then acts at random
+WANDERED = 0.1  # share of all steps that the first phase takes under noise; its actions are random
 REHEARSAL = 0.05  # share of all steps, at the end of a training with refits, without exploration and learning
 FILE = "agent.safetensors"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings that no algorithm takes
@@ -49,7 +49,7 @@ _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes
 
 
 def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:
-    """Return the default algorithm: recurrent PPO for recurrent agents, SAC if tuned for the task, else PPO."""
+    """Return ppo_lstm for recurrent agents, a system's ``PREFERRED``, sac for environments in sac.yml, or else ppo."""
     if information == "recurrent":
         return RECURRENT
     if task.system is not None:
@@ -103,8 +103,8 @@ def learn(
     suit them. The first steps are then fewer, their actions are random, and only the observer learns.
 
     For an agent that sees z under noise, the weights of z are learned from ``observer_steps`` random steps, if given.
-    All these first steps count as steps of the training. If ``aggregate`` is not 0, the observer is refitted so many
-    times to the agent's own steps, and once more at the end.
+    All these first steps count as steps of the training. The observer is refitted ``aggregate`` times to the agent's
+    own steps and, if this number is not 0, once more at the end.
 
     A resumed training starts new episodes, so that its agent differs from that of an uninterrupted training.
     ``Agent.training`` then holds the number of resumptions.
@@ -118,7 +118,7 @@ def learn(
     if information == "recurrent" and name != RECURRENT:
         raise ValueError(f"recurrent agents learn by {RECURRENT} only, got {name!r}")
     if aggregate and (task.system is not None or information not in ESTIMATED):
-        raise ValueError(f"an agent that sees {information!r} of {task.env_id} has no observer to refit")
+        raise ValueError(f"aggregate needs x_hat in an environment, not a system; got {information!r} of {task.env_id}")
     if task.system is not None and information in OBSERVED and observer is None and show is make:
         observer = observer_of(get_system(task.system))
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
@@ -130,7 +130,7 @@ def learn(
         raise ValueError(f"all entries of {task.env_id} are measured without noise: nothing is left to estimate")
     noisy_z = information == "z" and observer is None and task.measurement_noise and task.weights is None
     if observer_steps is not None and not (fits or noisy_z):
-        raise ValueError("observer_steps needs an agent that sees z under noise, or x_hat if no observer is given")
+        raise ValueError("observer_steps is only for environments without an observer: for x_hat, or for z under noise")
     weighs = noisy_z and observer_steps is not None
     first = _first_steps(task, steps, rehearsal, observer_steps) if fits or weighs else 0
     how = {"algorithm": name, **settings, "seed": seed, "observer_steps": first, "aggregate": aggregate}
@@ -310,11 +310,11 @@ class Learner:
 
 
 class _Until(BaseCallback):
-    """Stops before the first rollout after ``steps`` steps, or else before the last rollout of ``last`` steps."""
+    """Stops before the first rollout after ``steps`` of ``total`` steps, at the latest before the last rollout."""
 
-    def __init__(self, steps: int, last: int) -> None:
+    def __init__(self, steps: int, total: int) -> None:
         super().__init__()
-        self._steps, self._last, self._over = steps, last, False
+        self._steps, self._total, self._over = steps, total, False
 
     def _on_training_start(self) -> None:
         self._begun = self.num_timesteps
@@ -324,7 +324,7 @@ class _Until(BaseCallback):
         rollout = self.num_timesteps - self._begun
         self._begun = self.num_timesteps
         stopping = self.training_env.num_envs
-        self._over = self.num_timesteps >= min(self._steps, max(1, self._last - stopping - rollout))
+        self._over = self.num_timesteps >= min(self._steps, max(1, self._total - stopping - rollout))
 
     def _on_step(self) -> bool:
         return not self._over

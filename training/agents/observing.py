@@ -46,7 +46,7 @@ def signals(task: Task, env: gym.Env[Any, Any]) -> dict[str, Any]:
 class Privileged:
     """Makes environments that show the true hidden signals in place of estimates, and records their latest steps.
 
-    ``rows`` is their number; ``earlier`` are records of an interrupted training, in order of time.
+    ``rows`` is the number of environments; ``earlier`` are records of an interrupted training, in order of time.
     """
 
     def __init__(self, task: Task, rows: int, earlier: Sequence[Record] = ()) -> None:
@@ -109,7 +109,7 @@ def learn_observer(
     progress: ProgressBars,
     tracking: bool | None = None,
 ) -> Path:
-    """Learn an observer from records, and return its file; by default it has a tracker only under noise."""
+    """Learn an observer from records, and return its file; by default the observer tracks only under noise."""
     changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, **SETTINGS}
     changes["tracking"] = bool(task.measurement_noise) if tracking is None else tracking
     if task.measurement_noise:

@@ -16,8 +16,8 @@ SIGNALS = ("x", "x_hat", "y")  # keys of info whose values are recorded at each 
 class Episodes:
     """A batch of n episodes; after the end of an episode its last signals are repeated, with ``u`` = 0.
 
-    Shapes: ``returns``, ``lengths`` and ``escaped`` (n,), the mask of terminated episodes; ``x``, ``x_hat`` and ``y``
-    (steps + 1, n, signals), ``u`` (steps, n, nu), each None if ``info`` does not hold it.
+    ``escaped`` marks terminated episodes. Shapes: ``returns``, ``lengths``, ``escaped`` (n,); ``x``, ``x_hat``,
+    ``y`` (steps + 1, n, signals) and ``u`` (steps, n, nu), each of these four None if ``info`` does not hold it.
     """
 
     returns: np.ndarray
@@ -38,7 +38,7 @@ class Episodes:
 def play(
     env: VectorEnv, policy: Policy, *, seed: int, report: Callable[[float], object] = lambda ended: None
 ) -> Episodes:
-    """Play one episode in each row, with seed ``seed`` + i in row i; the environment must reset in the same step."""
+    """Play one episode in each row, with seed ``seed`` + i in row i; the autoreset mode must be SAME_STEP."""
     obs, info = env.reset(seed=seed)
     kept = {key: [info[key]] for key in SIGNALS if key in info}
     inputs = list[np.ndarray]()

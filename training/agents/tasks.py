@@ -26,9 +26,9 @@ TOLERANCE = 0.2  # largest distance from the target that counts as a success, in
 class Task:
     """An environment and the entries of its observations that agents may see.
 
-    In a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` stay empty. ``env_id`` and
-    ``env_kwargs`` are those of ``gym.make``. ``repeat`` counts samples per action; ``time_constants`` and ``frames``
-    count actions. ``weights`` are the memory's, as :meth:`kkl_gym.KKLMemory.learn_weights` returns them.
+    In a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` stay empty. ``hidden`` None
+    stands for all entries that are not measured. ``env_id`` and ``env_kwargs`` are those of ``gym.make``. ``repeat`` is
+    in samples, ``time_constants`` and ``frames`` in actions. ``weights``: see :meth:`kkl_gym.KKLMemory.learn_weights`.
     """
 
     env_id: str
@@ -46,7 +46,7 @@ class Task:
     def __post_init__(self) -> None:
         if not isinstance(self.env_id, str):
             raise ValueError(f"env_id must be a string, got {shown(self.env_id)}")
-        # A task that is read from a file must equal this one, and JSON turns tuples into lists.
+        # JSON turns tuples into lists, and a task that is read from a file must equal the task that was written.
         try:
             object.__setattr__(self, "env_kwargs", json.loads(json.dumps(dict(self.env_kwargs))))
         except (TypeError, ValueError) as error:
@@ -129,10 +129,10 @@ TASKS: dict[str, Task] = {
     "rossler": control_task("rossler", period=0.1, duration=30.0),
     "lorenz": control_task("lorenz", duration=5.0),
 }
-PREFERRED = {"reverse_duffing": "sac"}  # algorithms by system; for all other systems it is ppo
+PREFERRED = {"reverse_duffing": "sac"}  # default algorithms; all other systems have ppo
 
-# Positions are measured and velocities are hidden, as in rl-zoo3's tasks. Observers estimate all hidden entries but the
-# double pendulum's constraint forces.
+# Positions are measured and velocities are hidden, as in rl-zoo3's tasks. Observers estimate all hidden entries except
+# the double pendulum's constraint forces.
 HIDDEN_VELOCITIES: dict[str, Task] = {
     task.env_id: task
     for task in (

@@ -120,20 +120,20 @@ class Train:
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
-    """Standard deviation of the noise on each measured sample."""
+    """Standard deviation of the noise on each measured sample; in environments, the default is 0."""
     timesteps: Annotated[int | None, hint("the hyperparameters'")] = None
     """Number of actions in the training, over all environments."""
     observer: Annotated[str | None, hint("the system's map; one is learned for environments", metavar="MAP")] = None
     """A shipped map's name or a .safetensors file, for an agent that sees x_hat, x_hat_std or z."""
     algorithm: Annotated[
         Literal["ppo", "sac", "td3", "tqc", "dqn", "a2c", "ppo_lstm"] | None,
-        hint("sac for reverse_duffing and wherever it is tuned, else ppo"),
+        hint("ppo_lstm for recurrent; sac for reverse_duffing, Pendulum-v1, MountainCarContinuous-v0; else ppo"),
     ] = None
     """The algorithm of stable-baselines3. Recurrent agents need ppo_lstm."""
     observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
-    """Number of first steps in an environment from which the observer is learned, if --observer names none; of more
-    than 100,000, the latest are used. Without noise the agent also learns in these steps, from true hidden signals in
-    place of estimates. With noise these steps have random actions; for z, the weights of z are learned from them."""
+    """Number of first steps in an environment from which an observer is learned, without --observer. Without noise the
+    agent also learns in these steps, from true hidden signals, and only the latest 100,000 steps serve the observer.
+    With noise the actions are random. For z with noise, if given: random steps that fit the weights of z."""
     aggregate: int = 0
     """How often the observer is refitted to the agent's own steps while the agent learns from estimates. If this is not
     0, the agent does not explore in the last twentieth of all steps, after which a last refit follows."""
@@ -289,7 +289,7 @@ def evaluate(progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, tru
         if len(x):
             errors = np.sqrt(np.mean((x_hat - x) ** 2, axis=0)) / np.maximum(np.std(x, axis=0), 1e-300)
             text = ", ".join(f"{error:.2%}" for error in errors)
-            rows.append((f"error of x_hat over standard deviation, after {TRANSIENT} steps", text))
+            rows.append((f"rms error of x_hat / standard deviation of x, after {TRANSIENT} steps", text))
     table = Table(show_header=False)
     for label, value in rows:
         table.add_row(label, value)

@@ -24,8 +24,8 @@ from training.files import require_writable
 from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports of progress
-SECONDS = 12.0  # length of an animation; systems with a pace of 1 s run in real time
-FRAMES = 144  # largest number of frames in an animation
+SECONDS = 12.0  # length of an animation; it shows 1,200 times the system's dt, so that dt = 0.01 s gives real time
+FRAMES = 144  # number of frames in an animation
 TRAIL = 0.35  # share of the samples that one frame draws; older points would hide the latest
 
 
@@ -48,7 +48,7 @@ class Demo:
     """Seed of the starts and the noise."""
     policy: OwnPolicy = None
     gif: bool = False
-    """Also write estimates.gif: phase portraits over 12 s, or over 1,200 samples for systems of another pace."""
+    """Also write estimates.gif: phase portraits of the first 12 s (of your own systems, the first 1,200 samples)."""
 
     def run(self, console: Console) -> Path:
         """Play the episodes, and write the figure."""

@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
-SKIPPED = 5.0  # transient of driven runs in units of the system's pace, at most half of a run
-FIRST, SETTLED = 2.0, 5.0  # in units of the pace: error bars are evaluated before FIRST and after SETTLED
+SKIPPED = 5.0  # transient of driven runs, in multiples of 100 dt (``System.pace``); at most half of a run
+FIRST, SETTLED = 2.0, 5.0  # error bars are evaluated before FIRST and after SETTLED, in multiples of 100 dt
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, in multiples of the map's largest
 FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %")
 
@@ -82,7 +82,7 @@ class Motions:
         if not np.isfinite(self.plant_error):
             raise ValueError(f"plant_error must be a finite number, such as 0.1, got {self.plant_error}")
         if not system.parameters:
-            raise ValueError(f"{system.name} has no parameters that could be off")
+            raise ValueError(f"{system.name} has no parameters that could be off: leave --plant-error out")
         return system.replace({name: (1.0 + self.plant_error) * value for name, value in system.parameters.items()})
 
 
@@ -116,10 +116,10 @@ class Subject:
 class Evaluate:
     """Evaluate observers on unseen trajectories: errors, coverage of error bars, or detection of faults.
 
-    Trajectories start in X and in 2X outside X, with and without noise. SMAPE, in percent, uses the norm of all states,
-    over all steps (the paper's measure) and after the transient. NRMSE is the root mean square error of each state
-    after the transient, in percent of the state's standard deviation. The transient is the first fifth of a run. In
-    runs that random steps and sines drive, it is the first 5 s (500 samples for systems of another pace).
+    Trajectories start in X (the training box) and in 2X outside X, with and without noise. SMAPE, in percent, uses the
+    norm of all states, over all steps (the paper's measure) and after the transient. NRMSE is the root mean square
+    error of each state after the transient, in percent of the state's standard deviation. The transient is the first
+    fifth of a run. In runs that random steps and sines drive, it is the first 5 s (500 samples for your own systems).
 
     2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out, and so are
     noise levels beyond a map's range. If an observer was trained under a policy, this policy acts in all runs. In
@@ -324,7 +324,7 @@ class Evaluate:
     def _cases(
         self, description: str, of: Subject, levels: Sequence[Level], progress: ProgressBars, left_out: list[str]
     ) -> Iterator[tuple[str, bool, UnseenTrajectories, Level]]:
-        """Yield, for each noise level, the name of the starts, whether inputs act, the trajectories and the level.
+        """Yield, for each noise level, the name of the starts, whether runs are driven, the trajectories and the level.
 
         Starts from which all trajectories leave the bounds get a line in ``left_out``.
         """
@@ -369,7 +369,7 @@ def table(
     right: Sequence[str] = (),
     caption: str | None = None,
 ) -> Table:
-    """Return a table whose first columns are aligned left, and the others right."""
+    """Return a table whose first columns are aligned left, and the other columns right."""
     columns = [Column(name, justify="right") for name in right]
     laid_out = Table(*left, *columns, title=title or None, caption=caption)
     for row in rows:

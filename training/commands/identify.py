@@ -32,12 +32,12 @@ FARTHEST = 10.0  # largest factor between a parameter without limits and its fir
 
 @dataclass(frozen=True)
 class Identify:
-    """Learn a plant's unknown parameters, and an observer for it, from records of its outputs only.
+    """Learn a plant's unknown parameters, and an observer for it, from records of its outputs and inputs.
 
-    No recorded state is needed. Multiple shooting fits the parameters, and the states at which windows of the records
-    start, from random states in the training box, and gives standard errors. The observer is then trained on simulated
-    motions of the identified plant. --observer adapts an observer to a plant that differs from the observer's model,
-    with the settings of the observer's training.
+    No recorded state is needed. Multiple shooting fits the parameters and, from random first guesses in the training
+    box, the state at the start of each window of the records, and gives standard errors. The observer is then trained
+    on simulated motions of the identified plant. --observer adapts an observer to a plant that differs from the
+    observer's model, with the settings of the observer's training.
 
     The folder, runs/NAME-identified or with --observer runs/NAME-adapted, receives parameters.json, identification.png
     (residuals, and predictions of held-out records), NAME.safetensors, checkpoints and log.txt. Parameters that the
@@ -55,11 +55,11 @@ class Identify:
     data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
     """Records of the plant."""
     settings: tyro.conf.OmitArgPrefixes[SettingsOptions] = field(default_factory=SettingsOptions)
-    """Settings of the observer's training; dt is that of the records or of --observer."""
+    """Settings of the observer's training; by default, dt is that of the records or of --observer."""
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
     def run(self, console: Console) -> Path:
-        """Identify the plant, train the observer, and write both reports."""
+        """Identify the plant, train the observer, and write a report of each."""
         began = time.monotonic()
         set_threads(self.folder.threads)
         from training.evaluation.report import write_report

@@ -9,7 +9,7 @@ from rich.table import Table
 from observers import Artifact, shipped
 from observers.names import resolve
 
-WIDTH = 80  # columns of the table; narrower terminals wrap its lines
+WIDTH = 80  # width of the table in characters; narrower terminals wrap its lines
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ def names_in(text: str) -> tuple[str, ...]:
 
 
 _PARAMETER = words(pair(float, "parameter with its value", "NAME=VALUE, as in mu=3.3"), "NAME=VALUE")
-_UNKNOWN = pair(read_unknown, "unknown parameter", "NAME=VALUE, or NAME=VALUE:LOW:HIGH, as in mu=1.5:0.5:6")
+_UNKNOWN = pair(read_unknown, "first guess of a parameter", "NAME=VALUE, or NAME=VALUE:LOW:HIGH, as in mu=1.5:0.5:6")
 _HALF_WIDTH = pair(float, "uncertainty of a parameter", "NAME=SHARE, as in mu=0.1, or a number for all", EVERY)
 read_argument = pair(read_json, "argument of an environment", "NAME=VALUE, as in g=9.5")
 NO_FILE = hint("no file", metavar="FILE")

@@ -84,8 +84,8 @@ def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
     agent, here = Agent.read(path), env.spec.id if env.spec else ""
     if agent.information != "state" or agent.task.env_id != here:
         raise ValueError(
-            f"{path} is an agent for {agent.task.env_id} that sees {agent.information}; to act in {here}, "
-            "an agent must see its state"
+            f"{path} is an agent for {agent.task.env_id} that sees {agent.information}: name an agent for {here} "
+            "that sees state"
         )
     policy = agent.policy(env.action_space)
     flatten: Any = gym.spaces.flatten

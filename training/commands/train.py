@@ -54,7 +54,7 @@ class Train:
     """Learn an observer from equations or from records, and write it to one file.
 
     kkl-gym train lorenz: a shipped system. kkl-gym train script.py: the system that the script defines. kkl-gym train
-    NAME --data run*.csv: from recorded states. The folder runs/NAME receives NAME.safetensors (T_inv, the motion for
+    NAME --data run*.csv: from recorded states. The folder runs/NAME receives NAME.safetensors (T_inv, the model for
     tracking, covariances, a monitor's limits), report.png, checkpoints, and log.txt with all printed lines.
     """
 
@@ -191,19 +191,17 @@ class Train:
 
 
 def summary(result: "Result") -> list[str]:
-    """Return lines of text on a training: its CPU time, and the observer's method of estimation."""
+    """Return lines on a training: CPU time, the observer's method of estimation, and any errors on held-out records."""
     artifact = result.artifact
     by, covariance = tracks_by(artifact), artifact.inverse.error_covariance
     lines = [
         "CPU seconds: " + ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in result.seconds.items()),
-        f"it tracks by {MOTIONS[by]}; T_inv initialises it" if by else "it does not track: its estimates are T_inv's",
+        f"the observer tracks by {MOTIONS[by]}; T_inv initialises it" if by else "the observer is T_inv alone",
     ]
     if covariance is None:
         lines[-1] += ", without covariances"
     if errors := artifact.training.get("held_out_errors"):
         each = ", ".join(f"{name} {error:.3g}" for name, error in errors.items())
         after = artifact.training["held_out_after"]
-        lines.append(
-            f"rms error over standard deviation on held-out records: {each} (after {after:.2g} s of transient)"
-        )
+        lines.append(f"rms error / standard deviation on held-out records: {each} (after {after:.2g} s of transient)")
     return lines

@@ -195,7 +195,7 @@ def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, mon
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"information": "z", "aggregate": 2}, "no observer to refit"),
+        ({"information": "z", "aggregate": 2}, "aggregate needs x_hat in an environment"),
         ({"information": "recurrent", "algorithm": "ppo"}, "recurrent agents learn by ppo_lstm"),
         ({"information": "x_hat_std"}, "a trained observer with error bars"),
         ({"information": "x_hat", "timesteps": 4}, r"4 steps are too few .*--timesteps"),

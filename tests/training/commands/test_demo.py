@@ -54,7 +54,7 @@ def test_an_observer_of_a_bias(capsys):
     env = gym.make("KKLVanDerPol-v0")
     with pytest.raises(ValueError, match="this observer estimates a bias too, of which no start is known"):
         KKLObservation(env, "biased.safetensors", known_start=True)
-    with pytest.raises(SystemExit, match=r"biased\.safetensors estimates a bias too, which agents do not see"):
+    with pytest.raises(SystemExit, match=r"biased\.safetensors estimates a bias, which agents do not see"):
         main(["agent", "train", "van_der_pol", "--observer", "biased.safetensors", "--timesteps", "400"])
 
 

@@ -46,7 +46,7 @@ def test_from_a_system_to_an_observer_that_tracks(capsys):
     assert printed[1].startswith("pipeline input-aware, preset fast, size default; ")
     assert re.fullmatch(r"20 trajectories of 5 s at dt = 0.1 s; \d+ modes of A .*", printed[2])
     assert re.fullmatch(r"CPU seconds: motions \S+, free \S+, inverse \S+, calibrating \S+", printed[3])
-    assert printed[4] == "it tracks by the system's equations; T_inv initialises it"
+    assert printed[4] == "the observer tracks by the system's equations; T_inv initialises it"
     assert re.fullmatch(rf"wrote {path} \(0\.\d\d MB\), report\.png and log\.txt beside it, in \S+", printed[5])
     evaluation = re.fullmatch(r"kkl-gym (evaluate .*) measures its errors", printed[6])[1].split()
     assert printed[7:] == []
@@ -74,7 +74,7 @@ def test_other_kinds_have_names_of_their_own(options, name, capsys):
     main(["train", OSCILLATOR, *SIZES, *options])
     artifact = Artifact.read(f"runs/{name}/{name}.safetensors")
     assert (artifact.forward is None) == (artifact.motion is not None) == ("large" in name)
-    said = "it tracks by the system's equations" if "large" in name else "it does not track: its estimates are T_inv's"
+    said = "the observer tracks by the system's equations" if "large" in name else "the observer is T_inv alone"
     assert any(line.startswith(said) for line in lines(capsys))
 
 
@@ -110,8 +110,8 @@ def test_from_records_to_an_observer_that_tracks(capsys):
     )
     assert printed[0].startswith(f"{start} 49.75 s together, in steps of 0.05")
     assert re.search(r"\(median\), uneven by up to 19.\d%; resampled to 0.05 s$", printed[0])
-    assert "it tracks by a learned flow; T_inv initialises it" in printed
-    assert printed[-2].startswith("rms error over standard deviation on held-out records: position ")
+    assert "the observer tracks by a learned flow; T_inv initialises it" in printed
+    assert printed[-2].startswith("rms error / standard deviation on held-out records: position ")
     assert printed[-1].startswith(f"wrote {path} ")
     assert Path("runs/spring/report.png").stat().st_size > 10_000
     assert load(path).estimate(np.zeros((10, 1)), np.zeros((9, 1))).shape == (10, 2)
@@ -120,5 +120,5 @@ def test_from_records_to_an_observer_that_tracks(capsys):
     with pytest.raises(SystemExit, match="'spring' was learned from recorded states"):
         main(["evaluate", path])
     main([*command, "--hidden", "speed", "--set", "held_out=0", "--out", "whole"])
-    assert "it does not track: its estimates are T_inv's, without covariances" in lines(capsys)
+    assert "the observer is T_inv alone, without covariances" in lines(capsys)
     assert Path("whole/report.png").exists()
