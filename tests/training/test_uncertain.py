@@ -82,7 +82,7 @@ def test_it_does_not_track_and_says_why():
     said = Console(file=io.StringIO(), width=200)
     config = toy(Undamped(), uncertain={"stiffness": 0.3}, duration=1.0, inverse_steps=2, inputs=False)
     artifact = train(Undamped(), config, device=CPU, console=said).artifact
-    assert "a tracker needs the equations of one plant, not of a range of stiffness" in said.file.getvalue()
+    assert "a tracker needs exact parameters, but these are uncertain: stiffness" in said.file.getvalue()
     assert artifact.motion is None
     assert artifact.inverse.error_covariance.nx == 2
 

@@ -20,7 +20,7 @@ def coverage(
     seed: int,
     spans: tuple[slice, ...] = (slice(None),),
 ) -> list[dict[str, float]]:
-    """Compare covariances with errors on test trajectories; arguments are those of :func:`training.errors`.
+    """Compare covariances with errors on test trajectories; for arguments except ``spans`` see :func:`training.errors`.
 
     Returns for each span of samples the percentages of errors in the regions, for all states together ("90") and for
     each state ("90 x1"), the mean NEES, and the limits of a consistent filter's mean NEES.

@@ -130,9 +130,9 @@ def unseen_trajectories(
     moving = plant or system
     sizes, expected = ((each.nx, each.nu, each.ny) for each in (moving, system))
     if sizes != expected:
-        raise ValueError(f"a plant of {sizes} states, inputs and outputs does not fit {system.name}, of {expected}")
+        raise ValueError(f"a plant with (nx, nu, ny) = {sizes} does not fit {system.name}, which has {expected}")
     if n < 1 or seed < 0:
-        raise ValueError(f"cannot simulate {n} trajectories from seed {seed}")
+        raise ValueError(f"n must be positive and seed not negative, got n = {n} and seed = {seed}")
     check_duration(duration, dt)
     if domain not in get_args(Domain):
         raise ValueError(f"domain must be one of {', '.join(get_args(Domain))}, got {domain!r}")
@@ -162,7 +162,7 @@ def errors(
     seed: int,
     skip: float | None = None,
 ) -> Errors:
-    """Return errors on test trajectories of an observer that knows the noise levels, but not how the plant differs.
+    """Return an observer's errors on test trajectories. It knows the noise levels, but not how plant and model differ.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def noise_limit(
     Parameters
     ----------
     system, trajectories, measurement_noise, skip
-        As for :func:`errors`. Trajectories must start in X. The bound assumes at least 0.2 % of the system's own noise.
+        As for :func:`errors`. Trajectories must start in X. The bound assumes at least 0.2 % of the usual noise on y.
     seed : int
         Seed of the drawn errors.
 
@@ -264,7 +264,7 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Return parameter errors after the transient in percent of true values: the plant's, or else the last states."""
+    """Return rms parameter errors after the transient, in percent of the plant's values or else of x's last states."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
         raise ValueError(f"all {trajectories.escaped} runs left bounds = {system.bounds}")

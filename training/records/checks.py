@@ -11,12 +11,12 @@ from training.records.record import LONGEST_GAP, ROLES, Record, median_step
 Warn = Callable[[str], object]
 
 OTHER_CLOCK = 30.0  # if dt is longer than so many steps of a record, its times are probably in another unit
-WHOLE_TURN = 0.9 * 2 * np.pi, 2 * np.pi + 0.1  # least and largest jump of a wrapped angle
-FAR_OFF = 10.0  # a value that is farther from all others, over their range, may mark missing samples
+WHOLE_TURN = 0.9 * 2 * np.pi, 2 * np.pi + 0.1  # least and largest jump of a wrapped angle, in rad
+FAR_OFF = 10.0  # a value farther from all others than so many times their range may mark missing samples
 
 
 def check_signals(records: Sequence[Record], system: System | None = None) -> None:
-    """Raise ValueError unless all records have the same columns, as many of each role as the system has signals."""
+    """Raise ValueError unless all records have the same columns, of each role as many as a given ``system`` needs."""
     if not records:
         raise ValueError("no records are given")
     first = records[0]
@@ -29,12 +29,12 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
         if len(names[role]) != count and (names[role] or role == "measured"):
             raise ValueError(
                 f"{first.name}: the {role} columns are {', '.join(names[role]) or 'none'}, but {system.name} has "
-                f"{count}; name others by --{role}"
+                f"{count}; name other columns by --{role}"
             )
 
 
 def check_alike(record: Record, names: Mapping[str, Sequence[str]], environment: Any, other: str) -> None:
-    """Raise ValueError unless a record has the signals ``names`` (by role) and the environment that ``other`` has."""
+    """Raise ValueError unless a record has the signals (by role) and the environment of the data named ``other``."""
     for role, there in names.items():
         if (here := getattr(record.signals, role)) != tuple(there):
             here, there = (", ".join(each) or "none" for each in (here, there))
@@ -48,7 +48,7 @@ def check_alike(record: Record, names: Mapping[str, Sequence[str]], environment:
 
 
 def check_motion(records: Sequence[Record], warn: Warn) -> None:
-    """Raise ValueError if a signal never moves; warn of wrapped angles and of values that may mark missing samples."""
+    """Raise ValueError if an output or state never moves; warn of wrapped angles and of values that may mark gaps."""
     least, most = WHOLE_TURN
     for letter, role in (("y", "measured"), ("x", "hidden")):
         for j, column in enumerate(getattr(records[0].signals, role)):
@@ -86,5 +86,5 @@ def check_dt(records: Sequence[Record], dt: float) -> None:
         if not dt / OTHER_CLOCK < step <= LONGEST_GAP * dt:
             raise ValueError(
                 f"{record.name}: column {record.signals.time}: steps of {step:g} s do not fit dt = {dt:g} s; is the "
-                "time in seconds? If so, take an observer with another dt"
+                "time in seconds? If so, take another dt, or records with other steps"
             )

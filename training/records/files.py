@@ -18,7 +18,7 @@ from training.records.checks import Warn, check_motion, check_signals
 from training.records.episodes import is_dataset, read_dataset
 from training.records.record import ROLES, Record, Signals
 
-MISSING = ["na", "none", "NONE", "Null", "Nan", "Na"]  # missing cells, in addition to those that pandas recognises
+MISSING = ["na", "none", "NONE", "Null", "Nan", "Na"]  # marks of missing cells besides those that pandas recognises
 SEPARATORS = ",;\t"
 TIMES = ("t", "time")  # usual names of the column of time
 Columns = Mapping[str, Any]

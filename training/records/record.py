@@ -14,8 +14,8 @@ from observers.checks import real_array
 
 ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # field of Record: field of Signals that names its columns
 MAX_SAMPLE = 1e100  # largest valid sample, so that sums of squares stay finite
-LONGEST_GAP = 3.0  # longest gap, in steps, in which samples are interpolated
-ROUNDING = 1e-6  # tolerance of times, in steps
+LONGEST_GAP = 3.0  # longest gap, in steps of the grid, in which samples are interpolated
+ROUNDING = 1e-6  # tolerance of times, in steps of the grid
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def sampling_interval(*records: Record) -> float:
 
 
 def jitter(record: Record) -> float:
-    """Return the largest deviation of a time step from the median step, over the median step; gaps do not count."""
+    """Return the largest deviation of a time step from the nearest multiple of the median step, in median steps."""
     steps = np.diff(record.t) / median_step(record)
     return float(np.max(abs(steps - np.maximum(steps.round(), 1.0))))
 

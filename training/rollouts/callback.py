@@ -32,7 +32,7 @@ LONGEST = 250  # most steps in a piece; longer episodes are cut into pieces, so 
 
 @dataclass(frozen=True)
 class Refit:
-    """A refit: the observer in use after it, whether this is the new one, held-out errors, and the step."""
+    """A refit: the observer in use after it, whether it is new, held-out errors before and after, and the step."""
 
     artifact: Artifact
     taken: bool
@@ -52,11 +52,11 @@ class KKLTrainingCallback(BaseCallback):
     An observer is accurate where its rollouts have been, but an agent in training goes elsewhere. A refit learns T_inv,
     the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
     replaces the old one unless the new one's error on that share is larger. Filters keep their states. A refit
-    takes place only when an algorithm begins to collect a rollout, so that no on-policy batch mixes two observers, and
-    only after an episode was as long as the filter's settling time.
+    takes place only when an algorithm begins to collect a rollout (so that no on-policy batch mixes two observers) or
+    after a rehearsal, and only if a kept episode is as long as the filter's settling time.
 
-    The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square over standard
-    deviation), and ``kkl/error_before``, that of the observer before the refit.
+    The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square, divided by
+    standard deviations), and ``kkl/error_before``, that of the observer before the refit.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._gathering.steps + self._every
         kept, held_out = self._gathering.records()
         memory = settling_time(self.artifact.filter)
-        # Earlier records may be long enough without the agent's episodes, but only pieces of these are held out.
+        # Earlier records may be long enough without the agent's episodes, but only the agent's episodes are held out.
         needed = (kept, held_out) if self._before and self._config.held_out else (kept,)
         if all(any(record.duration >= memory for record in records) for records in needed):
             self._refit(kept, held_out)
@@ -237,8 +237,8 @@ def _in_use(env: VecEnv) -> tuple[list[KKLObserver], Callable[[Artifact], object
         inside = inside.env
     if not all(env.env_is_wrapped(KKLObservation)):
         raise ValueError(
-            "KKLTrainingCallback refits the observers of kkl_gym.KKLObservation, and the environment has none: put "
-            'KKLObservation(gym.make(ID), "observer.safetensors") around each'
+            "KKLTrainingCallback refits the observers of kkl_gym.KKLObservation, and the environment has none: wrap "
+            'each environment, as in KKLObservation(gym.make(ID), "observer.safetensors")'
         )
     return env.get_attr("observer"), partial(env.env_method, "replace_observer")
 
@@ -271,12 +271,12 @@ class Gathering:
         self._signals = Signals("t", *(tuple(names[role]) for role in ROLES.values()))
         self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
         self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
-        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; open ones by environment
+        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; last piece by environment
         self._made = self.steps = 0
         check_dt(before, self._dt)
         for record in before:
             if record.x is None:
-                raise ValueError(f"{record.name}: no hidden states were recorded; name them (--hidden)")
+                raise ValueError(f"{record.name}: no hidden states were recorded, but a refit needs them")
             known = {role: names[role] for role in ROLES.values() if artifact.nu or role != "inputs"}
             check_alike(record, known, self._environment, "the observer's rollouts")
             y, x, u = (getattr(resampled(record, self._dt), letter) for letter in "yxu")
@@ -297,7 +297,7 @@ class Gathering:
             raise ValueError(
                 f"info of environment {row} has no {', '.join(map(repr, missing))}: KKLObservation gives the true "
                 f"{', '.join(self._signals.hidden)} as 'x' if the environment inside provides them at each step; "
-                "training.agents.SB3VecEnv passes on its info_keys, ('y', 'u', 'x', 'sample')"
+                f"training.agents.SB3VecEnv passes on only info_keys: make them {(self._outputs, 'u', 'x', 'sample')}"
             )
         piece, sample = self._open[row], int(info["sample"])
         if piece.y and sample != piece.sample + 1:
@@ -315,7 +315,7 @@ class Gathering:
         self.steps += 1
 
     def records(self) -> tuple[list[Record], list[Record]]:
-        """Drop the oldest pieces; return records to fit and held-out records, unfinished episodes included."""
+        """Drop the oldest pieces beyond ``keep`` steps; return kept and held-out records, with unfinished episodes."""
         total, first = 0, len(self._pieces)
         while first and (not total or total + len(self._pieces[first - 1].u) <= self._keep):
             first -= 1

@@ -136,7 +136,7 @@ def roll_out(
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Records the last episodes in an environment: as many as hold ``keep`` steps, by default all."""
+    """Records the last episodes in an environment, the fewest that hold ``keep`` steps; by default all episodes."""
 
     def __init__(
         self,
@@ -171,7 +171,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the environment; RuntimeError before the first reset, or without a reset after :meth:`rollouts`."""
         if self._under_way is None:
-            raise RuntimeError("reset the environment before its first step")
+            raise RuntimeError("reset the environment before the first step of an episode")
         made = copy.deepcopy(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._under_way.seen.append(self._copied(observation, info))

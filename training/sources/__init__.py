@@ -20,7 +20,7 @@ class Runs:
     ``sound`` is True if the plant certainly had no faults.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
-    ``process_noise`` (n,), ``usual`` (n,): True for starts in X, False beyond.
+    ``process_noise`` (n,), ``usual`` (n,): True for starts in the training box X.
     """
 
     x: np.ndarray
@@ -84,7 +84,7 @@ class Source(Protocol):
         """Return arguments of :class:`training.maps.inverse.TrajectorySampler` that depend on the source."""
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report) -> Pairs:
-        """Return states of training motions and of a filter that runs along them; ``free`` motions have no input."""
+        """Return states of training motions and a filter along them; ``free``: of simulated motions without inputs."""
 
     def runs(self, *, report: Report) -> Runs:
         """Return motions for calibration; raise TooFewRunsError if too few are held out."""
@@ -96,7 +96,7 @@ class Source(Protocol):
         """Return changes of the state over one sampling interval: for learning a flow, and for measuring its error."""
 
     def tracking(self) -> dict[str, Any]:
-        """Return observers.Motion's arguments except equations and flow; raise ValueError if tracking is impossible."""
+        """Return the arguments of observers.Motion that the source fixes; ValueError if tracking is impossible."""
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
         """Return errors on held-out motions, for the training metadata of the artifact."""

@@ -30,15 +30,15 @@ WINDOW = 10  # least number of samples over which a tracker averages innovations
 # The residual of y = C x counts as noise unless it exceeds UNEXPLAINED times the output's standard deviation, or a fit
 # with products of states reduces it below SQUARES times itself.
 UNEXPLAINED, SQUARES = 0.7, 0.8
-LITTLE = 0.1  # a smaller residual, over the output's standard deviation, always counts as noise
-ROUNDING, OUTLIER = 1e-6, 6.0  # largest rounding error, over an output's size; least outlier, in standard deviations
+LITTLE = 0.1  # a residual below this share of the output's standard deviation always counts as noise
+ROUNDING, OUTLIER = 1e-6, 6.0  # largest rounding, relative to an output; least outlier, in residual standard deviations
 LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
-MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: number of modes of each output, their rates over the signals'
-RECORD_MEMORIES = 3.0  # least length of a record in settling times, unless that needs modes faster than the signals
+MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # records: modes per output; slowest and fastest, relative to the signal rate
+RECORD_MEMORIES = 3.0  # least settling times in a median record; fewer if the slowest mode would outpace the signals
 # For rollouts, whose hidden signals an agent needs within a few steps: number of modes of each output, and their rates
 # per step. A few modes that lie far apart forget the start soon, and distinguish single steps.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
-EPISODE_MEMORIES = 1.5  # least length of an episode in settling times
+EPISODE_MEMORIES = 1.5  # least number of settling times in a median episode; fewer if it is shorter than about 10 steps
 RECORDED_NOISE = 0.1  # largest noise added to that of the records, in standard deviations of the output
 RECORDED: dict[str, Any] = {
     "samples": 60, "width": 96, "depth": 2, "learning_rate": 3e-3, "inverse_steps": 3000, "members": 3,
@@ -67,8 +67,8 @@ class RecordedSource:
     Raises
     ------
     ValueError
-        If no hidden states were recorded, records have different signals, a signal is unknown, or dt does not suit the
-        records.
+        If a record has no hidden states, records have different signals, a signal is unknown, no signal moves, or dt
+        does not suit the records.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class RecordedSource:
         chosen = [evenly(windows.rows(age), n) for age in ages]
         if lacking := [age for age, rows in zip(ages, chosen) if not len(rows)]:
             raise ValueError(
-                f"no recorded state is {lacking[0] * self.dt:.3g} s after the start of its record, or after a gap; "
+                f"no recorded state is {lacking[0] * self.dt:.3g} s or more after the start of its record or a gap; "
                 "record longer runs, or take faster eigenvalues"
             )
         zs = [windows.restarted(rows, age) for age, rows in zip(ages, chosen)]
@@ -188,7 +188,7 @@ class RecordedSource:
         }
 
     def tracking(self) -> dict[str, Any]:
-        """Return arguments of :class:`observers.Motion` but the flow; ValueError if tracking is impossible."""
+        """Return the arguments of observers.Motion that records fix; ValueError if tracking is impossible."""
         if self.config.arbitrary_zero:
             raise ValueError(
                 f"a tracker compares {', '.join(self.config.arbitrary_zero)} with its prediction, so the zero matters: "
@@ -280,7 +280,7 @@ def evenly(rows: np.ndarray, n: int) -> np.ndarray:
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:
-    """Return kept and held-out records: the seed draws whole ones to hold out, or if they are few, all ends are."""
+    """Return kept and held-out records; held out are whole records that the seed draws, or the ends of few records."""
     if not share:
         return list(records), []
     if len(records) >= FEW:
@@ -295,7 +295,7 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
 
 
 def signal_rate(records: Sequence[Record]) -> float:
-    """Return the signals' rate in 1/s: rms of the derivative over standard deviation, median of moving signals."""
+    """Return the median rate of all moving signals in 1/s: the derivative's rms divided by the standard deviation."""
     rates = list[float]()
     for letter in "yx":
         signals = [(getattr(record, letter), record.t) for record in records if getattr(record, letter) is not None]
@@ -306,7 +306,7 @@ def signal_rate(records: Sequence[Record]) -> float:
             rates += (change[size > 0] / size[size > 0]).tolist()
     moving = [rate for rate in rates if rate > 0]
     if not moving:
-        raise ValueError(f"{records[0].name}: no signal moves, nor in any other record, so nothing can be learned")
+        raise ValueError(f"{records[0].name}: no signal moves in this or any other record, so nothing can be learned")
     return float(np.median(moving))
 
 
@@ -317,7 +317,7 @@ def recorded_errors(
     *,
     measurement_noise: float | tuple[float, ...] = 0.0,
 ) -> dict[str, float]:
-    """Return errors of hidden signals (rms over standard deviation, or NaN) after ``after`` s or the settling time."""
+    """Return rms errors of hidden signals, in standard deviations or NaN, after ``after`` s (None: settling time)."""
     first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
     pairs, rng = [np.zeros((0, 2, artifact.nx))], np.random.default_rng(0)
     for record in pieces(records):
@@ -360,7 +360,7 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
 
 
 def _fitted(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit C without outliers; return it, and the standard deviations (ny,) of the residual."""
+    """Fit C (ny, nx) of y = C x without outliers; return C and the standard deviations (ny,) of the residual."""
     size = np.sqrt(np.mean(x**2, 0))
     size, scale = np.where(size > 0, size, 1.0), np.where(scale > 0, scale, 1.0)
     kept = np.ones(len(x), dtype=bool)

@@ -19,18 +19,18 @@ from training.trajectories.equations import describe, digest, field_expression, 
 from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
-LEAD_IN_SHARE = 0.4  # share of the motions without inputs before which inputs have led the start out of X
+LEAD_IN_SHARE = 0.4  # share of the motions without inputs that start where inputs have led the state from X
 BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and some of a flow's training motions
-# In calibration, inputs drive every other run; a policy acts on exact states, without exploration, in every other run.
+# Random inputs drive every other calibration run. A policy, if given, drives all, half of them exactly (POLICYS_OWN).
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
-LEAST_PROCESS_NOISE = 0.005  # least level that a tracker assumes, in ``scale`` per pace: a tenth of the default
+LEAST_PROCESS_NOISE = 0.005  # least level of process noise for a tracker, in ``scale`` per pace; a tenth of the default
 WINDOW, RUN = 0.5, 20.0  # lengths of a tracker's window and of a calibration run, in units of the pace
 SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
 INTEGRATION_ERROR = 2e-5  # largest error of these steps in standard deviations of the states, well below the noise
-TOO_FAR_OFF = 0.01  # if SUBSTEPS steps have a larger error, as where f jumps, a flow is learned
+TOO_FAR_OFF = 0.01  # if SUBSTEPS steps have a larger error, for example because f jumps, a flow is learned
 INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
-DEVIATIONS = (1e-4, 0.3)  # range of the distances of increments from motions, in standard deviations of the states
+DEVIATIONS = (1e-4, 0.3)  # range of distances of increments' first states from motions, in standard deviations
 
 
 class SimulatedSource:
@@ -41,8 +41,8 @@ class SimulatedSource:
     system : System
         The system to simulate.
     config : Config
-        Settings of the training. The source itself reads those of motions: trajectories, duration, samples, runs, dt,
-        inputs, policy, uncertain parameters, bias, noise and seed.
+        Settings of the training. The source itself reads only the settings of motions, such as duration, dt, inputs,
+        policy, uncertain parameters, bias and seed.
 
     Raises
     ------
@@ -72,7 +72,7 @@ class SimulatedSource:
         self.ages = recording_ages(self.steps, config.samples)
 
     def identity(self) -> dict[str, Any]:
-        """Return the identity of the system with its equations, and everything else on which motions depend."""
+        """Return all that motions depend on apart from the settings: system, equations, noise, ranges and policy."""
         system = self.system
         noise = {"process_noise": float(system.process_noise), "scale": list(map(float, system.scale))}
         identity = describe(system) | noise
@@ -107,7 +107,7 @@ class SimulatedSource:
         }
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
-        """Return states of motions and of a filter along them; inputs first lead some ``free`` motions out of X."""
+        """Return states of motions and of a filter along them; if ``free``, inputs act only before some starts."""
         config, rng = self.config, generator(Stream.TRAINING, self.config.seed, *([1] if free else []))
         how: dict[str, Any] = {"kinds": DRIVEN if self.has_free_map else KINDS, "policy": self.policy}
         if free:
@@ -147,7 +147,7 @@ class SimulatedSource:
                 break
         if off > TOO_FAR_OFF:
             raise ValueError(
-                f"{SUBSTEPS} Runge-Kutta steps in each {self.dt:g} s are off by {off:.2g} standard deviations"
+                f"{SUBSTEPS} Runge-Kutta steps per {self.dt:g} s err by {off:.2g} > {TOO_FAR_OFF:g} standard deviations"
             )
         return equations
 
@@ -172,10 +172,10 @@ class SimulatedSource:
         return {}
 
     def tracking(self) -> dict[str, Any]:
-        """Return arguments of :class:`observers.Motion` but equations or flow; ValueError if tracking is impossible."""
+        """Return observers.Motion's arguments except equations, flow, factors; ValueError if tracking is impossible."""
         system = self.model
         if self.ranges:
-            raise ValueError(f"a tracker needs the equations of one plant, not of a range of {', '.join(self.ranges)}")
+            raise ValueError(f"a tracker needs exact parameters, but these are uncertain: {', '.join(self.ranges)}")
         output_facts(system)  # raises ValueError if an artifact cannot hold the output
         low, high = np.array(system.bounds, dtype=float).T
         offset, scale = self._scale
@@ -202,9 +202,9 @@ class SimulatedSource:
         along, _ = self._states(4)
         return along.mean(0), spread(along)
 
-    def _states(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return states (n, nx) along short motions from X and 2X, and inputs (n, nu)."""
-        rng, steps = generator(Stream.CALIBRATION, self.config.seed, 6), max(1, round(seconds * self.pace / self.dt))
+    def _states(self, paces: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return states (n, nx) along motions of so many paces from X and 2X, and inputs (n, nu)."""
+        rng, steps = generator(Stream.CALIBRATION, self.config.seed, 6), max(1, round(paces * self.pace / self.dt))
         motions = Motions(self.model, self.dt, steps, KINDS, self.policy, box_factor=BEYOND).with_inputs(self.nu)
         x, u, *_ = motions.drawn(100, rng)
         every = max(1, steps // 500)

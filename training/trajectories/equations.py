@@ -13,8 +13,8 @@ from kkl_gym.system import Components, System
 from observers import Expression
 
 ASIDE = 1e-5  # step of the central differences, in widths of X
-LINEAR_ROUNDING = 1e-9  # largest residual of a linear output, over its size
-EXPRESSION_ROUNDING = 1e-6  # largest difference of an expression from the equations, over a component's size
+LINEAR_ROUNDING = 1e-9  # largest residual of a linear output, as a share of its largest value
+EXPRESSION_ROUNDING = 1e-6  # largest difference of an expression from the equations, as a share of a component's size
 
 # Sympy's names of functions, and the names that expressions give them.
 _NAMES = {

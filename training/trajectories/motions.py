@@ -19,7 +19,7 @@ Report = Callable[[float], object]  # called with the amount of work that is don
 Chunk = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 KINDS = ("zero", "steps", "zero", "sine")  # signals that the inputs of successive trajectories follow
-DRIVEN = ("steps", "sine", "pulses")  # such signals if no trajectory shall be without inputs
+DRIVEN = ("steps", "sine", "pulses")  # the same if all trajectories shall have inputs
 CHUNK = 500  # number of trajectories simulated at once
 FIRST, FEWEST_INSIDE = 100, 0.05  # after so many trajectories, at least this share must have stayed within bounds
 # Durations for which inputs drive starts out of X, in multiples of the system's pace.
@@ -30,7 +30,7 @@ POLICY_KINDS = ("steps", "sine")  # signals of a policy's errors and of its expl
 POLICY_ERROR = (0.02, 0.5)  # range of errors in the states that a policy sees, in multiples of the system's scale
 EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in multiples of input bounds
 # One trajectory in so many follows the policy exactly; the others have errors and exploration. The exact policy's input
-# reveals the state, but an agent's input does not. Under the regulator on x_hat, at the default noise, the error of
+# reveals the state; an agent's, from x_hat, does not. Under the regulator on x_hat, at the default noise, the error of
 # cart-pole's angle is 3.4 % of X's half-width with one in 4, 3.2 % with one in 12, 3.1 % without any; an EKF has 2.7 %.
 POLICYS_OWN = 12
 
@@ -39,7 +39,7 @@ POLICYS_OWN = 12
 class Pairs:
     """States x (m, n, nx) of motions with process noise (n,), and z (m, n, size) of a filter that runs along them.
 
-    ``ages`` (m,) are in samples since the filter's start; ``nominal`` (n,) marks motions with the system's parameters.
+    ``ages`` (m,) are in samples since the filter's start; ``nominal`` (n,) marks motions with nominal parameters.
     """
 
     ages: np.ndarray
@@ -223,8 +223,8 @@ def under_policy(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories under a policy with errors in the state that it sees and with exploration.
 
-    The exact policy's input would reveal the state to an observer, which filters that input. So each trajectory has an
-    error in the state that the policy sees, and a signal added to its actions; those in the mask ``own`` have neither.
+    The exact policy's input would reveal the state to an observer, which filters that input. So all trajectories
+    except those in the mask ``own`` have an error in the state that the policy sees, and a signal added to the actions.
 
     Shapes: ``x0`` (n, nx), ``own`` (n,), ``w`` (steps, n, nx); returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
     """

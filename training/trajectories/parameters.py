@@ -10,8 +10,8 @@ from kkl_gym.system import Box, Components, System
 from observers.checks import shown
 from training.trajectories.motions import Controller
 
-# Share of the training motions with the system's own value of an uncertain parameter. With k parameters it is raised to
-# the power k, as it is less likely that all have these values. It was chosen on the four systems that ship: with 0.6
+# Share of the training motions with the system's own value of an uncertain parameter. With k parameters, the share with
+# all own values is this share to the power k. NOMINAL_SHARE was chosen on the four systems that ship: with 0.6
 # and a width of 256, Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of an additional state: hardly any process noise acts on it, and 0 would be invalid
@@ -34,7 +34,7 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
         if width := half_widths.get(name, half_widths.get(EVERY, 0.0)):
             if not value:
                 raise ValueError(
-                    f"the parameter {name} of {system.name} is 0, which has no relative range: leave it out, {name}=0"
+                    f"the parameter {name} of {system.name} is 0, which has no relative range: exclude it by {name}=0"
                 )
             ranges[name] = (value - width * abs(value), value + width * abs(value))
     return ranges
@@ -46,7 +46,7 @@ def nominal_share(ranges: Ranges) -> float:
 
 
 def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False) -> System:
-    """Return a system whose states are x, followed by some of its parameters with derivative zero.
+    """Return a system whose states are x, followed by some of its parameters, which stay constant.
 
     An observer of such a system estimates parameters; each motion has its own values. In training, a share of the
     motions has the system's own parameters, which are the likeliest; the parameters of the others lie more often near
@@ -154,5 +154,5 @@ def _with_constants(
 
 
 def blind(policy: Controller, nx: int) -> Controller:
-    """Return a policy for a system with additional states, which passes on only the first nx to ``policy``."""
+    """Return a policy that passes only the first nx states of an extended system on to ``policy``."""
     return lambda x: policy(x[:, :nx])

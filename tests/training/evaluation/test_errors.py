@@ -43,13 +43,13 @@ def test_process_noise_disturbs_the_motion_and_is_passed_to_the_observer(make_ar
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"n": 0}, "cannot simulate 0 trajectories"),
+        ({"n": 0}, "n must be positive and seed not negative, got n = 0 and seed = 0"),
         ({"duration": 0.0}, "duration must"),
         ({"domain": "3X"}, "domain must be one of X, 1.5X, 2X, got '3X'"),
         ({"process_noise": np.nan}, "process_noise must be a finite number, not negative, got nan"),
         (
             {"plant": get_system("lorenz")},
-            r"a plant of \(3, 1, 1\) states, inputs and outputs does not fit van_der_pol",
+            r"a plant with \(nx, nu, ny\) = \(3, 1, 1\) does not fit van_der_pol, which has \(2, 1, 1\)",
         ),
     ],
 )

@@ -192,7 +192,7 @@ def test_records_of_a_systems_signals(tmp_path):
     system, two = Oscillator(), np.stack([Y, Y], -1)
     with pytest.warns(UserWarning, match=r"b.npz: no column of inputs; they are assumed to be zero"):
         read_records([npz(tmp_path / "b.npz")], system=system)
-    with pytest.raises(ValueError, match=r"the measured columns are y1, y2, but \w+ has 1; name others by --measured"):
+    with pytest.raises(ValueError, match=r"the measured columns are y1, y2, but \w+ has 1; name other columns by"):
         read_records([npz(tmp_path / "b.npz", y=two)], system=system)
 
 

@@ -244,7 +244,7 @@ def test_environments_that_are_refused(pendulum, tmp_path):
     two = DummyVecEnv([partial(wrapped, "Pendulum-v1", pendulum)] * 2)
     two.envs[1] = wrapped("Pendulum-v1", tmp_path / "other.safetensors")
     for env, settings, told in (
-        (gym.make("Pendulum-v1"), {}, r"the environment has none: put KKLObservation"),
+        (gym.make("Pendulum-v1"), {}, r"the environment has none: wrap each environment"),
         (wrapped("Pendulum-v1", tmp_path / "plain.safetensors"), {}, "holds no settings of its training"),
         (hiding, {}, r"environment 0 has no 'x': KKLObservation gives the true obs\[2\] as 'x'"),
         (ActionRepeat(wrapped("Pendulum-v1", pendulum), 2), {}, "showed sample 4 after 2: put wrappers that skip"),

@@ -95,7 +95,7 @@ def test_signals_that_are_not_among_the_hidden_ones_cannot_be_tracked(tmp_path):
     new = resampled(swing(100), read.filter.dt)
     x_hat = KKLObserver(read).estimate(new.y, new.u)
     assert np.sqrt(np.mean((x_hat - new.x)[200:] ** 2)) < 0.2 * new.x.std()
-    with pytest.raises(ValueError, match=r"recorded states: speed from position and force, every 0.05 s.*environment"):
+    with pytest.raises(ValueError, match=r"estimates speed from position and force, sampled every 0.05 s.*environment"):
         read.check("spring", {}, dt=0.05, ny=1, nu=1)
 
 
@@ -219,7 +219,7 @@ def test_signals_that_stand_still_in_each_record():
     assert set(found) == {"speed"}
     kept = replace(SIGNALS, measured=("target",), hidden=("mass",))
     still = [replace(record, y=record.y[:, 1:], x=record.x[:, 1:], signals=kept) for record in records]
-    with pytest.raises(ValueError, match=r"run0\.csv: no signal moves, nor in any other record"):
+    with pytest.raises(ValueError, match=r"run0\.csv: no signal moves in this or any other record"):
         signal_rate(still)
 
 
