@@ -100,9 +100,11 @@ def check_equations(system: Any) -> None:
             found = f"something, but changed its argument, the {given}: write a = a + b in place of a += b"
             raise returned(equations, "a value and leave its arguments unchanged", found)
         rounding = 1e-6 * np.abs(alone).max(initial=0.0)
-        if batch.shape != alone.shape or not np.allclose(batch, alone, rtol=1e-3, atol=rounding):
+        differ = batch.shape != alone.shape or ~np.isclose(batch, alone, rtol=1e-3, atol=rounding).all(1)
+        if np.any(differ):
+            at = int(np.argmax(differ))
             wanted = "for each state of a batch the value that it returns for this state alone, at every call"
-            found = f"{batch[0].tolist()} in a batch and {alone[0].tolist()} alone; {held(starts[0])}"
+            found = f"{batch[at].tolist()} in a batch and {alone[at].tolist()} alone; {held(starts[at])}"
             fix = "sum, max and norm mix the states of a batch, so use arithmetic on components"
             raise returned(equations, wanted, f"{found}: {fix}")
     try:
