@@ -40,7 +40,7 @@ Advance = Callable[[Values, Values, Values, float], Values]
 
 # Longer programs, such as a neural network for f, would take many seconds to compile.
 MAX_OPERATIONS = 500
-_TRIALS = 200  # trial states of each kind, at which machine code is compared with Python
+_TRIALS = 200  # trial states of each kind in _trial_states, where machine code is compared with Python
 _MAX_TRIAL_SUBSTEPS = 64  # trial states that need more substeps are skipped, because Python is slow there
 _LANES = 32  # rows that are stepped together; they fill a few of the processor's vector registers
 # Largest number of kernels in the cache, which holds for each program its kernel, or the reason why it has none.
@@ -64,7 +64,7 @@ class SamplingStep(Generic[Values]):
 
 @dataclass(frozen=True)
 class Motion:
-    """A system's programs. If g is constant, x' = field(x) + push(u, w); otherwise, x' = field(x, u) + push(w).
+    """Programs of x' = field(x) + push(u, w) if g is constant, else of x' = field(x, u) + push(u, w) with push = w.
 
     ``rate`` is the program of the system's rate formula, None if it has no formula.
     """
@@ -95,7 +95,7 @@ def _shared(
     uncompiled: Callable[..., Values],
     log_line: str,
 ) -> SamplingStep[Values]:
-    """Return the step of a system; systems with the same programs share one compiled kernel."""
+    """Return the step of a system; systems of a class with the same programs share one compiled kernel."""
     plain = functools.partial(uncompiled, system)
     if system.discrete:
         return SamplingStep(plain, f"{system.name} is in discrete time and needs no integration")
@@ -153,7 +153,7 @@ def single_kernel(system: System, motion: Motion) -> Any:
     import numba
 
     if not (motion.field.exact and motion.push.exact):
-        raise ValueError("there is a power or a remainder, and only products are compiled: write x * x for x**2")
+        raise ValueError("there is a power or a remainder, which compilers round in another way: write x * x for x**2")
     nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
     x, u, w = ([f"{letter}{i}" for i in range(n)] for letter, n in (("x", nx), ("u", nu), ("w", nx)))
     lines = [
@@ -206,7 +206,7 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
 
 
 def batch_kernel(system: System, motion: Motion) -> Any:
-    """Compile the step of a batch: rows that need equally many substeps are stepped in groups."""
+    """Compile the step of a batch: rows are sorted by the substeps that they need, and stepped in groups."""
     import numba
 
     # Each row of a group is a lane. All components of all lanes lie in one array, at offsets that the compiler knows.
@@ -276,7 +276,7 @@ def _batch(system: System, kernel: Any) -> Advance[np.ndarray]:
     def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
         out = np.empty(x.shape)
         lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
-        # Rows that are NaN only after the step need substeps that follow the error.
+        # Rows that became NaN in this step need substeps whose length follows the error.
         if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):
             out[:, rows] = advance_batch(system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out

@@ -5,8 +5,8 @@ Plain arithmetic and comparisons already work on Python floats, NumPy arrays, to
 
     from kkl_gym.elementary import sin, where
 
-Arguments may mix numbers with arrays, tensors or expressions. For every type exp(1000) is inf, log(0) is -inf and
-sqrt(-1) is NaN, without a warning. ``docs/guides/your_system.md`` has a table of the functions.
+Arguments may mix numbers with arrays, tensors or expressions. On floats, arrays and tensors exp(1000) is inf, log(0) is
+-inf and sqrt(-1) is NaN, without a warning. ``docs/guides/your_system.md`` has a table of the functions.
 """
 
 import builtins

@@ -45,7 +45,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     0 the system is autonomous.
 
     **Observation.** float32: the true state x (``observe="state"``) or the noisy output y (``observe="output"``). x is
-    clipped to the system's declared bounds, y to the outputs that those bounds allow, widened by six standard
+    within the system's declared bounds. y is clipped to the outputs that these bounds allow, widened by six standard
     deviations of the noise. Where the ``sensor`` delivers no sample, the observation repeats the last y.
 
     **Info.** The same keys at reset and at steps. ``y`` is the noisy output, NaN where the ``sensor`` delivers no
@@ -220,7 +220,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         w, v = self._next_noise()
         x = self._advance(self._x, u, w, self.plant.dt)
         escaped = not self._inside(x)
-        # Substeps that were too coarse may also end outside the bounds, so that finer ones verify the escape.
+        # A step may also end outside the bounds because its substeps were too coarse. Finer ones verify the escape.
         if escaped:
             x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
             escaped = not self._inside(x)
@@ -289,7 +289,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     def _exchanged(self) -> None:
         self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
-        # The next reset adds _sample, which gives 0: a new system is compiled only after SOON samples of its own.
+        # The next reset adds _sample, so that only samples of the new system count towards SOON.
         self._samples = -self._sample
 
     def _input(self, action: np.ndarray) -> list[float]:

@@ -61,7 +61,7 @@ def _identity(spec: Any, env: Env) -> dict[str, Any]:
 
 
 def sampling_interval(env: Env) -> float:
-    """Return the seconds between samples of an environment: its attribute ``dt``, or 1 without this attribute."""
+    """Return the seconds between samples of an environment: its attribute ``dt``, or 1 without a valid one."""
     base: Any = env.unwrapped
     if _of_rows(base):
         dt = base.get_attr("dt")[0] if all(base.call("has_wrapper_attr", "dt")) else None

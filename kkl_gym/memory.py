@@ -32,16 +32,16 @@ class Memory:
     filter v' = (u - v) / tau itself, with u held between samples.
 
     The past before the first output is unknown. The memory assumes that y was constant until 64 steps before the first
-    output. From then on, y is assumed to have changed at its mean rate since the first output, as each filter weights
-    it. After k steps this assumption multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also assumes that
-    no input acted before the first output.
+    output, and from then to the first output changed at the weighted mean rate that each filter has seen since.
+    After k steps this assumption multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also assumes that no
+    input acted before the first output.
 
     Every w of a slow signal is nearly tau times the signal's rate, so that all w would carry the same information. The
     memory therefore returns combinations: first the w of the slowest filter, and of each faster filter the part of w
-    that the slower ones do not predict. These coordinates are uncorrelated and as large as y if y is an
-    Ornstein-Uhlenbeck process with a correlation time from twice the shortest time constant to eight times the longest.
-    In the long run they amplify white noise on y at most threefold. At first they rest on few samples and amplify noise
-    more: with the default time constants 22-fold in the first step, and fourfold in the fifth.
+    that the slower ones do not predict. These coordinates are uncorrelated and as large as y on average over
+    Ornstein-Uhlenbeck processes y with correlation times from twice the shortest time constant to eight times the
+    longest. In the long run they amplify white noise on y at most threefold. At first they rest on few samples and
+    amplify noise more: with the default time constants 22-fold in the first step, and fourfold in the fifth.
 
     If an angle is measured by its cosine and its sine, the memory filters the unwrapped angle itself. It assumes that
     the angle turns by less than half a turn from one sample to the next, and that it does not change where cosine and

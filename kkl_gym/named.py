@@ -49,7 +49,7 @@ def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str
         entries = _entries(name if function is None or name in there else function[2].strip(), space, there)
         if not entries or (function and len(entries) > 1):
             known = textwrap.shorten(", ".join(there), 200, placeholder=" ...") or "no numbers"
-            ask = "" if not entries else ": name one entry of it"
+            ask = "" if not entries else ": cos and sin take a single entry"
             raise ValueError(
                 f"{role} names {name!r}, but an observation of {source} holds {known}{ask}; an index stands for its "
                 "entry (2 for obs[2]), and info[KEY] for an entry of info"

@@ -68,7 +68,7 @@ class Plant:
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Draw w (NOISE_BLOCK, nx) and v (NOISE_BLOCK, nv), which :meth:`noise` scales."""
-        # A sensor draws from its own generator, so that a seed gives the same motions and noise without a sensor.
+        # A sensor draws from its own generator: a seed gives the same motions and noise with and without a sensor.
         n, ny = NOISE_BLOCK, self.ny
         w = rng.random((n, len(self._w_range)), out=w)
         if not self._random:

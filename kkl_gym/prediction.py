@@ -1,4 +1,4 @@
-"""A memory for noisy outputs: combinations of filters that predict later outputs, fitted on random steps."""
+"""A memory for noisy outputs: combinations of filters that predict later outputs, fitted under random actions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -19,7 +19,7 @@ class PredictiveMemory(Memory):
 
     The filters are those of :class:`Memory`, of all outputs and angles. Cosine and sine of an angle are filtered too,
     because a torque may depend on them. ``weights``, (features, width), multiply the features [signals, w, v, 1]. The
-    first columns give the expected change of each output or angle, the others the further predictions.
+    first columns give each output's or angle's expected change in a step, the other columns the further predictions.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class PredictiveMemory(Memory):
         """Fit the weights by least squares. Shapes: each episode (samples, features).
 
         Of the predictions beyond the next step, the fit keeps the linear combinations whose variance is well above that
-        of their errors, and scales them to unit variance.
+        of a fit to white noise, and scales them to unit variance.
         """
         horizons = sorted({1, 2, *np.ceil(self.time_constants).astype(int).tolist()})  # in steps
         last = horizons[-1]

@@ -31,7 +31,7 @@ class Trails:
         self.rows: list[deque[list[float]]] = [deque(maxlen=TRAIL) for _ in range(num_envs)]
 
     def add(self, states: np.ndarray, samples: np.ndarray) -> None:
-        """Append one state to each row's trail, (num_envs, nx); sample 0 begins a new trail."""
+        """Append the ``states`` (num_envs, nx), one to each row's trail; sample 0 begins a new trail."""
         for trail, state, sample in zip(self.rows, states.tolist(), samples.tolist(), strict=True):
             if sample == 0:
                 trail.clear()

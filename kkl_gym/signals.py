@@ -78,7 +78,7 @@ class Outputs:
             raise ValueError(f"angles must be among the measured entries, {self.measured}, got {self.angles}")
         plain = [i for angle in at if len(angle) == 1 for i in angle[0]]
         if period is not None and not plain:
-            raise ValueError(f"period = {period:g} has no effect: no entry of angles is an angle itself")
+            raise ValueError(f"period = {period:g} has no effect: angles names only pairs, or no entry")
         units = {i: TURN / (self.period or self._period_of(low[i], high[i], self._names[i])) for i in plain}
         self._take = np.repeat(taken, [1 + (i in units) for i in taken])
         self._whole = self._take.tolist() == list(range(len(owners)))

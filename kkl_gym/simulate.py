@@ -2,7 +2,7 @@
 
 The system's own ``rate(x)``, or else an estimate of the error, sets the number of substeps. Single states on Python
 floats (:func:`advance`) and batches on arrays (:func:`advance_batch`) agree to rounding, 1e-13 of the state in each
-step.
+step. Where equal substeps are not accurate enough, substeps whose length follows the error replace them.
 """
 
 import functools
@@ -23,16 +23,16 @@ RATE_STEP = 0.4
 # This is a millionth less than 1 / RATE_STEP. Without this margin, two rates that differ only by rounding could get
 # different numbers of substeps where rate * dt / RATE_STEP is a power of two.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
-# Largest accepted estimates of a substep's error, in half-widths of X; errors are a thousand times smaller. TOLERANCE
-# is for systems without a rate formula. With it, stiff systems, and the shipped ones without their formulas, also keep
-# the error below 1e-5. ROUGH is for systems with a rate formula, and detects where the formula fails, as at an
-# ignition. It is a hundred times the largest estimate of the shipped systems.
+# Largest accepted estimates of a substep's error, in half-widths of X; the true errors are a thousand times smaller.
+# TOLERANCE is for systems without a rate formula. With it, stiff systems, and the shipped ones without their formulas,
+# also keep the error below 1e-5. ROUGH is for systems with a rate formula, and detects where the formula fails, as at
+# an ignition. It is a hundred times the largest estimate of the shipped systems.
 TOLERANCE, ROUGH = 3e-6, 0.1
 # Number of attempts with equal substeps. After them, or beyond MOST_EQUAL substeps, the step length follows the error.
 ATTEMPTS = 3
 MOST_EQUAL = 1 << 10
 MAX_SUBSTEPS = 1 << 16
-REPORTED = 50  # sampling intervals between two reports
+REPORTED = 50  # sampling intervals between two calls of ``report`` by :func:`simulate`
 
 # Butcher's explicit sixth-order method with seven stages (J. C. Butcher, Numerical Methods for Ordinary Differential
 # Equations, sec. 31). A method of order four needs four times as many evaluations for the same error on Lorenz.
@@ -169,7 +169,7 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
-    """Return the state after an interval by substeps whose length follows the error; ``end`` if x leaves the bounds."""
+    """Return the state after an interval by substeps whose length follows the error; ``end`` if x escapes or is NaN."""
     # Motions that accelerate, as at an ignition, need such substeps. They also verify an escape, because equal substeps
     # that were too long at the end of the interval may have left the bounds only by their error.
     if system.discrete:

@@ -152,7 +152,7 @@ class System:
         """
         try:
             rate = self.typical_rate
-        except ValueError:  # the rate is 0, as for an integrator, and any interval suits
+        except ValueError:  # the rate is 0, as for an integrator, which any interval suits, or it cannot be computed
             return DT
         (least, slow), (most, fast) = SHORT_STEP, LONG_STEP
         if least <= rate * DT <= most:
@@ -190,7 +190,7 @@ class System:
 
     @functools.cached_property
     def typical_rate(self) -> float:
-        """Median rate of f(x) + g(x) u, in 1/s, over a thousand starts under the largest input; ValueError if 0."""
+        """Median rate of f(x) + g(x) u, in 1/s, over 1,000 starts at the largest input; ValueError if 0 or infinite."""
         return typical_rate(self, _starts(self))
 
     def f(self, x: Components) -> Components:

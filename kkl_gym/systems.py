@@ -158,7 +158,7 @@ class Lorenz(System):
     sigma : float
         Prandtl number.
     rho : float
-        Rayleigh number over its critical value.
+        Ratio of the Rayleigh number to its critical value.
     beta : float
         Geometric factor of the convection cells.
     """

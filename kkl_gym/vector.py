@@ -112,7 +112,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._w, self._v = (np.empty((NOISE_BLOCK, width, num_envs)) for width in (nx, self.plant.nv))
         self._used = np.full(num_envs, NOISE_BLOCK)
         self._everyone = np.arange(num_envs)
-        self._x = np.full((nx, num_envs), np.nan)  # component first, like all arrays inside
+        self._x = np.full((nx, num_envs), np.nan)  # components before rows, as in all arrays of this class
         self._y = self._held = np.full((ny, num_envs), np.nan)
         self._sample = np.zeros(num_envs, dtype=np.int64)
         self._escaped, self._terminated, self._truncated = np.zeros((3, num_envs), dtype=bool)
@@ -125,7 +125,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
     @property
     def compiled(self) -> bool:
-        """Whether steps run as compiled code (extra ``fast``). If not, the logger ``kkl_gym`` reports why."""
+        """Whether steps are compiled (extra ``fast``). If f is integrated, the logger ``kkl_gym`` reports why not."""
         return self._advance.obstacle is None
 
     def reset(
@@ -296,7 +296,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
         escaped = self._outside(x)
-        # Substeps that were too coarse may also end outside the bounds, so that finer ones verify the escape.
+        # A step may also end outside the bounds because its substeps were too coarse. Finer ones verify the escape.
         if escaped.any():
             x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(escaped))
             escaped = self._outside(x)

@@ -97,8 +97,8 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     on, it assumes that y changed in the 64 steps before the reset at the mean rate that it has had since the reset.
     ``info`` is unchanged.
 
-    A Dict stays a Dict with the same keys; the new key ``"memory"`` holds the memory, and the cosine and sine of
-    angles. Images are not remembered.
+    Unless ``measured`` holds indices, a Dict stays a Dict of its measured keys; the new key ``"memory"`` holds the
+    memory, and the cosine and sine of angles. Images are not remembered.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._flat = np.empty(0)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and the memory. Returns the measured entries, with the memory of constant outputs."""
+        """Reset the environment and the memory. Returns the first observation, as if y had been constant before."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._flat = self._of.read(obs)
         return self._of.show(obs, self._flat, self._of.memory.reset(self._of.outputs.of_flat(self._flat))), info

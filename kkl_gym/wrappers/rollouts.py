@@ -126,7 +126,7 @@ class Samples:
             return {}
         try:
             return {"x": self.hidden(observation, info, batch)}
-        # A wrapper inside replaces them by NaN, or ``info`` lacks them at this step.
+        # A wrapper inside replaces hidden signals by NaN, or ``info`` lacks them at this step.
         except ValueError:
             return {}
 
@@ -152,7 +152,7 @@ def _check_actions(env: Any, space: gym.Space[Any]) -> None:
 
 
 def _bounds(artifact: Artifact, space: gym.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds of the hidden signals in the observation space; infinite for signals outside it."""
+    """Return bounds of the hidden signals: the observation space's, -1 and 1 for cos and sin, else infinite."""
     low, high = np.full(artifact.nx, -np.inf), np.full(artifact.nx, np.inf)
     there = observed(space)
     for i, name in enumerate((artifact.signals or {})["hidden"]):

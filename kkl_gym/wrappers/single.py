@@ -82,8 +82,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         [z_y, z_u].
     measurement_noise : float or sequence of float, length ny, optional
         The noise level that the observer assumes, one for all outputs or one for each. None takes the level of a
-        :class:`KKLEnv`, and no level around other environments. Maps that need a level of process noise always take the
-        environment's.
+        :class:`KKLEnv`, and 0 around other environments. Maps that need a level of process noise always take the level
+        of the :class:`KKLEnv`.
     ignore_input : bool
         Whether to use a map without inputs, such as the paper's, although the agent acts.
     monitor : bool
@@ -113,8 +113,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         the agent acts on a map without inputs and ``ignore_input`` is false, or if a wrapper inside skips samples. At a
         reset or step, if a wrapper inside changes observations: the observer would not see the change.
     observers.ArtifactError
-        If the file is missing or damaged, or was made for another system, other parameters or another dt. If it lacks
-        the forward map or motion for ``known_start``, or the covariance for ``uncertainty``. It is a ValueError.
+        A ValueError for a file that is missing or damaged, was made for another system, other parameters or another dt,
+        or lacks the forward map or motion for ``known_start``, or the covariance for ``uncertainty``.
 
     Examples
     --------

@@ -43,7 +43,7 @@ class VectorEstimate(VectorWrapper):
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._sample = np.zeros(env.num_envs, dtype=np.int64)
         self.emitted = b""  # the last observations, as in KKLVectorEnv
-        # The environment or observer that emits the observations; None for a Sync or Async vector.
+        # The environment or observer that emits the observations; None for other vectors, and with rollout observers.
         self._inside: Any = None if isinstance(env, _SignalsInInfo) else env
         while self._inside is not None and not isinstance(self._inside, KKLVectorEnv | VectorEstimate):
             self._inside = getattr(self._inside, "env", None)
@@ -85,7 +85,7 @@ class VectorEstimate(VectorWrapper):
         disabled = self.autoreset_mode is AutoresetMode.DISABLED
         expected = self._sample + 1
         over = bool(before.any())
-        if over:  # these rows were reset in this step, or stay at their end
+        if over:  # the rows ``before`` were reset in this step, or stay at their end
             expected[before] = self._sample[before] if disabled else 0
         self._check(expected, info["sample"], before)
         if over and disabled:
@@ -124,8 +124,8 @@ class VectorEstimate(VectorWrapper):
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw the phase portrait of each row with states and estimates so far.
 
-        Estimates are drawn around a :class:`kkl_gym.KKLVectorEnv`, if the observers report ``x_hat``. For Sync and
-        Async vectors put :class:`kkl_gym.KKLObservation` into each environment.
+        Estimates are drawn only if the vector inside is a :class:`kkl_gym.KKLVectorEnv` and the observers report
+        ``x_hat``. For Sync and Async vectors put :class:`kkl_gym.KKLObservation` into each environment.
         """
         env: Any = self.env
         return env.render() if self._trails is None else env.unwrapped.draw(self._trails)
@@ -425,7 +425,7 @@ def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
 
 
 def plant_of(env: VectorEnv, *also: str) -> Plant:
-    """Return the plant that all rows of a vector environment share; ValueError if they differ in it or in ``also``."""
+    """Return the first row's plant; ValueError if rows differ in system, dt, measurement noise, or ``also``."""
     base: Any = env.unwrapped if isinstance(env, gym.vector.VectorEnv) else env
     if isinstance(base, KKLVectorEnv):
         return base.plant

@@ -197,7 +197,7 @@ def test_the_period_of_angles_follows_from_the_bounds_or_is_given():
             dial(high, low)
     with pytest.raises(ValueError, match="period must be the positive length of a turn, such as 360, got -1"):
         dial(period=-1)
-    with pytest.raises(ValueError, match="period = 360 has no effect: no entry of angles is an angle"):
+    with pytest.raises(ValueError, match="period = 360 has no effect: angles names only pairs, or no entry"):
         KKLMemory(gym.make("Pendulum-v1"), angles=[(0, 1)], period=360)
 
 
