@@ -15,10 +15,10 @@ demo: $(VENV)/ready  ## run the four environments with their shipped observers
 install: $(VENV)/ready  ## make the virtual environment .venv with the package, all extras and the tools
 
 # Two processes of one thread each: more threads would compete for the cores.
-test: $(VENV)/ready $(if $(AREA),,lint)  ## lint, then all tests; AREA=training/maps runs tests/training/maps alone, without lint
+test: $(VENV)/ready $(if $(AREA),,lint)  ## lint, then all tests without a target of their own; AREA=training/maps runs tests/training/maps alone, without lint
 	$(if $(AREA),$(BIN)/pytest tests/$(AREA),OMP_NUM_THREADS=1 $(BIN)/pytest -n 2)
 
-test-coverage: $(VENV)/ready  ## all tests, and a report in htmlcov of the lines that they run; takes a quarter longer
+test-coverage: $(VENV)/ready  ## the same tests, and a report in htmlcov of the lines that they run; takes a quarter longer
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --cov --cov-report=html
 
 guard: $(VENV)/ready  ## compare estimates, dynamics, names, held-out errors and short trainings with stored ones; two minutes
@@ -130,7 +130,7 @@ kinds: $(VENV)/ready  ## agents in five kinds of partial observability, an hour 
 speed: $(VENV)/ready  ## the speed of environments, beside Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/python -m examples.research speed
 
-# RLlib pins a version of Gymnasium, and Tianshou one of a package that tyro needs: each has a virtual environment.
+# RLlib pins Gymnasium's version, and Tianshou the version of a package that tyro needs: each has a virtual environment.
 CLIENTS_zoo := --editable ".[agents]" rl-zoo3 torchrl "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
 CLIENTS_rllib := --editable . "distributed>=2025.1" "ray[rllib]>=2.40" "torch<2.14" tyro
 CLIENTS_tianshou := --editable . "tianshou[eval]>=2" "torch<2.14"

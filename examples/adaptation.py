@@ -68,7 +68,7 @@ def main(
         seed: seed of the records.
         out: folder of the runs.
         inverse_steps: batches of both trainings; by default as many as for the shipped observer.
-        trajectories: simulated trajectories of both trainings, with the same default.
+        trajectories: simulated trajectories of both trainings; by default as many as for the shipped observer.
     """
     console, model = Console(), get_system(system)
     plant = model.replace({name: WRONG * value for name, value in model.parameters.items()})

@@ -76,7 +76,7 @@ def exploring(policy: Callable, env: gym.Env, seed: int) -> Callable:
 
 
 def under_noise(env_id: str, artifact: Artifact | None, noise: float, seed: int, episodes: int = 20) -> float:
-    """Let the policy act on an observer's estimates, or else on the true signals; returns the mean return."""
+    """Let the policy act on an observer's estimates, or, without an observer, on the truth; return the mean return."""
     measured, _, policy = CASES[env_id]
     returns, apart = list[float](), list[np.ndarray]()
     env: gym.Env = MeasurementNoise(make(env_id), measured, noise)
@@ -112,7 +112,7 @@ def main(
     noise: float = 0.0,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Learn an observer for an environment; returns its errors on held-out rollouts.
+    """Learn an observer for an environment; returns its largest held-out errors and, under noise, mean returns.
 
     Args:
         env_id: one of Pendulum-v1, CartPole-v1, MountainCarContinuous-v0 and, with MuJoCo, InvertedDoublePendulum-v5.
@@ -151,10 +151,10 @@ def main(
         records = [record for record in rollouts.records() if len(record.t) > AFTER + 1]
         errors = recorded_errors(artifact, records, AFTER * artifact.filter.dt)
         shown = ", ".join(f"{name} {error:.2%}" for name, error in errors.items())
-        print(f"held-out rollouts, {label}: rms error over standard deviation, after {AFTER} steps: {shown}")
+        print(f"held-out rollouts, {label}: rms errors in % of standard deviations, after {AFTER} steps: {shown}")
         found[label] = max(errors.values())
     if noise:
-        print(f"noise {noise:g}: mean return where the controller acts on")
+        print(f"noise {noise:g}: mean return of the policy if it acts on")
         for label, observer in (
             ("tracked", artifact),
             ("T_inv alone", replace(artifact, motion=None)),

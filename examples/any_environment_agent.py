@@ -76,7 +76,7 @@ def main(
     """Train the agents; returns for each way the larger error of the two hidden signals in the agent's episodes.
 
     Args:
-        observer_steps: steps from which the first observer is learned, random ones or those of a trained agent.
+        observer_steps: steps from which the first observer is learned: random steps, or steps of a trained agent.
         members: number of networks of the first observer, whose outputs are averaged.
         timesteps: further steps, in which the agents learn.
         every: steps between refits; also the number of steps that the third agent learns on estimates.

@@ -38,7 +38,7 @@ class CartPole(kkl_gym.System):
     measurement_noise: ClassVar = 0.02  # m and rad
 
     def _terms(self, x):
-        """Return the total mass, the pole's moment, and the denominator of both accelerations."""
+        """Return the total mass, the pole's mass times half-length, and the denominator of the angular acceleration."""
         mass, moment = self.cart + self.pole, self.pole * self.length
         return mass, moment, self.length * (4.0 / 3.0 - self.pole * cos(x[2]) ** 2 / mass)
 

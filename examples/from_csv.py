@@ -23,7 +23,7 @@ from training.records import read_records
 MU = 3.3  # the plant's parameter; the model begins with GUESS
 GUESS, LIMITS = 2.0, (0.2, 20.0)
 NOISE = 0.1
-STARTS = ((-3.0, 3.0), (-6.0, 6.0))  # from these starts the controller's bounded input is strong enough
+STARTS = ((-3.0, 3.0), (-6.0, 6.0))  # from these starts the controller's bounded input can stabilise the plant
 
 Policy = Callable[[np.ndarray, dict[str, np.ndarray]], np.ndarray]
 """Maps the state and the info of an environment to an action."""
@@ -100,7 +100,7 @@ def main(
     observer = observers.load(str(out / "van_der_pol.safetensors"), NOISE)
 
     def on_estimate(x: np.ndarray, info: dict[str, np.ndarray]) -> np.ndarray:
-        """Act on the observer's estimate from samples and inputs, as beside a real plant."""
+        """Act on the observer's estimate, which needs only the samples and inputs that a real plant shows."""
         x_hat = observer.reset(info["y"]) if info["sample"] == 0 else observer.step(info["y"], info["u"])
         return act(x_hat[None])[0]
 

@@ -1,6 +1,6 @@
 """Identify parameters and train an observer from outputs only, and compare them with the simulated plant.
 
-The records hold only t and y. First guesses of the parameters are 30 to 50 % off::
+The records hold only t and y. First guesses of the parameters are 25 to 50 % off::
 
     python examples/identification.py lorenz --noise 0.5
 

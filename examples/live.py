@@ -19,9 +19,9 @@ from training.evaluation.faults import BIAS, FAULTS, Fault
 from training.evaluation.levels import Level
 from training.figures import ALARM, ESTIMATE, MEASURED, TRUTH, style
 
-SECONDS = 12.0  # length of the time axis, in units of the system's pace
+SECONDS = 12.0  # longest time axis, in multiples of System.pace
 FRAME = 0.04  # seconds between frames
-# Most samples that a frame advances. If a window is too slow for this, the motion falls behind real time.
+# Largest number of samples that a frame advances. Where more are due, the motion falls behind real time.
 MOST = 100
 KEYS = "space: pause   n: new start   left, right: input   up, down: noise   f: next fault"
 
@@ -59,8 +59,8 @@ class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
 class Live:
     """An environment with its observer, on a figure that is redrawn continuously.
 
-    ``clock`` is the time that a sample takes in the window, in seconds; ``history`` holds x, x_hat, y and score of the
-    samples in the drawing.
+    ``clock`` is the time that a sample takes in the window, in seconds; ``history`` holds x, x_hat, y and the
+    monitor's score for each sample in the drawing.
     """
 
     def __init__(self, figure: Any, environment: Shown, measurement_noise: Level | None, *, seed: int) -> None:
@@ -93,7 +93,7 @@ class Live:
         self._remember(info)
 
     def advance(self, samples: int) -> None:
-        """Advance by some samples; a motion that leaves the system's bounds restarts."""
+        """Advance by some samples; after a termination, a new motion begins."""
         for _ in range(samples):
             _, _, terminated, _, info = self.env.step(self._action)
             self._remember(info)
@@ -205,7 +205,7 @@ def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> A
     if backend.lower() not in windows:
         raise ValueError(
             f"this needs a window, and matplotlib's backend here is {backend!r}: run it where there is a display, "
-            "with tkinter or PyQt installed; MPLBACKEND must not name another backend"
+            "with tkinter or PyQt installed; MPLBACKEND must not name a backend without windows"
         )
     with style():
         figure: Any = plt.figure(figsize=(12, 7.5), layout="none")

@@ -5,7 +5,7 @@ The same from the command line::
     kkl-gym train examples/own_system.py:Pendulum
     kkl-gym evaluate runs/pendulum/pendulum.safetensors --system examples/own_system.py:Pendulum
 
-docs/guides/your_system.md has the other commands, and registers an environment id.
+docs/guides/your_system.md has the other commands, and shows how to register an environment id.
 """
 
 from dataclasses import dataclass

@@ -6,10 +6,10 @@ finite differences, which a control engineer would try first::
 
     python examples/qube.py PATH
 
-PATH is a folder with run01.csv to run12.csv, whose columns are alpha, theta (rad), alpha_dot, theta_dot (rad/s) and
-time (s): the twelve free runs that come with Buisson-Fenet, Bahr, Morgenthaler, Di Meglio, "Towards gain tuning for
-numerical KKL observers" (2023), repository Centre-automatique-et-systemes/learn_observe_KKL, MIT licence.
-docs/results/qube.md has the results.
+PATH is a folder with run01.csv to run12.csv, whose columns are alpha (pendulum, rad), theta (arm, rad), alpha_dot,
+theta_dot (rad/s) and time (s): the twelve runs without motor input of Buisson-Fenet, Bahr, Morgenthaler, Di Meglio,
+"Towards gain tuning for numerical KKL observers" (2023), repository
+Centre-automatique-et-systemes/learn_observe_KKL, MIT licence. docs/results/qube.md has the results.
 
 Two facts about the device are used besides the records. Left and right are symmetric, so the observer learns from each
 run twice: as recorded, and mirrored, with the signs of both angles changed. No angle of the arm is special, so the map
@@ -52,10 +52,10 @@ from training.records import Record, Signals, read_records, resampled
 from training.sources.recorded import RecordedSource, recorded_preset
 
 SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))
-MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # factors of these signals in the mirror image
+MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # factors of the hidden signals in the mirror image
 TRAINING, HELD_OUT = (1, 2, 4, 5, 7, 8, 10, 11), (3, 6, 9, 12)
-# Training runs with large and with small swings. --cross-validate holds out each half in turn, because the test runs
-# swing less than any training run.
+# Training runs with large and with small swings. --cross-validate holds out each half in turn to test extrapolation to
+# other swings, because the test runs swing less than any training run.
 FOLDS = ((1, 4, 7, 10), (2, 5, 8, 11))
 DT = 0.004  # s, the device's sampling interval
 TRANSIENT = 1.0  # s; errors before this time of each run do not count
@@ -92,7 +92,7 @@ DIFFERENCES = "finite differences"
 GUIDED = "Kalman filter, fitted model with an arm that sticks, started by the second KKL"
 # Line styles and colours of the estimators in the figure, in the order of the table.
 LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", ESTIMATE), ("-", RIVAL), ("-", TARGET)
-# The figure shows the first 4 s of each run, with errors averaged over 125 samples.
+# The figure shows the first 4 s of each run, with root mean square errors over windows of 125 samples.
 SHOWN, AVERAGED = 4.0, 125
 # The equations are fitted to windows of 125 samples, from the first 9 s of each run; afterwards the pendulum rests.
 WINDOW, FITTED = 125, 9.0
@@ -170,7 +170,7 @@ def read(path: Path, runs: Sequence[int]) -> list[Record]:
 
 
 def fitted(records: Sequence[Record], model: BothAngles | None = None) -> BothAngles:
-    """Fit the device's model to windows of the records: WINDOW samples, or LONGER for a model that is given."""
+    """Fit the device's model to windows of the records, of WINDOW samples, or of LONGER samples if a model is given."""
     model, window, noise = (
         (BothAngles(), WINDOW, None) if model is None else (model, LONGER, (ENCODER / 2, ENCODER / 2))
     )
@@ -283,8 +283,8 @@ def recorded_signals(angles: np.ndarray, records: Sequence[Record]) -> list[np.n
 def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
     """Return estimates of an extended Kalman filter, whose noise covariances were chosen on the training runs.
 
-    It starts with a hanging pendulum at rest. The standard deviations are 1.8 rad for the angle of the pendulum, and 4
-    and 12 rad/s for the rates of arm and pendulum.
+    It starts with a hanging pendulum at rest. The initial standard deviations of arm and pendulum are 1 and 1.8 rad for
+    their angles, and 4 and 12 rad/s for their rates.
     """
     y = padded([record.y for record in records])
     kalman_filter = ExtendedKalmanFilter(

@@ -86,7 +86,7 @@ class Sticking(BothAngles):
     name: ClassVar[str] = "qube-sticking"
 
     def rate(self, x):
-        """A rate that gives two substeps for each sample, which keep the method stable while the arm sticks."""
+        """A rate that gives two substeps for each sample, which keep the integration stable while the arm sticks."""
         return 150.0 + 0.0 * x[0]
 
 

@@ -64,7 +64,7 @@ def main(
     runners: int = 2,
     seed: int = 0,
 ) -> tuple[int, float]:
-    """Train for a while; returns the number of actions and the mean reward of the last episodes.
+    """Train for a while; returns the number of actions and the mean return of the last episodes.
 
     Args:
         algorithm: the algorithm to train.

@@ -32,7 +32,7 @@ SAMPLES = 131_072
 FREE = 50
 # Samples of the first three quarters of the multisine, and of its last quarter.
 TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)
-# Samples of the arrow, and of its part within the range of the training's outputs.
+# Samples of the arrow (noise of growing amplitude), and of its part within the range of the training's outputs.
 ARROW, ARROW_INSIDE = (100, 40_575), (100, 32_100)
 # Number and length of the records that are taken from the training part; one is held out, to test predictions.
 RECORDS, LENGTH = 8, 2_048
@@ -64,12 +64,12 @@ class Silverbox(kkl_gym.System):
     cube: float = 4e5  # 1/(V^2 s^2)
     offset: float = 0.0  # V/s^2
     gain: float = 1.2e5  # 1/s^2
-    before: float = 0.0  # weights of the neighbouring samples; the sample itself has the rest of 1
+    before: float = 0.0  # weights of neighbouring samples; the sample's own is 1 - before - after
     after: float = 0.0
 
     name: ClassVar[str] = "silverbox"
     state_names: ClassVar = ("position in V", "velocity in V/s")
-    X: ClassVar = ((-0.3, 0.3), (-130.0, 130.0))  # the range of the outputs and their differences
+    X: ClassVar = ((-0.3, 0.3), (-130.0, 130.0))  # ranges of the outputs and of their difference quotients
     bounds: ClassVar = ((-3.0, 3.0), (-1300.0, 1300.0))
     u_max: ClassVar = (0.15, 0.15, 0.15)  # V
     dt: ClassVar[float] = DT

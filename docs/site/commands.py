@@ -45,7 +45,7 @@ trajectories = 2000
 Some defaults depend on `--preset`, `--pipeline` or `--data`: "fast 20, paper 512" is 20 for `--preset fast` and 512 for
 `--preset paper`. Parentheses list the systems with their own value.
 """
-OF_OPTIONS = ("pipeline", "policy")  # settings that are options only
+OF_OPTIONS = ("pipeline", "policy")  # settings that only options of their own can set
 DEFAULT = re.compile(r"\s*\((?:default: (.*)|(required|optional|sets: .*))\)\s*$", re.DOTALL)
 SHOWN = 3  # longest tuple whose numbers the table lists
 

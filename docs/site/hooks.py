@@ -26,7 +26,7 @@ SHOWN: Mapping[str, str] = {
     "CHANGELOG.md": "development/changes.md",
     **{f"examples/notebooks/{path.name}": f"notebooks/{path.stem}.md" for path in NOTEBOOKS},
 }
-WIDE = 1.5  # width over height, from which pictures scroll on phones
+WIDE = 1.5  # ratio of width to height above which pictures scroll on phones
 ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>~?")  # Sphinx roles in docstrings
 FETCHED = re.compile(r'<(?:script|link|img)[^>]+(?:src|href)="?(https?://[^" >]+)')
 # Blocks and spans of code, which contain no links; then the target of a link or an image.
@@ -134,9 +134,9 @@ def typeset(html: str) -> str:
 
 
 def themed(markdown: str, folder: Path) -> str:
-    """A page in which ``NAME-dark.png`` follows ``NAME.png``, if both files exist in the folder of the page.
+    """A page in which ``NAME-dark.png`` follows ``NAME.png`` wherever ``folder`` has the dark file.
 
-    Browsers load and show the one that suits the background.
+    Browsers load and show the file that suits the background.
     """
 
     def twice(found: re.Match[str]) -> str:

@@ -1,4 +1,4 @@
-"""``python -m examples.research``: its commands, on the command line of ``kkl-gym``."""
+"""The commands of ``python -m examples.research``, run by the same main function as those of ``kkl-gym``."""
 
 from training.cli import main
 

@@ -1,8 +1,8 @@
 """Draw the figures of the pages, on a light and on a dark background: ``make figures``.
 
 The data are files in docs/results, or simulations that take seconds. The commands draw with the same functions. Each
-figure and animation is written twice, as NAME.png and NAME-dark.png; docs/site/hooks.py shows the one of the reader's
-theme.
+figure and animation is written twice, as NAME and NAME-dark; docs/site/hooks.py shows the file of the reader's theme.
+
 ``python -m examples.research.figures figures/portraits.gif`` draws a single figure.
 
 docs/figures/qube.png is not drawn here and has only a light version: it needs a training (examples/qube.py) and records
@@ -51,14 +51,14 @@ RESULTS = DOCS / "results"
 Draw = Callable[[Path], object]
 COLOURS = 256  # colours in a picture; so few reduce its size to a third
 SEED = 7  # seed of the animations
-DT = 0.01  # s, of the shipped systems
+DT = 0.01  # s, sampling interval of the shipped systems
 EKF = "EKF with the exact equations"
 RIVALS = {"ekf": "tuned EKF", "ukf": "tuned UKF", "gru": "GRU"}  # methods in the figure of noise levels
 BAND = 0.9  # share of errors within a band
 THRESHOLDS = (0.5, 100.0)  # range of scores in the figure of faults
 LEVELS = (0.0, 0.5)  # measurement noise in the figure of errors over time
-SMALLEST = 0.01  # lower end of the error axis in %, under noise, in the same figure
-QUANTILES = (0.1, 0.5, 0.9)  # quantiles over runs in the same figure
+SMALLEST = 0.01  # lower end of the error axis in %, under noise, in the figure of errors over time
+QUANTILES = (0.1, 0.5, 0.9)  # quantiles over runs in the figure of errors over time
 AGENTS = {"the agent sees the noisy output y": "van_der_pol-y", "the agent sees the estimate": "van_der_pol"}
 FIRST = 1.0  # s at the start, in which bands may exceed their panels
 # Colours of docs/figures/kkl.svg, and their replacements on a dark background.
@@ -173,7 +173,7 @@ def errors_of_runs(
 ) -> dict[str, list[np.ndarray]]:
     """Return errors in % by system, (steps, n) for the default map and for an EKF, in runs of ``kkl-gym evaluate``.
 
-    The runs start in X. The tables of the pages contain the means of these errors.
+    The runs start in X. A run's SMAPE, of which the pages' tables contain medians, is the mean of its errors here.
     """
     errors = {}
     for name, kind in SYSTEMS.items():

@@ -1,7 +1,7 @@
 """What must not change while the code does: estimates, errors, trainings, dynamics, names.
 
 ``python tests/guard/guard.py`` measures all of it and compares it with the files beside this one; ``make test`` does so
-for the parts that take seconds. A change that means to move digits renews a part in a commit of its own, which says
+for the parts that take seconds. If a change is meant to move digits, renew the part in a commit of its own, which says
 why: ``python tests/guard/guard.py --renew estimates``.
 """
 
@@ -26,16 +26,16 @@ SYSTEMS = tuple(sorted(kkl_gym.SYSTEMS))
 VARIANTS = ("", "-large", "-spinn")
 NOISE = 0.5
 DT = 0.01
-EVERY = 40  # samples from one estimate that is kept to the next
+EVERY = 40  # number of samples between two stored estimates
 # Estimates come from networks of float32, whose rounding differs between processors: 1e-5 of the widths of X.
 # Equations are in float64, and these runs are short enough for chaos not to matter.
 CLOSE = {"estimates": 1e-5, "dynamics": 1e-9}
-SAME_ERROR = 0.02  # medians of held-out errors, relative: chaos amplifies the rounding of another processor
+SAME_ERROR = 0.02  # relative tolerance of medians of errors: chaos amplifies the rounding of other processors
 SHORT_TRAINING, LUCKY = 1.15, 3.0  # a short training may err by these factors more, or less
 
 
 def records(system):
-    """Outputs and inputs of four kinds of motion from starts in X, of which some stay hidden from training."""
+    """Outputs and inputs of four kinds of motion from starts in X: clean, noisy, driven, and with missing samples."""
     from kkl_gym.simulate import simulate
 
     rng = np.random.default_rng(20_000)
@@ -68,7 +68,7 @@ def follow(observer, y, u):
 
 
 def estimates():
-    """Estimates and covariances of every map that ships, on the records that are kept beside them."""
+    """Estimates and covariances of every map that ships, on the records in records.npz."""
     path = FOLDER / "records.npz"
     held = dict(np.load(path)) if path.exists() else {}
     if new := [name for name in SYSTEMS if f"{name}/clean/y" not in held]:
@@ -157,7 +157,7 @@ def names():
 
 
 def errors():
-    """Medians of held-out errors in %, of every map that ships: all steps of 20 s, from starts in X and in 2X."""
+    """Medians of held-out errors in % over 20 s, of every map that ships: starts in X and 2X, inputs, process noise."""
     from training import errors, unseen_trajectories
 
     cases = {
@@ -173,7 +173,7 @@ def errors():
             unseen = unseen_trajectories(system, DT, n=40, duration=20.0, seed=11, **motions)
             for variant in VARIANTS:
                 artifact = observers.load(name + variant).artifact
-                if variant == "-large":  # T_inv that stands alone
+                if variant == "-large":  # T_inv alone, without a model
                     artifact = dataclasses.replace(artifact, motion=None)
                 if case == "driven" and not artifact.nu:
                     continue
@@ -185,7 +185,7 @@ def errors():
 
 
 def trainings():
-    """Held-out errors of short trainings: from equations by both ways, from records, from rollouts."""
+    """Held-out errors of short trainings: from equations by both pipelines, from records, from rollouts."""
     import training
     from training.cli import main
 
@@ -235,7 +235,7 @@ def oscillator(path, seed):
 
 
 def relative(estimate, truth):
-    """Root of the mean squared error over the standard deviation of the truth."""
+    """Root mean square error, divided by the standard deviation of the truth."""
     return float(np.sqrt(np.mean((estimate - truth) ** 2)) / np.std(truth))
 
 
@@ -244,11 +244,11 @@ SLOW = {"errors": errors, "trainings": trainings}
 
 
 def differences(part):
-    """Measure a part, and say what differs from what is kept; a list of lines, empty where all is as before."""
+    """Measure a part; return a line for each difference from the stored values."""
     found = (QUICK | SLOW)[part]()
     if part in CLOSE:
         kept = dict(np.load(FOLDER / f"{part}.npz"))
-        lines = [f"{part}: {key} is only on one side" for key in sorted(kept.keys() ^ found.keys())]
+        lines = [f"{part}: {key} is either not stored or not measured" for key in sorted(kept.keys() ^ found.keys())]
         for key in kept.keys() & found.keys():
             if kept[key].shape != found[key].shape:
                 lines.append(f"{part}: {key} has the shape {found[key].shape}, not {kept[key].shape}")
@@ -256,7 +256,7 @@ def differences(part):
                 lines.append(f"{part}: {key} is off by {np.nanmax(np.abs(found[key] - kept[key])):.2g}")
         return lines
     kept = json.loads((FOLDER / f"{part}.json").read_text())
-    lines = [f"{part}: {key} is only on one side" for key in sorted(kept.keys() ^ found.keys())]
+    lines = [f"{part}: {key} is either not stored or not measured" for key in sorted(kept.keys() ^ found.keys())]
     for key in kept.keys() & found.keys():
         a, b = kept[key], found[key]
         if part == "names" and a != b:

@@ -41,22 +41,22 @@ class Compare:
     information: Annotated[
         tuple[Kind, ...] | None, tyro.conf.arg(help_behavior_hint="(default: those of the published tables)")
     ] = None
-    """Information that agents see (docs/guides/agents.md); ekf exists only for systems."""
+    """Information that agents see (docs/guides/agents.md); ekf and x_hat_std exist only for systems."""
     seeds: int = comparison.SEEDS
-    """Number of agents of each kind. On systems there are at most 3 recurrent agents, which take longest, and
-    only 1 at the second noise level."""
+    """Number of agents of each kind. On systems there are at most 3 agents of each recurrent kind, whose trainings take
+    longest, and only 1 at the second noise level."""
     episodes: int = 100
     """Number of evaluation episodes of each agent."""
     timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: from the hyperparameters)")] = None
     """Number of actions in a training, over all environments."""
     measurement_noise: Annotated[
-        NoiseLevels, tyro.conf.arg(help_behavior_hint="(default: the task's own, on Van der Pol also 0.2, on Lorenz 2)")
+        NoiseLevels, tyro.conf.arg(help_behavior_hint="(default: the task's own; also 0.2 on Van der Pol, 2 on Lorenz)")
     ] = None
     """Standard deviations of the measurement noise; each level is a separate task."""
     observers: tuple[str, ...] = ()
     """Observers for agents on systems: a .safetensors file for each of your own systems, or shipped maps."""
     aggregate: int = 0
-    """How often an observer is refitted to the agent's own steps in environments (kkl-gym agent train --help)."""
+    """How many times an observer is refitted to the agent's own steps in environments (kkl-gym agent train --help)."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     out: Annotated[
         Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/comparison, or runs/agents/environments)")
@@ -77,7 +77,7 @@ class Compare:
             raise ValueError("compare agents either on systems or in environments, in separate folders")
         (on_systems,) = systems
         if not on_systems and {"ekf", "x_hat_std"} & set(self.information or ()):
-            raise ValueError("agents in environments cannot be compared by ekf and x_hat_std")
+            raise ValueError("agents in environments cannot be compared by ekf or x_hat_std; leave out both")
         out = self.out or Path("runs/agents") / ("comparison" if on_systems else "environments")
         kinds = self.information
         how: dict[str, Any] = {
@@ -89,7 +89,7 @@ class Compare:
         agents = comparison.planned(tasks, out, kinds=kinds, seeds=self.seeds, **how)
 
         def report(progress: ProgressBars) -> None:
-            """Report all agents of these tasks in the folder, including those of earlier runs."""
+            """Report on all agents of these tasks in the folder, including agents of earlier runs."""
             everyone = comparison.planned(tasks, out, kinds=comparison.KINDS, seeds=comparison.seeds_in(out), **how)
             there = [agent for agent in everyone if (agent.folder / agent.result).exists() and agent.done]
             results = comparison.collect(there)

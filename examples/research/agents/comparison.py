@@ -42,10 +42,10 @@ Kind = Literal[
 KINDS: tuple[Kind, ...] = get_args(Kind)
 ON_SYSTEMS: tuple[Kind, ...] = ("state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state")
 IN_ENVIRONMENTS: tuple[Kind, ...] = ("state", "x_hat", "z", "stacked", "recurrent", "y")
-IDLE: Literal["random"] = "random"  # no action on systems, random actions elsewhere; its normalised score is 0
-# The information set of kinds that have another name.
+IDLE: Literal["random"] = "random"  # zero input on systems, random actions in environments; normalised score 0
+# The information sets of the kinds that are not named after their information set.
 SEEN: dict[str, Information] = {"ekf": "x_hat", "recurrent-state": "state"}
-# The kinds for which a setting of a task matters.
+# For some settings of a task: the kinds of agents that depend on the setting.
 CONCERNED = {
     "time_constants": ("z", "traces"),
     "frames": ("stacked",),
@@ -55,7 +55,7 @@ CONCERNED = {
 }
 SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # a second noise level for these tasks
 SEEDS = 5
-# Most recurrent agents on a system, whose trainings take longest; the second number is for the second noise level.
+# Largest numbers of agents of each (slow) recurrent kind on a system: at the first and at the second noise level.
 RECURRENT_SEEDS, SECOND_NOISE_RECURRENT_SEEDS = 3, 1
 COLUMNS = {
     "results.csv": ["environment", "noise", "shown", "seed", "return", "success", "seconds"],
@@ -186,7 +186,7 @@ def planned(
     observers: dict[str, str] | None = None,
     **how: Any,
 ) -> list[ComparedAgent]:
-    """Return the agents of a comparison, by seed; in environments, all noise levels share the agents without noise."""
+    """Return the agents in the order of seeds; an environment's noise levels share its state and idle agents."""
     agents: dict[Path, ComparedAgent] = {}
     for seed in range(seeds):
         for task in tasks:
@@ -231,7 +231,7 @@ def read_results(folder: Path) -> "pd.DataFrame":
 
 
 def unusual_settings(tasks: Sequence[Task]) -> str:
-    """Return a sentence with the changed settings of memories and stacks; empty if all are the defaults."""
+    """Return a sentence with the changed settings of memories and stacks, or no text if all are the defaults."""
     changed = []
     for field in fields(Task):
         values = {getattr(task, field.name) for task in tasks} if field.name in CONCERNED else set()

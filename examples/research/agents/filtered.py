@@ -10,12 +10,12 @@ from training.agents.information import FeatureObservation, Information
 from training.agents.tasks import Task, deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 
-# White process noise that the filters assume, in multiples of each state's scale per square root of the pace.
+# White process noise that the filters assume, in multiples of each state's scale per square root of System.pace.
 PROCESS_NOISE = 1e-2
 
 
 def kalman_filters(env: VectorEnv) -> Estimates:
-    """Make extended Kalman filters for VectorEstimate, which know the model, the noise level and the input."""
+    """Make, for VectorEstimate, extended Kalman filters that know the model, the noise level and the input."""
     plant = plant_of(env)
     system = plant.system
     Q = np.diag((PROCESS_NOISE * np.array(system.scale)) ** 2 / system.pace)
@@ -24,7 +24,7 @@ def kalman_filters(env: VectorEnv) -> Estimates:
 
 
 def show_filtered(task: Task, information: Information, rows: int, *, observer: str | None = None) -> VectorEnv:
-    """Make a system's task in which the agent sees the estimates of extended Kalman filters."""
+    """Make environments of a system's task in which the agent sees the estimates of extended Kalman filters."""
     assert task.system is not None
     system = get_system(task.system)
     env = vector(task, rows, lambda env: VectorEstimate(env, kalman_filters(env)))

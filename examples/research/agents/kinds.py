@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from kkl_gym.wrappers.vector import VectorEnv
 
 Shown = Literal["state", "y", "stacked", "traces", "z", "x_hat", "lru"]
-# The same settings of PPO for all environments and information sets. Agents on the full state and on traces chose them.
+# The settings of PPO for all environments and information sets, chosen by returns of agents on the state and on traces.
 PPO: dict[str, Any] = {
     "policy": "MlpPolicy",
     "normalize": True,
@@ -49,12 +49,12 @@ PPO: dict[str, Any] = {
 CONTINUOUS = {"use_sde": True, "sde_sample_freq": 4}  # smooth exploration where actions are continuous
 LEARNING_RATE = 0.001  # at the start; it falls linearly to zero
 FRAMES = 32  # length of the linear recurrent unit's history
-EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100
+EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluations, and episodes of each and of the last
 OBSERVER_STEPS = 40_000  # steps from which an observer, or the weights of z under noise, are learned
 TRUTH = 0.15  # share of the time, at the start, in which agents on x_hat see the true state
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and the agent sees only estimates
-OF_STATE = ("masked", "parameters")  # agents on the full state do not depend on the sensors of the other kinds
-STEPS = 200_000  # at which returns are compared too
+OF_STATE = ("masked", "parameters")  # kinds in which agents on the full state train; sensor faults do not affect them
+STEPS = 200_000  # number of steps after which returns are compared, too
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return")
 
 
@@ -89,7 +89,7 @@ class TimedAgent(Job):
         how = {"env_id": self.env_id, **KINDS[self.kind], "hold": self.shown != "x_hat"}
         y, angles = tuple(range(self._ny)), ANGLES.get(self.env_id, ())
         task = Task(f"examples.research.agents.partly:{ENV_ID}", y, env_kwargs=how, angles=angles)
-        weighs = self.shown == "z" and self._noise and angles  # without angles the weights are no better
+        weighs = self.shown == "z" and self._noise and angles  # without angles, learning weights does not help
         return weighted(task, OBSERVER_STEPS, seed=self.seed) if weighs else task
 
     @property
@@ -101,7 +101,7 @@ class TimedAgent(Job):
         return float(KINDS[self.kind].get("noise", 0.0))
 
     def _states(self, size: int) -> tuple[int, ...]:
-        """Indices of the state in an observation of some size; without faults, agents on x_hat read a part from y."""
+        """State indices in an observation; without faults, agents on x_hat read the measured entries from y instead."""
         known = MEASURED[self.env_id] if self.shown == "x_hat" and self.kind not in FAULTY else ()
         return tuple(place for place in range(self._ny, size) if place - self._ny not in known)
 
@@ -128,7 +128,7 @@ class TimedAgent(Job):
         return FeatureObservation(env, lambda at: at["obs"][:, first:], flatdim(env.single_observation_space) - first)
 
     def learn_observer(self, act: Callable[[np.ndarray], Any]) -> Path:
-        """Learn an observer in a simulator: from random steps, and from as many of an agent that sees the truth."""
+        """Learn an observer in a simulator: from random steps, and as many steps of an agent that sees the truth."""
         from training.agents.observing import learn_observer
         from training.rollouts.playing import WANDERING, policy_of, roll_out
 
@@ -190,7 +190,7 @@ def policy_of(model: Any, *, deterministic: bool = True) -> Callable[[np.ndarray
 
 
 class _Clock:
-    """CPU seconds of this process since ``start``."""
+    """CPU seconds of this process since ``start``, which evaluations move on."""
 
     def __init__(self) -> None:
         self.start = time.process_time()
@@ -233,9 +233,9 @@ class Kinds:
     information: tuple[Shown, ...] = get_args(Shown)
     """Information that agents see; lru is a linear recurrent unit over 32 frames."""
     seeds: int = 5
-    """Number of agents of each kind."""
+    """Number of agents for each environment, kind and information."""
     seconds: float = 50.0
-    """CPU seconds of an agent, including its observer."""
+    """CPU seconds of an agent's training, including its observer's."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     out: Path = Path("runs/agents/kinds")
     """Folder of results."""
@@ -281,8 +281,8 @@ def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
     lines = [
         "# Kinds of partial observability",
         "",
-        "Returns: interquartile means over seeds, [95 % interval], number of seeds. Bold: the best agent without the "
-        f"full state, and those above the lower end of its interval.{partial}",
+        "Returns: interquartile means over seeds, [95 % interval], number of seeds. Bold: the best mean without the "
+        f"full state, and means above the lower end of its interval.{partial}",
         "",
     ]
     equal = agents.apply(lambda curve: np.interp(STEPS, curve.steps, curve["return"]))
@@ -293,7 +293,7 @@ def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
 
 
 def _trained_in(kind: str, shown: str) -> str:
-    """The kind whose agents are compared in a kind."""
+    """The kind in which the agents that are compared in ``kind`` were trained."""
     return "masked" if shown == "state" and kind not in OF_STATE else kind
 
 

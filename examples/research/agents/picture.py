@@ -14,7 +14,7 @@ from training.agents.tasks import Task
 from training.evaluation.levels import show_level
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, drawing, save_moving, style
 
-FRAMES = 150  # most frames in an animation
+FRAMES = 150  # approximate number of frames in an animation
 SECONDS = 10.0  # length of an animation
 WIDTH = 4.6  # width of a column in inches
 

@@ -1,4 +1,4 @@
-"""Tables and figures of compared agents, from results.csv only."""
+"""Tables and figures of compared agents, from results.csv, and learning curves from the agents' folders."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -90,7 +90,7 @@ def _task_name(environment: str, noise: float | str) -> str:
 
 
 def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
-    """Return rows with task and idle return; in environments, agents on the full state count for all noise levels."""
+    """Return rows with columns task and idle; in environments, agents on the state count for all noise levels."""
     import pandas as pd
 
     tasks = []

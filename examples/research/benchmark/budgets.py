@@ -1,6 +1,6 @@
 """The budgets of trainings and the test protocols behind ``--budget`` and ``--quick``.
 
-Times are for systems with a pace of 1 s; all systems have equally many samples.
+Durations and dt are for systems with a System.pace of 1 s; all systems have equally many samples.
 """
 
 import math
@@ -26,11 +26,11 @@ SEARCH = 0.2  # share of the budget's CPU seconds for the training of each compa
 
 
 def paced_budget(budget: Budget, system: System) -> Budget:
-    """Return the budget with times scaled by a system's pace."""
+    """Return the budget with its duration and dt scaled by a system's pace."""
     dt = float(f"{budget.dt * system.pace:.12g}")  # removes the rounding error of the product
     return replace(budget, duration=budget.duration * system.pace, dt=dt)
 
 
 def paced_protocol(protocol: Protocol, system: System) -> Protocol:
-    """Return the protocol with times scaled by a system's pace."""
+    """Return the protocol with its duration scaled by a system's pace."""
     return replace(protocol, duration=protocol.duration * system.pace)

@@ -32,11 +32,11 @@ class Benchmark:
     budget: Literal["short", "cpu"] = "cpu"
     """cpu: 400,000 points and 300 CPU seconds for each training. short: half of the points, 40 s."""
     quick: bool = False
-    """Instead of the budget: trainings of 300 batches, no search, few and short test trajectories. Takes minutes, with
-    the same results each time."""
+    """Instead of the budget: trainings of 300 batches of the first configuration, few and short test trajectories.
+    Takes minutes, with the same results each time."""
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Shipped systems, or your own as script.py:Class or module:Class."""
-    methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
+    methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: the first nine)")] = None
     """default, spinn, node, node-noise, gru, lru, transformer, ekf, ukf; for the maps that ship, shipped,
     shipped-spinn, shipped-large; or your own classes as script.py:Class or module:Class."""
     measurement_noise: NoiseLevels = None

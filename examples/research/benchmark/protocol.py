@@ -16,7 +16,7 @@ from training.evaluation.levels import Level, as_cell, multiple
 from training.evaluation.metrics import by_state, nrmse, smape
 from training.seeds import Stream, generator
 
-UNTIMED, TIMED = 100, 400  # samples of each round; observers converge during the untimed ones
+UNTIMED, TIMED = 100, 400  # samples of each round; observers converge during the untimed samples
 LOST = 50.0  # a trajectory with a larger SMAPE in % after the transient counts as lost
 SETTLED = 0.1  # limit of settled errors, as a share of a trajectory's root mean square
 
@@ -57,7 +57,7 @@ def rmse(x: np.ndarray, x_hat: np.ndarray) -> np.ndarray:
 
 
 def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
-    """Return times (n,) in seconds after which |x - x_hat| stays below a tenth of the root mean square of |x|."""
+    """Return times (n,) in s after which |x - x_hat| stays below a tenth of the rms of |x|; infinity if it does not."""
     limit = SETTLED * np.sqrt((x**2).sum(-1).mean(0))
     outside = ~(np.linalg.norm(x - x_hat, axis=-1) <= limit)
     last = len(x) - 1 - outside[::-1].argmax(0)
@@ -95,7 +95,7 @@ def measure(method: Method[Any], trained: Any, system: System, *, dt: float, pro
 
 
 def tuned_for(method: Method[Any], system: System) -> tuple[Level, ...] | None:
-    """Return noise levels for the comparison of a method's configurations; None for those of the test."""
+    """Return noise levels for the comparison of a method's configurations; None stands for the test's levels."""
     return None if method.tuned_for is None else tuple(multiple(system, factor) for factor in method.tuned_for)
 
 

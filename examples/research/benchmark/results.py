@@ -18,7 +18,7 @@ FILES = ("results.csv", "methods.csv")  # a row for each trajectory; a row for e
 
 
 def collect(out: Path, beside: Path | None = None) -> None:
-    """Write a CSV file with the errors, and one with the costs, of all jobs in the folder."""
+    """Write results.csv and methods.csv of all jobs in the folder, joined with other observers' rows in ``beside``."""
     errors, costs = [], []
     for folder in sorted(path.parent for path in (out / "jobs").glob("*/*/errors.csv")):
         with explained(folder, ValueError):
@@ -56,7 +56,7 @@ def _as_written(source: Path | StringIO) -> pd.DataFrame:
 
 
 def _joined(rows: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of jobs in the columns of earlier rows, and unchanged the earlier rows of other observers."""
+    """Return the jobs' rows, in the columns of ``earlier``, and then the rows of ``earlier`` for other observers."""
     here, there = (_conditions(frame, set(rows.system) & set(earlier.system)) for frame in (rows, earlier))
     if here != there:
         raise ValueError(
@@ -68,7 +68,7 @@ def _joined(rows: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
 
 
 def _conditions(frame: pd.DataFrame, systems: set[str]) -> set[str]:
-    """Return the conditions that all rows of a benchmark share."""
+    """Return the conditions that two results of one benchmark share: budgets and seeds, or test cases."""
     if "budget" in frame:
         return {f"budget {budget}, seed {seed}" for budget, seed in zip(frame.budget, frame.seed)}
     cases = frame[frame.system.isin(systems)][["system", "starts", "noise"]].drop_duplicates()

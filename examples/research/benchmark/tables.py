@@ -68,13 +68,13 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         medians = results[results.escaped == 0].groupby(["starts", "noise", "system", "method"])[states].median()
         for case in cases:
             lines += [f"## NRMSE in % after the first 20 %, {DOMAINS[case[0]]}, noise {case[1]}", ""]
-            lines += ["Of each state: median of its rms error over its standard deviation in all trajectories.", ""]
+            lines += ["Median of each state's rms error, in % of its standard deviation in all trajectories.", ""]
             lines += _by_method(methods, partial(_each_state, medians, case))
     order = ", ".join(f"{starts} at noise {noise}" for starts, noise in cases)
     lines += [
         "## Lost trajectories in %",
         "",
-        f"Above 50 % after the first 20 %, or not finite. In this order: {order}.",
+        f"SMAPE above 50 % after the first 20 %, or estimates not finite. In this order: {order}.",
     ]
     lost = results[results.escaped == 0].groupby(["system", "method", "starts", "noise"]).lost.mean() * 100
     lines += ["", *_by_method(methods, partial(_lost, lost, cases))]
@@ -109,7 +109,7 @@ def _by_method(methods: pd.DataFrame, cell: Callable[[tuple[str, str]], str]) ->
 
 
 def _by_text_of_noise(results: pd.DataFrame) -> pd.DataFrame:
-    """Return the frame with noise levels as text, for one level or one for each output."""
+    """Return the frame with noise levels as text; a level is one number, or one for each output."""
     texts = {noise: show_level(read_level(str(noise))) for noise in results.noise.unique()}
     return results.assign(noise=results.noise.map(texts))
 
@@ -204,7 +204,7 @@ def _write_cell(ax: Any, at: tuple[int, int], median: float, half_iqr: float) ->
 
 
 def _labels(methods: pd.DataFrame) -> dict[str, str]:
-    """Return labels by method; a label includes the number of trajectories if it differs from the others."""
+    """Return labels by method; a label includes the number of trajectories if it is below the largest."""
     most = methods.trajectories.max()
     return {
         row.method: row.label if row.trajectories == most else f"{row.label} ({row.trajectories} runs)"

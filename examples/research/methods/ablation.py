@@ -1,6 +1,6 @@
 """Ablation: series of pipelines, each of which differs from the next in a few settings, trained for equal times.
 
-One series leads from the paper's SPINN to the package's, the other from inverses without T to the default.
+One series leads from the paper's SPINN to the package's, the other from an inverse without noise to the default.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ from training.spectrum import papers_spectrum
 Settings = Mapping[str, Any]
 
 NO_NOISE = 0.02  # largest noise in the training of noise-free inverses, as a share of the system's own
-# A single inverse for free and driven motion, with the same sampling for all systems.
+# A single inverse for free and driven motion, with the same distribution of noise levels for all systems.
 TOGETHER: Settings = {
     "free_inverse": False,
     "process_noise_share": 0.0,
@@ -26,7 +26,7 @@ TOGETHER: Settings = {
     "high_noise_emphasis": 2.0,
 }
 ADAM: Settings = {"optimiser": "adam", "batch": 4096, "learning_rate": 8e-3}
-# The paper's SPINN (its sec. 8.1) without its spectrum: points uniform in X, and a small budget.
+# The paper's SPINN (its sec. 8.1) except its spectrum and budget, with points uniform in X.
 PAPERS: Settings = {
     "optimiser": "adam",
     "learning_rate": 1e-3,
@@ -37,7 +37,7 @@ PAPERS: Settings = {
     "transients": False,
     "solved_output_layer": False,
 }
-# Name, label, and the paper's settings that this step replaces by the preset's.
+# Name and label of each step, and the paper's settings that the step replaces by the preset's.
 SPINN_STEPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("ablation-spinn", "SPINN", ()),
     ("ablation-spinn-soap", "SPINN by SOAP", ("optimiser", "learning_rate", "batch")),
@@ -65,12 +65,12 @@ class Ablation(KKLMethod):
 
 
 def papers_modes(task: Task) -> Settings:
-    """Return the paper's spectrum."""
+    """Return the settings of the paper's spectrum."""
     return {"eigenvalues": papers_spectrum(task.system), "pairs": ()}
 
 
 def _without(replaced: tuple[str, ...]) -> Callable[[Task], Settings]:
-    """Return a function for the paper's settings, without those that the preset's replace."""
+    """Return a function from a task to the paper's settings, without the settings in ``replaced``."""
     return lambda task: {key: value for key, value in {**papers_modes(task), **PAPERS}.items() if key not in replaced}
 
 

@@ -46,7 +46,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Data:
-    """Noise-free training trajectories.
+    """Noise-free training trajectories: y at all samples, and x at the samples ``ages``.
 
     Shapes: ``ages`` (m,), ``x`` (m, n, nx), ``y`` (steps + 1, n, ny).
     """
@@ -97,7 +97,7 @@ class Task:
         return generator(Stream.TRAINING, self.seed, 1)
 
     def fit(self, name: str, module: nn.Module, loss: Loss, learning_rate: float, share: float = 1.0) -> None:
-        """Minimise a loss by Adam; resumes from a checkpoint if there is one."""
+        """Minimise a loss by Adam within a share of the CPU time; resumes from a checkpoint if there is one."""
         self.folder.mkdir(parents=True, exist_ok=True)
         identity = json.dumps([describe(self.system), asdict(self.budget), self.seed], sort_keys=True)
         limits: dict[str, Any] = {"steps": self.budget.steps, "cpu_seconds": self.budget.cpu_seconds * share}
@@ -115,7 +115,7 @@ class Method(ABC, Generic[Trained]):
     tuned_for: ClassVar[tuple[float, ...] | None] = None
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Propose one to three configurations; the benchmark takes that with the least validation error."""
+        """Propose one to three configurations; the benchmark takes the best of them on validation trajectories."""
         return ({},)
 
     @abstractmethod

@@ -11,9 +11,9 @@ from observers.estimator import Estimator
 from training.evaluation.levels import Level
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 
-# Levels of the white process noise that a filter assumes, in multiples of each state's scale per square root of the
-# pace. The trajectories have no process noise; the level accounts for the filter's errors of linearisation. It differs
-# from the bounded process noise of environments.
+# Levels of the white process noise that a filter assumes, in multiples of each state's scale per square root of
+# System.pace. The trajectories have no process noise; the level accounts for the filter's errors of linearisation. This
+# white noise is not the bounded process noise of environments.
 DIFFUSION = (1e-4, 1e-3, 1e-2)
 
 

@@ -72,9 +72,9 @@ def trained(task: Task, config: Config) -> Artifact:
 class Default(KKLMethod):
     """The package's method: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
 
-    It simulates its own trajectories. For each of its two inverses these are as many as every method has: driven ones
-    for the first, and for the second free ones, of which some start at states that inputs have reached from X. Each
-    inverse has half of the time, although the benchmark uses only the inverse of free motion. The only configuration is
+    For each of its two inverses it simulates as many trajectories as every other method has: driven motions for one,
+    free motions for the other. Some free motions start at states that inputs have reached from X. Each inverse has half
+    of the time, although the benchmark uses only the inverse of free motion. The only configuration is
     the preset, which was chosen during the package's development.
     """
 

@@ -142,9 +142,9 @@ def rollout(
     y: torch.Tensor,
     ages: np.ndarray,
 ) -> torch.Tensor:
-    """Run z_k+1 = transition z_k + early y_k + late y_k+1, and return its states at some ages.
+    """Run z_k+1 = transition z_k + early y_k + late y_k+1, and return its states at the samples ``ages``.
 
-    Powers of the transition advance the filter from age to age in one operation, however many samples lie between.
+    One power of the transition advances the filter to the next of these samples, however many samples lie between.
 
     Shapes: ``transition`` (nz, nz), ``early``, ``late`` (nz, ny), ``z0`` (n, nz), ``y`` (n, steps + 1, ny), ``ages``
     (m,); returns (m, n, nz).
@@ -152,7 +152,7 @@ def rollout(
     gaps = np.diff(ages, prepend=0)
     powers = torch.eye(len(transition), dtype=transition.dtype)[None]
     square = transition
-    while len(powers) <= gaps.max():  # all powers of the transition, by doubling
+    while len(powers) <= gaps.max():  # all powers of the transition up to the largest gap, by doubling
         powers = torch.cat([powers, powers @ square])
         square = square @ square
     # w = z - late y follows w_k+1 = transition w_k + (early + transition late) y_k, with one sample of y in each step.

@@ -21,7 +21,7 @@ ROWS, CHUNK = 64, 100  # rows of a batch, and samples of truncated back-propagat
 WIDTH = 64  # width of features and hidden vectors
 LEARNING_RATE = 3e-3
 READOUT = 128  # neurons of the layer between the hidden vector and the estimate
-FAINT_NOISE = 0.01  # levels below this share of the system's own enter linearly, higher ones logarithmically
+FAINT_NOISE = 0.01  # levels below this share of the system's own enter linearly, higher levels logarithmically
 ROUNDING = 1e-3  # errors shorter than this share of a state's standard deviation are smoothed
 
 
@@ -144,7 +144,7 @@ class TransformerCell(Cell):
 
 
 class Model(nn.Module):
-    """A cell from scaled samples of y and their noise level to scaled estimates. Buffers hold the scales."""
+    """A network around a cell: maps samples of y and their noise level to scaled estimates. Buffers hold the scales."""
 
     def __init__(self, kind: type[Cell], width: int, ny: int, nx: int) -> None:
         super().__init__()
@@ -168,7 +168,7 @@ class Model(nn.Module):
 class SequenceMethod(Method[Arrays]):
     """A method that trains a cell by truncated back-propagation along trajectories.
 
-    The rows of a batch have random ages, so that every batch has transients and settled motion. Half of the
+    The rows of a batch are at random times of their trajectories: transients and settled motion. Half of the
     trajectories have no noise, the others a random level up to the system's own; the level is an input of the network.
     The loss is the mean length of the scaled error, because transients would dominate its square.
     """
@@ -200,7 +200,7 @@ class GRU(SequenceMethod):
 
 
 class LRU(SequenceMethod):
-    """A. Orvieto et al., "Resurrecting recurrent neural networks for long sequences", ICML 2023."""
+    """Linear recurrent unit: Orvieto et al., "Resurrecting recurrent neural networks for long sequences", ICML 2023."""
 
     name: ClassVar[str] = "lru"
     label: ClassVar[str] = "LRU"
@@ -218,7 +218,7 @@ class Transformer(SequenceMethod):
 class _Problem(nn.Module):
     """The model, and the positions of rows along the trajectories, which are buffers for the checkpoint.
 
-    A row follows a trajectory from its start to a random age, and then begins another one.
+    A row follows a trajectory from its start for a random number of samples, its age, and then begins another one.
     """
 
     def __init__(self, kind: type[Cell], task: Task) -> None:
@@ -232,7 +232,7 @@ class _Problem(nn.Module):
         self._y = tensor(data.y, cpu)
         self._x = (tensor(data.x, cpu) - self.model.x_offset) / self.model.x_scale
         self._noise = tensor(np.broadcast_to(task.system.measurement_noise, data.y.shape[-1:]), cpu)
-        self._number = torch.full((len(data.y),), -1)  # index of each sample among the recorded ones
+        self._number = torch.full((len(data.y),), -1)  # index of each sample among the recorded samples, or -1
         self._number[torch.as_tensor(data.ages)] = torch.arange(len(data.ages))
         self._steps = torch.arange(min(CHUNK, len(data.y)))[:, None]
         self.register_buffer("places", torch.zeros(3, ROWS, dtype=torch.long))  # trajectory, age, and age at the end

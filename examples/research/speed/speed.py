@@ -37,7 +37,7 @@ class Speed:
     is timed if you name its file. The references are also timed with the memory of `kkl_gym.KKLMemory`.
 
     Times are CPU times of this process, which other processes hardly affect: run it with one thread. Further tables
-    compare observers without an environment with extended Kalman filters on the same samples.
+    compare observers alone, without an environment, to extended Kalman filters on the same samples.
     """
 
     system: OneSystem = None
@@ -49,7 +49,7 @@ class Speed:
     num_envs: int = 1024
     """Rows of the vector environments."""
     vector_steps: int = 1000
-    """Steps of each vector environment in a turn, which begin at starts in the training box."""
+    """Steps of each vector environment in a turn; its rows start in the training box."""
 
     def run(self, console: Console) -> dict[str, float]:
         """Measure the times, print tables and return the ratios."""
