@@ -47,7 +47,7 @@ def test_an_agent_for_a_system_of_ones_own(saved, script):
     path = "runs/agents/oscillator-x_hat-0/agent.safetensors"
     agent = Agent.read(path)
     assert (agent.observer, agent.training["algorithm"]) == (saved(system=OWN), "ppo")
-    with pytest.raises(SystemExit, match=r"trust .* if you trust the agent's file"):
+    with pytest.raises(SystemExit, match=r"trust .* if you trust this code"):
         main(["agent", "evaluate", path, "--episodes", "2"])
     main(["agent", "evaluate", path, "--episodes", "2", "--trust", OWN])
     with pytest.raises(SystemExit, match="pendulum has no inputs"):
@@ -73,7 +73,7 @@ def test_options_become_a_task(capsys):
     assert (task.angles, task.env_kwargs) == (((3, 1), (4, 2)), {"a": 1, "b": "x"})
     with pytest.raises(SystemExit):
         read(["agent", "train", "CartPole-v1", "--angles", "0,1,2"])
-    assert "got '0,1,2', not the cosine's entry and the sine's" in capsys.readouterr().err
+    assert "expected the entries of a cosine and a sine, as in 0, 1; got '0,1,2'" in capsys.readouterr().err
 
 
 def test_an_agent_on_the_state_is_recorded_as_a_policy(tmp_path, monkeypatch):
@@ -88,5 +88,5 @@ def test_an_agent_on_the_state_is_recorded_as_a_policy(tmp_path, monkeypatch):
     for k in range(len(record.t) - 1):
         obs = np.float32([record.y[k, 0], record.x[k, 0], record.y[k, 1], record.x[k, 1]])
         assert record.u[k].argmax() == policy(obs[None])[0]
-    with pytest.raises(ValueError, match="see its state"):
+    with pytest.raises(ValueError, match="for Acrobot-v1 that sees state"):
         RecordCommand("Acrobot-v1", **{**options, "measured": "0", "hidden": "1"}).run(Console())
