@@ -1,4 +1,4 @@
-"""Your own task, from plant to agent: a motor turns a link, which is not measured, through a spring to an angle.
+"""Your own task, from plant to agent: a motor brings an unmeasured link to a goal angle through a spring.
 
 The same from the command line, as docs/guides/own_task.md explains::
 

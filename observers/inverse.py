@@ -153,7 +153,7 @@ class InverseMap:
         return value
 
     def part(self, outputs: slice) -> "InverseMap":
-        """Return a map to some of the outputs, without covariance, or this map if all outputs are selected."""
+        """Return a map to some entries of the estimate, without covariance, or this map if all are selected."""
         if range(self.mlp.outputs)[outputs] == range(self.mlp.outputs):
             return self
         x_offset, x_scale = self.x_offset[outputs], self.x_scale[outputs]

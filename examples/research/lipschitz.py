@@ -99,7 +99,7 @@ def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
     low, high = SLOPES[mlp.activation]
     weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in mlp.weights]
     # The certificate holds for every diagonal matrix D > M. Here D is a scaled diagonal of M, times the least factor
-    # with D >= M, times 1 + e^margin. Zeros are a good start: for diagonal M they give D = 2 M, which is optimal.
+    # with D >= M, times 1 + e^margin. The start, zeros, gives D = 2 M for diagonal M, which is optimal for tanh.
     shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
     margins = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in weights[:-1]]
 

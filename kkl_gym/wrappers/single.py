@@ -59,8 +59,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     (nx,). Both are float64 and not clipped. With ``monitor`` it gains ``score``, an array of shape (). The score is
     above 1 where the samples do not fit the estimates, as with a faulty sensor or far outside the map's training.
 
-    With ``estimate="z"`` neither the inverse map nor the tracker runs, unless there is a monitor or the start is known.
-    There is then no ``x_hat``, and :meth:`render` shows no estimate.
+    With ``estimate="z"`` there is no ``x_hat``, and :meth:`render` shows no estimate. Neither the inverse map nor the
+    tracker runs then, unless there is a monitor or the start is known.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
     ``training.learn``). Such an observer sees the actions, and the signals of the observation that its file names. The
@@ -92,7 +92,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Whether the observer is given the true state ``info["x"]`` at reset, and only there. It then has no transient.
         This needs a map that tracks, such as the default ones, or a forward map T, as in ``observer="SYSTEM-spinn"``.
     uncertainty : bool
-        Whether the observation is [x_hat, std], where std are the standard deviations of the estimation error.
+        Whether x_hat in the observation is followed by std, the standard deviations of the estimation error.
         ``info`` then gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). This needs a map with a covariance,
         such as ``kkl-gym train`` makes.
     compiled : bool, optional
@@ -110,8 +110,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     ValueError
         If the environment is not a :class:`KKLEnv` and the observer is not from its rollouts, ``estimate`` is unknown,
         a flag is not a bool, no map ships for the system, or the noise level is beyond the map's range. At a step, if
-        the agent acts on a map without inputs and ``ignore_input`` is false, or if a wrapper inside skips samples. At a
-        reset or step, if a wrapper inside changes observations: the observer would not see the change.
+        the agent acts, but the map has no inputs and ``ignore_input`` is false, or if a wrapper inside skips samples.
+        At a reset or step, if a wrapper inside changes observations: the observer would not see the change.
     observers.ArtifactError
         A ValueError for a file that is missing or damaged, was made for another system, other parameters or another dt,
         or lacks the forward map or motion for ``known_start``, or the covariance for ``uncertainty``.

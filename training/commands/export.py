@@ -25,7 +25,7 @@ class ExportCommand:
     Like observers.KKLObserver, the exported observer takes a sample and the input before it, and returns the estimate.
     Every map can be exported: shipped ones, those of your own systems, and those from records and rollouts.
 
-    --format onnx: NAME.onnx takes a batch of any size, and noise levels as inputs. It needs the extra onnx.
+    --format onnx: NAME.onnx takes a batch of any size, and noise levels as inputs. Exporting needs the extra onnx.
     --format c: NAME.h and NAME.c allocate no memory and need only the C library. NAME_main.c is a program that reads
     samples and prints estimates. docs/guides/export.md shows a complete example.
     """

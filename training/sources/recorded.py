@@ -21,7 +21,7 @@ from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
 FEW = 5  # with fewer records than this, none is held out whole
-STRETCHES, SAMPLES = 600, 2_000_000  # most stretches of records to calibrate on, and most samples in all of them
+STRETCHES, SAMPLES = 600, 2_000_000  # largest number of stretches of records for calibration, and of samples in them
 STRETCH_MEMORIES = 2.0  # greatest length of such a stretch, in settling times of the filter
 FEWEST = 50  # least number of samples at which a stretch for calibration may begin
 BEYOND = 0.5  # estimates may leave the range of the states by this fraction of it
@@ -34,7 +34,7 @@ LITTLE = 0.1  # a residual below this share of the output's standard deviation a
 ROUNDING, OUTLIER = 1e-6, 6.0  # largest rounding, relative to an output; least outlier, in residual standard deviations
 LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
 MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # records: modes per output; slowest and fastest, relative to the signal rate
-RECORD_MEMORIES = 3.0  # least settling times in a median record; fewer if the slowest mode would outpace the signals
+RECORD_MEMORIES = 3.0  # least number of settling times in a median record; fewer if all modes would outpace the signals
 # For rollouts, whose hidden signals an agent needs within a few steps: number of modes of each output, and their rates
 # per step. A few modes that lie far apart forget the start soon, and distinguish single steps.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
@@ -67,8 +67,8 @@ class RecordedSource:
     Raises
     ------
     ValueError
-        If a record has no hidden states, records have different signals, a signal is unknown, no signal moves, or dt
-        does not suit the records.
+        If a record has no hidden states, records have different signals, ``arbitrary_zero`` names one that is not
+        measured, no signal moves, or dt does not suit the records.
     """
 
     def __init__(
@@ -280,7 +280,7 @@ def evenly(rows: np.ndarray, n: int) -> np.ndarray:
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:
-    """Return kept and held-out records; held out are whole records that the seed draws, or the ends of few records."""
+    """Return kept and held-out records: records drawn by the seed are held out, or the end of each if there are few."""
     if not share:
         return list(records), []
     if len(records) >= FEW:
@@ -317,7 +317,7 @@ def recorded_errors(
     *,
     measurement_noise: float | tuple[float, ...] = 0.0,
 ) -> dict[str, float]:
-    """Return rms errors of hidden signals, in standard deviations or NaN, after ``after`` s (None: settling time)."""
+    """Return hidden signals' rms errors divided by std, after ``after`` s (None: settling time); NaN if undefined."""
     first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
     pairs, rng = [np.zeros((0, 2, artifact.nx))], np.random.default_rng(0)
     for record in pieces(records):
@@ -354,7 +354,7 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
     if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
         raise ValueError(
             f"{', '.join(other)} is not a weighted sum of {', '.join(signals.hidden)} (without an offset), and a "
-            "tracker predicts only such sums: add the measured signals, in the same units, to the hidden ones"
+            "tracker predicts only such sums: list the measured signals, in the same units, as hidden ones too"
         )
     return C, least
 
