@@ -104,7 +104,7 @@ def unseen_trajectories(
     domain : {"X", "1.5X", "2X"}
         Where the trajectories start: in X, or in the multiple of X but outside X.
     driven : bool
-        Whether random inputs act, steps and sines in turn. With ``policy``: whether it sees state errors and explores.
+        Whether random inputs, steps and sines, act. With ``policy``: whether it explores and sees states with errors.
     stream : Stream
         Stream of random numbers, for evaluation or for validation.
     process_noise : float
@@ -207,7 +207,7 @@ def noise_limit(
     Parameters
     ----------
     system, trajectories, measurement_noise, skip
-        As for :func:`errors`. Trajectories must start in X. The bound assumes at least 0.2 % of the usual noise on y.
+        As for :func:`errors`. Trajectories must start in X. The bound assumes at least 0.2 % of the default noise on y.
     seed : int
         Seed of the drawn errors.
 
@@ -264,7 +264,7 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Return rms parameter errors after the transient, in percent of the plant's values or else of x's last states."""
+    """Return rms parameter errors after the transient, in percent of true values: the plant's or x's last states."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
         raise ValueError(f"all {trajectories.escaped} runs left bounds = {system.bounds}")

@@ -1,4 +1,4 @@
-"""The figure of a training: losses of the networks, and estimates along motions that no training used."""
+"""The figure of a training: losses of the networks, and estimates along motions on which no network was trained."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from training.sources.simulated import SimulatedSource
 
 
 def write_report(path: Path, result: Result, source: Source | System) -> None:
-    """Draw the losses, and estimates along simulated calibration motions, without and with noise, or a recorded one."""
+    """Draw the losses, and estimates along calibration motions: simulated without and with noise, or a recorded one."""
     artifact = result.artifact
     if isinstance(source, System):
         source = SimulatedSource(source, settings_of(artifact.training))

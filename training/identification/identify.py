@@ -18,7 +18,7 @@ from training.records import Record, check_signals, pieces
 HELD_OUT = 10  # of the pieces of records without a gap, the 6th, 16th, 26th, ... are held out of the fit
 KEPT_RATIOS = 100.0  # prior variance of the log of a common factor, relative to that of each parameter's own factor
 BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(), tried in turn until a fit is about as good as the first one
-UNSCALED = 0.05  # a state whose relative change is a larger share of the parameters' has no identifiable scale
+UNSCALED = 0.05  # ratio of a state's to the parameters' relative change from which the state's scale is unidentifiable
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
 HIDDEN = 0.05  # a parameter with a larger component of an unidentifiable direction is unidentifiable
 
@@ -133,8 +133,8 @@ def _check_unknown(system: System, unknown: Limits) -> None:
 def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     """Return the parameters nearest to ``given`` among all that explain the outputs as well as ``values`` do.
 
-    Parameters without influence on the outputs take their given values; parameters with another sign than given keep
-    theirs. The others' distance grows mainly with changes of ratios: a faster plant may have all larger by one factor.
+    Parameters without influence on the outputs take their given values; those whose sign differs from the given one
+    keep theirs. The distance of the others is mainly that of their ratios: a faster plant may scale all of them alike.
 
     Shapes: ``values`` (p,), ``given`` (p,), unidentifiable directions ``hidden`` (p, k); returns (p,).
     """

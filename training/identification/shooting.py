@@ -50,7 +50,7 @@ class Fit:
     def errors(self, directions: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Return standard errors along directions: for white noise or by scatter of windows, whichever is larger.
 
-        Residuals that process noise correlates make parameters less certain than white residuals of equal
+        Residuals that are correlated by process noise make parameters less certain than white residuals of equal
         size. The scatter of the gradients of at least CLUSTERS windows accounts for the correlation (the sandwich
         estimator for clustered data). ``known`` spans the identifiable directions.
 

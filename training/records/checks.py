@@ -16,7 +16,7 @@ FAR_OFF = 10.0  # a value farther from all others than so many times their range
 
 
 def check_signals(records: Sequence[Record], system: System | None = None) -> None:
-    """Raise ValueError unless all records have the same columns, of each role as many as a given ``system`` needs."""
+    """Raise ValueError if records differ in columns or environment, or if the columns do not fit a given ``system``."""
     if not records:
         raise ValueError("no records are given")
     first = records[0]

@@ -27,7 +27,7 @@ from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a shorter training than the first, as there are many refits
-LONGEST = 250  # most steps in a piece; longer episodes are cut into pieces, so that parts of each can be held out
+LONGEST = 250  # largest number of steps in a piece; longer episodes are cut, so that parts of each can be held out
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class KKLTrainingCallback(BaseCallback):
     the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
     replaces the old one unless the new one's error on that share is larger. Filters keep their states. A refit
     takes place only when an algorithm begins to collect a rollout (so that no on-policy batch mixes two observers) or
-    after a rehearsal, and only if a kept episode is as long as the filter's settling time.
+    after a rehearsal, and only if a kept episode, cut after 250 steps, is as long as the filter's settling time.
 
     The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square, divided by
     standard deviations), and ``kkl/error_before``, that of the observer before the refit.

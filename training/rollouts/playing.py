@@ -55,7 +55,7 @@ def policy_of(policy: str | Policy, env: Env) -> Policy:
 
 
 def _wandering(space: gym.Space[Any]) -> Iterator[Any]:
-    """Yield random actions, each held for a random number of steps, whose mean changes every hundred steps."""
+    """Yield random actions, each held for a random number of steps; every 100 steps, this number's mean changes."""
     left, action = 0, None
     for call in itertools.count():
         if call % 100 == 0:

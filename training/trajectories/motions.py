@@ -22,7 +22,7 @@ KINDS = ("zero", "steps", "zero", "sine")  # signals that the inputs of successi
 DRIVEN = ("steps", "sine", "pulses")  # the same if all trajectories shall have inputs
 CHUNK = 500  # number of trajectories simulated at once
 FIRST, FEWEST_INSIDE = 100, 0.05  # after so many trajectories, at least this share must have stayed within bounds
-# Durations for which inputs drive starts out of X, in multiples of the system's pace.
+# Durations, in multiples of the system's pace, of lead-ins: inputs that lead starts out of X before a trajectory.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 FAR = 0.6  # share of the trajectories that start in the larger box, if there is one
 INPUT_WEIGHT = 0.1  # a regulator's weight on inputs, relative to that on states, both scaled by typical sizes
@@ -92,8 +92,8 @@ class Motions:
     def chunks(self, n: int, rng: np.random.Generator, report: Report = lambda done: None) -> Iterator[Chunk]:
         """Simulate in chunks; trajectories with inputs of the same kind replace those that leave the system's bounds.
 
-        Yields ``x`` (steps + 1, m, nx), ``u`` (steps, m, nu), the levels of process noise (m,), and a mask of the
-        trajectories that start in X (m,), with m up to CHUNK.
+        Yields ``x`` (steps + 1, m, nx), ``u`` (steps, m, nu), the levels of process noise (m,), and a mask (m,)
+        of the trajectories whose starts were drawn in X, even if then led out of X; m is up to CHUNK.
         """
         system, steps, pending, tried = self.system, self.steps, np.arange(n), 0
         while len(pending):

@@ -12,7 +12,7 @@ from training.trajectories.motions import Controller
 
 # Share of the training motions with the system's own value of an uncertain parameter. With k parameters, the share with
 # all own values is this share to the power k. NOMINAL_SHARE was chosen on the four systems that ship: with 0.6
-# and a width of 256, Lorenz's map no longer distinguished its own plant from the others.
+# and layers of 256 units, Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of an additional state: hardly any process noise acts on it, and 0 would be invalid
 EVERY = "all"  # stands for every parameter that is not named
