@@ -110,7 +110,7 @@ class SB3VecEnv(VecEnv):
         return list(self._rows_of("call", method_name)(method_name, *args, **options))
 
     def _owner(self, name: str) -> Any:
-        """Return the wrapper that has an attribute, else the vector environment; None for a Sync or Async vector."""
+        """Return the wrapper that has an attribute, else the vector environment, or None if that is Sync or Async."""
         env: Any = self.env
         while hasattr(env, "env"):
             if name in vars(env):

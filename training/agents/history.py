@@ -13,7 +13,7 @@ from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 
 
 class History(VectorWrapper):
-    """Shows the state s of linear filters: an action u and the next observation y make it ``keep`` s + ``take`` [y, u].
+    """Shows the state s of linear filters; s becomes ``keep`` s + ``take`` [y, u] at action u and next observation y.
 
     Filters begin an episode at the first observation and a zero action; without ``actions``, u is left out. The
     autoreset mode must be SAME_STEP. Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.

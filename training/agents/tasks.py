@@ -132,7 +132,7 @@ TASKS: dict[str, Task] = {
 PREFERRED = {"reverse_duffing": "sac"}  # default algorithms; all other systems have ppo
 
 # Positions are measured and velocities are hidden, as in rl-zoo3's tasks. Observers estimate all hidden entries except
-# the double pendulum's constraint forces.
+# the double pendulum's constraint force.
 HIDDEN_VELOCITIES: dict[str, Task] = {
     task.env_id: task
     for task in (

@@ -259,7 +259,7 @@ class AgentCommand:
 
 
 def evaluate(progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, trusted: str | None = None) -> Episodes:
-    """Play episodes and print the return, in systems also score and success, in environments errors of x_hat."""
+    """Play episodes and print the return, and score and success at a system's target or else any errors of x_hat."""
     first, task = agent_evaluation_seed(seed, n), agent.task
     env = agent.make(n, trusted=trusted)
     try:

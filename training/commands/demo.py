@@ -85,7 +85,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of an environment with an observer; ``spinn`` holds the estimates of SPINN, if it ships."""
+    """One episode of an environment with an observer; ``spinn`` holds the estimates of SPINN, if it ran."""
 
     environment: Shown
     artifact: Artifact

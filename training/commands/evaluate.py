@@ -326,7 +326,7 @@ class Evaluate:
     ) -> Iterator[tuple[str, bool, UnseenTrajectories, Level]]:
         """Yield, for each noise level, the name of the starts, whether runs are driven, the trajectories and the level.
 
-        Starts from which all trajectories leave the bounds get a line in ``left_out``.
+        A case without starts, or whose trajectories all leave the bounds, gets a line in ``left_out`` instead.
         """
         cases = CASES[: 3 if of.artifact.nu else 2] if levels else ()
         bar = progress.add_task(description, total=len(cases) * len(levels))
