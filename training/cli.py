@@ -1,6 +1,6 @@
 """The command line ``kkl-gym`` (or ``python -m training``): its table of commands and its error messages.
 
-It imports nothing that is slow or may be missing: the module of a command is imported when the command is called.
+Importing this module loads nothing slow or optional: the module of a command is imported when the command is called.
 """
 
 import _thread

@@ -34,7 +34,7 @@ Biases = Annotated[
     frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 )
 class Config:
-    """The settings of a training; the preset "fast" for input-aware maps keeps the defaults unless systems differ.
+    """The settings of a training; the input-aware preset "fast" has the defaults except where it depends on the system.
 
     Raises
     ------

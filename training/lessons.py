@@ -43,7 +43,7 @@ class Result:
     artifact : Artifact
         The observer.
     losses : dict of str to list of (int, float)
-        For each stage that trained a network, pairs of a number of batches and the mean error of the last 100 or less.
+        For each stage that trained a network, pairs (batches so far, mean error over the last 100 of them or fewer).
     seconds : dict of str to float
         CPU seconds of each stage.
     """
@@ -280,7 +280,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
     parts = {"x_offset": learned.x.mean(0), "x_scale": spread(learned.x)} | parts
-    offset, scale = parts["x_offset"], parts["x_scale"]  # a source's own scale is the unit of its process noise
+    offset, scale = parts["x_offset"], parts["x_scale"]  # a source's x_scale is kept: its process noise has that unit
     u_scale = np.abs(learned.u).max(0, initial=0.0)
     u_scale = np.where(u_scale > 0, u_scale, 1.0)
     inputs = np.column_stack([(learned.x - offset) / scale, learned.u / u_scale])

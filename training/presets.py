@@ -75,7 +75,7 @@ PROFILES: dict[str, Profile] = {
         # The paper's eigenvalues suffice, as motions of this system neither diverge nor converge.
         spinn_settings={"eigenvalues": tuple(np.linspace(-1.5, -3.0, 5).tolist())},
         controller=homogeneous,
-        fault_deadline=10.0,  # about a period at amplitude 1
+        fault_deadline=10.0,  # more than a period from (1, 0), 6.2, or from (0, 1), 7.4
     ),
     "van_der_pol": Profile(
         # Fast modes follow the jumps of y, and slow ones average its noise; this range gave the smallest errors.
@@ -87,7 +87,7 @@ PROFILES: dict[str, Profile] = {
             "high_noise_emphasis": 4.5,
         },
         # High noise levels are drawn more often, as they make the phase hard to estimate. Inputs within their bound
-        # cannot drive the oscillator out of X, so stronger inputs drive the starts there.
+        # cannot drive the oscillator out of X, so stronger inputs lead some starts out of it.
         settings={"lead_in_input": 4.0, "noise_free_share": 0.05, "high_noise_emphasis": 4.0},
         # Without a tracker, slow complex modes at frequencies of y average the noise of y.
         large_settings={
@@ -99,8 +99,8 @@ PROFILES: dict[str, Profile] = {
     ),
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
-        # Under noise, real modes hardly distinguish the three parameters, but slow pairs at frequencies of y do: two
-        # reduced the best decoder's error from 2.3 to 1.9 % (parameters 10 % off), and longer training by another 3 %.
+        # Under noise, real modes hardly distinguish the parameters, but slow pairs at frequencies of y do: the first
+        # two reduce the best decoder's error from 2.3 to 1.9 % (parameters 10 % off). More training cut T_inv's by 3 %.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,

@@ -52,7 +52,7 @@ class Run:
     resume : bool
         Whether stages resume from their checkpoints.
     losses : dict of str to list of (int, float)
-        For each stage, pairs of a number of batches and the mean error of the last 100 or less.
+        For each stage, pairs (batches so far, mean error over the last 100 of them or fewer).
     seconds : dict of str to float
         CPU seconds of each stage.
     samples : dict of str to int

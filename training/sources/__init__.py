@@ -84,7 +84,7 @@ class Source(Protocol):
         """Return arguments of :class:`training.maps.inverse.TrajectorySampler` that depend on the source."""
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report) -> Pairs:
-        """Return states of training motions and a filter along them; ``free``: of simulated motions without inputs."""
+        """Return states of training motions and of a filter along them; ``free``: simulated motions without inputs."""
 
     def runs(self, *, report: Report) -> Runs:
         """Return motions for calibration; raise TooFewRunsError if too few are held out."""
