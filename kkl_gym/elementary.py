@@ -132,7 +132,7 @@ def where(condition: Any, a: Any, b: Any) -> Any:
         A comparison such as ``x[0] > 0``. Combine several by ``&`` and ``|``, each in parentheses. Do not negate by
         ``~``, which is bitwise on Python's True and False: write the opposite comparison.
     a, b : float, array, tensor or sympy expression
-        Both are evaluated everywhere; infinite or NaN values do no harm where they are not selected.
+        Both are evaluated everywhere; infinite or NaN values that are not selected harm only torch's backward pass.
 
     Returns
     -------

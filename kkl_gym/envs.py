@@ -25,7 +25,7 @@ from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, Components, System, reward_of
 from observers.checks import integer, mapping, real_array, shown
 
-# Number of samples after which the step is compiled; in shorter simulations compiling takes more time than it saves.
+# Samples after which a reset compiles the step; in shorter simulations compiling takes more time than it saves.
 SOON = 1000
 _KEYS = (("a", "d"), ("s", "w"))  # keys for the lower and the upper bound of the first two inputs
 _INTEGER, _FLOAT32 = np.dtype(np.int64), np.dtype(np.float32)
@@ -289,7 +289,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     def _exchanged(self) -> None:
         self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
-        # The next reset adds _sample, so that only samples of the new system count towards SOON.
+        # The next reset adds _sample, which then includes samples of the old system; they do not count towards SOON.
         self._samples = -self._sample
 
     def _input(self, action: np.ndarray) -> list[float]:

@@ -49,7 +49,7 @@ def failed(error: Exception, equations: Equations, *args: Any) -> EquationError:
     frame = steps[0].tb_frame
     local = frame.f_locals.get(next(iter(frame.f_code.co_varnames[1:2]), ""))
     if isinstance(local, tuple | list | np.ndarray) and len(local) == len(x):
-        # Integration calls the equations at states within a step, too; they failed at their own argument.
+        # Integration also calls the equations at states within a step: report the state at which they failed.
         x = local
     return EquationError(
         f"{label(equations)} failed in {line_of(steps[-1])}: {what}; {held(x)}{_hint(error, steps[-1], x)}"

@@ -56,7 +56,7 @@ def rate_at(system: Any, x: Any) -> Any:
 
 
 def check_task(system: Any, x: Any, u: Any) -> list[Any]:
-    """Call a system's reward and terminated, and check the returned values. Shapes: ``x`` (nx,), ``u`` (nu,)."""
+    """Call a system's reward and terminated, and check the returned values. Shapes: ``x`` of length nx, ``u`` of nu."""
     wanted = "a bool or a comparison such as x[0] > 1 for each state x"
     ended = _number_at(system.terminated, wanted, x)
     if np.asarray(ended).dtype.kind != "b":

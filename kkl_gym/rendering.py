@@ -11,14 +11,14 @@ from kkl_gym.system import Box, System
 from observers.checks import shown
 
 ESTIMATE, TARGET = "C3", "C2"  # in matplotlib's colour cycle; states have the colour of text
-TRAIL = 1000  # most samples that a phase portrait shows
-FRAMES = 100  # most frames a second in a video; players can hardly show more
-DRAWN = 50  # most frames a second in a window, which runs in real time
+TRAIL = 1000  # largest number of samples that a phase portrait shows
+FRAMES = 100  # largest number of frames a second in a video; players can hardly show more
+DRAWN = 50  # largest number of frames a second in a window, which runs in real time
 ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 
 
 def render_metadata(dt: float, modes: Collection[str], render_mode: str | None = None) -> dict[str, Any]:
-    """Return metadata with the modes and the real-time frame rate; ValueError if ``render_mode`` is not a mode."""
+    """Return the modes and a frame rate of 1 / dt, at most FRAMES; ValueError if ``render_mode`` is not a mode."""
     if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
         raise ValueError(f"render_mode must be None or one of {[*modes]}, got {shown(render_mode)}")
     return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}

@@ -46,9 +46,9 @@ STAGES = (
     (9 / 44, -9 / 11, 63 / 44, 18 / 11, 0, -16 / 11),
 )
 WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
-# The error estimate is h times the difference between two stages' slopes at mid-step, of order h^5. This difference is
-# zero where the derivative depends only on time. Therefore 1/256 of the fourth divided difference over the interval is
-# added; its coefficients are (1, 0, -9, -9, 16, 0, 1).
+# The error estimate, of order h^5, is h times the difference between two stages' slopes at mid-step. This difference is
+# zero where the derivative depends only on time. Therefore a multiple of the slopes' fourth divided difference over the
+# interval is added, with the coefficients (1, 0, -9, -9, 16, 0, 1) / 256.
 ERROR = (1 / 256, 0, -9 / 256, -9 / 256, 16 / 256 - 1, 1, 1 / 256)
 # For each stage and for the result: coefficients of the state, of a constant slope and of the earlier slopes.
 _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]

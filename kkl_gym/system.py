@@ -217,7 +217,7 @@ class System:
         """Draw ``n`` starts, (n, nx), within ``factor`` times X; default: uniform in that box.
 
         Override it where not every point of X is a state, as for an angle given by its cosine and sine; such a system
-        also sets ``process_noise = 0.0``, because noise would leave the set of states. Starts lie within the bounds.
+        also sets ``process_noise = 0.0``, because noise would make x invalid. Starts must lie within the bounds.
         """
         return rng.uniform(*self.box(factor), (n, self.nx))
 

@@ -1,4 +1,4 @@
-"""Equations of the four benchmark systems, and the lookup of a system by its name."""
+"""Equations of the four benchmark systems of the paper (docs/background/paper.md), and their lookup by name."""
 
 # ruff: noqa: D102 - System documents the methods that each system overrides
 
@@ -114,7 +114,7 @@ class Rossler(System):
 
     name: ClassVar[str] = "rossler"
     X: ClassVar[Box] = ((-10, 10), (-10, 10), (0, 20))
-    # Multiples of X are about the origin, because the paper multiplies the corners of the box.
+    # Multiples of X are centred at the origin, because the paper multiplies the corners of the box.
     X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)
     bounds: ClassVar[Box] = ((-50, 50), (-70, 70), (-5, 500))
     u_max: ClassVar[tuple[float, ...]] = (2.0,)

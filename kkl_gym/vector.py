@@ -108,7 +108,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
         # A block of unscaled noise for each row, and the number of its samples that are used. At first all count as
-        # used, so that the first step draws a block.
+        # used, so that the first reset draws a block.
         self._w, self._v = (np.empty((NOISE_BLOCK, width, num_envs)) for width in (nx, self.plant.nv))
         self._used = np.full(num_envs, NOISE_BLOCK)
         self._everyone = np.arange(num_envs)
@@ -383,7 +383,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
 
 def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any] | None, np.ndarray]:
-    """Return the reset options and the mask (n,); options are copied, as some environments remove their mask."""
+    """Return the reset options and the mask (n,); options are copied, as some environments pop the mask."""
     given = dict(mapping("options", options))
     if given.get("reset_mask") is None:
         return None if options is None else given, np.ones(n, dtype=bool)

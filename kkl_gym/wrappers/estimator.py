@@ -202,7 +202,7 @@ def check_untouched(obs: Any, emitted: bytes, env: Any, inside: Any) -> None:
 
 
 def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds (2 nx,) of states and their standard deviations; these are at most ``high`` - ``low``."""
+    """Return bounds (2 nx,) of states, and of their standard deviations, which are at most ``high`` - ``low``."""
     with np.errstate(over="ignore"):  # widths beyond float32 become infinite
         return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
 

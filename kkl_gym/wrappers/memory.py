@@ -103,8 +103,8 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     Parameters
     ----------
     env : gymnasium.Env
-        Any environment whose observations and actions are Box or Discrete, or Dict and Tuple spaces of these. Images
-        may only be keys of a Dict.
+        Any environment whose observations and actions are Box, Discrete, MultiDiscrete or MultiBinary, or Dict and
+        Tuple spaces of these. Images may only be keys of a Dict.
     measured : sequence of int or of str, optional
         Entries that the agent sees: keys of a Dict, or indices in the flattened observation. With indices the
         observation is flat. None is all entries.

@@ -217,7 +217,7 @@ class _SignalsInInfo(VectorWrapper):
         return obs, reward, terminated, truncated, info | signals
 
     def _states(self, obs: Any, info: Infos) -> dict[str, np.ndarray]:
-        """Return the true hidden signals, and a mask of the rows that show them; empty if no row does."""
+        """Return the true hidden signals, and a mask of the rows that show them; empty if they cannot be read."""
         found = self._read.states(obs, info, (self.num_envs,))
         if found:
             known = np.ones(self.num_envs, dtype=bool)
