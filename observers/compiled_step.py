@@ -85,13 +85,13 @@ class CompiledStep:
 
 def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]:
     """Return ages in seconds since reset, and the covariances of both maps at these ages, (maps, ages, nx^2)."""
-    errors = [each.error for each in maps if each.error is not None]  # both have one if the observer tracks
+    errors = [each.error for each in maps if each.error is not None]  # each map has a covariance if the observer tracks
     ages = np.unique([age for error in errors for age in error.ages])
     return ages, np.array([error(ages, ages.shape).reshape(len(ages), -1) for error in errors])
 
 
 def _of_filter(linear: LinearFilter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return gains from z, outputs and inputs to the next z, and places and values of the off-diagonal gains from z."""
+    """Return the transition's diagonal stacked on ``drive``, and places and values of its other nonzero entries."""
     diagonal = linear.transition.diagonal()
     places = np.array(np.nonzero(linear.transition - np.diag(diagonal)))
     return np.vstack([diagonal, linear.drive]), places, linear.transition[*places]

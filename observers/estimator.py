@@ -27,7 +27,7 @@ class Estimator(Protocol[State]):
     def advance(self, state: State, y: np.ndarray, u: np.ndarray | None = None, dt: float | None = None) -> State:
         """Return the state after samples y (n, ny), NaN where missing, and inputs u (n, nu) held for dt before them.
 
-        A row starts at its first complete sample, and ignores its u. By default u is 0, dt the sampling interval.
+        A row starts at its first complete sample; earlier u are ignored. By default u is 0, dt the sampling interval.
         """
 
     def estimate(self, state: State) -> Estimate:

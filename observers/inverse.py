@@ -76,11 +76,11 @@ class InverseMap:
     noise_gain : ndarray, shape (modes,) or (ny, modes)
         Standard deviation of each mode per unit of sigma_v, for all outputs together or for each output.
     x_offset, x_scale : ndarray, shape (nx,)
-        Scaling of the estimate.
+        Scaling of the estimate; nx counts the estimated parameters, too.
     measurement_noise_unit : float or tuple of float, length ny, default 1
         Unit of sigma_v. If ``noise_gain`` has a row for each output, a number becomes a tuple.
     measurement_noise_max : float or tuple of float, length ny, default inf
-        The largest sigma_v in training, in the same form. A map without the feature takes any sigma_v.
+        The largest sigma_v in training, in the same form. A map without ``measurement_noise`` takes any sigma_v.
     process_noise_unit : float, default 1
         Unit of the process noise level.
     process_noise_max : float, default inf

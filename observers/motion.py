@@ -109,7 +109,7 @@ class Motion:
     mean : ndarray, shape (nx,)
         Mean of the initial states in training: the estimate before the first sample.
     covariance : ndarray, shape (nx, nx)
-        Covariance of the initial states in training.
+        Covariance of the initial states in training, in units of the states.
     error : ndarray, shape (nx,)
         Standard deviation of the model's error over one sample.
     process_noise : ndarray, shape (nx,)

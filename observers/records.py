@@ -24,7 +24,7 @@ class RecordEstimates:
     ) -> np.ndarray:
         """Return the estimates along a whole record, as :meth:`reset` and :meth:`step` would return them row by row.
 
-        The observer's own state does not change. Raises the errors of :meth:`reset` and :meth:`step`.
+        The observer's state does not change. Raises ValueError like :meth:`reset` and :meth:`step`, and with a delay.
 
         Parameters
         ----------
@@ -45,18 +45,18 @@ class RecordEstimates:
         return self._along(y, u, x0, of=self._kkl.decode, t=t)
 
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Return the estimates of uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
+        """Return estimates (steps, ..., number) of uncertain parameters: :attr:`parameters_hat` along a whole record.
 
-        Arguments and errors are those of :meth:`estimate`. Shapes: returns (steps, ..., number of parameters).
+        Arguments and errors are those of :meth:`estimate`; raises ValueError, too, if there are no such parameters.
         """
         return self._along(y, u, None, of=self._kkl.parameters_hat)
 
     def estimate_covariance(
         self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the error covariances of the estimates of :meth:`estimate`: :attr:`covariance` at each sample.
+        """Return the error covariances (steps, ..., nx, nx) of :meth:`estimate`: :attr:`covariance` at each sample.
 
-        Arguments and errors are those of :meth:`estimate`. Shapes: returns (steps, ..., nx, nx).
+        Arguments and errors are those of :meth:`estimate`; raises ArtifactError, too, if there is no covariance.
         """
         self.artifact.require_covariance()
         return self._along(y, u, x0, of=self._kkl.covariance)

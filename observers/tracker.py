@@ -65,8 +65,8 @@ class Tracker:
     """An unscented Kalman filter on the system's equations, or on a learned flow, with one estimate in each row.
 
     It starts from the initial states' mean and covariance in training, corrected by the first sample, or from a known
-    state as if past the first window. In this window each step is repeated twice: the sample corrects the state before
-    the step, too, and the motion is linearised about this smoothed state (Kullberg, Skog and Hendeby, 2023).
+    state, as if past the first :attr:`Motion.window`. In this window each step is repeated twice: the sample corrects
+    the state before the step, too, and the motion is linearised about this smoothed state (Kullberg et al., 2023).
 
     The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's in
     two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The

@@ -46,7 +46,7 @@ def onnx_model(exported: Exported) -> Any:
             dynamic_shapes=[None if value is None else {0: batch} for value in example.values()],
             custom_translation_table={torch.ops.aten.scalar_tensor.default: scalar},
             dynamo=True,
-            optimize=False,  # ONNX Runtime optimises when it loads the model, which is faster
+            optimize=False,  # ONNX Runtime optimises models on loading, faster than Torch would here
             verbose=False,
         )
     assert program is not None

@@ -58,7 +58,7 @@ static int untouched(const NAME_observer *observer)
 }
 // end free
 
-/* Writes T_inv(z), by the map for the inputs so far, to x_hat. */
+/* Writes T_inv(z) to x_hat. A map for motion without input, if any, applies until the first nonzero input. */
 static void invert(const NAME_observer *observer, real *x_hat)
 {
 // if free
@@ -287,7 +287,7 @@ static correction correct(prediction *p, const real y[NY])
     return c;
 }
 
-/* Predicts again, with the motion linearised about the last state, which the sample smooths. */
+/* Predicts again, with the motion linearised about the last state as smoothed by the sample. */
 static void relinearise(NAME_observer *observer, prediction *p, const real y[NY], const real *u)
 {
     correction c = correct(p, y);
