@@ -1,6 +1,6 @@
 """From CSV files to an observer in a control loop, without recorded states and with an unknown parameter.
 
-The identification from the command line, with the names and units of your own columns::
+The identification from the command line; options name the columns of your own files::
 
     kkl-gym identify van_der_pol --data runs/from_csv/record-*.csv --unknown mu=2 --out runs/from_csv
 """
@@ -64,7 +64,7 @@ def main(
     """Record, identify, control; returns the identified mu, and the costs with x_hat and with the true state.
 
     Args:
-        runs: number of files to write; with five or more, one is held out of the fit, to test predictions.
+        runs: number of files to write; the 6th, 16th, ... are held out of the fit, to test predictions.
         seconds: length of each record.
         inverse_steps: batches of the observer's training.
         trajectories: simulated trajectories of the identified plant, for the training.

@@ -26,7 +26,7 @@ FACTORS: dict[str, dict[str, float]] = {
 
 
 class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
-    """Shows [y, state]: the outputs of a faulty sensor, then the whole observation and the varied parameters.
+    """Shows [y, state]: the outputs of a faulty sensor, then the whole observation and the parameters' factors.
 
     With ``hold``, the last sample replaces a lost one, which is NaN otherwise.
     """

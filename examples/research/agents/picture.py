@@ -20,7 +20,7 @@ WIDTH = 4.6  # width of a column in inches
 
 
 def draw(task: Task, played: Mapping[str, Episodes], path: Path) -> None:
-    """Draw states, estimates, target, outputs and inputs over time of the first episode of several agents."""
+    """Draw states, estimates, target, outputs and inputs over time, for the first episode of each agent."""
     system = _system(task)
     names = [*system.state_names, *_numbered("y", system.ny), *_numbered("u", system.nu)]
     with drawing(path, WIDTH * len(played), 1.6 * len(names)) as figure:

@@ -8,7 +8,7 @@ import scipy
 
 
 def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
-    """Return scores on a scale with 0 for idle agents and 1 for the best agents."""
+    """Return scores on a scale with 0 for idle agents and 1 for ``top``, the mean of the agents on the full state."""
     span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
     return np.asarray((scores - idle) / span)
 
@@ -23,7 +23,7 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
 
     With only five agents the interval covers the true value in about nine of ten cases.
 
-    Shapes: ``values`` (n,), ``best`` (m,).
+    Shapes: ``values`` (n,), ``best`` (m,), the scores of the agents on the full state.
     """
 
     def statistic(mine: np.ndarray, tops: np.ndarray = best, axis: int = -1) -> np.ndarray:

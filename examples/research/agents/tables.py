@@ -46,7 +46,7 @@ WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 class Cell:
     """Agents of one kind in one task.
 
-    Shapes: ``values``, ``scores`` (n,). ``scores`` and ``interval`` are normalised, NaN without idle or best agents.
+    Shapes: ``values``, ``scores`` (n,). Normalised ``scores`` and ``interval``: NaN without idle or full-state agents.
     """
 
     values: np.ndarray
@@ -62,7 +62,7 @@ def on_systems(results: "pd.DataFrame") -> bool:
 
 
 def tasks_in(results: "pd.DataFrame") -> list[tuple[str, Any]]:
-    """Return environments and noise levels in order, without those that have only agents on the full state."""
+    """Return environments and noise levels in order, without those that have only full-state or idle agents."""
     partly = results[~results.shown.isin(["state", IDLE])]
     return list(partly[["environment", "noise"]].drop_duplicates().itertuples(index=False, name=None))
 
@@ -214,7 +214,7 @@ def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
 
 
 def _draw_panel(ax: "Axes", row: Sequence[Cell | None]) -> None:
-    """Draw agents as dots, and their means with intervals; the first kind is at the bottom."""
+    """Draw agents as dots, and their means with intervals; the first cell of ``row`` is at the bottom."""
     for place, cell in enumerate(row):
         if cell is not None and np.isfinite(cell.interval[0]):
             score, low, high = cell.interval

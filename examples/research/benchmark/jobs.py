@@ -145,7 +145,7 @@ class Training(Job):
         return method.load(path), seconds
 
     def time_steps(self) -> None:
-        """Time the steps of the observer, unless they are timed; call it while no training runs."""
+        """Time the steps of the observer, unless speed.json exists; call it while no training runs."""
         path = self.folder / "speed.json"
         if path.exists():
             return

@@ -16,7 +16,7 @@ from training.evaluation.levels import Level, as_cell, multiple
 from training.evaluation.metrics import by_state, nrmse, smape
 from training.seeds import Stream, generator
 
-UNTIMED, TIMED = 100, 400  # samples of each round; observers converge during the untimed samples
+UNTIMED, TIMED = 100, 400  # samples of a round of step_time; observers converge in the untimed ones
 LOST = 50.0  # a trajectory with a larger SMAPE in % after the transient counts as lost
 SETTLED = 0.1  # limit of settled errors, as a share of a trajectory's root mean square
 
@@ -37,7 +37,7 @@ def with_shared_noise(
 ) -> np.ndarray:
     """Return outputs with noise on every sample, the same noise for every method.
 
-    Shapes: ``measurement_noise`` of length ny; returns (steps + 1, trajectories inside bounds, ny).
+    ``measurement_noise`` is one level, or one for each output. Returns (steps + 1, trajectories inside bounds, ny).
     """
     unit = generator(*seed).standard_normal((n, len(runs.x), system.ny))
     v = np.asarray(measurement_noise) * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)

@@ -126,7 +126,7 @@ class Method(ABC, Generic[Trained]):
     def observer(self, trained: Trained, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
         """Make an observer. The arguments are positional, so that a class may choose their names.
 
-        Shapes: ``measurement_noise`` of length ny.
+        ``measurement_noise`` is one level for all outputs, or a tuple with one for each.
         """
 
     def save(self, trained: Trained, path: Path) -> None:

@@ -123,7 +123,7 @@ class TransformerCell(Cell):
         return torch.zeros(n, self.blocks, self.window, 2 * self.width)
 
     def forward(self, features: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Apply all blocks; a sample attends only to samples within a window before it."""
+        """Apply all blocks; a sample attends only to itself and to a window of samples before it."""
         samples, after = len(features), []
         age = torch.arange(samples)[:, None] + self.window - torch.arange(self.window + samples)
         hidden_by_age = (age < 0) | (age > self.window)
@@ -159,7 +159,7 @@ class Model(nn.Module):
         self.x_scale: torch.Tensor
 
     def forward(self, y: torch.Tensor, noise: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return scaled estimates (samples, n, nx) and the state after y (samples, n, ny); a missing sample is 0."""
+        """Return scaled estimates (samples, n, nx) and the state after y (samples, n, ny); NaN counts as mean y."""
         scaled = torch.nan_to_num((y - self.y_offset) / self.y_scale)
         hidden, state = self.cell(self.inlet(torch.cat([scaled, noise.expand_as(scaled)], -1)), state)
         return self.readout(hidden), state
@@ -218,7 +218,7 @@ class Transformer(SequenceMethod):
 class _Problem(nn.Module):
     """The model, and the positions of rows along the trajectories, which are buffers for the checkpoint.
 
-    A row follows a trajectory from its start for a random number of samples, its age, and then begins another one.
+    A row follows a trajectory from its start up to a random age in samples, and then begins another one.
     """
 
     def __init__(self, kind: type[Cell], task: Task) -> None:

@@ -18,7 +18,7 @@ from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
 
-BATCHES = 10  # steps of a batch for the Kalman filters, which are slow
+BATCHES = 10  # number of steps of the Kalman filters, which are slow, on a batch of rows
 FEWER = 10  # single steps in Python are timed on fewer samples by this factor
 
 
