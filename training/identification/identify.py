@@ -104,7 +104,7 @@ def estimate_parameters(
     whole = [record for record in pieces(records) if len(record.t) > least]
     if not whole:
         raise ValueError(f"no record has more than {least} samples without a gap: a fit of an initial state needs more")
-    held_out = whole[HELD_OUT // 2 :: HELD_OUT] if len(whole) >= HELD_OUT // 2 else []
+    held_out = whole[HELD_OUT // 2 :: HELD_OUT]
     fitted = [record for record in whole if not any(record is other for other in held_out)]
     rng, dt = np.random.default_rng(seed), float(records[0].t[1] - records[0].t[0])
     given = np.array([system.parameters[name] for name in unknown])
