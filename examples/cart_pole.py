@@ -1,6 +1,6 @@
 """An unstable plant, the cart-pole. Its observer is trained under one policy; another policy acts on the estimate.
 
-The same from the command line::
+Training and evaluation from the command line::
 
     kkl-gym train examples/cart_pole.py:CartPole --policy controller
     kkl-gym evaluate runs/cart_pole/cart_pole.safetensors --system examples/cart_pole.py:CartPole

@@ -1,4 +1,4 @@
-"""Bring your own system: define it, train an observer for it, run it inside an environment, evaluate it.
+"""Bring your own system: define it, train an observer for it, run this observer inside an environment, evaluate it.
 
 The same from the command line::
 

@@ -92,7 +92,7 @@ def _module(where: str) -> Any:
 
 @contextlib.contextmanager
 def _importing_from(folder: Path) -> Iterator[None]:
-    """Let a script import modules from its own folder, as Python does for a script that it runs."""
+    """Put a folder first on the import path: a script's own, as when Python runs it, or the current one for modules."""
     sys.path.insert(0, str(folder))
     try:
         yield

@@ -18,7 +18,7 @@ class Stream(IntEnum):
 
 
 def generator(stream: Stream, *seed: int) -> np.random.Generator:
-    """Make a generator for a purpose and a seed; further entries give other generators for parts of the purpose."""
+    """Make a generator for a purpose and a seed; a further nonzero entry gives another, for a part of the purpose."""
     for entry in seed:
         if not 0 <= entry < 2**32:
             raise ValueError(f"seed = {entry} must be a whole number from 0 to 2**32 - 1")

@@ -8,7 +8,7 @@ from training.evaluation.errors import UnseenTrajectories, estimates
 from training.evaluation.levels import Level
 
 REGIONS = {"50": 0.5, "90": 0.9, "99": 0.99}  # nominal shares of errors, by their names in tables
-INTERVAL = 0.95  # probability that the mean NEES of a consistent filter lies within its limits
+INTERVAL = 0.95  # probability that a consistent filter's NEES, averaged over trajectories at one sample, is in limits
 
 
 def coverage(
@@ -23,7 +23,7 @@ def coverage(
     """Compare covariances with errors on test trajectories; for arguments except ``spans`` see :func:`training.errors`.
 
     Returns for each span of samples the percentages of errors in the regions, for all states together ("90") and for
-    each state ("90 x1"), the mean NEES, and the limits of a consistent filter's mean NEES.
+    each state ("90 x1"), the mean NEES, and limits for a consistent filter's trajectory-averaged NEES at one sample.
     """
     x_hat, P = estimates(
         artifact, system, trajectories, measurement_noise=measurement_noise, seed=seed, covariances=True

@@ -65,7 +65,7 @@ def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
 
 
 def measure(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> pd.DataFrame:
-    """Evaluate an observer on test trajectories. Returns a row for each trajectory and case."""
+    """Evaluate an observer on test trajectories. Returns a row for each domain, noise level and trajectory."""
     n, frames = protocol.trajectories, []
     for i, domain in enumerate(protocol.domains):
         seed = (Stream.EVALUATION, protocol.seed, 1, i)

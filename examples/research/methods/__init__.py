@@ -20,7 +20,7 @@ def _by_name(*methods: Method[Any]) -> Methods:
 
 default = Default()
 METHODS = _by_name(default, SPINN(), NODE(), NODENoise(), GRU(), LRU(), Transformer(), EKF(), UKF())
-# Steps from the paper's pipeline to the package's, in the order of ``make ablation``.
+# The ablation's two series, in the order of ``make ablation``; the second ends at the default.
 ABLATION = _by_name(*SPINN_METHODS, *INVERSE_METHODS, default)
 # These need a map that ships for the system; they run only if they are named.
 AS_SHIPPED = _by_name(Shipped(), ShippedSPINN(), ShippedLarge())

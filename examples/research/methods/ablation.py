@@ -1,6 +1,6 @@
 """Ablation: series of pipelines, each of which differs from the next in a few settings, trained for equal times.
 
-One series leads from the paper's SPINN to the package's, the other from an inverse without noise to the default.
+One leads from the paper's SPINN to the package's, the other from an inverse trained without noise to the default.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,7 +26,7 @@ TOGETHER: Settings = {
     "high_noise_emphasis": 2.0,
 }
 ADAM: Settings = {"optimiser": "adam", "batch": 4096, "learning_rate": 8e-3}
-# The paper's SPINN (its sec. 8.1) except its spectrum and budget, with points uniform in X.
+# SPINN as in the paper's sec. 8.1, with collocation points uniform in X; spectrum and budget are set elsewhere.
 PAPERS: Settings = {
     "optimiser": "adam",
     "learning_rate": 1e-3,
