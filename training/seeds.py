@@ -11,7 +11,6 @@ class Stream(IntEnum):
     TRAINING = 1
     EVALUATION = 2
     VALIDATION = 3  # splits of records, their diagnosis, and the benchmark's choice of settings
-    CERTIFICATE = 4
     CALIBRATION = 5
     FAULTS = 6
     TUNING = 7

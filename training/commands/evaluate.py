@@ -300,7 +300,7 @@ class Evaluate:
             return []
         frame = pd.DataFrame(rows)
         limits = f"{frame.nees_low.min():.2f} to {frame.nees_high.max():.2f}"
-        caption = f"with true covariances, NEES lies within {limits} with probability 95 %"
+        caption = f"with true covariances, the NEES of one sample lies within {limits} with probability 95 %"
         title = f"{of.name}: errors in regions, %, {self._runs(of)}{of.on}"
         right = ["noise", *(f"{name} %" for name in REGIONS), "NEES"]
         progress.console.print(table(title, ["observer", "starts", "span"], shown, right, caption))
