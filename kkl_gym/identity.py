@@ -23,7 +23,7 @@ def source_of(env: Any) -> str:
 
 
 def check_autoreset(env: Any) -> None:
-    """Raise ValueError if there is a wrapper Autoreset inside, which starts the next episode at a step."""
+    """Raise ValueError if ``env`` contains an Autoreset wrapper, whose step may start the next episode."""
     base = env.unwrapped
     for one in base.envs if isinstance(base, gym.vector.SyncVectorEnv) else [env]:
         while isinstance(one, gym.Wrapper):

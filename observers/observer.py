@@ -43,7 +43,7 @@ class KKLObserver(RecordEstimates):
     artifact : Artifact
         The learned filter, maps and motion.
     measurement_noise : float or sequence of float, length ny, optional
-        Standard deviation of the noise on each sample, one for all outputs or one for each, for maps that take it. By
+        Standard deviation of the noise on each sample, one for all, or for each output if the map takes that. By
         default :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
     process_noise : float, optional
         Level of the noise on the state's derivative, in multiples of the system's scale per second as in environments,
@@ -62,7 +62,7 @@ class KKLObserver(RecordEstimates):
         Largest innovation, in multiples of its standard deviation. The observer treats outputs with larger innovations
         as missing; :attr:`rejected` counts them. In the first window (:attr:`Motion.window`, 0.5 s for the maps that
         ship) after a reset without ``x0``, it accepts all outputs. After a divergence, or a whole window beyond the
-        gate, it accepts outputs until they fit again, so a lasting jump is accepted. A gate needs a map that tracks.
+        gate, it accepts all outputs until they fit: it follows a lasting jump. A gate needs a map that tracks.
     delay : int, default 0
         Samples by which outputs arrive late. ``step(y, u)`` takes the output of ``delay`` samples ago and the input
         held since the last sample; the motion model then predicts the current state. A delay needs a map that tracks.
@@ -237,8 +237,8 @@ class KKLObserver(RecordEstimates):
     def score(self) -> np.ndarray:
         """How badly the samples since reset fit the estimates, shape (...,): above 1 a fault is likely.
 
-        The score is the largest ratio of a running mean or mean square of y - h(x_hat) to its upper limit, or of a
-        lower limit to a mean square. It is 0 in the warm-up after a reset, and missing outputs do not change it.
+        For y - h(x_hat), the score is the largest of running mean / limit, mean square / upper limit, and lower limit /
+        mean square. It is 0 in the warm-up after a reset, and missing outputs do not change it.
         Biased, frozen and dead sensors raise it, and so do states outside the training. :class:`observers.Limits` gives
         the rate of false alarms. Raises RuntimeError before :meth:`reset`, or without ``monitor=True``.
         """
@@ -261,7 +261,7 @@ class KKLObserver(RecordEstimates):
         """Distance of the filter's state from the image of T, shape (...,): 0 where z_y = T(x_hat).
 
         It is the root mean square of (T(x_hat) - z_y) / :attr:`ForwardMap.z_scale` over the entries of z_y. It is large
-        in the transient, under sensor faults and inputs, on another plant, and outside the training; noise adds a
+        in the transient, under inputs and sensor faults, on another plant, and outside the training; noise adds a
         little. It does not show a fault that keeps z on the image of T. Compare it with its value in sound runs.
         Raises RuntimeError before :meth:`reset`, and ValueError if the artifact holds no T.
         """
