@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.ma import MaskedArray, is_masked
 
-_FLOAT = np.dtype(float)  # arrays of float64 share this object, and `is` is the fastest comparison
+_FLOAT = np.dtype(float)  # arrays of float64 share this dtype object, and `is` is the fastest comparison
 LARGEST = 1e15  # largest absolute value of an output or input; larger values could overflow in float32
 _NO_NUMBERS = (bool, np.timedelta64)  # types that count as integers in Python and NumPy, but are no numbers
 _TEXTS = (str, bytes, bytearray, memoryview)  # sequences that are not lists of numbers
@@ -20,7 +20,7 @@ class ArtifactError(ValueError):
 
 
 def check_shapes(owner: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raise ArtifactError unless each attribute of ``owner`` that ``shapes`` names has the shape given there."""
+    """Raise ArtifactError unless ``owner`` has attributes of these shapes; the keys of ``shapes`` are their names."""
     for name, shape in shapes.items():
         if (given := getattr(owner, name).shape) != shape:
             raise ArtifactError(f"{name} does not fit the other parts: it must have shape {shape}, got {given}")

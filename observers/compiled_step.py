@@ -12,7 +12,7 @@ from observers.tracker import Tracker
 
 _LANES = 8  # rows of the batch that the kernel steps together
 MOST_OPERATIONS = 400  # in an expression; longer expressions, such as a network for f, take many seconds to compile
-MOST_ROWS = 32  # of a covariance; eight larger covariances, one for each lane, would exceed a thread's stack
+MOST_ROWS = 32  # of a covariance; larger covariances of _LANES rows of the batch would exceed a thread's stack
 
 
 class CompiledStep:
@@ -91,7 +91,7 @@ def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]
 
 
 def _of_filter(linear: LinearFilter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the transition's diagonal stacked on ``drive``, and places and values of its other nonzero entries."""
+    """Return the transition's diagonal above ``drive``, and places and values of nonzero entries off the diagonal."""
     diagonal = linear.transition.diagonal()
     places = np.array(np.nonzero(linear.transition - np.diag(diagonal)))
     return np.vstack([diagonal, linear.drive]), places, linear.transition[*places]

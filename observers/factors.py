@@ -33,8 +33,8 @@ class Factors:
         Levels of measurement noise, rising from 0, in multiples of the largest in the map's training.
     ages : ndarray, shape (m,)
         Seconds since reset, rising from 0.
-    factors : ndarray, shape (2, k, m)
-        Positive factors: [0] without process noise, [1] at its largest level in training; (1, k, m) holds for both.
+    factors : ndarray, shape (2, k, m) or (1, k, m)
+        Positive factors: [0] without process noise, [1] at its largest level in training; a single [0] holds for both.
     """
 
     levels: np.ndarray
@@ -95,7 +95,7 @@ class ErrorCovariance:
         return type(self)(np.zeros(1), self.ages, interpolated(level, self.levels, self.covariance)[None])
 
     def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
-        """Return the first level's covariances (..., nx, nx) at ages that broadcast to ``shape`` (...), if given."""
+        """Return the first level's covariances (..., nx, nx) at ages; ``shape``, if given, is the batch (...)."""
         return interpolated(np.broadcast_to(age, shape or np.shape(age)), self.ages, self.covariance[0])
 
 

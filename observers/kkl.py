@@ -91,7 +91,7 @@ class KKL(Estimator[np.ndarray]):
         return state
 
     def take_over(self, other: "KKL", state: np.ndarray) -> np.ndarray:
-        """Return rows that continue those of ``other`` with the same filter; a tracker starts if ``other`` has none."""
+        """Continue the rows of ``other``, which has the same filter; a tracker starts if ``other`` has none."""
         new = self.begin(state[:, other.y], state[:, other.z], state[:, other.age])
         if self.tracker is not None and other.tracker is not None:
             new[:, self.tracked] = self.tracker.take_over(state[:, other.tracked])
@@ -159,7 +159,7 @@ class KKL(Estimator[np.ndarray]):
     def _predicted(
         self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, state: np.ndarray, linear: LinearFilter
     ) -> np.ndarray:
-        """Fill gaps by h(T_inv(z)) at the next z, which the filter predicts with h(T_inv(z)) at the last z."""
+        """Fill gaps by h(T_inv(z)) at the last z, advance the filter by this sample, and fill again at the new z."""
         z, before, age = state[:, self.z], state[:, self.y], state[:, self.age]
         following, age = z, age * self.artifact.filter.dt
         for ahead in (0.0, linear.dt):

@@ -60,7 +60,7 @@ def _forgiving() -> Any:
     from numba.core.caching import FunctionCache
 
     class Forgiving(FunctionCache):
-        def _index_key(self, sig: Any, codegen: Any) -> Any:  # the name contains a hash of the content
+        def _index_key(self, sig: Any, codegen: Any) -> Any:  # __qualname__ contains a hash of the content
             return sig, codegen.magic_tuple(), self._py_func.__qualname__
 
         def load_overload(self, *arguments: Any) -> Any:
@@ -84,7 +84,7 @@ def _forgiving() -> Any:
 def part(**options: Any) -> Callable[[_F], _F]:
     """Register a plain function that kernels may call.
 
-    A compiled function would differ between processes, and kernels that call it would not be found on disk.
+    A compiled function would differ between processes, so the cache on disk would be useless for kernels that call it.
     """
 
     def registered(function: _F) -> _F:

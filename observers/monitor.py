@@ -23,7 +23,7 @@ class Limits:
         Standard deviations of the measurement noise, one for all outputs or one for each, rising from 0. With one for
         each, every row is a multiple of the last row. Limits are interpolated between levels.
     mean : ndarray, shape (k, ny)
-        Limits of the absolute value of the residual's running mean.
+        Limits of the residual's running mean, in absolute value.
     low, high : ndarray, shape (k, ny)
         Limits of the residual's running mean square. ``low`` is 0 at level 0, where sound sensors have no noise.
     window : float

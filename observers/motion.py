@@ -120,7 +120,7 @@ class Motion:
         Lower bounds of the assumed standard deviations of the measurement noise.
     window : float
         Seconds over which innovations are averaged. For this time after a reset, T_inv's estimate may replace the
-        tracker's.
+        tracker's even without a divergence.
     factors : Factors, optional
         Calibration factors of the Kalman filter's covariance.
     """

@@ -43,8 +43,8 @@ class KKLObserver(RecordEstimates):
     artifact : Artifact
         The learned filter, maps and motion.
     measurement_noise : float or sequence of float, length ny, optional
-        Standard deviation of the noise on each sample, one for all, or for each output if the map takes that. By
-        default :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
+        Standard deviation of the noise on each sample: one for all outputs, or one for each if the map takes that.
+        By default :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
     process_noise : float, optional
         Level of the noise on the state's derivative, in multiples of the system's scale per second as in environments,
         for maps that take it. T_inv limits the level to the largest in its training; the tracker takes any level. By
@@ -61,8 +61,8 @@ class KKLObserver(RecordEstimates):
     gate : float, optional
         Largest innovation, in multiples of its standard deviation. The observer treats outputs with larger innovations
         as missing; :attr:`rejected` counts them. In the first window (:attr:`Motion.window`, 0.5 s for the maps that
-        ship) after a reset without ``x0``, it accepts all outputs. After a divergence, or a whole window beyond the
-        gate, it accepts all outputs until they fit: it follows a lasting jump. A gate needs a map that tracks.
+        ship) after a reset without ``x0``, it accepts all outputs. After a divergence or a whole window beyond the
+        gate, an output is accepted until it fits: the observer follows a lasting jump. A gate needs a map that tracks.
     delay : int, default 0
         Samples by which outputs arrive late. ``step(y, u)`` takes the output of ``delay`` samples ago and the input
         held since the last sample; the motion model then predicts the current state. A delay needs a map that tracks.

@@ -24,7 +24,7 @@ class RecordEstimates:
     ) -> np.ndarray:
         """Return the estimates along a whole record, as :meth:`reset` and :meth:`step` would return them row by row.
 
-        The observer's state does not change. Raises ValueError like :meth:`reset` and :meth:`step`, and with a delay.
+        The observer keeps its state. Raises ValueError like :meth:`reset` and :meth:`step`, and if there is a delay.
 
         Parameters
         ----------
@@ -47,7 +47,7 @@ class RecordEstimates:
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Return estimates (steps, ..., number) of uncertain parameters: :attr:`parameters_hat` along a whole record.
 
-        Arguments and errors are those of :meth:`estimate`; raises ValueError, too, if there are no such parameters.
+        Arguments and errors are those of :meth:`estimate`. Also raises ValueError if there are no such parameters.
         """
         return self._along(y, u, None, of=self._kkl.parameters_hat)
 
@@ -56,7 +56,7 @@ class RecordEstimates:
     ) -> np.ndarray:
         """Return the error covariances (steps, ..., nx, nx) of :meth:`estimate`: :attr:`covariance` at each sample.
 
-        Arguments and errors are those of :meth:`estimate`; raises ArtifactError, too, if there is no covariance.
+        Arguments and errors are those of :meth:`estimate`. Also raises ArtifactError if the artifact has no covariance.
         """
         self.artifact.require_covariance()
         return self._along(y, u, x0, of=self._kkl.covariance)

@@ -18,7 +18,7 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tr
     if not isinstance(artifact, Artifact):
         raise ValueError(f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names")
     if flag("monitor", monitor) and artifact.limits is None:
-        parts = "limits" if artifact.knows_output else "limits and with the output h(x), which it lacks, too"
+        parts = "limits" if artifact.knows_output else "limits and with the output h(x), which this one lacks, too"
         raise ValueError(
             f"this artifact for {artifact.system!r} holds no limits for a monitor; training.calibrate(artifact, "
             f"system) returns an artifact with {parts}"

@@ -31,7 +31,7 @@ _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype
 
 @contextmanager
 def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Put ``path``, the written file, into OSErrors that name the temporary file or, as on a full disk, no file."""
+    """Name ``path`` in OSErrors that name the temporary file instead or, as on a full disk, no file."""
     try:
         yield
     except OSError as problem:

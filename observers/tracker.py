@@ -11,9 +11,9 @@ from observers.decoder import Decoders
 from observers.motion import Motion
 from observers.unscented import add, factor, shift, solved, transformed, whitened
 
-# The two limits of Supervision follow from these quantiles of the normal distribution. A NIS beyond its limit discards
-# the estimate; a trend (mean innovation) beyond its limit only inflates the covariance. Running means are more skewed
-# than the assumed chi-square distribution: white innovations exceed the trend's limit with probability 2e-4 (not 1e-5).
+# The two limits of Supervision follow from these quantiles of the normal distribution. Beyond the limit of the NIS, the
+# tracker discards its estimate; beyond the limit of the trend's mean square, it only inflates the covariance. This mean
+# square is more skewed than chi-square: for white innovations it exceeds its limit with probability 2e-4, not 1e-5.
 _DIVERGED = 6.0  # for the NIS, with tail probability 1e-9
 _COLOURED = 4.265  # for the mean square of the trend, with tail probability 1e-5
 _TREND = 0.25  # time constant of the trend, the innovations' running mean, in multiples of Motion.window
@@ -64,15 +64,15 @@ def _limit(freedom: float, quantile: float) -> float:
 class Tracker:
     """An unscented Kalman filter on the system's equations, or on a learned flow, with one estimate in each row.
 
-    It starts from the initial states' mean and covariance in training, corrected by the first sample, or from a known
-    state, as if past the first :attr:`Motion.window`. In this window each step is repeated twice: the sample corrects
-    the state before the step, too, and the motion is linearised about this smoothed state (Kullberg et al., 2023).
+    It starts from the initial states' mean and covariance in training, corrected by the first sample. At a known state
+    it starts as if past the first :attr:`Motion.window`. In this window each step is repeated twice: the sample also
+    corrects the state before the step, and the motion is linearised about this smoothed state (Kullberg et al., 2023).
 
     The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's in
     two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The
     filter has diverged if the mean square of its innovations over the window (NIS) exceeds its limit, or if its
-    covariance is no longer positive definite. T_inv's covariance is then that of an age of at most one window, because
-    the cause of the divergence may have disturbed z, too.
+    covariance is no longer positive definite. T_inv's covariance is taken at an age of at most one window, because the
+    cause of the divergence may have disturbed z, too.
 
     Estimation errors smaller than the noise still correlate the innovations. If the mean square of the innovations'
     running mean exceeds its limit, the covariance is multiplied by ten.
@@ -131,7 +131,7 @@ class Tracker:
         return self._packed(x, P, np.concatenate([np.ones((n, 2)), seen, np.zeros((n, 1 + 2 * y.shape[1]))], 1))
 
     def take_over(self, rows: np.ndarray) -> np.ndarray:
-        """Return the rows of a tracker with another motion, with estimates limited to this motion's bounds."""
+        """Return another tracker's rows, with their estimates limited to the bounds of this tracker's motion."""
         rows = rows.copy()
         rows[:, self.x] = self._within(rows[:, self.x])
         return rows
@@ -187,7 +187,7 @@ class Tracker:
     def _gated(
         self, rows: np.ndarray, y: np.ndarray, innovation: np.ndarray, S: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return outputs (n, ny), NaN where rejected, and the updated counts (n, 1 + ny) of outputs beyond the gate."""
+        """Return outputs (n, ny), NaN where rejected, and the gate's updated counts (n, 1 + ny); see the class."""
         counts, window = rows[:, self.nis + 3 : self.trends], self.supervision.window
         if self.gate == math.inf:
             return y, counts

@@ -13,7 +13,7 @@ _BETA = 2.0
 
 
 def weights(nx: int) -> tuple[float, float, float]:
-    """Return the weights of the central point in means and in covariances, and of every other point in both."""
+    """Return the central point's weight in means, its weight in covariances, and each outer point's weight in both."""
     middle = (_scale(nx) - nx) / _scale(nx)
     return middle, middle + _BETA, 1 / (2 * _scale(nx))
 
@@ -85,7 +85,7 @@ def factor(P: np.ndarray) -> np.ndarray:
     """Return the Cholesky factors (n, nx, nx) of covariances, NaN where P is not positive definite or not finite."""
     try:
         root: np.ndarray = np.linalg.cholesky(P)
-    except np.linalg.LinAlgError:  # it does not name the failing matrices, which halving finds
+    except np.linalg.LinAlgError:  # the error does not name the failing matrices; halving the batch finds them
         root = np.full_like(P, np.nan)
         rows = np.flatnonzero(np.isfinite(P).all((1, 2)))
         if len(P) > 1:

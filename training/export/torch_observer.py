@@ -22,7 +22,7 @@ class TorchObserver(Module):
     ``state * ~done[:, None]`` restarts the rows of finished episodes. In later samples, NaN marks missing outputs.
 
     The whole step is differentiable, also with respect to the weights. The filter's state and the tracker's covariance
-    are float64 whatever ``dtype`` is; after ``observer.float()``, T_inv's estimates are inaccurate.
+    are float64 whatever ``dtype`` is. In float32, after ``observer.float()``, T_inv's estimates would be inaccurate.
 
     Parameters
     ----------

@@ -12,11 +12,11 @@ from observers.expression import Expression
 from observers.network import MLP
 from training.maps.networks import from_mlp
 
-LEAST_PIVOT = 1e-30  # lower bound of the pivots, which are variances, by which a Cholesky factorisation divides
+LEAST_PIVOT = 1e-30  # lower bound of the pivots by which a Cholesky factorisation divides; they are variances
 
 
 def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Return a function that converts numbers to tensors of doubles, bools to tensors, and calls ``function``."""
+    """Return a version of ``function`` that also takes numbers, which become doubles, and bools."""
 
     def tensor(value: Any) -> Tensor:
         return torch.tensor(value, dtype=torch.bool if isinstance(value, bool) else torch.float64)
@@ -83,8 +83,8 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 def eliminated(P: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return the Cholesky factors L of covariances P = L L^T (m, m, n), stacked on B L^-T for matrices B (k, m, n).
 
-    Also returns a mask (n,) of the P that are positive definite. In every other P, LEAST_PIVOT replaces smaller pivots,
-    so that gradients stay finite. Entries of L above the diagonal are rounding errors.
+    Also returns a mask (n,) of the P that are positive definite. In the others, LEAST_PIVOT replaces smaller pivots, so
+    that gradients stay finite. Entries of L above the diagonal are rounding errors.
     """
     rest, columns, pivots = torch.cat([P, *rows]), [], []
     for j in range(len(P)):

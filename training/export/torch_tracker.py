@@ -51,7 +51,7 @@ class TorchTracker(Module):
         self.put(levels=factors.levels, ages=factors.ages, factors=factors.factors[0], most=factors.factors[-1])
 
     def covariance(self, state: Tensor, age: Tensor, share: Tensor, process_share: Tensor) -> Tensor:
-        """Return calibrated covariances (n, nx^2) at ages (n, 1) and shares (n, 1) of the largest noise levels."""
+        """Return calibrated covariances (n, nx^2) at ages (n, 1) and noise levels (n, 1), relative to the largest."""
         table = self.factors + process_share.clamp(max=1.0)[..., None] * (self.most - self.factors)
         factor = between(age, self.ages, between(share, self.levels, table).log()[..., None]).exp()
         return factor * (self._unpacked(state)[1] * self.units).flatten(0, 1).T
@@ -63,7 +63,7 @@ class TorchTracker(Module):
     def advance(
         self, state: Tensor, y: Tensor, u: Tensor, begins: Tensor, measurement_noise: Tensor, process_noise: Tensor
     ) -> tuple[Tracked, Tensor]:
-        """Predict, correct by y (ny, n; missing: NaN); return the state (on failure NIS = inf) and expected outputs."""
+        """Predict and correct by y (ny, n); return the state, with infinite NIS on failure, and expected outputs."""
         Q = self.eye * ((process_noise.clamp(min=self.least_process_noise) * self.process_noise) ** 2 + self.error**2)
         R = self.eye_y * torch.maximum(measurement_noise, self.least_measurement_noise) ** 2
         numbers, (x0, P0, nis, square, seen, trend) = self.numbers, self._unpacked(state)
@@ -132,7 +132,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return V and white (corrected: mean + V white, P - V V^T), the expected outputs, and whether V is valid."""
+        """Return V and white for corrected mean + V white and P - V V^T, expected outputs, and whether V is valid."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)
@@ -149,7 +149,7 @@ class TorchTracker(Module):
     def _transformed(
         self, x: Tensor, L: Tensor, function: Callable[[Tensor, Tensor], Tensor], u: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return mean and covariance of a function of s ~ N(x, L L^T) by sigma points, and E: L E^T = cov(s, .)."""
+        """Return mean and covariance of f(s), s ~ N(x, L L^T), by sigma points, and E with L E^T = cov(s, f(s))."""
         middle, far, count = x[:, None], self.far * L, 1 + 2 * self.nx
         to = function(torch.cat([middle, middle + far, middle - far], 1).flatten(1), u.repeat(1, count))
         to = to.reshape(len(to), count, -1)
