@@ -175,7 +175,7 @@ class _Calibration:
         return distances, extremes
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
-        """Return ``find`` of values (ages, n, ...) around each knot, or around the nearest with ``FEWEST`` or more."""
+        """Return ``find`` of values (ages, n, ...) near each knot, or near the closest knot with ``FEWEST`` values."""
         finite = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
         cells = [np.isin(self.ages, span)[:, None] & finite for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]

@@ -188,7 +188,7 @@ def load(module: str, name: str) -> Callable[..., Any]:
 
 @cache
 def _described(module: str, name: str) -> Callable[..., Any]:
-    """Make a substitute for a command that is not called: its summary is read from the source, without an import."""
+    """Make a substitute for a command that is not called, with the summary that the command's source holds."""
     import ast  # not at the top, so that interruptions are handled before slow imports
     from importlib.util import find_spec
     from pathlib import Path
@@ -205,7 +205,7 @@ def _described(module: str, name: str) -> Callable[..., Any]:
 
 
 def _message(error: Exception) -> str:
-    """Return an error's message; it has a line ``name = value: requirement`` for each invalid setting."""
+    """Return an error's message; for a ValidationError, a line ``name = value: requirement`` for each setting."""
     from pydantic import ValidationError
 
     if isinstance(error, OSError) and error.filename and error.strerror:

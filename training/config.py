@@ -135,7 +135,7 @@ class Config:
     estimate_parameters: bool = False
     """Whether T_inv estimates the uncertain parameters, too."""
     cpu_seconds: Positive | None = None
-    """CPU seconds after which the training of all networks together ends, even before the last step."""
+    """Most CPU seconds for training the maps' networks together; a flow may take as many again."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of everything random."""
 

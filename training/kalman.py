@@ -18,7 +18,7 @@ NOISE_FLOOR = 0.002  # least measurement noise that a filter assumes, in multipl
 
 
 def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
-    """Return the covariance (ny, ny) of the noise that a filter assumes on y, at levels of at least ``NOISE_FLOOR``."""
+    """Return the covariance (ny, ny) of assumed noise on y; its level is at least ``NOISE_FLOOR`` of the default."""
     least = NOISE_FLOOR * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)

@@ -30,7 +30,7 @@ from training.spectrum import Spectrum, check_continuous
 
 # Size and training of the flow's network.
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
-LEAST = 0.01  # added to a scaled residual's mean square, by which the loss divides, lest tiny residuals dominate
+LEAST = 0.01  # the loss divides errors by the scaled residual's mean square plus this, lest tiny residuals dominate
 LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, as a fraction of the increments' rms
 
 
@@ -91,8 +91,8 @@ def train(
     Raises
     ------
     ValueError
-        If ``folder`` holds checkpoints and ``resume`` is False, or checkpoints of another configuration; if another
-        process works in it, motions leave the system's bounds, or ``config`` differs from a source's configuration.
+        If ``folder`` holds checkpoints and ``resume`` is False, holds those of another configuration, or is in use by
+        another process; if motions leave the system's bounds, or ``config`` differs from a source's configuration.
     FloatingPointError
         If the loss becomes NaN.
     """
@@ -132,7 +132,7 @@ def train(
 
 
 def _motion(source: Source, run: Run) -> Motion | None:
-    """Return the tracker's motion model, by the source's equations or else a flow; None if tracking is impossible."""
+    """Return the tracker's motion model, with the source's equations or else a flow; None if tracking is impossible."""
     try:
         parts = source.tracking()
     except ValueError as reason:
@@ -280,7 +280,7 @@ def learn_flow(source: Source, run: Run) -> Motion:
     with run.timed("motions"), run.progress.phase("motions for a flow") as report:
         learned, judged = source.increments(report=report)
     parts = {"x_offset": learned.x.mean(0), "x_scale": spread(learned.x)} | parts
-    offset, scale = parts["x_offset"], parts["x_scale"]  # a source's x_scale is kept: its process noise has that unit
+    offset, scale = parts["x_offset"], parts["x_scale"]  # a source that gives x_scale gives process noise in that unit
     u_scale = np.abs(learned.u).max(0, initial=0.0)
     u_scale = np.where(u_scale > 0, u_scale, 1.0)
     inputs = np.column_stack([(learned.x - offset) / scale, learned.u / u_scale])

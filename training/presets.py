@@ -75,7 +75,7 @@ PROFILES: dict[str, Profile] = {
         # The paper's eigenvalues suffice, as motions of this system neither diverge nor converge.
         spinn_settings={"eigenvalues": tuple(np.linspace(-1.5, -3.0, 5).tolist())},
         controller=homogeneous,
-        fault_deadline=10.0,  # more than a period from (1, 0), 6.2, or from (0, 1), 7.4
+        fault_deadline=10.0,  # longer than the period of motions from (1, 0), 6.2 s, and from (0, 1), 7.4 s
     ),
     "van_der_pol": Profile(
         # Fast modes follow the jumps of y, and slow ones average its noise; this range gave the smallest errors.
@@ -100,7 +100,7 @@ PROFILES: dict[str, Profile] = {
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
         # Under noise, real modes hardly distinguish the parameters, but slow pairs at frequencies of y do: the first
-        # two reduce the best decoder's error from 2.3 to 1.9 % (parameters 10 % off). More training cut T_inv's by 3 %.
+        # two reduce the least error from 2.3 to 1.9 % (parameters 10 % off). More training cut T_inv's error by 3 %.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
@@ -219,7 +219,7 @@ def preset(
 
 
 def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
-    """Return real eigenvalues of A for an input-aware map: the profile's, or else from the system's rate and dt."""
+    """Return an input-aware map's real eigenvalues of A: the profile's, or else ones from the system's rate and dt."""
     chosen = profile(system).eigenvalues
     if chosen is not None:
         return chosen

@@ -8,7 +8,7 @@ from training.evaluation.errors import UnseenTrajectories, estimates
 from training.evaluation.levels import Level
 
 REGIONS = {"50": 0.5, "90": 0.9, "99": 0.99}  # nominal shares of errors, by their names in tables
-INTERVAL = 0.95  # probability that a consistent filter's NEES, averaged over trajectories at one sample, is in limits
+INTERVAL = 0.95  # probability that a consistent filter's NEES, averaged over trajectories at a sample, is in the limits
 
 
 def coverage(

@@ -38,8 +38,8 @@ def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     """Root mean square error of each state, in percent of that state's standard deviation.
 
     The standard deviation is over all steps of all trajectories, skipped steps too, so that small errors stay small
-    where motions come to rest. Unlike a norm of all states, it does not depend on units. Tables show the median over
-    the trajectories.
+    where motions come to rest. Unlike a norm of all states, this error does not depend on units. Tables show the
+    median over the trajectories.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ class Batch(NamedTuple):
 
 
 class Sampler(Protocol):
-    """Draws batches for T_inv, in cells that count equally in the loss, and makes an inverse map of a network."""
+    """Draws batches for T_inv, each sample in one of ``cells`` groups, and makes the inverse map of a network."""
 
     cells: int = 1
     kinds_of_plant: int = 1  # 2 if motions with the system's own parameters have separate cells
@@ -194,7 +194,7 @@ class ForwardMapSampler(Sampler):
     Lipschitz constant (paper, lemma R-eta-bound). Gaussian noise with the covariance of T's error, measured on the
     training data of T, is therefore added to z', and each coordinate is shrunk to its linear conditional mean.
 
-    Shapes: ``error``, the covariance of T's error, (nz, nz), ``points`` (n, nx).
+    Shapes: ``error`` (nz, nz), the covariance of T's error; ``points`` (n, nx).
     """
 
     def __init__(

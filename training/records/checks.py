@@ -1,4 +1,4 @@
-"""Checks of well-formed records: signals, values and time steps."""
+"""Checks of the signals, values and time steps of records."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

@@ -68,10 +68,10 @@ def learn(
     """
     from training.lessons import train  # torch takes seconds to import
 
-    # Config checks the settings before anything is played; -1 stands for eigenvalues that follow from the rollouts.
     if not np.size(hidden):
         raise ValueError("name the hidden signals, which the observer is to estimate, as in hidden=[2]")
     settings = {"seed": seed} | settings
+    # Config checks the settings before anything is played; -1 stands for eigenvalues that follow from the rollouts.
     Config("input-aware", **{"eigenvalues": (-1.0,)} | {name: v for name, v in settings.items() if v is not None})
     folder = None if out is None else Path(out)
     if folder is not None:

@@ -51,9 +51,9 @@ class KKLTrainingCallback(BaseCallback):
 
     An observer is accurate where its rollouts have been, but an agent in training goes elsewhere. A refit learns T_inv,
     the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
-    replaces the old one unless the new one's error on that share is larger. Filters keep their states. A refit
-    takes place only when an algorithm begins to collect a rollout (so that no on-policy batch mixes two observers) or
-    after a rehearsal, and only if a kept episode, cut after 250 steps, is as long as the filter's settling time.
+    replaces the old one unless the new one's error on that share is larger. Filters keep their states. A refit takes
+    place only after a rehearsal, or as an algorithm begins to collect a rollout, lest an on-policy batch mix observers.
+    Episodes are cut into parts of 250 steps, and a refit needs a part as long as the filter's settling time.
 
     The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square, divided by
     standard deviations), and ``kkl/error_before``, that of the observer before the refit.
@@ -271,7 +271,7 @@ class Gathering:
         self._signals = Signals("t", *(tuple(names[role]) for role in ROLES.values()))
         self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
         self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
-        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; last piece by environment
+        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; the open one by row
         self._made = self.steps = 0
         check_dt(before, self._dt)
         for record in before:

@@ -67,8 +67,8 @@ class RecordedSource:
     Raises
     ------
     ValueError
-        If a record has no hidden states, records have different signals, ``arbitrary_zero`` names one that is not
-        measured, no signal moves, or dt does not suit the records.
+        If a record has no hidden states, records have different signals, ``arbitrary_zero`` names a signal that is
+        not measured, no signal moves, or dt does not suit the records.
     """
 
     def __init__(
@@ -317,7 +317,7 @@ def recorded_errors(
     *,
     measurement_noise: float | tuple[float, ...] = 0.0,
 ) -> dict[str, float]:
-    """Return hidden signals' rms errors divided by std, after ``after`` s (None: settling time); NaN if undefined."""
+    """Return hidden signals' rms errors from ``after`` s on (None: settling time), divided by std; NaN if undefined."""
     first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
     pairs, rng = [np.zeros((0, 2, artifact.nx))], np.random.default_rng(0)
     for record in pieces(records):

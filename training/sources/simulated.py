@@ -19,7 +19,7 @@ from training.trajectories.equations import describe, digest, field_expression, 
 from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, recording_ages
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
-LEAD_IN_SHARE = 0.4  # share of the motions without inputs that start where inputs have led the state from X
+LEAD_IN_SHARE = 0.4  # in this share of the motions without inputs, earlier inputs have moved the start
 BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and some of a flow's training motions
 # Random inputs drive every other calibration run. A policy drives all, every other one without errors or exploration.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
@@ -30,7 +30,7 @@ SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
 INTEGRATION_ERROR = 2e-5  # largest error of these steps in standard deviations of the states, well below the noise
 TOO_FAR_OFF = 0.01  # if SUBSTEPS steps have a larger error, for example because f jumps, a flow is learned
 INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
-DEVIATIONS = (1e-4, 0.3)  # range of distances of increments' first states from motions, in standard deviations
+DEVIATIONS = (1e-4, 0.3)  # range of typical distances of increments' starts from motions, in standard deviations
 
 
 class SimulatedSource:

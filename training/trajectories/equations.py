@@ -25,7 +25,7 @@ _NAMES = {
 
 
 def describe(system: System) -> dict[str, Any]:
-    """Return the identity of a system, with a hash of its equations at points of X."""
+    """Return the identity of a system, with a hash of the values of its equations at points of X."""
     rng = np.random.default_rng(0)
     x = system.draw_starts(rng, 20)
     if system.discrete:

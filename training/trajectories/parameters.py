@@ -10,9 +10,9 @@ from kkl_gym.system import Box, Components, System
 from observers.checks import shown
 from training.trajectories.motions import Controller
 
-# Share of the training motions with the system's own value of an uncertain parameter. With k parameters, the share with
-# all own values is this share to the power k. NOMINAL_SHARE was chosen on the four systems that ship: with 0.6
-# and layers of 256 units, Lorenz's map no longer distinguished its own plant from the others.
+# With k uncertain parameters, NOMINAL_SHARE ** k of the training motions have the system's own values of all of them,
+# and the other motions have other values. NOMINAL_SHARE was chosen on the four systems that ship: with 0.6 and layers
+# of 256 units, Lorenz's map no longer distinguished its own plant from the others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of an additional state: hardly any process noise acts on it, and 0 would be invalid
 EVERY = "all"  # stands for every parameter that is not named
@@ -46,11 +46,11 @@ def nominal_share(ranges: Ranges) -> float:
 
 
 def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False) -> System:
-    """Return a system whose states are x, followed by some of its parameters, which stay constant.
+    """Return a system whose states are x, followed by the parameters in ``ranges``, which stay constant in a motion.
 
-    An observer of such a system estimates parameters; each motion has its own values. In training, a share of the
-    motions has the system's own parameters, which are the likeliest; the parameters of the others lie more often near
-    the ends of their ranges, where errors are largest.
+    An observer of this system can estimate the parameters. In training, a share of the motions has the system's own
+    parameters, which are the likeliest. The parameters of the other motions lie more often near the ends of their
+    ranges, where errors are largest.
     """
     if not ranges:
         return system
