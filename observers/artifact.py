@@ -258,12 +258,12 @@ class Artifact:
             "--pipeline spinn makes one"
         )
 
-    def require_known_start(self) -> None:
-        """Raise ArtifactError unless an observer can start at a known state, which needs T or a motion."""
-        if self.motion is None and self.forward is None:
+    def require_known_start(self, *, tracking: bool) -> None:
+        """Raise ArtifactError unless an observer, which tracks or not, can start at a known state."""
+        if not tracking and self.forward is None:
             self._lacks(
-                "cannot start at a known state: it holds neither a motion nor T; kkl-gym train SYSTEM makes a map with "
-                "a motion, and kkl-gym train SYSTEM --pipeline spinn a map with T"
+                "cannot start at a known state: it has no T, and the observer does not track; kkl-gym train SYSTEM "
+                "makes a map that tracks, and kkl-gym train SYSTEM --pipeline spinn a map with T"
             )
 
     def require_covariance(self) -> None:

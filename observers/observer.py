@@ -216,8 +216,8 @@ class KKLObserver(RecordEstimates):
         Raises
         ------
         ValueError
-            If a shape is wrong, an entry is not a finite real number, or x0 is given and the artifact holds neither T
-            nor a motion model. The observer is then unchanged.
+            If a shape is wrong, an entry is not a finite real number, or x0 is given, but the map has no T and the
+            observer does not track. The observer is then unchanged.
         """
         y0 = real_array("y", y0).copy()  # the caller may reuse its array
         check_output(self.artifact, y0, y0.shape[:-1])
@@ -228,7 +228,7 @@ class KKLObserver(RecordEstimates):
 
     def _begin(self, y0: np.ndarray, x0: np.ndarray | None) -> np.ndarray:
         """Return rows of the state at first samples (..., ny) and, if given, known states (..., nx)."""
-        z0, age = first_state(self.artifact, y0, x0)
+        z0, age = first_state(self.artifact, self.tracking, y0, x0)
         n = math.prod(y0.shape[:-1])
         x0 = None if x0 is None else real_array("x0", x0).reshape(n, self.artifact.nx)
         return self._kkl.begin(y0.reshape(n, self.artifact.ny), z0.reshape(n, self.artifact.filter.size), age, x0)

@@ -129,11 +129,11 @@ def held_input(
     return u if nu else u[..., :0]
 
 
-def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
+def first_state(artifact: Artifact, tracking: bool, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
     """Return the filter's state (..., size) and age at the first sample (..., ny), from ``x0`` (..., nx) if given."""
     if x0 is None:
         return artifact.filter.start(y0), 0
-    artifact.require_known_start()
+    artifact.require_known_start(tracking=tracking)
     x0, shape = real_array("x0", x0), (*y0.shape[:-1], artifact.nx)
     if x0.shape != shape:
         raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")

@@ -118,7 +118,7 @@ class KKLEstimator:
         """Return the artifact that :meth:`replace` would use; ValueError if it lacks a part that an option needs."""
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
         if self._known_start:
-            artifact.require_known_start()  # raises now instead of at the first reset
+            artifact.require_known_start(tracking=artifact.motion is not None)  # now, not at the first reset
         if self._uncertainty and self.estimate != "x":
             raise ValueError(f"uncertainty=True is about x_hat: it needs estimate='x', got {self.estimate!r}")
         if self._uncertainty:

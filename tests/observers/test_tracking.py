@@ -183,6 +183,8 @@ def test_a_known_start_is_begun_with(t_is_there):
     observer.restart(y[1][:1], [True, False, False])
     assert (observer.std[0] > 0.1).all()
     np.testing.assert_allclose(observer.std[1:], sure[1:])  # T_inv, which is less sure, does not take over
+    with pytest.raises(ArtifactError, match="has no T, and the observer does not track"):
+        KKLObserver(replace(artifact, forward=None), LEVEL, tracking=False).reset(y[0], x[0])
 
 
 def test_maps_are_replaced_while_it_runs():
