@@ -14,11 +14,11 @@ from kkl_gym.wrappers.vector import KKLVectorObservation, VectorActionRepeat
 
 __version__ = "0.1.0"
 
-# The id that takes a user's own system, by the argument ``system``.
+# The id for a user's own system, which is passed as the argument ``system``.
 OWN_ID = "kkl_gym/Own-v0"
 ENV_IDS = {cls.name: f"KKL{cls.__name__}-v0" for cls in SYSTEMS.values()}
 
-# About nine tenths of the return that the shipped agent of each system reaches on the estimate x_hat. Under zero
+# Each is about nine tenths of the return that the system's shipped agent reaches on the estimate x_hat. Under zero
 # action, episodes return 1,850 to 2,700.
 _REWARD_THRESHOLDS = {"reverse_duffing": 4100.0, "van_der_pol": 3900.0, "rossler": 4300.0, "lorenz": 4400.0}
 

@@ -1,6 +1,6 @@
 """Machine code for the step over a sampling interval, if Numba is installed and can compile a system's equations.
 
-The equations run once on symbols, which record them as a program (:mod:`kkl_gym.tracing`). Numba compiles this program
+The equations run on symbols, which record them as a program (:mod:`kkl_gym.tracing`). Numba compiles this program
 together with the Runge–Kutta step, in about a second. The compiled step of a single state equals the step in Python to
 the last bit and takes a tenth of its time. Compilers round powers and remainders in their own way, so equations with
 these are compiled only for batches.
@@ -40,10 +40,10 @@ Advance = Callable[[Values, Values, Values, float], Values]
 
 # Longer programs, such as a neural network for f, would take many seconds to compile.
 MAX_OPERATIONS = 500
-_TRIALS = 200  # trial states of each kind in _trial_states, where machine code is compared with Python
+_TRIALS = 200  # number of trial states of each kind, at which machine code is compared with Python
 _MAX_TRIAL_SUBSTEPS = 64  # trial states that need more substeps are skipped, because Python is slow there
 _LANES = 32  # rows that are stepped together; they fill a few of the processor's vector registers
-# Largest number of kernels in the cache, which holds for each program its kernel, or the reason why it has none.
+# Largest number of entries in the cache. An entry is a kernel, or the reason why a program was not compiled.
 _KEPT = 64
 _kept: dict[Any, Any] = {}
 
@@ -95,7 +95,7 @@ def _shared(
     uncompiled: Callable[..., Values],
     log_line: str,
 ) -> SamplingStep[Values]:
-    """Return the step of a system; systems of a class with the same programs share one compiled kernel."""
+    """Return the step of a system; systems of one class share a kernel if their programs are equal."""
     plain = functools.partial(uncompiled, system)
     if system.discrete:
         return SamplingStep(plain, f"{system.name} is in discrete time and needs no integration")
@@ -210,7 +210,7 @@ def batch_kernel(system: System, motion: Motion) -> Any:
     import numba
 
     # Each row of a group is a lane. All components of all lanes lie in one array, at offsets that the compiler knows.
-    # It can then use the processor's vector registers.
+    # The compiler can then use the processor's vector registers.
     nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
     lanes = [f"s[{i * _LANES} + j]" for i in range(size + nx + 3)]
     states, d, (substeps, length, error) = lanes[:size], lanes[size:-3], lanes[-3:]
@@ -304,7 +304,7 @@ def _assembled(motion: Motion, lines: list[str], jit: Callable[..., Any]) -> Any
 
 
 def _trial_states(system: System, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return trial states for machine code: random ones (400, nx); bounds, whole numbers and starts (600, nx)."""
+    """Return two arrays of trial states: random states (400, nx), and bounds, whole numbers and starts (600, nx)."""
     n, (low, high) = _TRIALS, np.array(system.bounds, dtype=float).T
     random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])
     ends = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])

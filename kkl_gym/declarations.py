@@ -1,4 +1,4 @@
-"""The class variables of a user's system: checked and completed when the class is defined."""
+"""Checks and completes the class variables of a user's system when its class is defined."""
 
 import dataclasses
 import inspect
@@ -15,7 +15,7 @@ _SIZES = {"nx": "X", "nu": "u_max", "ny": "h(x)", "parameters": "the fields"}
 
 
 def complete(cls: Any, base: Any) -> None:
-    """Check a system's class variables, convert their numbers to tuples, and set the defaults of missing ones."""
+    """Check a system's class variables, convert their sequences to tuples, and set the defaults of missing ones."""
     _check_names(cls, base)
     _read_box(cls)
     nx = len(cls.X)
@@ -49,7 +49,7 @@ def complete(cls: Any, base: Any) -> None:
 
 
 def _check_names(cls: Any, base: Any) -> None:
-    """Raise TypeError if a name is missing, or if its definition does not do what the user probably intended."""
+    """Raise TypeError if a class variable is missing, or a definition does not do what the user probably intended."""
     missing = [name for name in ("name", "X", "bounds") if not hasattr(cls, name)]
     if missing:
         raise TypeError(f"{cls.__name__} must set the class variables name, X and bounds; it lacks {missing[0]}")

@@ -1,7 +1,7 @@
 """Elementary functions for equations of motion. They take every type of number.
 
 Plain arithmetic and comparisons already work on Python floats, NumPy arrays, torch tensors and sympy expressions alike.
-``math.sin``, ``np.sin`` and ``if`` do not. Equations that need such functions import them from here::
+``math.sin``, ``np.sin`` and ``if`` do not. Equations import replacements from here::
 
     from kkl_gym.elementary import sin, where
 
@@ -111,8 +111,8 @@ exp = _unary("exp", math.exp, "e to the power of x")
 log = _unary("log", math.log, "the natural logarithm")
 sqrt = _unary("sqrt", math.sqrt, "the square root")
 tanh = _unary("tanh", math.tanh, "the hyperbolic tangent")
-abs = _unary("abs", builtins.abs, "the absolute value, like Python's own")
-sign = _unary("sign", _sign, "-1, 0 or 1")
+abs = _unary("abs", builtins.abs, "the absolute value, like Python's abs")
+sign = _unary("sign", _sign, "which is -1, 0 or 1")
 atan2 = _binary("atan2", math.atan2, "the angle of the point (b, a) in rad")
 minimum = _binary("minimum", _minimum, "the smaller of the two")
 maximum = _binary("maximum", _maximum, "the larger of the two")
@@ -124,7 +124,7 @@ def clip(x: Any, low: Any, high: Any) -> Any:
 
 
 def where(condition: Any, a: Any, b: Any) -> Any:
-    """where(condition, a, b), a where the condition holds, else b. It replaces ``if``, also for arrays and symbols.
+    """Return ``a`` where the condition holds, else ``b``. This replaces ``if``, also for arrays and symbols.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, Components, System, reward_of
 from observers.checks import integer, mapping, real_array, shown
 
-# Samples after which a reset compiles the step; in shorter simulations compiling takes more time than it saves.
+# A reset after this number of samples compiles the step; in shorter simulations compiling costs more than it saves.
 SOON = 1000
 _KEYS = (("a", "d"), ("s", "w"))  # keys for the lower and the upper bound of the first two inputs
 _INTEGER, _FLOAT32 = np.dtype(np.int64), np.dtype(np.float32)
@@ -45,19 +45,19 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     0 the system is autonomous.
 
     **Observation.** float32: the true state x (``observe="state"``) or the noisy output y (``observe="output"``). x is
-    within the system's declared bounds. y is clipped to the outputs that these bounds allow, widened by six standard
-    deviations of the noise. Where the ``sensor`` delivers no sample, the observation repeats the last y.
+    within the system's declared bounds. y is clipped to the range of h(x) within these bounds, widened by six
+    standard deviations of the noise. Where the ``sensor`` delivers no sample, the observation repeats the last y.
 
-    **Info.** The same keys at reset and at steps. ``y`` is the noisy output, NaN where the ``sensor`` delivers no
-    sample, ``x`` the true state, and ``u`` the physical input that acted, zero at reset. These arrays are float64 and
-    never clipped. ``sample``, an integer of shape (), counts the sampling intervals since reset. ``escaped``, a bool
+    **Info.** The keys are the same at reset and at steps. ``y`` is the noisy output (NaN where the ``sensor`` delivers
+    no sample), ``x`` the true state, and ``u`` the physical input that acted (zero at reset). These arrays are float64
+    and never clipped. ``sample``, an integer of shape (), counts sampling intervals since reset. ``escaped``, a bool
     of shape (), is true if the state left its declared bounds.
 
     **Reward.** The system's ``reward(x, u)`` at the new state x. The default is 1 / (1 + 4 c) in (0, 1] with
-    c = mean(((x - target) / scale)^2). It is 1 at the system's target.
+    c = mean(((x - target) / scale)^2). This reward is 1 at the system's target.
 
     **Ends.** An episode is ``terminated`` where the system's ``terminated(x)`` is true, and where the state leaves its
-    declared bounds (``info["escaped"]``). In the second case the last state and output inside the bounds are returned.
+    declared bounds (``info["escaped"]``). At an escape, the last state and output inside the bounds are returned.
     The registered ids truncate after 5,000 steps.
 
     Parameters
@@ -220,7 +220,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         w, v = self._next_noise()
         x = self._advance(self._x, u, w, self.plant.dt)
         escaped = not self._inside(x)
-        # A step may also end outside the bounds because its substeps were too coarse. Finer ones verify the escape.
+        # A step may also end outside the bounds because its substeps were too coarse. Finer substeps verify the escape.
         if escaped:
             x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
             escaped = not self._inside(x)
@@ -272,7 +272,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         """Return keys for :func:`gymnasium.utils.play.play`.
 
         The keys a and d set the first input to its lower and upper bound, s and w the second. Also pass
-        ``noop=np.zeros(nu, np.float32)`` to ``play``, the action while no key is pressed.
+        ``noop=np.zeros(nu, np.float32)`` to ``play``: this is the action while no key is pressed.
         """
         actions = {}
         for ends in itertools.product(*((("", 0), (low, -1), (high, 1)) for low, high in _KEYS[: self._nu])):

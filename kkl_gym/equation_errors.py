@@ -85,7 +85,7 @@ def code_of(equations: Equations) -> CodeType | None:
 
 
 def held(x: Any) -> str:
-    """Return a text about the components of a state: their numbers, or the type and shape that they have."""
+    """Return a text about the components of a state: their values, or their type and shape."""
     first = x[0]
     for library, kind, plural in (("torch", "Tensor", "tensors"), ("numpy", "ndarray", "arrays")):
         if is_of(library, kind, first):
@@ -125,7 +125,7 @@ def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     on_floats = isinstance(x[0], Real)
     called = re.findall(r"(?:(?:math|cmath|np|numpy|torch|sympy)\.|(?<![\w.]))(\w+)\(", text_of(step))
     known = [_FUNCTIONS[name] for name in called if name in _FUNCTIONS]
-    # On floats the hint is right where math.sqrt(-1) failed, but not for a TypeError, as of abs(x) on the whole state.
+    # On floats the hint suits a failed math.sqrt(-1), but not a TypeError such as that of abs(x) with the whole state.
     if known and not (on_floats and isinstance(error, TypeError)):
         return f": use kkl_gym.elementary.{known[0]}, which takes {_TYPES}"
     if "truth value" in str(error) or "Boolean value" in str(error):

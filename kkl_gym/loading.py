@@ -55,7 +55,7 @@ def _is_own(value: Any, base: type, module: str) -> bool:
 
 
 def _imported(where: str, failure: str) -> Any:
-    """Import a module or script; ``failure`` begins the message of the ValueError if that fails."""
+    """Import a module or script; if this fails, the message of the ValueError begins with ``failure``."""
     try:
         return _module(where)
     except Exception as error:  # a user's script may raise anything
@@ -92,7 +92,7 @@ def _module(where: str) -> Any:
 
 @contextlib.contextmanager
 def _importing_from(folder: Path) -> Iterator[None]:
-    """Put a folder first on the import path: a script's own, as when Python runs it, or the current one for modules."""
+    """Put a folder first on the import path: for a script its own folder, for a module the current folder."""
     sys.path.insert(0, str(folder))
     try:
         yield

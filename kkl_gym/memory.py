@@ -14,7 +14,7 @@ from observers.checks import real_array, shown
 SHORTEST, LONGEST = 0.5, 10_000.0  # limits of time constants, in steps
 # Least ratio of successive time constants. Closer ones would give coordinates that are mostly rounding errors.
 CLOSEST = 1.5
-# Number of steps before the first output over which the outputs are assumed to have changed.
+# The outputs are assumed to have changed over this number of steps before the first output.
 IMAGINED = 64
 # Up to this number of coordinates, one matrix product advances a single memory faster than several NumPy calls.
 SMALL = 200
@@ -32,13 +32,13 @@ class Memory:
     filter v' = (u - v) / tau itself, with u held between samples.
 
     The past before the first output is unknown. The memory assumes that y was constant until 64 steps before the first
-    output, and from then to the first output changed at the weighted mean rate that each filter has seen since.
+    output. For these 64 steps, each filter assumes the weighted mean rate of change that it has seen since.
     After k steps this assumption multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also assumes that no
     input acted before the first output.
 
     Every w of a slow signal is nearly tau times the signal's rate, so that all w would carry the same information. The
-    memory therefore returns combinations: first the w of the slowest filter, and of each faster filter the part of w
-    that the slower ones do not predict. These coordinates are uncorrelated and as large as y on average over
+    memory therefore returns combinations: the w of the slowest filter, then for each faster filter the part of its w
+    that the slower filters do not predict. These coordinates are uncorrelated and as large as y on average over
     Ornstein-Uhlenbeck processes y with correlation times from twice the shortest time constant to eight times the
     longest. In the long run they amplify white noise on y at most threefold. At first they rest on few samples and
     amplify noise more: with the default time constants 22-fold in the first step, and fourfold in the fifth.

@@ -14,7 +14,7 @@ from kkl_gym.system import Box, Components, System
 from kkl_gym.systems import get_system
 from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
-# Number of random states at which h is evaluated to bound the outputs; a grid has about as many states at most.
+# To bound the outputs, h is evaluated at this number of random states, and on a grid of about this size or smaller.
 _MOST_POINTS = 1000
 # The noise of this number of samples is drawn at once, because single draws take longer than the simulation.
 NOISE_BLOCK = 256
@@ -126,7 +126,7 @@ class OfPlant:
         raise NotImplementedError
 
     def _judged(self, x: Components, u: Components) -> tuple[Any, Any]:
-        """Return rewards of intervals under u that ended at x, and whether episodes end at x, as numbers or arrays."""
+        """Return rewards (numbers or arrays) of intervals that ended at x under u, and whether episodes end at x."""
         system = self.plant.system
         try:
             reward, ended = self._reward(x, u), system.terminated(x)
@@ -158,10 +158,10 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
 def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return bounds of h(x) over the declared bounds of the state, widened by ``margin``.
 
-    Before they are widened, they are exact if h is monotone in each state.
+    Without the margin, they are exact if h is monotone in each state.
     """
-    # h is evaluated at random states, and on the grid of each state's low, middle and high values, on which it must not
-    # be NaN. With more than six states, only a part of the grid is taken. This part includes, for each output, the two
+    # h is evaluated at random states, and on the grid of each state's low, middle and high values, where h must not be
+    # NaN. With more than six states, only a part of the grid is taken. This part includes, for each output, the two
     # corners towards which the output rises and falls from the centre.
     low, high = np.array(system.bounds, dtype=float).T
     rng, nx = np.random.default_rng(0), system.nx

@@ -17,7 +17,7 @@ SAMPLES = 10
 class PredictiveMemory(Memory):
     """A memory that returns the outputs expected in the next step, and predictions of later ones.
 
-    The filters are those of :class:`Memory`, of all outputs and angles. Cosine and sine of an angle are filtered too,
+    It has the filters of :class:`Memory` for all outputs and angles. Cosine and sine of an angle are filtered too,
     because a torque may depend on them. ``weights``, (features, width), multiply the features [signals, w, v, 1]. The
     first columns give each output's or angle's expected change in a step, the other columns the further predictions.
     """
@@ -76,7 +76,7 @@ class PredictiveMemory(Memory):
         weights = np.linalg.lstsq(x / size, change, rcond=1e-9)[0] / size[:, None]
         to_next, to_later = weights[:, : len(self._targets)], weights[:, len(self._targets) :]
         predicted = x @ to_later
-        # This least variance keeps the covariance of the errors invertible where predictions are exact.
+        # This lower bound of the variance keeps the covariance of the errors invertible where predictions are exact.
         floor = np.maximum(1e-9 * later.var(0), 1e-12)
         error = np.atleast_2d(np.cov((later - predicted).T, bias=True)) + np.diag(floor)
         to_white = to_later @ np.linalg.inv(np.linalg.cholesky(error)).T

@@ -12,7 +12,7 @@ from observers.checks import shown
 
 ESTIMATE, TARGET = "C3", "C2"  # in matplotlib's colour cycle; states have the colour of text
 TRAIL = 1000  # largest number of samples that a phase portrait shows
-FRAMES = 100  # largest number of frames a second in a video; players can hardly show more
+FRAMES = 100  # largest number of frames a second in a video; most players show no more
 DRAWN = 50  # largest number of frames a second in a window, which runs in real time
 ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 
@@ -129,7 +129,7 @@ class Window:
         self._screen = None
 
     def _open(self) -> bool:
-        """Whether the window is open: a process has only one, and another environment or the user may close it."""
+        """Whether the window is open. A process has only one window, and other code may close or replace it."""
         return self._screen is not None and self._pygame.display.get_surface() is self._screen
 
 

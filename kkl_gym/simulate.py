@@ -26,7 +26,7 @@ PER_RATE = (1.0 - 1e-6) / RATE_STEP
 # Largest accepted estimates of a substep's error, in half-widths of X; the true errors are a thousand times smaller.
 # TOLERANCE is for systems without a rate formula. With it, stiff systems, and the shipped ones without their formulas,
 # also keep the error below 1e-5. ROUGH is for systems with a rate formula, and detects where the formula fails, as at
-# an ignition. It is a hundred times the largest estimate of the shipped systems.
+# an ignition. ROUGH is a hundred times the shipped systems' largest estimate.
 TOLERANCE, ROUGH = 3e-6, 0.1
 # Number of attempts with equal substeps. After them, or beyond MOST_EQUAL substeps, the step length follows the error.
 ATTEMPTS = 3
@@ -159,7 +159,7 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
 
 def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: float) -> Components | None:
-    """Return the next state, computed on arrays, on which ``where`` can discard infinite values; None if that fails."""
+    """Return the next state, computed on arrays, where ``where`` discards infinite values; None if it is not finite."""
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
         end: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
@@ -170,7 +170,7 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
     """Return the state after an interval by substeps whose length follows the error; ``end`` if x escapes or is NaN."""
-    # Motions that accelerate, as at an ignition, need such substeps. They also verify an escape, because equal substeps
+    # Motions that accelerate, as at an ignition, need such substeps. The substeps also verify an escape: equal substeps
     # that were too long at the end of the interval may have left the bounds only by their error.
     if system.discrete:
         return end

@@ -152,7 +152,7 @@ class System:
         """
         try:
             rate = self.typical_rate
-        except ValueError:  # the rate is 0, as for an integrator, which any interval suits, or it cannot be computed
+        except ValueError:  # the rate cannot be computed, or is 0 (an integrator, which any interval suits)
             return DT
         (least, slow), (most, fast) = SHORT_STEP, LONG_STEP
         if least <= rate * DT <= most:
@@ -271,7 +271,7 @@ class System:
 
         By default it is a numerical derivative, with each state in units of X's half-width, so that the rate does not
         depend on the user's units. An estimate of the error then sets the number of substeps. If a subclass overrides
-        this method, its rate sets the number of substeps: each lasts at most 0.4 / rate. This helps where f jumps.
+        this method, its rate sets the number of substeps: each lasts at most 0.4 / rate. Override it if f jumps.
         """
         return slope(self.f, x, self.X)
 
@@ -315,7 +315,7 @@ def nearness_of_rows(target: np.ndarray, weight: np.ndarray, x: np.ndarray, u: C
 
 
 def reward_of(system: System, *, rows: bool = False) -> Callable[[Any, Components], Any]:
-    """Return the reward function for one state or for a batch; the default reads the target only once, here."""
+    """Return the reward function for one state or for a batch; the default reward reads the target only once, here."""
     if type(system).reward is not System.reward:
         return system.reward
     goal = goal_of(system)

@@ -21,7 +21,7 @@ from observers.checks import bool_array, choice, integer, mapping, real_array, s
 Infos = dict[str, Any]
 Rows = np.ndarray | slice
 ALL = slice(None)  # all rows; indexing by this slice gives a view
-# The noise of this number of rows is drawn and transposed together, which fits the processor's cache.
+# The noise of this number of rows is drawn and transposed together; it fits the processor's cache.
 ROWS_AT_ONCE = 64
 MOST_ENVS = 1_000_000  # each stores 256 samples of noise, about 10 kB
 
@@ -33,7 +33,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     and states agree to rounding. ``info`` holds the same keys, as arrays with a row for each environment. For each key
     a mask ``_key`` marks the rows that reported it, as in Gymnasium's own vector environments.
 
-    **Autoreset modes.** ``NEXT_STEP``: the step after an episode's end ignores that row's action and resets it.
+    **Autoreset modes.** ``NEXT_STEP``: the step after a row's episode ends ignores the row's action and resets the row.
     ``SAME_STEP``: the row is reset at once; ``info["final_obs"]`` and ``info["final_info"]`` hold the episode's last
     observation and info. ``DISABLED``: a row stays at its episode's end, with reward 0 and its flags still set, until
     ``reset(options={"reset_mask": mask})``. Its ``u`` and ``escaped`` are then not reported.
@@ -296,7 +296,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
         escaped = self._outside(x)
-        # A step may also end outside the bounds because its substeps were too coarse. Finer ones verify the escape.
+        # A step may also end outside the bounds because its substeps were too coarse. Finer substeps verify the escape.
         if escaped.any():
             x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(escaped))
             escaped = self._outside(x)
@@ -351,7 +351,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
                 block[:, :, at] = drawn[: len(some)].transpose(1, 2, 0)
 
     def _measure(self, x: np.ndarray, v: np.ndarray, rows: Rows, *, start: bool) -> np.ndarray:
-        # This is System.output with the component first, and takes a third of its time.
+        # This is System.output with components before rows, in a third of the time.
         white = v if self._readings is None else np.zeros((self.plant.ny, x.shape[1]))
         try:
             y = np.array([hi + vi for hi, vi in zip(self.system.h(x), white, strict=True)])

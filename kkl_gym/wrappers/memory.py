@@ -94,7 +94,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     u has a running mean for each input and time constant. The cosine and sine of an angle share one memory, that of
     the unwrapped angle. Once the memory has filled, its numbers are about as large as y, see
     :class:`kkl_gym.memory.Memory`. At reset it assumes that y was constant and that no input acted. From the first step
-    on, it assumes that y changed in the 64 steps before the reset at the mean rate that it has had since the reset.
+    on, it assumes that y changed in the 64 steps before the reset at the mean rate that y has had since the reset.
     ``info`` is unchanged.
 
     Unless ``measured`` holds indices, a Dict stays a Dict of its measured keys; the new key ``"memory"`` holds the
@@ -130,7 +130,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ValueError
         If the environment is not a gymnasium.Env, has other spaces or is under ``Autoreset``, if an argument is not as
         described, or if the period of an angle is unknown. At a reset or step, if a measured entry is infinite, beyond
-        1e15, or NaN without "hold", because the memory would keep it. At a step, if the action is such a value.
+        1e15, or NaN without "hold", because the memory would keep it. At a step, if the action holds such a value.
 
     Examples
     --------
@@ -182,7 +182,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._of.show(obs, self._flat, shown), reward, terminated, truncated, info
 
     def learn_weights(self, steps: int = 4_000, *, seed: int = 0) -> list[list[float]]:
-        """Fit weights, on random actions, by which the memory predicts later outputs.
+        """Fit the weights by which the memory predicts later outputs.
 
         All environments of an agent need the same weights. This method resets the environment.
 
@@ -222,7 +222,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 class KKLVectorMemory(VectorWrapper):
     """:class:`KKLMemory` for vector environments: one batched memory, reset row by row in every autoreset mode.
 
-    It works around Gymnasium's Sync and Async vectors, and around environments that are natively vectors.
+    It wraps Gymnasium's Sync and Async vectors, and environments that are natively vectors.
     ``info["final_obs"]`` holds the last observations with their memory; the rest of ``info`` is unchanged. In the mode
     SAME_STEP, vectors return an episode's last observation after the next reset. If the environments overwrite it by
     then, because they reuse one array, wrap each in :class:`KKLMemory` instead.

@@ -104,7 +104,7 @@ class Samples:
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Return outputs and hidden signals after a reset; hidden signals that the environment does not show are NaN.
 
-        Adds the keys of a KKLEnv to ``info``.
+        Sets ``sample`` and, if shown, ``x`` in ``info``, as in a KKLEnv.
         """
         self.count = 0
         y, x = self.outputs(observation, info), self.states(observation, info)
@@ -113,7 +113,7 @@ class Samples:
         return y, x.get("x", self._nothing)
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return outputs after a step and the inputs that led to them; adds the keys of a KKLEnv to ``info``."""
+        """Return outputs after a step and the inputs that led to them; sets ``u``, ``sample`` and ``x`` in ``info``."""
         y, u = self.outputs(observation, info), self.inputs(action)
         x = self.states(observation, info)
         info.pop("x", None)
@@ -140,7 +140,7 @@ def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) 
 
 
 def _check_actions(env: Any, space: gym.Space[Any]) -> None:
-    """Raise ValueError if a wrapper inside changes the scale of actions, as ClipAction does by an unbounded box."""
+    """Raise ValueError if a wrapper inside changes the scale of actions, as ClipAction does with its infinite box."""
     base, source = env.unwrapped, source_of(env)
     own = base.single_action_space if isinstance(base, gym.vector.VectorEnv) else base.action_space
     here, there = (Inputs(one, source=source) for one in (space, own))

@@ -56,24 +56,24 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
     Around a :class:`KKLEnv` the observer sees only the sensor's output ``info["y"]`` and the input ``info["u"]`` that
     the environment applied. ``info`` gains ``z``, the filter's state, and with ``estimate="x"`` also ``x_hat``, shape
-    (nx,). Both are float64 and not clipped. With ``monitor`` it gains ``score``, an array of shape (). The score is
+    (nx,). Both are float64 and not clipped. With ``monitor``, ``info`` also has ``score``, of shape (). The score is
     above 1 where the samples do not fit the estimates, as with a faulty sensor or far outside the map's training.
 
     With ``estimate="z"`` there is no ``x_hat``, and :meth:`render` shows no estimate. Neither the inverse map nor the
     tracker runs then, unless there is a monitor or the start is known.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
-    ``training.learn``). Such an observer sees the actions, and the signals of the observation that its file names. The
+    ``training.learn``). Such an observer sees the actions, and the observed signals that its file names. The
     observation is then [y, x_hat] or [y, z]: the measured outputs, then the estimates. ``info`` also gains ``y``, the
-    inputs ``u`` that led to it, and the number of the ``sample`` since the reset. It gains ``x``, shape (nx,), the true
+    inputs ``u`` that led to it, and ``sample``, the count of steps since reset. It gains ``x``, shape (nx,), the true
     hidden signals, where the environment inside shows them. ``x`` is privileged: it serves evaluation and
     ``training.KKLTrainingCallback``.
 
     Parameters
     ----------
     env : gymnasium.Env
-        A :class:`KKLEnv`, bare or under wrappers that do not change observations and ``info``; or the environment that
-        the observer's file names, under wrappers that do not change its measured signals, its actions and its steps.
+        A :class:`KKLEnv`, bare or under wrappers that change neither observations nor ``info``; or the environment that
+        the observer's file names, under wrappers that leave its measured signals, actions and steps unchanged.
     observer : str or path, optional
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the environment's
         system.
@@ -108,13 +108,13 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     Raises
     ------
     ValueError
-        If the environment is not a :class:`KKLEnv` and the observer is not from its rollouts, ``estimate`` is unknown,
+        If the environment is no :class:`KKLEnv` and the observer not from its rollouts, or if ``estimate`` is unknown,
         a flag is not a bool, no map ships for the system, or the noise level is beyond the map's range. At a step, if
         the agent acts, but the map has no inputs and ``ignore_input`` is false, or if a wrapper inside skips samples.
         At a reset or step, if a wrapper inside changes observations: the observer would not see the change.
     observers.ArtifactError
         A ValueError for a file that is missing or damaged, was made for another system, other parameters or another dt,
-        or lacks the forward map or motion for ``known_start``, or the covariance for ``uncertainty``.
+        or lacks what an option needs: a tracker's model or T for ``known_start``, a covariance for ``uncertainty``.
 
     Examples
     --------
@@ -220,7 +220,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Raises
         ------
         ValueError
-            If the noise level is beyond the new maps' range, or they have no limits for the monitor in use.
+            If the noise level is beyond the new maps' range, or the monitor in use needs limits that the maps lack.
         observers.ArtifactError
             If the filters' A, B or dt or the signals differ, or the file is missing or damaged.
         """

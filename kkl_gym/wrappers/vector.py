@@ -237,7 +237,7 @@ def _states(info: Infos, rows: np.ndarray) -> np.ndarray:
 class KKLVectorObservation(VectorEstimate):
     """:class:`kkl_gym.KKLObservation` for vector environments: one batched observer, reset row by row.
 
-    It works around :class:`kkl_gym.KKLVectorEnv`, and around Gymnasium's Sync and Async vectors of
+    It wraps :class:`kkl_gym.KKLVectorEnv`, and Gymnasium's Sync and Async vectors of
     :class:`kkl_gym.KKLEnv`, in every autoreset mode. Vectors of another environment need an observer from its rollouts.
     Observations then hold the measured outputs beside the estimates, as in :class:`kkl_gym.KKLObservation`.
 
@@ -248,7 +248,7 @@ class KKLVectorObservation(VectorEstimate):
     Parameters
     ----------
     env : gymnasium.vector.VectorEnv
-        A vector of :class:`kkl_gym.KKLEnv`, bare or under wrappers that do not change observations and ``info``, or a
+        A vector of :class:`kkl_gym.KKLEnv`, bare or under wrappers that change neither observations nor ``info``, or a
         vector of the environment that the observer's file names.
     observer : str or path, optional
         As for :class:`kkl_gym.KKLObservation`.

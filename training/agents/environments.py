@@ -40,7 +40,7 @@ def vector(
 
 
 def single(task: Task, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
-    """Make one environment of a task without a system: flat observations, measured entries with noise if ``noisy``."""
+    """Make one environment of a task without a system; observations are flat, and ``noisy`` adds measurement noise."""
     env = make(task.env_id, task.env_kwargs)
     if not (isinstance(env.observation_space, spaces.Box) and len(env.observation_space.shape) == 1):
         env = gym.wrappers.FlattenObservation(env)

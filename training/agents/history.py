@@ -13,7 +13,7 @@ from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 
 
 class History(VectorWrapper):
-    """Shows the state s of linear filters; s becomes ``keep`` s + ``take`` [y, u] at action u and next observation y.
+    """Shows the state s of linear filters; action u and next observation y turn s into ``keep`` s + ``take`` [y, u].
 
     Filters begin an episode at the first observation and a zero action; without ``actions``, u is left out. The
     autoreset mode must be SAME_STEP. Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.
@@ -62,7 +62,7 @@ class History(VectorWrapper):
 
 
 def stacked(env: VectorEnv, frames: int, *, actions: bool = True) -> History:
-    """Show the last ``frames`` observations in order of time, with ``actions`` each with the action that led to it."""
+    """Show the last ``frames`` observations in order of time and, with ``actions``, the action that led to each."""
     return History(env, np.eye(frames, k=1), np.eye(frames)[-1], actions=actions)
 
 

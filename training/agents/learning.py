@@ -38,11 +38,11 @@ from training.progress import ProgressBars, progress_bars
 from training.run import CHECKPOINT
 
 RECURRENT = "ppo_lstm"
-# A training that learns an observer begins without estimates. Without noise, this first phase takes this share of all
-# steps, and the agent learns from true hidden signals: later estimates are so accurate that its policy suits them, too.
+# A training that learns an observer has a first phase without estimates. Without noise, the phase takes this share of
+# all steps, and the agent learns from true hidden signals: its policy also suits the later, very accurate estimates.
 PRIVILEGED = 0.9
 WANDERED = 0.1  # share of all steps that the first phase takes under noise; its actions are random
-REHEARSAL = 0.05  # share of all steps, at the end of a training with refits, without exploration and learning
+REHEARSAL = 0.05  # share of all steps: the last of a training with refits, without exploration or learning
 FILE = "agent.safetensors"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings that no algorithm takes
 _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes a system's task
@@ -97,12 +97,12 @@ def learn(
 ) -> Agent:
     """Train one agent, with checkpoints; write agent.safetensors, curve.csv and, if learned, observer.safetensors.
 
-    For an agent that sees x_hat in an environment without a system, an observer is learned, if none is given, from the
+    If no observer is given to an agent that sees x_hat in an environment without a system, one is learned from the
     first ``observer_steps`` steps. Without noise the agent also learns in these steps: it sees the true hidden signals,
     and afterwards their estimates. Under noise the estimates are less accurate, and a policy for true signals does not
     suit them. The first steps are then fewer, their actions are random, and only the observer learns.
 
-    For an agent that sees z under noise, the weights of z are learned from ``observer_steps`` random steps, if given.
+    If an agent sees z under noise and ``observer_steps`` is given, z's weights are learned from so many random steps.
     All these first steps count as steps of the training. The observer is refitted ``aggregate`` times to the agent's
     own steps and, if this number is not 0, once more at the end.
 

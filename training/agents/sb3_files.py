@@ -77,7 +77,7 @@ def to_sb3(agent: Agent, *, trusted: str | None = None) -> BaseAlgorithm:
 def from_sb3(
     path: str | os.PathLike[str], task: Task, information: Information = "x_hat", observer: str | None = None
 ) -> Agent:
-    """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task, without VecNormalize.
+    """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task without VecNormalize.
 
     Only the tensors and the text of the file are read; nothing is unpickled.
     """

@@ -26,7 +26,7 @@ TOLERANCE = 0.2  # largest distance from the target that counts as a success, in
 class Task:
     """An environment and the entries of its observations that agents may see.
 
-    In a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` stay empty. ``hidden`` None
+    In a system's environment y is measured, and ``measured``, ``hidden`` and ``angles`` are unused. ``hidden`` None
     stands for all entries that are not measured. ``env_id`` and ``env_kwargs`` are those of ``gym.make``. ``repeat`` is
     in samples, ``time_constants`` and ``frames`` in actions. ``weights``: see :meth:`kkl_gym.KKLMemory.learn_weights`.
     """
@@ -174,7 +174,7 @@ def get_task(name: str, measurement_noise: Level | None = None, **changes: Any) 
 
 
 def task_of(system: System, name: str | None = None) -> Task:
-    """Return the task of a system; ``name`` is the script's class of a system that does not ship."""
+    """Return the task of a system; ``name`` names the class of a system that does not ship."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs for an agent to act on")
     dt = system.dt
