@@ -20,7 +20,7 @@ from training.agents.environments import MeasurementNoise
 from training.rollouts import make, roll_out
 from training.sources.recorded import recorded_errors
 
-AFTER = 20  # first steps of each rollout, whose errors do not count
+AFTER = 20  # number of steps at the start of each rollout, in which errors do not count
 GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # gains of a linear-quadratic regulator for the double pendulum
 
 

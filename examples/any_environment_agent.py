@@ -1,9 +1,9 @@
 """Learn an observer on the states that an agent visits: PPO balances CartPole-v1 on estimates.
 
 Positions are measured. Velocities are hidden, but a simulator shows them in training. The example compares three ways
-with equally many steps. In the first, the observer is learned from random steps. In the second, it is also refitted
-while the agent learns. In the third, the agent first learns on the true velocities, and the observer is learned from
-the agent's steps.
+to train observer and agent in equally many steps. In the first, the observer is learned from random steps. In the
+second, it is also refitted while the agent learns. In the third, the agent first learns on the true velocities, and the
+observer is learned from the agent's steps.
 """
 
 import tempfile
@@ -23,7 +23,7 @@ from observers import Artifact, KKLObserver
 
 ENV_ID, MEASURED, HIDDEN = "CartPole-v1", [0, 2], [1, 3]
 ORDER = MEASURED + HIDDEN  # the order of the signals in KKLObservation's observations
-AFTER = 20  # first steps of each episode, whose errors do not count
+AFTER = 20  # number of steps at the start of each episode, in which errors do not count
 
 
 def wrapped(path: Path) -> gym.Env:

@@ -75,7 +75,7 @@ def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("r
     for _ in range(1000):
         top = 1.5 * system.gravity / system.length  # potential energy at the top, divided by the moment of inertia
         missing = top - x_hat[2] ** 2 / 2 - top * x_hat[0]
-        # The policy adds energy until the pendulum has as much as at rest at the top.
+        # The policy brings the energy to that of the pendulum at rest at the top.
         x_hat, _, _, _, info = env.step(np.clip(missing * x_hat[2:], -1.0, 1.0))
         errors.append(x_hat - info["x"])
     print(f"after {len(errors) * env.unwrapped.dt:g} s: x = {info['x'].round(3)}, x_hat = {x_hat.round(3)}")

@@ -170,7 +170,7 @@ def read(path: Path, runs: Sequence[int]) -> list[Record]:
 
 
 def fitted(records: Sequence[Record], model: BothAngles | None = None) -> BothAngles:
-    """Fit the device's model to windows of the records, of WINDOW samples, or of LONGER samples if a model is given."""
+    """Fit the device's model to windows of WINDOW samples, or a given model to windows of LONGER samples."""
     model, window, noise = (
         (BothAngles(), WINDOW, None) if model is None else (model, LONGER, (ENCODER / 2, ENCODER / 2))
     )

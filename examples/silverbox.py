@@ -54,8 +54,8 @@ class Silverbox(kkl_gym.System):
     """A forced Duffing oscillator, y'' = -damping y' - (stiffness + square y + cube y^2) y + offset + gain u(t).
 
     The generator's input is smooth between samples, but the simulation holds its input over an interval. A weighted sum
-    of three samples of V1, before, at and after the interval's first sample, has the same effect. For slow signals the
-    weights before = -1/6 and after = 1/3 are right to second order.
+    of three samples of V1, before, at and after the interval's first sample, has the smooth input's effect. For slow
+    signals the weights before = -1/6 and after = 1/3 are right to second order.
     """
 
     damping: float = 60.0  # 1/s

@@ -173,7 +173,7 @@ def errors_of_runs(
 ) -> dict[str, list[np.ndarray]]:
     """Return errors in % by system, (steps, n) for the default map and for an EKF, in runs of ``kkl-gym evaluate``.
 
-    The runs start in X. A run's SMAPE, of which the pages' tables contain medians, is the mean of its errors here.
+    The runs start in X. The mean of a run's errors is its SMAPE; the tables of the pages show medians of SMAPEs.
     """
     errors = {}
     for name, kind in SYSTEMS.items():

@@ -31,7 +31,7 @@ from training.evaluation.levels import show_level
 from training.files import locked
 from training.progress import LOG, ProgressBars, progress_bars
 
-TRANSIENT = 20  # number of first steps of an episode whose errors do not count
+TRANSIENT = 20  # number of steps at the start of an episode, in which errors do not count
 Name = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
@@ -92,8 +92,8 @@ class TaskOptions:
     no_past_actions: tyro.conf.FlagCreatePairsOff[bool] = False
     """Leave past actions out of z, traces and stacked."""
     angles: Annotated[tuple[Annotated[tuple[int, ...], _PAIR], ...], tyro.conf.UseAppendAction, hint("none")] = ()
-    """Measured entries that are the cosine and the sine of an angle, once for each angle, as in 0,1. z then holds the
-    unwrapped angle."""
+    """Entries of the cosine and the sine of a measured angle, as in 0,1; repeat the option for each angle. z then holds
+    the unwrapped angle."""
 
     def task(self, name: str, measurement_noise: Any = None) -> Task:
         """Return the task of a system or an environment with these options."""
@@ -107,7 +107,7 @@ class TaskOptions:
 
 @dataclass(frozen=True)
 class Train:
-    """Train an agent with stable-baselines3: to hold a system at its target, or in any partly observed environment.
+    """Train an agent with stable-baselines3, to hold a system at its target or to act in a partly observed environment.
 
     Writes agent.safetensors (the policy, with its task and observer) and curve.csv (steps, CPU seconds and return of
     each episode) into the run's folder. Hyperparameters are those of training/agents/hyperparameters. A resumed
@@ -121,7 +121,7 @@ class Train:
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each measured sample; in environments, the default is 0."""
-    timesteps: Annotated[int | None, hint("the hyperparameters'")] = None
+    timesteps: Annotated[int | None, hint("from the hyperparameters")] = None
     """Number of actions in the training, over all environments."""
     observer: Annotated[str | None, hint("the system's map; one is learned for environments", metavar="MAP")] = None
     """A shipped map's name or a .safetensors file, for an agent that sees x_hat, x_hat_std or z."""
@@ -133,10 +133,10 @@ class Train:
     observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
     """Number of first steps in an environment from which an observer is learned, without --observer. Without noise the
     agent also learns in these steps, from true hidden signals, and only the latest 100,000 steps serve the observer.
-    With noise the actions are random. For z with noise, if given: random steps that fit the weights of z."""
+    With noise the actions are random. For z with noise, the option fits z's weights to so many random steps."""
     aggregate: int = 0
-    """How often the observer is refitted to the agent's own steps while the agent learns from estimates. If this is not
-    0, the agent does not explore in the last twentieth of all steps, after which a last refit follows."""
+    """Number of refits of the observer to the agent's own steps while the agent learns from estimates. If it is not 0,
+    the agent does not explore in the last twentieth of all steps, and a last refit follows."""
     options: tyro.conf.OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
@@ -216,7 +216,7 @@ class Export:
 
 @dataclass(frozen=True)
 class Import:
-    """Convert an agent of stable-baselines3 or rl-zoo3; for a system, one that was trained in training.agents.OnTask.
+    """Convert an agent of stable-baselines3 or rl-zoo3; for a system it must have learned in training.agents.OnTask.
 
     Writes agent.safetensors for kkl-gym agent evaluate. Nothing is unpickled.
     """
@@ -259,7 +259,7 @@ class AgentCommand:
 
 
 def evaluate(progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, trusted: str | None = None) -> Episodes:
-    """Play episodes and print the return, and score and success at a system's target or else any errors of x_hat."""
+    """Play episodes, and print the return and, where they exist, scores at a target or errors of x_hat."""
     first, task = agent_evaluation_seed(seed, n), agent.task
     env = agent.make(n, trusted=trusted)
     try:

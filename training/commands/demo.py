@@ -31,7 +31,7 @@ TRAIL = 0.35  # share of the samples that one frame draws; older points would hi
 
 @dataclass(frozen=True)
 class Demo:
-    """Run the environments with their observers: a table of errors, a figure of true and estimated states.
+    """Run the environments with their observers; print errors, and draw true and estimated states.
 
     The observer runs inside the environment. The paper's observer, SPINN, then runs on the same outputs, if it ships.
     """
@@ -112,7 +112,7 @@ def play(
     policy: str | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> Episode:
-    """Play one episode with an observer; inputs act only if the observer was trained under a policy."""
+    """Play one episode with an observer; the inputs are zero unless a policy acts."""
     options: dict[str, Any] = {"measurement_noise": measurement_noise, "max_episode_steps": steps}
     env = kkl_gym.KKLObservation(gym.make(environment.env_id, **environment.options, **options), environment.observer)
     base: Any = env.unwrapped

@@ -46,10 +46,10 @@ ONLY = {
 class Diagnose:
     """Report before any training whether a system can be observed and learned, with problems and their remedies.
 
-    The subject is a system (only NAME), an environment, of which episodes are then played (NAME with --measured and
-    --hidden), or recorded data (--data without NAME). The command takes about ten seconds.
+    The subject is a system (only NAME), an environment (NAME with --measured and --hidden; the command then plays
+    episodes), or recorded data (--data without NAME). The command takes about ten seconds.
 
-    For a system it checks the equations on floats, arrays and symbols, motions, sampling, outputs and noise, and the
+    For a system it checks the equations (on floats, arrays and symbols), motions, sampling, outputs and noise, and the
     least error of each state. For data and environments it reports which hidden signals y and u determine, over which
     window and under how much noise. The exit status is 1 if there is a problem. docs/guides/diagnose.md explains the
     lines.

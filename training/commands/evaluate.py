@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
 SKIPPED = 5.0  # transient of driven runs, in multiples of 100 dt (``System.pace``); at most half of a run
 FIRST, SETTLED = 2.0, 5.0  # error bars are evaluated before FIRST and after SETTLED, in multiples of 100 dt
-SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, in multiples of the map's largest
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, in multiples of the map's largest level
 FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %")
 
 
@@ -66,11 +66,11 @@ class Motions:
     seed: int = 0
     """Seed of the trajectories and the noise. They differ from those of every training."""
     process_noise: float = 0.0
-    """Level of the process noise, in multiples of the system's scale per second. Environments have 0.05 by default."""
+    """Level of the process noise, in multiples of the system's scale per second. Shipped environments have 0.05."""
     plant: Plant = ()
     """Parameters of the simulated plant, such as mu=3.3. The observer keeps its model."""
     plant_error: Annotated[float | None, hint("none", metavar="SHARE")] = None
-    """Instead of --plant: share by which each parameter of the plant is larger; 0.1 is 10 %."""
+    """Instead of --plant: share by which each parameter of the plant exceeds the observer's; 0.1 is 10 %."""
 
     def plant_of(self, system: System) -> System | None:
         """Return the plant, or None if the plant is the system itself."""
@@ -117,13 +117,13 @@ class Evaluate:
     """Evaluate observers on unseen trajectories: errors, coverage of error bars, or detection of faults.
 
     Trajectories start in X (the training box) and in 2X outside X, with and without noise. SMAPE, in percent, uses the
-    norm of all states, over all steps (the paper's measure) and after the transient. NRMSE is the root mean square
+    norm of the whole state, over all steps (the paper's measure) and after the transient. NRMSE is the root mean square
     error of each state after the transient, in percent of the state's standard deviation. The transient is the first
     fifth of a run. In runs that random steps and sines drive, it is the first 5 s (500 samples for your own systems).
 
-    2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out, and so are
-    noise levels beyond a map's range. If an observer was trained under a policy, this policy acts in all runs. In
-    driven runs it sees the state with errors, and explores. In other runs its inputs reveal the state to the observer.
+    2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out; noise levels
+    beyond a map's range are left out. A policy under which an observer was trained acts in all runs. In driven runs it
+    sees the state with errors, and explores. In other runs it sees the exact state, which its inputs reveal.
 
     --calibration: the shares of errors within the 50, 90 and 99 % regions of the covariances, for all states together
     and for each, and the mean normalised estimation error squared (NEES), at six noise levels.
@@ -326,7 +326,7 @@ class Evaluate:
     ) -> Iterator[tuple[str, bool, UnseenTrajectories, Level]]:
         """Yield, for each noise level, the name of the starts, whether runs are driven, the trajectories and the level.
 
-        A case without starts, or whose trajectories all leave the bounds, gets a line in ``left_out`` instead.
+        A case gets a line in ``left_out`` instead if it has no starts, or if all its trajectories leave the bounds.
         """
         cases = CASES[: 3 if of.artifact.nu else 2] if levels else ()
         bar = progress.add_task(description, total=len(cases) * len(levels))

@@ -34,14 +34,14 @@ FARTHEST = 10.0  # largest factor between a parameter without limits and its fir
 class Identify:
     """Learn a plant's unknown parameters, and an observer for it, from records of its outputs and inputs.
 
-    No recorded state is needed. Multiple shooting fits the parameters and, from random first guesses in the training
-    box, the state at the start of each window of the records, and gives standard errors. The observer is then trained
-    on simulated motions of the identified plant. --observer adapts an observer to a plant that differs from the
+    No recorded state is needed. Multiple shooting fits the parameters, with standard errors, and the state at the start
+    of each window of the records, from random first guesses in the training box. The observer is then trained on
+    simulated motions of the identified plant. --observer adapts an observer to a plant that differs from the
     observer's model, with the settings of the observer's training.
 
     The folder, runs/NAME-identified or with --observer runs/NAME-adapted, receives parameters.json, identification.png
-    (residuals, and predictions of held-out records), NAME.safetensors, checkpoints and log.txt. Parameters that the
-    outputs do not identify are listed, and are null in parameters.json.
+    (residuals, and predictions of held-out records), NAME.safetensors, report.png, checkpoints and log.txt. Parameters
+    that the outputs do not identify are listed, and are null in parameters.json.
     """
 
     system: SystemName

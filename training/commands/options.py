@@ -281,7 +281,7 @@ def shown(system: str | None, observer: str | None) -> list[Shown]:
 
 
 def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> Controller | None:
-    """Return the policy for the evaluation of an observer, which is the policy of its training."""
+    """Return the policy under which an observer is evaluated: the given one or, by default, that of its training."""
     trained = artifact.training.get("policy")
     if own_policy is None and trained is not None and trained != "controller":
         raise ValueError(

@@ -93,5 +93,5 @@ def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
 
 
 def _word(text: str) -> str:
-    """Return a text in the form that parts of a data set's name have."""
+    """Return a text as a part of a data set's name."""
     return re.sub(r"\W+", "-", text.rpartition("/")[2].lower().removesuffix(".safetensors")).strip("-") or "data"

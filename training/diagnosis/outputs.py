@@ -1,4 +1,4 @@
-"""Which states the outputs of a system determine: near each state by the equations, globally by simulated motions."""
+"""Which states a system's outputs determine: locally, by the equations, and globally, by simulated motions."""
 
 import contextlib
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ MIN_STEPS = 10  # least number of samples of a motion
 # A direction of x is a problem or a note if this share of its initial standard deviation is left at a motion's end.
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in the direction
-VAGUE = 0.3  # least error without noise that is noted, in standard deviations of the state
+VAGUE = 0.3  # a larger error without noise, in standard deviations of the state, is a note
 # A state has a symmetry if its error is at most LOCALLY by the equations, but at least GLOBALLY by neighbours in z.
 LOCALLY, GLOBALLY = 0.1, 0.3
 

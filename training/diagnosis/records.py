@@ -191,7 +191,7 @@ def of_records(
     """Find which recorded states the recorded outputs and inputs determine.
 
     For a window of k steps, the KKL filter that a training on these records would use starts k steps before a sample.
-    At each noise level, its state z at the sample is compared with similar z at other samples, all with noise.
+    At each noise level, x at the sample is then predicted from x at other samples with similar noisy z.
     """
     integer("seed", seed, 0)
     check_signals(records)
@@ -239,7 +239,7 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
 
 
 def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return z (n, size) of filters started ``steps`` before evenly spread samples, and x and its change since then."""
+    """Return z (n, size) of filters begun ``steps`` before evenly spread samples, and x with its change meanwhile."""
     rows = windows.rows(steps)
     rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
     rows = evenly(rows, min(most, len(rows)))

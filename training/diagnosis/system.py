@@ -43,8 +43,8 @@ def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
 class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
-    ``motions`` are states (steps + 1, MOTIONS, nx), NaN after they leave the bounds, and inputs; each of the ``kinds``
-    has an equal share. The mask ``stay`` (MOTIONS,) selects those that stay within the bounds; ``y`` are their outputs.
+    ``motions`` are states (steps + 1, MOTIONS, nx) and inputs. States are NaN after they leave the bounds. Each of the
+    ``kinds`` has an equal share. The mask ``stay`` (MOTIONS,) selects motions within bounds; ``y`` are their outputs.
     """
 
     def __init__(

@@ -18,7 +18,7 @@ from training.records import Record, check_signals, pieces
 HELD_OUT = 10  # of the pieces of records without a gap, the 6th, 16th, 26th, ... are held out of the fit
 KEPT_RATIOS = 100.0  # prior variance of log c over that of log f_i, where parameter i is given[i] * c * f_i
 BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(), tried in turn until a fit is about as good as the first one
-UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change exceeds this share of the parameters'
+UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change is a larger share of the parameters' change
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
 HIDDEN = 0.05  # a parameter with a larger component of an unidentifiable direction is unidentifiable
 
@@ -76,7 +76,7 @@ class Identified:
             only = ", ".join(f"{one.text} = {one.value:.6g} +- {one.standard_error:.2g}" for one in known)
             lines.append(f"not identifiable from the outputs: {', '.join(hidden)}" + (f"; only {only}" if only else ""))
             used = ", ".join(f"{name} = {values[name]:.6g}" for name in hidden)
-            lines.append(f"the observer uses {used}: others fit too, these are near the first guesses")
+            lines.append(f"the observer uses {used}: other values fit too, but these are near the first guesses")
             if self.unscaled_states:
                 lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: these values fix it")
         lines += [
@@ -133,8 +133,8 @@ def _check_unknown(system: System, unknown: Limits) -> None:
 def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     """Return the parameters nearest to ``given`` among all that explain the outputs as well as ``values`` do.
 
-    Parameters without influence on the outputs become ``given``; those whose sign differs from it keep ``values``. For
-    the others the ratios count most, and a common factor little: a faster plant may scale all of them alike.
+    Parameters without influence on the outputs become ``given``; those of another sign than ``given`` keep ``values``.
+    For the others the ratios count most, and a common factor little: a faster plant may scale all of them alike.
 
     Shapes: ``values`` (p,), ``given`` (p,), unidentifiable directions ``hidden`` (p, k); returns (p,).
     """

@@ -126,7 +126,7 @@ class Problem:
         return H, np.einsum("knya,kny->na", Jw, at.r[:, rows], optimize=True)
 
     def derivatives(self, theta: np.ndarray, at: Motions, rows: np.ndarray, *, parameters: bool = True) -> np.ndarray:
-        """Return J (steps + 1, m, ny, d) of some windows, which is zero where an output is missing or J not finite."""
+        """Return J (steps + 1, m, ny, d) of some windows, zero where an output or a finite derivative is missing."""
         u = self.windows.u[:, rows]
         J = self.shooting.derivatives(theta, at.x0[rows], u, y=at.y[:, rows], parameters=parameters)
         there = self.there[:, rows][..., None] & np.isfinite(J).all(-1, keepdims=True)
@@ -164,7 +164,7 @@ class Problem:
     def searched(self, theta: np.ndarray, rng: np.random.Generator) -> Motions:
         """Return motions that fit the windows, found from random starts in X.
 
-        The squared residuals of a long chaotic window have many minima, those of its beginning few. A start is
+        The squared residuals of a long chaotic window have many minima, those of its beginning have few. A start is
         therefore fitted first to the beginning, and then to longer and longer parts of the window.
         """
         x0, (length, *longer) = self.windows.x0.copy(), self.beginnings()

@@ -17,7 +17,7 @@ EXACT = 1e-16  # a smaller mean square of residuals, relative to the outputs' va
 ROUNDING = 1e-14  # lower bound of the noise, relative to an output's standard deviation
 MOST_DAMPING = 1e9
 CLUSTERS = 20  # least number of windows whose scatter gives standard errors
-COLOURED = 1.5  # largest ratio of standard errors by scatter to those for white noise that chance gives in 20 windows
+COLOURED = 1.5  # residuals are coloured if scatter multiplies a standard error by more than chance does in 20 windows
 OUTLIER = 9.0  # a window is left out if its mean square is so many median absolute deviations above the median
 
 
@@ -127,7 +127,7 @@ def predictable(fit: Fit, windows: Windows) -> np.ndarray:
 
 
 def explained(each: np.ndarray) -> np.ndarray:
-    """Return a mask of the windows whose residuals' mean squares ``each`` (n,) are no outliers."""
+    """Return a mask of the windows with mean squares ``each`` (n,) of the residuals that are no outliers."""
     median = np.median(each)
     deviation = np.median(np.abs(each[np.isfinite(each)] - median)) if np.isfinite(median) else 0.0
     return np.isfinite(each) & (each <= median + OUTLIER * deviation)
@@ -146,8 +146,8 @@ def shoot(
     """Fit parameters, and starts of windows of one length, by least squares; ``report`` receives the share done.
 
     Windows that the model explains much worse than most are left out. If the model is accurate for some motions and
-    rough for others, as models of friction are, pass the standard deviations of the ``noise``: all windows then have
-    weights 1 / (1 + c), with c their residuals' mean square in units of the noise; only ``Fit.used`` leaves some out.
+    rough for others, as models of friction are, pass the standard deviations of the ``noise``. A window then has
+    the weight 1 / (1 + c), with c its residuals' mean square in units of the noise; only ``Fit.used`` omits windows.
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):

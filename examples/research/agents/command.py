@@ -116,7 +116,7 @@ class Compare:
         return [self.options.task(name, level) for level in levels]
 
     def _observers(self, tasks: list[Task]) -> dict[str, str]:
-        """Return the observers by the name of their system; ValueError if one is missing."""
+        """Return the observers by the name of their system; raise ValueError if one is missing or unfit."""
         observers: dict[str, str] = {}
         systems = {task.name: task.system for task in tasks if task.system is not None}
         for observer in self.observers:

@@ -186,7 +186,7 @@ def planned(
     observers: dict[str, str] | None = None,
     **how: Any,
 ) -> list[ComparedAgent]:
-    """Return the agents in the order of seeds; an environment's noise levels share its state and idle agents."""
+    """Return the agents in the order of seeds; an environment's noise levels share full-state and idle agents."""
     agents: dict[Path, ComparedAgent] = {}
     for seed in range(seeds):
         for task in tasks:

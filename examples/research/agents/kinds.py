@@ -49,7 +49,7 @@ PPO: dict[str, Any] = {
 CONTINUOUS = {"use_sde": True, "sde_sample_freq": 4}  # smooth exploration where actions are continuous
 LEARNING_RATE = 0.001  # at the start; it falls linearly to zero
 FRAMES = 32  # length of the linear recurrent unit's history
-EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluations, and episodes of each and of the last
+EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # number of evaluations; episodes of each, and of the last one
 OBSERVER_STEPS = 40_000  # steps from which an observer, or the weights of z under noise, are learned
 TRUTH = 0.15  # share of the time, at the start, in which agents on x_hat see the true state
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and the agent sees only estimates
@@ -101,7 +101,7 @@ class TimedAgent(Job):
         return float(KINDS[self.kind].get("noise", 0.0))
 
     def _states(self, size: int) -> tuple[int, ...]:
-        """State indices in an observation; without faults, agents on x_hat read the measured entries from y instead."""
+        """Indices of the state in an observation; without faults, agents on x_hat read its measured entries from y."""
         known = MEASURED[self.env_id] if self.shown == "x_hat" and self.kind not in FAULTY else ()
         return tuple(place for place in range(self._ny, size) if place - self._ny not in known)
 
@@ -190,7 +190,7 @@ def policy_of(model: Any, *, deterministic: bool = True) -> Callable[[np.ndarray
 
 
 class _Clock:
-    """CPU seconds of this process since ``start``, which evaluations move on."""
+    """CPU seconds of this process since ``start``; an evaluation moves ``start``, so that its time does not count."""
 
     def __init__(self) -> None:
         self.start = time.process_time()

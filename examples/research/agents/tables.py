@@ -46,7 +46,7 @@ WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 class Cell:
     """Agents of one kind in one task.
 
-    Shapes: ``values``, ``scores`` (n,). Normalised ``scores`` and ``interval``: NaN without idle or full-state agents.
+    Shapes: ``values``, ``scores`` (n,). Without idle or full-state agents, ``scores`` and ``interval`` are NaN.
     """
 
     values: np.ndarray

@@ -48,7 +48,7 @@ class Benchmark:
     """Seed of the test trajectories. Trainings always have seed 0."""
     beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
     """Folder with results.csv and methods.csv of the same benchmark, such as docs/results/benchmark. The tables then
-    include its other observers, without training them again."""
+    include the observers that only this folder has, without training them again."""
     report: bool = False
     """Only write the table and the figure again, from OUT/results.csv and OUT/methods.csv."""
 

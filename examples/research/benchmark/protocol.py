@@ -125,7 +125,7 @@ def validate(method: Method[Any], trained: Any, system: System, *, dt: float, pr
 def step_time(
     method: Method[Any], trained: Any, *, system: System, dt: float, batch: int, seconds: float = 0.3
 ) -> float:
-    """Return the CPU time in µs of a step of a whole batch, along motions from X, after the observer's transient."""
+    """Return the CPU time in µs of one step of a batch, along motions from X, after the observer's transient."""
     observer = Running(method.observer(trained, system, dt, system.measurement_noise))
     x = simulate(system, starts(system, "X", batch, np.random.default_rng(0)), UNTIMED + TIMED, dt)
     y = np.nan_to_num(system.output(x))

@@ -1,6 +1,6 @@
-"""Ablation: series of pipelines, each of which differs from the next in a few settings, trained for equal times.
+"""Ablation: two series of pipelines, trained for equal times. Each pipeline differs from the next in a few settings.
 
-One leads from the paper's SPINN to the package's, the other from an inverse trained without noise to the default.
+The first leads from the paper's SPINN to the package's, the other from an inverse trained without noise to the default.
 """
 
 from collections.abc import Callable, Mapping

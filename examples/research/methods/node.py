@@ -24,7 +24,7 @@ SOFT_FLOOR = 1e-4  # directions of z with less than this share of the largest va
 # The loss is absolute, and quadratic only for errors below this share of a state's standard deviation. Peaks would
 # dominate a quadratic loss: Rössler's x3 stays near 0.02 between peaks of 20.
 ROUNDING = 0.01
-SPECTRUM_PACE = 0.1  # ratio of the spectrum's learning rate to that of the network, which has to follow it
+SPECTRUM_PACE = 0.1  # ratio of the spectrum's learning rate to the network's; the network has to follow the spectrum
 LEARNING_RATE = 1e-2
 
 
@@ -111,7 +111,7 @@ class _Problem(nn.Module):
         return -(self._log_rates + SPECTRUM_PACE * self.change).exp()
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Return the error of the scaled estimate at random ages of random trajectories, from z0 = -A^-1 B y0."""
+        """Return the error of the scaled estimate at random ages of random trajectories; z starts at -A^-1 B y0."""
         rows = torch.randint(len(self._y), (TRAJECTORIES_PER_BATCH,), generator=generator)
         chosen = torch.randperm(len(self._ages), generator=generator)[:AGES_PER_BATCH].sort().values
         ages = self._ages[chosen.numpy()]

@@ -1,6 +1,6 @@
 """Neural networks on sequences of outputs: several cells share one training and one observer.
 
-A cell maps the features of samples and its state before them to a hidden vector for each sample and its new state.
+From its state and the features of new samples, a cell computes a hidden vector for each sample, and its next state.
 """
 
 import math
@@ -216,7 +216,7 @@ class Transformer(SequenceMethod):
 
 
 class _Problem(nn.Module):
-    """The model, and the positions of rows along the trajectories, which are buffers for the checkpoint.
+    """The model, and the positions of rows along the trajectories, in buffers that checkpoints contain.
 
     A row follows a trajectory from its start up to a random age in samples, and then begins another one.
     """
