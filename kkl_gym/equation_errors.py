@@ -1,4 +1,4 @@
-"""Messages for errors in a user's equations: they name the system, the equation, its line, its argument and a fix."""
+"""Messages for errors in a user's equations: they name the system, the equation, its line and, where known, a fix."""
 
 import inspect
 import re
@@ -31,8 +31,8 @@ Equations = Callable[..., Any]
 class EquationError(ValueError):
     """A user's equations failed, or returned an invalid value.
 
-    The message names the system, the equation, its file and line, the argument and a fix. If the equations raised an
-    exception, it is the cause.
+    The message names the system, the equation, its file and line and, where known, the argument and a fix. If the
+    equations raised an exception, it is the cause.
     """
 
 

@@ -45,8 +45,8 @@ def input_matrix(system: Any, x: Any) -> Any:
     wanted = f"{nx} rows, one for each state, of {nu} components, one for each input"
     if not is_sequence(rows) or len(rows) != nx:
         raise returned(system.g, wanted, shown(rows))
-    for row in rows:
-        _check_components(system.g, row, nu, like=x[0], wanted=wanted)
+    for i, row in enumerate(rows):
+        _check_components(system.g, row, nu, like=x[0], wanted=wanted, where=f"in row [{i}] ")
     return rows
 
 
@@ -199,14 +199,14 @@ def _is_default(equations: Equations) -> bool:
     return getattr(equations, "__module__", None) == "kkl_gym.system"
 
 
-def _check_components(equations: Any, values: Any, n: int | None, *, like: Any, wanted: str) -> None:
+def _check_components(equations: Any, values: Any, n: int | None, *, like: Any, wanted: str, where: str = "") -> None:
     if not is_sequence(values):
-        raise returned(equations, wanted, shown(values))
+        raise returned(equations, wanted, f"{where}{shown(values)}")
     if len(values) != n if n is not None else len(values) == 0:
-        raise returned(equations, wanted, f"{len(values)} of them: {shown(values)}")
+        raise returned(equations, wanted, f"{where}{len(values)} of them: {shown(values)}")
     for i, value in enumerate(values):
         if not _fits(value, like):
-            raise returned(equations, wanted, f"{shown(values)}, whose entry [{i}] is {_misfit(value, like)}")
+            raise returned(equations, wanted, f"{where}{shown(values)}, whose entry [{i}] is {_misfit(value, like)}")
 
 
 def _fits(value: Any, like: Any) -> bool:
@@ -237,7 +237,7 @@ def _misfit(value: Any, like: Any) -> str:
     if is_of("sympy", "Basic", value):
         return f"{value}, not a number: use kkl_gym.elementary.where({value}, 1.0, 0.0)"
     if dtype is not None and np.shape(like) != np.shape(value):
-        return f"of shape {tuple(np.shape(value))}, where the components of x have shape {tuple(np.shape(like))}"
+        return f"an array of shape {tuple(np.shape(value))}, where components of x have shape {tuple(np.shape(like))}"
     return f"{shown(value)}, of type {type(value).__name__}" + (
         ": equations of symbols take kkl_gym.elementary in place of NumPy" if is_of("sympy", "Basic", like) else ""
     )

@@ -11,7 +11,7 @@ from training.identification.motions import FIRST_DAMPING, Motions, Problem, Sho
 RESETTLING = 3  # largest number of steps that refit a start if its window fits worse after a step of the parameters
 NONLINEAR = 0.3  # largest rms error, in units of the noise, of outputs linearised over one standard error
 ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
-SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square by less is slow; three slow steps in a row end the fit
+SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square per output by less is slow; three such in a row end the fit
 SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit
 EXACT = 1e-16  # a smaller mean square of residuals, relative to the outputs' variances, ends the fit
 ROUNDING = 1e-14  # lower bound of the noise, relative to an output's standard deviation
@@ -127,7 +127,7 @@ def predictable(fit: Fit, windows: Windows) -> np.ndarray:
 
 
 def explained(each: np.ndarray) -> np.ndarray:
-    """Return a mask of the windows with mean squares ``each`` (n,) of the residuals that are no outliers."""
+    """Return a mask (n,) of the windows that are no outliers, given the mean squares ``each`` (n,) of residuals."""
     median = np.median(each)
     deviation = np.median(np.abs(each[np.isfinite(each)] - median)) if np.isfinite(median) else 0.0
     return np.isfinite(each) & (each <= median + OUTLIER * deviation)
@@ -147,7 +147,8 @@ def shoot(
 
     Windows that the model explains much worse than most are left out. If the model is accurate for some motions and
     rough for others, as models of friction are, pass the standard deviations of the ``noise``. A window then has
-    the weight 1 / (1 + c), with c its residuals' mean square in units of the noise; only ``Fit.used`` omits windows.
+    the weight 1 / (1 + c), with c its residuals' mean square in units of the noise. No step leaves a window out then;
+    the standard errors of the Fit still leave out outliers (``Fit.used``).
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):

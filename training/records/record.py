@@ -133,7 +133,7 @@ def resampled(record: Record, dt: float | None = None) -> Record:
     """Put a record on a uniform grid that begins with its first sample.
 
     Outputs are interpolated linearly, as the filter assumes, so that a value depends on no sample after the next one.
-    States, which no observer sees, follow a monotone cubic (PCHIP). Each column is NaN in gaps of more than 3 dt.
+    States, which no observer sees, follow a monotone cubic (PCHIP). Outputs and states are NaN in gaps of over 3 dt.
     Inputs, held between samples, are averaged over each interval of the grid. A complete record that already has this
     grid changes only by rounding.
     """

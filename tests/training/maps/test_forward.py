@@ -113,7 +113,7 @@ def test_equations_on_tensors_are_those_on_arrays(system):
         (Branching().f, "; x held tensors of shape (4,), on which `if`, `and`, `or` and `not` cannot decide: use"),
         (
             lambda x: (x[0], x[1].reshape(2, 2)),
-            "whose entry [1] is of shape (2, 2), where the components of x have shape",
+            "whose entry [1] is an array of shape (2, 2), where components of x have shape",
         ),
         (lambda x: torch.complex(x[0], x[1])[None], "which is complex"),
     ],
