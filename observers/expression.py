@@ -125,7 +125,7 @@ def _checked(part: Any, condition: bool, levels: int, left: list[int]) -> Any:
     if is_finite(part) and not condition:
         return float(part)
     if not isinstance(part, list | tuple) or not part or not isinstance(part[0], str):
-        raise ValueError(f"expected a name and arguments{'' if condition else ', or a number'}, got {reprlib.repr(part)}")
+        raise ValueError(f"expected a {'' if condition else 'number or '}name and arguments, got {reprlib.repr(part)}")
     name, *arguments = part
     if name in ("x", "u") and not condition:
         if len(arguments) != 1 or type(arguments[0]) is not int or arguments[0] < 0:
