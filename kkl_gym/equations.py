@@ -90,7 +90,7 @@ def check_equations(system: Any) -> None:
         wrong = ~np.isfinite(alone).all(1) | ((alone < 0).any(1) if name == "rate" else False)
         if wrong.any():
             at = int(wrong.argmax())
-            wanted = "finite numbers within X" + (", not below zero" if name == "rate" else "")
+            wanted = "finite numbers at each start" + (", not below zero" if name == "rate" else "")
             raise returned(equations, wanted, f"{alone[at].tolist()}; {held(starts[at])}")
         x = starts.T.copy()
         u = np.zeros((system.nu, n))

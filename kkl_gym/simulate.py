@@ -159,7 +159,7 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
 
 def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: float) -> Components | None:
-    """Return the next state, computed on arrays, where ``where`` discards infinite values; None if it is not finite."""
+    """Return the next state, computed on arrays, on which division by 0 raises no error; None if it is not finite."""
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
         end: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()

@@ -125,7 +125,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
     @property
     def compiled(self) -> bool:
-        """Whether steps are compiled (extra ``fast``). If f is integrated, the logger ``kkl_gym`` reports why not."""
+        """Whether steps are compiled (extra ``fast``). If f cannot be, the logger ``kkl_gym`` gives the reason."""
         return self._advance.obstacle is None
 
     def reset(

@@ -160,9 +160,9 @@ class InverseMap:
         return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, error_covariance=None)
 
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        """Return noise levels, limited to the largest in training if the map takes them; a float if all are equal.
+        """Return noise levels, limited to the largest in training if the map takes levels; equal levels as a float.
 
-        Raises ValueError if the levels of several outputs differ and the map takes one level for all outputs.
+        Raises ValueError for a tuple of levels if the map takes one level for all outputs.
         """
         if isinstance(measurement_noise, tuple) and self.noise_gain.ndim == 1 and self.noise_gain.any():
             raise ValueError(

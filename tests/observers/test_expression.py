@@ -107,7 +107,9 @@ NONE = [
 
 def test_what_is_no_expression():
     for wrong in NONE:
-        with pytest.raises(ValueError, match=r"output|expression|state|name and argum|must be one of|takes \D*\d arguments"):
+        with pytest.raises(
+            ValueError, match=r"output|expression|state|name and arg|must be one of|takes \D*\d arguments"
+        ):
             Expression(wrong)
 
 

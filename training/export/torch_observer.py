@@ -35,7 +35,7 @@ class TorchObserver(Module):
     tracking : bool, optional
         Whether to track, as for :class:`observers.KKLObserver`.
     dtype : torch.dtype, default torch.float32
-        Type of the networks and of the estimates: float32, as in NumPy, or float64.
+        Type of the networks and of the estimates: float32, as in :class:`observers.KKLObserver`, or float64.
 
     Raises
     ------
@@ -82,7 +82,7 @@ class TorchObserver(Module):
         return self.update.new_zeros(n, sum(self.widths))
 
     def estimate(self, state: Tensor) -> Tensor:
-        """Return the estimates (n, nx) at states (n, width), followed by the estimated parameters, if any."""
+        """Return the estimates at states (n, width): rows of x_hat, then of the estimated parameters, if any."""
         x = torch.split(state, self.widths, 1)[3]
         if self.tracker is not None:
             x = self.tracker.states(x[:, : self.nx].T).T
@@ -140,7 +140,7 @@ class TorchObserver(Module):
         -------
         state : Tensor, shape (n, width)
             The next state.
-        x_hat : Tensor, shape (n, nx)
+        x_hat : Tensor, shape (n, nx) or, with estimated parameters, (n, nx + their number)
             The estimates, followed by the estimated parameters, if any.
         """
         begins = state[:, :1] == 0
@@ -202,7 +202,7 @@ class TorchMap(Module):
             self.put(levels=error.levels, ages=error.ages, error=table)
 
     def forward(self, z: Tensor, age: Tensor, level: Tensor, process_level: Tensor) -> Tensor:
-        """Return the estimates (n, nx) from filter states (n, size) at ages (n, 1) in seconds."""
+        """Return the estimates of T_inv from filter states (n, size) at ages (n, 1) in seconds."""
         inputs = [(z @ self.whiten - self.offset) / (1.0 + level**2 @ self.squared_gain)]
         for name, value in zip(FEATURES[2:], (level, process_level, age), strict=True):
             if name in self.features:

@@ -41,7 +41,7 @@ def _draw_residuals(ax: Any, found: Identified) -> None:
     fit = found.fit
     for j, noise in enumerate(fit.noise):
         values = autocorrelation(fit.residuals[:, fit.used, j], LAGS)
-        ax.plot(range(1, len(values) + 1), values, ".-", label=f"output {j + 1}, residuals of {noise:.3g}")
+        ax.plot(range(1, len(values) + 1), values, ".-", label=f"output {j + 1}, residuals' deviation {noise:.3g}")
     limit = 1.96 / np.sqrt(max(np.isfinite(fit.residuals[:, fit.used, 0]).sum(), 1))
     ax.axhspan(-limit, limit, color=MEASURED, alpha=0.3, lw=0, zorder=0)
     ax.set(xlabel="lag in samples", ylabel="autocorrelation", title=f"{found.system.name}, residuals of the windows")

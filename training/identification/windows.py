@@ -118,7 +118,7 @@ def _first_fit(
     lengths: Sequence[int],
     fitted: Callable[[Shooting, np.ndarray, Windows], Fit],
 ) -> Fit:
-    """Search starts in X; return the fit of the longest first windows with small residuals, else of the shortest."""
+    """Return the fit of the longest windows with small residuals, else of the shortest; searches their starts in X."""
     spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
     expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
     theta, best, problem = shooting.given, None, UnexplainedError("")
@@ -143,7 +143,7 @@ def _cuts(records: Sequence[Record], length: int) -> list[tuple[int, int]]:
 
 
 def windows(records: Sequence[Record], starts: Starts, length: int) -> Windows:
-    """Cut the windows that begin at ``starts`` and have a given length out of records."""
+    """Cut records into windows of a given length, which begin at ``starts``."""
 
     def cut(values: Sequence[np.ndarray], samples: int) -> np.ndarray:
         return np.stack([values[index][k : k + samples] for index, k in starts], 1)
