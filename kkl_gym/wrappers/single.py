@@ -61,8 +61,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     Once ``observer.gate`` is set, ``rejected`` counts rejected outputs. If the map estimates parameters, they are in
     ``parameters_hat``.
 
-    With ``estimate="z"`` there are no ``x_hat`` and ``parameters_hat``, and :meth:`render` shows no estimate. Neither the
-    inverse map nor the tracker runs then, unless there is a monitor or the start is known.
+    With ``estimate="z"`` there are no ``x_hat`` and ``parameters_hat``, and :meth:`render` shows no estimate. Neither
+    the inverse map nor the tracker runs then, unless there is a monitor or the start is known.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
     ``training.learn``). Such an observer sees the actions, and the observed signals that its file names. The
