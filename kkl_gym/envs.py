@@ -45,13 +45,13 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     0 the system is autonomous.
 
     **Observation.** float32: the true state x (``observe="state"``) or the noisy output y (``observe="output"``). x is
-    within the system's declared bounds. y is clipped to the range of h(x) within these bounds, widened by six
-    standard deviations of the noise. Where the ``sensor`` delivers no sample, the observation repeats the last y.
+    within the system's declared bounds. y is clipped to the range of noise-free outputs within these bounds, widened by
+    six standard deviations of the noise. Where the ``sensor`` delivers no sample, the observation repeats the last y.
 
     **Info.** The keys are the same at reset and at steps. ``y`` is the noisy output (NaN where the ``sensor`` delivers
     no sample), ``x`` the true state, and ``u`` the physical input that acted (zero at reset). These arrays are float64
-    and never clipped. ``sample``, an integer of shape (), counts sampling intervals since reset. ``escaped``, a bool
-    of shape (), is true if the state left its declared bounds.
+    and not clipped to the observation space. ``sample``, an integer of shape (), counts sampling intervals since reset.
+    ``escaped``, a bool of shape (), is true if the state left its declared bounds.
 
     **Reward.** The system's ``reward(x, u)`` at the new state x. The default is 1 / (1 + 4 c) in (0, 1] with
     c = mean(((x - target) / scale)^2). This reward is 1 at the system's target.

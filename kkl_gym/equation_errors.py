@@ -62,7 +62,7 @@ def returned(equations: Equations, wanted: str, found: str) -> EquationError:
 
 
 def label(equations: Equations) -> str:
-    """Return name, arguments and system of equations as a text, such as ``f(x) of 'lorenz'``."""
+    """Return the name of equations, their arguments and their system as a text, such as ``f(x) of 'lorenz'``."""
     system = getattr(getattr(equations, "__self__", None), "name", None)
     return signature(equations) + ("" if system is None else f" of {system!r}")
 

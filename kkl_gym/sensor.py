@@ -21,8 +21,8 @@ class Sensor:
 
     c is first-order coloured noise: its autocorrelation over t seconds is exp(-t / time_constant). v is the white
     ``measurement_noise`` of the environment. Every parameter is one number for all outputs, or a sequence with one for
-    each. A sample that the sensor does not deliver is NaN in ``info["y"]``, and the observer then predicts without
-    correction. An observation of the output repeats the last sample. The first sample of an episode is never missing.
+    each. Where the sensor delivers no sample, ``info["y"]`` is NaN, the observer predicts without correction, and an
+    observation of the output repeats the last sample. The first sample of an episode is never missing.
 
     Parameters
     ----------

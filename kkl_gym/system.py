@@ -208,7 +208,7 @@ class System:
         """Return the next state of a system in discrete time, a sampling interval after x, under the held input u.
 
         A system with this method needs no f and g, must set ``dt``, and is not integrated. Process noise adds w dt to
-        the next state. f is then the mean derivative over the interval without input. Components are as for
+        the next state. f is then the mean derivative over an interval in which the input is 0. Components are as for
         :meth:`f`.
         """
         raise NotImplementedError(f"{type(self).__name__} is integrated from f; it defines no step")

@@ -18,7 +18,7 @@ from observers.names import matching, suggestion
 class ReverseDuffing(System):
     """Reverse Duffing oscillator (paper, sec. 8, eq. rev_duff), y = x1, input on x2.
 
-    x1' = a x2^3, x2' = -b x1 + u. Without input a x2^4/4 + b x1^2/2 is constant, so motions are periodic; small ones
+    x1' = a x2^3, x2' = -b x1 + u. If u = 0, a x2^4/4 + b x1^2/2 is constant, so motions are periodic; small ones
     have long periods. All quantities are dimensionless. The origin is a degenerate equilibrium whose linearisation
     cannot be stabilised. The paper has no parameters; a = b = 1 is its system.
 
@@ -50,7 +50,7 @@ class ReverseDuffing(System):
         return (x[0],)
 
     def rate(self, x: Components) -> Any:
-        # An upper bound of the linearised motion's frequency, sqrt(3 a b) |x2|. Motions speed up as sqrt(a b).
+        # The linearised motion's frequency is sqrt(3 a b) |x2|; this formula bounds it. Motions speed up as sqrt(a b).
         return math.sqrt(abs(self.a * self.b)) * (1.0 + 2.0 * abs(x[1]))
 
 

@@ -36,7 +36,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     **Autoreset modes.** ``NEXT_STEP``: the step after a row's episode ends ignores the row's action and resets the row.
     ``SAME_STEP``: the row is reset at once; ``info["final_obs"]`` and ``info["final_info"]`` hold the episode's last
     observation and info. ``DISABLED``: a row stays at its episode's end, with reward 0 and its flags still set, until
-    ``reset(options={"reset_mask": mask})``. Its ``u`` and ``escaped`` are then not reported.
+    ``reset(options={"reset_mask": mask})``. While a row stays there, its ``u`` and ``escaped`` are not reported.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 
     @property
     def compiled(self) -> bool:
-        """Whether steps are compiled (extra ``fast``). If f cannot be, the logger ``kkl_gym`` gives the reason."""
+        """Whether Numba (extra ``fast``) compiles steps. If it cannot compile f, the logger ``kkl_gym`` reports why."""
         return self._advance.obstacle is None
 
     def reset(

@@ -65,7 +65,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     the inverse map nor the tracker runs then, unless there is a monitor or the start is known.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
-    ``training.learn``). Such an observer sees the actions, and the observed signals that its file names. The
+    ``training.learn``). Such an observer sees the actions, and the measured signals that its file names. The
     observation is then [y, x_hat] or [y, z]: the measured outputs, then the estimates. ``info`` also gains ``y``, the
     inputs ``u`` that led to it, and ``sample``, the count of steps since reset. It gains ``x``, shape (nx,), the true
     hidden signals, where the environment inside shows them. ``x`` is privileged: it serves evaluation and

@@ -43,7 +43,7 @@ class VectorEstimate(VectorWrapper):
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._sample = np.zeros(env.num_envs, dtype=np.int64)
         self.emitted = b""  # the last observations, as in KKLVectorEnv
-        # The environment or observer that emits the observations; None for other vectors, and with rollout observers.
+        # The KKLVectorEnv or VectorEstimate inside; None for Sync and Async vectors, and for observers from rollouts.
         self._inside: Any = None if isinstance(env, _SignalsInInfo) else env
         while self._inside is not None and not isinstance(self._inside, KKLVectorEnv | VectorEstimate):
             self._inside = getattr(self._inside, "env", None)
@@ -396,7 +396,7 @@ class VectorActionRepeat(VectorWrapper):
 
 
 def _merged(old: Infos, new: Infos) -> Infos:
-    """Return the entries of ``new``, and in rows where ``new`` has no entry those of ``old``."""
+    """Return the entries of ``new``; in rows where ``new`` has no entry, return the entry of ``old``."""
     out = dict(old)
     for key, mask in new.items():
         if key.startswith("_") and key[1:] in new:
@@ -425,7 +425,7 @@ def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
 
 
 def plant_of(env: VectorEnv, *also: str) -> Plant:
-    """Return the first row's plant; ValueError if rows differ in system, dt, measurement noise, or ``also``."""
+    """Return the plant of row 0; ValueError if rows differ in system, dt, measurement noise or attributes ``also``."""
     base: Any = env.unwrapped if isinstance(env, gym.vector.VectorEnv) else env
     if isinstance(base, KKLVectorEnv):
         return base.plant
