@@ -117,7 +117,7 @@ class Agent:
         return self.network.inputs if self.lstm is None else self.lstm.inputs
 
     def policy(self, action_space: gym.Space[Any]) -> Callable[[np.ndarray], Any]:
-        """Return a function from observations (n, inputs) to n actions; recurrent agents need a new one per episode."""
+        """Return a function from observations (n, inputs) to n actions, for one episode if the agent is recurrent."""
         space: Any = action_space
         memory: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -236,7 +236,7 @@ def fingerprint(observer: str) -> str:
 
 
 def find(name: str) -> Path:
-    """Return the file of a shipped agent by its name, or the path itself if it ends in .safetensors."""
+    """Return the path of a shipped agent by its name; a name that ends in .safetensors is itself the path."""
     if name.endswith(".safetensors"):
         return Path(name)
     folder = files("training.agents").joinpath("shipped")

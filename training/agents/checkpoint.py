@@ -45,7 +45,7 @@ class Checkpoint(BaseCallback):
         self.weights = (self.saved or {}).get("weights")  # the memory's weights
 
     def restore(self, model: BaseAlgorithm, steps: int) -> None:
-        """Restore the saved training, if there is one; the algorithm learns until it has made ``steps`` steps."""
+        """Restore the saved training, if there is one; ``steps`` is the number of steps at which learning ends."""
         if (saved := self.saved) is None:
             return
         with run.restoring(self.path):

@@ -42,7 +42,7 @@ RECURRENT = "ppo_lstm"
 # all steps, and the agent learns from true hidden signals: its policy also suits the later, very accurate estimates.
 PRIVILEGED = 0.9
 WANDERED = 0.1  # share of all steps that the first phase takes under noise; its actions are random
-REHEARSAL = 0.05  # share of all steps: the last of a training with refits, without exploration or learning
+REHEARSAL = 0.05  # share of all steps: the end of a training with refits, without exploration or learning
 FILE = "agent.safetensors"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings that no algorithm takes
 _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes a system's task

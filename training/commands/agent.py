@@ -131,7 +131,7 @@ class Train:
     ] = None
     """The algorithm of stable-baselines3. Recurrent agents need ppo_lstm."""
     observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
-    """Number of first steps in an environment from which an observer is learned, without --observer. Without noise the
+    """For environments without --observer: number of first steps, from which an observer is learned. Without noise the
     agent also learns in these steps, from true hidden signals, and only the latest 100,000 steps serve the observer.
     With noise the actions are random. For z with noise, the option fits z's weights to so many random steps."""
     aggregate: int = 0

@@ -33,7 +33,7 @@ TRAIL = 0.35  # share of the samples that one frame draws; older points would hi
 class Demo:
     """Run the environments with their observers; print errors, and draw true and estimated states.
 
-    The observer runs inside the environment. The paper's observer, SPINN, then runs on the same outputs, if it ships.
+    The observer runs inside the environment. If no policy acts, the paper's observer, SPINN, also runs, where it ships.
     """
 
     system: OneSystem = None
@@ -48,7 +48,7 @@ class Demo:
     """Seed of the starts and the noise."""
     policy: OwnPolicy = None
     gif: bool = False
-    """Also write estimates.gif: phase portraits of the first 12 s (of your own systems, the first 1,200 samples)."""
+    """Also write a .gif of phase portraits: the first 12 s (of your own systems, the first 1,200 samples)."""
 
     def run(self, console: Console) -> Path:
         """Play the episodes, and write the figure."""

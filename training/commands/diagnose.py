@@ -50,9 +50,9 @@ class Diagnose:
     episodes), or recorded data (--data without NAME). The command takes about ten seconds.
 
     For a system it checks the equations (on floats, arrays and symbols), motions, sampling, outputs and noise, and the
-    least error of each state. For data and environments it reports which hidden signals y and u determine, over which
-    window and under how much noise. The exit status is 1 if there is a problem. docs/guides/diagnose.md explains the
-    lines.
+    least error of each state. For data and environments it reports whether y and u determine each hidden signal, over
+    which window and under how much noise. The exit status is 1 if there is a problem. docs/guides/diagnose.md explains
+    the lines.
     """
 
     name: Annotated[

@@ -34,8 +34,8 @@ FARTHEST = 10.0  # largest factor between a parameter without limits and its fir
 class Identify:
     """Learn a plant's unknown parameters, and an observer for it, from records of its outputs and inputs.
 
-    No recorded state is needed. Multiple shooting fits the parameters, with standard errors, and the state at the start
-    of each window of the records, from random first guesses in the training box. The observer is then trained on
+    No recorded state is needed. Multiple shooting fits the parameters, with standard errors, and the initial state of
+    each window of the records, searched from random states in the training box. The observer is then trained on
     simulated motions of the identified plant. --observer adapts an observer to a plant that differs from the
     observer's model, with the settings of the observer's training.
 

@@ -10,7 +10,7 @@ from kkl_gym.equations import input_matrix
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
-RANK = 1e-7  # eigenvalues of the information matrix below this share of the largest count as zero
+RANK = 1e-7  # an eigenvalue of the information matrix below this share of the largest one counts as zero
 HARDLY = 1.0  # relative standard error from which a direction counts as unidentifiable
 PART = 0.05  # a parameter whose component of a direction is smaller does not belong to the direction
 LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # largest denominator of an exponent, and relative error of its rounding

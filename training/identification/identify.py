@@ -17,8 +17,8 @@ from training.records import Record, check_signals, pieces
 
 HELD_OUT = 10  # of the pieces of records without a gap, the 6th, 16th, 26th, ... are held out of the fit
 KEPT_RATIOS = 100.0  # prior variance of log c over that of log f_i, where parameter i is given[i] * c * f_i
-BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(), tried in turn until a fit is about as good as the first one
-UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change is a larger share of the parameters' change
+BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(), tried in turn until one leaves the fit about as good
+UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change exceeds this share of the parameters' change
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
 HIDDEN = 0.05  # a parameter with a larger component of an unidentifiable direction is unidentifiable
 
@@ -134,7 +134,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     """Return the parameters nearest to ``given`` among all that explain the outputs as well as ``values`` do.
 
     Parameters without influence on the outputs become ``given``; those of another sign than ``given`` keep ``values``.
-    For the others the ratios count most, and a common factor little: a faster plant may scale all of them alike.
+    In the distance of the rest, ratios count most, a common factor little: a faster plant may scale all of them alike.
 
     Shapes: ``values`` (p,), ``given`` (p,), unidentifiable directions ``hidden`` (p, k); returns (p,).
     """

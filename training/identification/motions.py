@@ -90,7 +90,7 @@ class Motions:
     each: np.ndarray
 
     def take(self, others: "Motions", rows: np.ndarray, of: np.ndarray) -> None:
-        """Replace the motions ``rows`` by the motions ``of`` from others."""
+        """Replace the motions ``rows`` by the motions ``of`` from ``others``."""
         self.x0[rows], self.each[rows] = others.x0[of], others.each[of]
         self.y[:, rows], self.r[:, rows] = others.y[:, of], others.r[:, of]
 
@@ -152,7 +152,7 @@ class Problem:
             moved, rows = rows[going], rows[going | ~better]
 
     def part(self, rows: np.ndarray, x0: np.ndarray, length: int | None = None) -> "Problem":
-        """Return the same problem for some windows with starts ``x0``, or for their first ``length`` samples."""
+        """Return the same problem for some windows with starts ``x0``, cut to their first ``length`` steps if given."""
         u = self.windows.u[:length, rows]
         return Problem(self.shooting, Windows(self.windows.y[: len(u) + 1, rows], u, x0), self.weight**-0.5)
 

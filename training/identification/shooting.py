@@ -17,7 +17,7 @@ EXACT = 1e-16  # a smaller mean square of residuals, relative to the outputs' va
 ROUNDING = 1e-14  # lower bound of the noise, relative to an output's standard deviation
 MOST_DAMPING = 1e9
 CLUSTERS = 20  # least number of windows whose scatter gives standard errors
-COLOURED = 1.5  # residuals are coloured if scatter multiplies a standard error by more than chance does in 20 windows
+COLOURED = 1.5  # residuals are coloured if scatter multiplies a standard error by more, as chance hardly does
 OUTLIER = 9.0  # a window is left out if its mean square is so many median absolute deviations above the median
 
 

@@ -118,7 +118,7 @@ def _first_fit(
     lengths: Sequence[int],
     fitted: Callable[[Shooting, np.ndarray, Windows], Fit],
 ) -> Fit:
-    """Return the fit of the longest windows with small residuals, else of the shortest; searches their starts in X."""
+    """Return the fit of the longest windows with small residuals, else of the shortest, with starts searched in X."""
     spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
     expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
     theta, best, problem = shooting.given, None, UnexplainedError("")
