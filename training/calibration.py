@@ -66,8 +66,8 @@ def calibrate(
     Raises
     ------
     ValueError
-        If ``false_alarms`` is not between 0 and 1, most motions leave the system's bounds, or too few motions are held
-        out; :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
+        If ``false_alarms`` is not between 0 and 1, almost all motions leave the system's bounds, or too few motions are
+        held out; :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
     """
     if isinstance(source, System):
         artifact.check(source.name, source.parameters, dt=artifact.filter.dt, ny=source.ny, nu=source.nu)
@@ -175,7 +175,7 @@ class _Calibration:
         return distances, extremes
 
     def by_knot(self, values: np.ndarray, group: np.ndarray, find: Any) -> np.ndarray:
-        """Return ``find`` of values (ages, n, ...) near each knot, or near the closest knot with ``FEWEST`` values."""
+        """Apply ``find`` to the values (ages, n, ...) near each knot; if they are too few, copy the closest result."""
         finite = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1) & group
         cells = [np.isin(self.ages, span)[:, None] & finite for span in self.spans]
         enough = [i for i, cell in enumerate(cells) if cell.sum() >= FEWEST]
@@ -185,7 +185,7 @@ class _Calibration:
         return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
     def limits(self, extremes: np.ndarray) -> Limits:
-        """Return limits; a fault-free motion crosses one of the 3 ny with a probability of at most false_alarms / 2."""
+        """Return 3 ny limits; a fault-free motion crosses any of them with probability false_alarms / 2 at most."""
         share, sound = self.false_alarms / (6 * self.artifact.ny), self.noisy if self.noisy.any() else ~self.noisy
         largest, low, high = extremes[:, :, sound]
         mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))

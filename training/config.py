@@ -45,7 +45,7 @@ class Config:
     pipeline: Pipeline
     """How the observer is learned. input-aware: T_inv(z_y, z_u) is fitted along noisy trajectories with inputs, and
     T_inv(z_y) along those without inputs, transients included. spinn: as in the paper, a physics-informed network
-    learns T, and T_inv is fitted on z' = T(x') (see ``transients``), without inputs."""
+    learns T, and T_inv is fitted on z = T(x) (see ``transients``), without inputs."""
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
     """Real eigenvalues of A, in 1/s; B is all ones for each output."""
     pairs: tuple[tuple[Annotated[float, Field(lt=0)], Positive], ...] = ()
@@ -75,13 +75,13 @@ class Config:
     inverse_steps: Count = 1500
     """Batches for each inverse map."""
     collocation: Literal["motions", "box"] = "motions"
-    """Points x' at which the forward map's equation must hold (spinn): states of motions, or uniform in the box X."""
+    """Points x at which the forward map's equation must hold (spinn): states of motions, or uniform in the box X."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
     """Most trajectories start in this multiple of the training box X, the others in X (spinn)."""
     solved_output_layer: bool = True
     """Whether least squares determine the forward map's output layer after its training (spinn)."""
     transients: bool = True
-    """Whether T_inv is fitted to z at all times since reset and all noise levels (spinn), not only to z' = T(x')."""
+    """Whether T_inv is fitted to z at all times since reset and all noise levels (spinn), not only to z = T(x)."""
     scaling: Scaling = "relative"
     """How states are scaled. relative: by their standard deviation; errors of T_inv count relative to the state's size.
     range: by half their range; all errors count alike."""
@@ -135,7 +135,7 @@ class Config:
     estimate_parameters: bool = False
     """Whether T_inv estimates the uncertain parameters, too."""
     cpu_seconds: Positive | None = None
-    """Most CPU seconds for training the maps' networks together; a flow may take as many again."""
+    """Limit of CPU seconds for the maps' networks together; a flow may take as many again."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of everything random."""
 

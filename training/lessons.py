@@ -92,7 +92,7 @@ def train(
     ------
     ValueError
         If ``folder`` holds checkpoints and ``resume`` is False, holds those of another configuration, or is in use by
-        another process; if motions leave the system's bounds, or ``config`` differs from a source's configuration.
+        another process; if almost all motions leave the system's bounds, or ``config`` differs from the source's.
     FloatingPointError
         If the loss becomes NaN.
     """
@@ -177,7 +177,7 @@ def learn_map(source: Source, run: Run) -> Maps:
     Raises
     ------
     ValueError
-        If the motions leave the system's bounds, or are too short for the filter.
+        If almost all motions leave the system's bounds, or motions are too short for the filter.
     FloatingPointError
         If the loss becomes NaN.
     """

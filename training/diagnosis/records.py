@@ -239,7 +239,7 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
 
 
 def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return z (n, size) of filters begun ``steps`` before evenly spread samples, and x with its change meanwhile."""
+    """Return, at evenly spread samples, z (n, size) of filters begun ``steps`` samples before, and x and its change."""
     rows = windows.rows(steps)
     rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
     rows = evenly(rows, min(most, len(rows)))

@@ -91,7 +91,7 @@ class Record:
                     raise ValueError(f"{self.name}: column {name}, row {row + 1}: {why}")
 
     def part(self, rows: slice) -> "Record":
-        """Return some rows of the record, at least two; without states if no row has all of them."""
+        """Return the given rows, two or more, as a record; it has no states if no row has all of them."""
         u, x = (None if values is None else values[rows] for values in (self.u, self.x))
         if x is not None and np.isnan(x).any(-1).all():
             x = None

@@ -32,7 +32,7 @@ LONGEST = 250  # largest number of steps in a piece; longer episodes are cut, so
 
 @dataclass(frozen=True)
 class Refit:
-    """A refit: the observer in use after it, whether it is new, held-out errors before and after, and the step."""
+    """A refit: the observer in use afterwards, whether this one is new, held-out errors before and after, the step."""
 
     artifact: Artifact
     taken: bool

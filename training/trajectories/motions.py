@@ -90,7 +90,7 @@ class Motions:
         return _together(self.chunks(n, rng, report))
 
     def chunks(self, n: int, rng: np.random.Generator, report: Report = lambda done: None) -> Iterator[Chunk]:
-        """Simulate in chunks; trajectories with inputs of the same kind replace those that leave the system's bounds.
+        """Simulate in chunks. For each trajectory that leaves the bounds, draw another with the same kind of inputs.
 
         Yields ``x`` (steps + 1, m, nx), ``u`` (steps, m, nu), the levels of process noise (m,), and a mask (m,)
         of the trajectories whose starts were drawn in X, even if then led out of X; m is up to CHUNK.
