@@ -41,7 +41,7 @@ class Artifact:
     forward : ForwardMap, optional
         T, the map from x to z, if it was learned.
     C : ndarray, shape (ny, nx), optional
-        Matrix of a linear output h(x) = C x. Predictions of missing outputs and the monitor need C or h.
+        Matrix of a linear output h(x) = C x. The monitor, and predictions of missing outputs, need C or h.
     h : Expression, optional
         A nonlinear output h(x).
     limits : Limits, optional
@@ -259,7 +259,7 @@ class Artifact:
         )
 
     def require_known_start(self, *, tracking: bool) -> None:
-        """Raise ArtifactError unless an observer, which tracks or not, can start at a known state."""
+        """Raise ArtifactError unless an observer, with or without ``tracking``, can start at a known state."""
         if not tracking and self.forward is None:
             self._lacks(
                 "cannot start at a known state: it has no T, and the observer does not track; kkl-gym train SYSTEM "

@@ -39,9 +39,9 @@ class LinearFilter:
     transition : ndarray, shape (size, size)
         Matrix from z_k to z_k+1.
     early_y, late_y : ndarray, shape (size, ny)
-        Matrices from the outputs at the beginning and at the end of an interval to z_k+1.
+        Matrices to z_k+1 from the outputs at the beginning and at the end of the interval.
     held_u : ndarray, shape (size, nu)
-        Matrix from the inputs held over an interval to z_k+1.
+        Matrix to z_k+1 from the inputs held over the interval.
     drive : ndarray, shape (2 ny + nu, size)
         early_y, held_u and late_y side by side, transposed.
     equilibrium : ndarray, shape (size, ny)

@@ -80,7 +80,7 @@ class InverseMap:
     measurement_noise_unit : float or tuple of float, length ny, default 1
         Unit of sigma_v. If ``noise_gain`` has a row for each output, a number becomes a tuple.
     measurement_noise_max : float or tuple of float, length ny, default inf
-        The largest sigma_v in training, in the same form. A map without ``measurement_noise`` takes any sigma_v.
+        Largest sigma_v in training, in the same form. Without the feature ``measurement_noise``, any sigma_v is valid.
     process_noise_unit : float, default 1
         Unit of the process noise level.
     process_noise_max : float, default inf

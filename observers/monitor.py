@@ -73,7 +73,7 @@ class Limits:
         """Return the limits at a noise level.
 
         Some outputs may be noisier than others, relative to the largest levels. Their noise reaches the estimate, and
-        so every residual: the upper limits of all outputs are those at the noisiest output's relative level.
+        through it every residual: the upper limits of all outputs are those at the noisiest output's relative level.
 
         Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each. Mean squares
         and squared means are interpolated in the squared level. Raises ValueError if a level is invalid or too large.

@@ -46,9 +46,9 @@ class KKLObserver(RecordEstimates):
         Standard deviation of the noise on each sample: one for all outputs, or one for each if the map takes that.
         By default :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
     process_noise : float, optional
-        Level of the noise on the state's derivative, in multiples of the system's scale per second as in environments,
-        for maps that take it. T_inv limits the level to the largest in its training; the tracker takes any level. By
-        default the largest level in T_inv's training, which is also the default of the system's environments.
+        Level of the noise on the state's derivative, in multiples of the system's scale per second, as in environments.
+        The tracker takes any level; T_inv limits the level to the largest in its training. By default that largest
+        level, which is also the default of the system's environments; 0 if T_inv takes no level.
     monitor : bool, default False
         Whether to test if the samples fit the estimates, see :attr:`score`.
     tracking : bool, optional
@@ -61,8 +61,8 @@ class KKLObserver(RecordEstimates):
     gate : float, optional
         Largest innovation, in multiples of its standard deviation. The observer treats outputs with larger innovations
         as missing; :attr:`rejected` counts them. In the first window (:attr:`Motion.window`, 0.5 s for the maps that
-        ship) after a reset without ``x0``, it accepts all outputs. After a divergence or a whole window beyond the
-        gate, an output is accepted until it fits: the observer follows a lasting jump. A gate needs a map that tracks.
+        ship) after a reset without ``x0``, the gate is open. It also opens after a divergence, and for an output beyond
+        it for a whole window, until the output fits: estimates follow a lasting jump. A gate needs a map that tracks.
     delay : int, default 0
         Samples by which outputs arrive late. ``step(y, u)`` takes the output of ``delay`` samples ago and the input
         held since the last sample; the motion model then predicts the current state. A delay needs a map that tracks.

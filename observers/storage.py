@@ -31,7 +31,7 @@ _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype
 
 @contextmanager
 def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Name ``path`` in OSErrors that name the temporary file instead or, as on a full disk, no file."""
+    """Put ``path`` into OSErrors that name the temporary file or, as on a full disk, no file."""
     try:
         yield
     except OSError as problem:
@@ -44,8 +44,8 @@ def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary file to write, which replaces ``path`` once it is complete and on disk.
 
-    The temporary file is in the same folder, which is created if missing. It has the same suffix, from which some
-    writers choose a format, and the permissions that the umask allows. After an exception it is deleted, and ``path``
+    The temporary file is in the same folder, which is created if missing. It has the permissions that the umask
+    allows, and the same suffix, from which some writers choose a format. After an exception it is deleted, and ``path``
     is unchanged. If the process is killed, the file stays until :func:`training.files.clear_unfinished` removes it.
     """
     target = Path(path)

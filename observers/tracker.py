@@ -64,9 +64,9 @@ def _limit(freedom: float, quantile: float) -> float:
 class Tracker:
     """An unscented Kalman filter on the system's equations, or on a learned flow, with one estimate in each row.
 
-    It starts from the initial states' mean and covariance in training, corrected by the first sample. At a known state
-    it starts as if past the first :attr:`Motion.window`. In this window each step is repeated twice: the sample also
-    corrects the state before the step, and the motion is linearised about this smoothed state (Kullberg et al., 2023).
+    It starts from the initial states' mean and covariance in training, corrected by the first sample. In the first
+    :attr:`Motion.window` each step is repeated twice: the sample also corrects the state before the step, and the
+    motion is linearised about this smoothed state (Kullberg et al., 2023). A known initial state skips this window.
 
     The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's in
     two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The

@@ -18,7 +18,7 @@ from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
 from training.trajectories.motions import Controller, draw_process_noise, random_inputs, under_policy
 
 TRANSIENT = 0.2  # share of a trajectory, at its start, that errors after the transient leave out
-MAX_TRIES = 1000  # number of starts in a row within X after which the search for one outside X ends
+MAX_TRIES = 1000  # number of successive starts inside X after which the search for one outside X ends
 
 Domain = Literal["X", "1.5X", "2X"]
 
@@ -104,7 +104,7 @@ def unseen_trajectories(
     domain : {"X", "1.5X", "2X"}
         Where the trajectories start: in X, or in the multiple of X but outside X.
     driven : bool
-        Whether random inputs, steps and sines, act. With ``policy``: whether it explores and sees states with errors.
+        Whether random steps and sines act as inputs. With ``policy``: whether it explores and sees states with errors.
     stream : Stream
         Stream of random numbers, for evaluation or for validation.
     process_noise : float
@@ -162,7 +162,7 @@ def errors(
     seed: int,
     skip: float | None = None,
 ) -> Errors:
-    """Return an observer's errors on test trajectories. It knows the noise levels, but not its model's errors.
+    """Return an observer's errors on test trajectories. The observer knows the noise levels, but no model errors.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Return rms parameter errors after the transient, in percent of the plant's values, or else of x's last states."""
+    """Return rms parameter errors after the transient, in percent of the truth (the plant's, or in x's last states)."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
         raise ValueError(f"all {trajectories.escaped} runs left bounds = {system.bounds}")

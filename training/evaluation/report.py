@@ -16,7 +16,7 @@ from training.sources.simulated import SimulatedSource
 
 
 def write_report(path: Path, result: Result, source: Source | System) -> None:
-    """Draw the losses, and estimates along calibration motions: simulated without and with noise, or a recorded one."""
+    """Draw the losses, and estimates along calibration motions: one without and one with noise, or a recorded one."""
     artifact = result.artifact
     if isinstance(source, System):
         source = SimulatedSource(source, settings_of(artifact.training))

@@ -35,7 +35,7 @@ class TorchObserver(Module):
     tracking : bool, optional
         Whether to track, as for :class:`observers.KKLObserver`.
     dtype : torch.dtype, default torch.float32
-        Type of the networks and of the estimates: float32, as in :class:`observers.KKLObserver`, or float64.
+        Type of the networks and of the estimates: float32 (as the networks of KKLObserver) or float64.
 
     Raises
     ------
@@ -82,7 +82,7 @@ class TorchObserver(Module):
         return self.update.new_zeros(n, sum(self.widths))
 
     def estimate(self, state: Tensor) -> Tensor:
-        """Return the estimates at states (n, width): rows of x_hat, then of the estimated parameters, if any."""
+        """Return the estimates at states (n, width): in each row x_hat, then the estimated parameters, if any."""
         x = torch.split(state, self.widths, 1)[3]
         if self.tracker is not None:
             x = self.tracker.states(x[:, : self.nx].T).T

@@ -83,8 +83,8 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 def eliminated(P: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return the Cholesky factors L of covariances P = L L^T (m, m, n), stacked on B L^-T for matrices B (k, m, n).
 
-    Also returns a mask (n,) of the P that are positive definite. In the others, LEAST_PIVOT replaces smaller pivots, so
-    that gradients stay finite. Entries of L above the diagonal are rounding errors.
+    Also returns a mask (n,) of the P that are positive definite. LEAST_PIVOT replaces smaller pivots, so that gradients
+    stay finite. Entries of L above the diagonal are rounding errors.
     """
     rest, columns, pivots = torch.cat([P, *rows]), [], []
     for j in range(len(P)):

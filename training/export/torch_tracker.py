@@ -132,7 +132,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return V and white for corrected mean + V white and P - V V^T, expected outputs, and whether V is valid."""
+        """Return V and white, which correct to mean + V white and P - V V^T, the expected outputs, and V's validity."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)
@@ -169,7 +169,7 @@ class TorchTracker(Module):
         return (moved - self.x_offset) / self.x_scale
 
     def _output(self, s: Tensor, _: Tensor) -> Tensor:
-        """Return the outputs of scaled states (nx, n), or of the states limited to their bounds if h is undefined."""
+        """Return outputs of scaled states (nx, n) or, where h is undefined, of the states limited to their bounds."""
         assert self.h is not None
         y, near = (self.h(self.states(each)) for each in (s, self._within(s)))
         return torch.where(y.isfinite(), y, near)

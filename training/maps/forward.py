@@ -43,10 +43,10 @@ def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[tor
 class ForwardProblem(nn.Module):
     """The physics-informed risk R_S1(theta) (paper, eq. emp-risk-theta) of a forward network.
 
-    It is mean |z - T(x)|^2 over simulated pairs + nu * mean |dT/dx f(x) - A T(x) - B h(x)|^2 over collocation points.
-    Both terms measure each component of z in units of its standard deviation. Each component's residual is divided by
-    the local speed of the scaled motion plus the rate of the component's mode, so that fast regions do not dominate
-    (the authors' released code weights by the speed as well).
+    It is mean |z - T(x)|^2 over simulated pairs + ``physics_weight`` * mean |dT/dx f(x) - A T(x) - B h(x)|^2
+    over collocation points. Both terms measure each component of z in units of its standard deviation. Each component's
+    residual is divided by the local speed of the scaled motion plus the rate of the component's mode, so that fast
+    regions do not dominate (the authors' released code weights by the speed as well).
 
     Shapes: ``pairs`` (n, nx) and (n, nz), ``points`` (m, nx).
     """

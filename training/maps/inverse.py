@@ -29,7 +29,7 @@ PROCESS_NOISE_UNIT = 0.1  # unit in the process noise feature log(1 + level / un
 
 
 class Batch(NamedTuple):
-    """Samples to which the inverse is fitted; ``cell`` numbers each sample's group of similar age and noise."""
+    """Samples to which the inverse is fitted; ``cell`` is the index of a sample's group of similar age and noise."""
 
     inputs: torch.Tensor
     x: torch.Tensor
@@ -188,11 +188,11 @@ def _float_or_tuple(values: np.ndarray) -> float | tuple[float, ...]:
 
 
 class ForwardMapSampler(Sampler):
-    """Draws batches from the paper's second data set S_2 (sec. 5.2): points x' with z' = T(x'), without transients.
+    """Draws batches from the paper's second data set S_2 (sec. 5.2): points x with z = T(x), without transients.
 
-    The filter's z differs from T(x) by the error of T, which an inverse fitted to T(x') alone would magnify by its
+    The filter's z differs from T(x) by the error of T, which an inverse fitted to T(x) alone would magnify by its
     Lipschitz constant (paper, lemma R-eta-bound). Gaussian noise with the covariance of T's error, measured on the
-    training data of T, is therefore added to z', and each coordinate is shrunk to its linear conditional mean.
+    training data of T, is therefore added to T(x), and each coordinate is shrunk to its linear conditional mean.
 
     Shapes: ``error`` (nz, nz), the covariance of T's error; ``points`` (n, nx).
     """
