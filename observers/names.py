@@ -84,7 +84,7 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
 
 def matching(text: str, names: Iterable[str]) -> str | None:
     """Return the name that matches a text, or None; case, underscores, prefix "KKL" and suffix "-v0" do not matter."""
-    return {_plain(name): name for name in names}.get(_plain(text.removeprefix("KKL").removesuffix("-v0")))
+    return {_plain(name): name for name in names}.get(_plain(text.lower().removeprefix("kkl").removesuffix("-v0")))
 
 
 def suggestion(text: str, names: Iterable[str]) -> str:

@@ -157,7 +157,7 @@ class Agent:
             )
         observer = observer or self.observer
         if observer is not None and fingerprint(observer) != self.fingerprint:
-            raise AgentError(f"the agent was trained with another observer than {observer!r}")
+            raise AgentError(f"the agent was not trained with the observer {observer!r}")
         now = rules(self.task)
         for name in now:
             if self.rules.get(name) != now[name]:

@@ -12,7 +12,7 @@ from training.config import Scaling
 SMALLEST_MODE = 1e-7  # least ratio of a singular value of z to the largest; directions below it are rounding errors
 STILL = 1e-12  # least ratio of a component's standard deviation to its largest value; less is rounding error
 SETTLED = np.log(1e3)  # number of time constants after which a thousandth of a filter's start is left
-LEAST = 0.1  # the loss divides errors by the scaled state's mean square plus this, lest small states dominate
+LEAST = 0.1  # the loss divides square errors by the mean square of x / scale plus this, lest small states dominate
 
 
 @dataclass(frozen=True)

@@ -159,8 +159,8 @@ def _interpolated(record: Record, name: str, values: np.ndarray, t: np.ndarray, 
         close = inside | (np.minimum(abs(t - at[after - 1]), abs(t - at[after])) <= ROUNDING * dt)
     if close.sum() < 2 or not (smooth or (close[1:] & close[:-1]).any()):  # a filter needs consecutive samples
         raise ValueError(
-            f"{record.name}: column {name}: no samples are less than {LONGEST_GAP:g} dt = {LONGEST_GAP * dt:.3g} s "
-            "apart; take a larger dt"
+            f"{record.name}: column {name}: too few samples are within {LONGEST_GAP:g} dt = {LONGEST_GAP * dt:.3g} s "
+            "of each other; take a larger dt"
         )
     return np.where(close, PchipInterpolator(at, values)(t) if smooth else np.interp(t, at, values), np.nan)
 

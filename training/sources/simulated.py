@@ -21,7 +21,7 @@ from training.trajectories.parameters import blind, nominal_share, relative_rang
 
 LEAD_IN_SHARE = 0.4  # in this share of the motions without inputs, earlier inputs have moved the start
 BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and some of a flow's training motions
-# Without a policy, random inputs drive every other calibration run. A policy drives all runs, half of them exactly.
+# Random inputs drive every other calibration run. A policy, if any, drives all, every other one with errors.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
 LEAST_PROCESS_NOISE = 0.005  # least level of process noise for a tracker, in ``scale`` per pace; a tenth of the default

@@ -65,7 +65,7 @@ def test_states_may_be_missing():
 
 
 def test_dt_that_does_not_fit():
-    with pytest.raises(ValueError, match=r"a: column y1: no samples are less than 3 dt = 0.003 s apart"):
+    with pytest.raises(ValueError, match=r"a: column y1: too few samples are within 3 dt = 0.003 s"):
         resampled(record(jittery()[1:], y=np.sin(T[1:])[:, None]), 0.001)
     for dt in (0.0, -1.0, 20.0):
         with pytest.raises(ValueError, match="must lie between 0 and its duration"):
