@@ -51,7 +51,7 @@ def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str
             known = textwrap.shorten(", ".join(there), 200, placeholder=" ...") or "no numbers"
             ask = "" if not entries else ": cos and sin take a single entry"
             raise ValueError(
-                f"{role} names {name!r}, but an observation of {source} holds {known}{ask}; an index stands for its "
+                f"{role} contains {name!r}, but an observation of {source} holds {known}{ask}; an index stands for its "
                 "entry (2 for obs[2]), and info[KEY] for an entry of info"
             )
         found += [f"{function[1]}({entry})" for entry in entries] if function else entries
@@ -142,7 +142,7 @@ class InputReader:
         self._inputs, there = Inputs(space, source=source), acting(space)
         for name in names:
             if name not in there:
-                raise ValueError(f"inputs names {name!r}, but the inputs of {source} are {', '.join(there)}")
+                raise ValueError(f"inputs contains {name!r}, but the inputs of {source} are {', '.join(there)}")
         self._take = np.array([there.index(name) for name in names], dtype=int)
 
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:

@@ -57,7 +57,7 @@ class MLP:
             with np.errstate(over="ignore"):  # numbers that are too large become infinite, and are rejected below
                 object.__setattr__(self, name, [real_array(name, each).astype(np.float32) for each in arrays])
         if not self.weights or len(self.weights) != len(self.biases):
-            raise ValueError(f"a network needs as many weights as biases, got {len(self.weights)}, {len(self.biases)}")
+            raise ValueError(f"a network needs n > 0 weights and n biases, got {len(self.weights)}, {len(self.biases)}")
         width, layers = None, []
         for weight, bias in zip(self.weights, self.biases, strict=True):
             if weight.ndim != 2 or bias.shape != weight.shape[:1]:

@@ -30,8 +30,8 @@ Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]
 class VectorEstimate(VectorWrapper):
     """Replaces observations by the estimates of a batch of observers, which read ``info["y"]`` and ``info["u"]``.
 
-    In every autoreset mode, ``info`` and ``info["final_info"]`` gain the observers' reports, with a row for each
-    environment, and ``info["final_obs"]`` holds the last estimates.
+    ``info`` gains the observers' reports, with a row for each environment. In the autoreset mode SAME_STEP,
+    ``info["final_info"]`` gains them too, and ``info["final_obs"]`` holds the last estimates.
     """
 
     def __init__(self, env: VectorEnv, estimator: Estimates | KKLEstimator) -> None:

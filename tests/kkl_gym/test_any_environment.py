@@ -90,7 +90,7 @@ def test_other_environments_are_refused(saved):
     KKLObservation(gym.make("Pendulum-v1", render_mode="rgb_array", max_episode_steps=7), path)
     with pytest.raises(ArtifactError, match=r"the sampling interval 0\.1, but this is 0\.05"):
         KKLObservation(gym.make("Pendulum-v1"), saved(observer_of("Pendulum-v1", ["obs[0]"], ["obs[2]"], [], dt=0.1)))
-    with pytest.raises(ArtifactError, match=r"does not fit: measured names 'obs\[3\]'"):
+    with pytest.raises(ArtifactError, match=r"does not fit: measured contains 'obs\[3\]'"):
         KKLObservation(gym.make("Pendulum-v1"), saved(observer_of("Pendulum-v1", ["obs[3]"], ["obs[2]"], [], dt=0.05)))
     with pytest.raises(ValueError, match="kkl-gym record CartPole-v1 --measured"):
         KKLObservation(gym.make("CartPole-v1"))

@@ -30,7 +30,7 @@ def test_keys_of_a_dict_stand_for_all_of_their_entries():
 
 @pytest.mark.parametrize("wrong", ["4", "obs[9]", "-1", "speed", "cos(7)", "tan(0)", "info[]"])
 def test_an_entry_that_is_not_there_is_named(wrong):
-    with pytest.raises(ValueError, match=r"measured names .*Env-v0 holds obs\[0\], obs\[1\].*an index stands for"):
+    with pytest.raises(ValueError, match=r"measured contains .*Env-v0 holds obs\[0\], obs\[1\].*an index stands for"):
         names(wrong)
 
 
@@ -80,5 +80,5 @@ def test_inputs_are_scaled_or_one_hot():
     assert InputReader(box, ["action[1]"], source="Env-v0")(np.array([1.0, 3.0])).tolist() == [0.5]
     one_of = InputReader(spaces.Discrete(3), acting(spaces.Discrete(3)), source="Env-v0")
     np.testing.assert_array_equal(one_of(np.array([2, 0]), (2,)), [[0, 0, 1], [1, 0, 0]])
-    with pytest.raises(ValueError, match=r"inputs names 'action\[3\]'"):
+    with pytest.raises(ValueError, match=r"inputs contains 'action\[3\]'"):
         InputReader(spaces.Discrete(3), ["action[3]"], source="Env-v0")

@@ -102,7 +102,7 @@ def learn(
     and afterwards their estimates. Under noise the estimates are less accurate, and a policy for true signals does not
     suit them. The first steps are then fewer, their actions are random, and only the observer learns.
 
-    If an agent sees z under noise and ``observer_steps`` is given, z's weights are learned from so many random steps.
+    If an agent sees z under noise and ``observer_steps`` is given, z's weights are learned from that many random steps.
     All these first steps count as steps of the training. The observer is refitted ``aggregate`` times to the agent's
     own steps and, if this number is not 0, once more at the end.
 

@@ -23,7 +23,7 @@ from training.trajectories.motions import recording_ages
 FEW = 5  # with fewer records than this, none is held out whole
 STRETCHES, SAMPLES = 600, 2_000_000  # largest number of stretches of records for calibration, and of samples in them
 STRETCH_MEMORIES = 2.0  # greatest length of such a stretch, in settling times of the filter
-FEWEST = 50  # least number of samples at which a stretch for calibration may begin
+FEWEST = 50  # calibration needs at least this many samples at which a stretch may begin
 BEYOND = 0.5  # estimates may leave the range of the states by this fraction of it
 INCREMENTS = 400_000  # largest number of increments that a flow is learned from
 WINDOW = 10  # least number of samples over which a tracker averages innovations

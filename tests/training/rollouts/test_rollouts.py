@@ -80,7 +80,7 @@ def test_the_same_seed_plays_the_same_until_episodes_or_steps_are_played(drift):
 
 def test_what_cannot_be_recorded(drift):
     for changes, message in (
-        ({"measured": ["far"]}, r"names 'far', but an observation of Drift-v0 holds goal\[0\], goal\[1\], place; an"),
+        ({"measured": ["far"]}, r"contains 'far', but an observation of Drift-v0 holds goal\[0\], goal\[1\], place;"),
         ({"measured": []}, "name the measured entries of the observation"),
         ({"measured": ["info[speed]"]}, r"episode 0: info\[speed\] is missing after the reset"),
         ({"hidden": ["info[height]"]}, "info has no 'height'"),
