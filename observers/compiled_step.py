@@ -12,7 +12,7 @@ from observers.tracker import Tracker
 
 _LANES = 8  # rows of the batch that the kernel steps together
 MOST_OPERATIONS = 400  # in an expression; longer expressions, such as a network for f, take many seconds to compile
-MOST_ROWS = 32  # of a covariance; larger covariances of _LANES rows of the batch would exceed a thread's stack
+MOST_ROWS = 32  # of a covariance; larger ones, for _LANES observers at once, would exceed a thread's stack
 
 
 class CompiledStep:

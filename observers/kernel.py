@@ -328,7 +328,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     def supervise(
         rows: Any, count: int, sizes: Any, dt: float, window: float, limit: float, states: Any, maps: Any, scratch: Any
     ) -> None:
-        """Reinitialise by T_inv after a divergence, and in the first window where T_inv's covariance is smaller."""
+        """Reinitialise by T_inv after a divergence and, during the first window, if T_inv's covariance is smaller."""
         (driven, free, ages, covariances), (nz, size) = maps, sizes
         base = size + ny + 1
         P, L, inverse, own, quotient = stack(square, W), stack(square, W), stack(nx, W), stack(nx, W), stack(1, W)
@@ -395,7 +395,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     ) -> None:  # fmt: skip
         """Advance rows of the state (n, width) by samples y (steps, n, ny) and inputs u (steps, n, nu).
 
-        ``record`` receives each sample's rows, (steps, n, width), estimates, (steps, n, nx), or nothing, (1, 0, 0).
+        ``record`` receives, by its shape, rows (steps, n, width), estimates (steps, n, nx) or nothing (1, 0, 0).
         """
         nz, widest, substeps = flags
         h, samples, dt, limit = numbers[:4]

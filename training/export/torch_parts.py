@@ -16,7 +16,7 @@ LEAST_PIVOT = 1e-30  # lower bound of the pivots by which a Cholesky factorisati
 
 
 def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Return a version of ``function`` that also takes numbers, which become doubles, and bools."""
+    """Return a version of ``function`` that also takes bools, and numbers, which become doubles."""
 
     def tensor(value: Any) -> Tensor:
         return torch.tensor(value, dtype=torch.bool if isinstance(value, bool) else torch.float64)

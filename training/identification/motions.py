@@ -64,7 +64,7 @@ class Shooting:
     def derivatives(
         self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
     ) -> np.ndarray:
-        """Return derivatives (steps + 1, n, ny, d) by starts in half-widths of X and, if asked, parameters in units."""
+        """Return derivatives (steps + 1, n, ny, d) by starts (X's half-widths) and, if asked, parameters (``unit``)."""
         n, nx = x0.shape
         size = np.concatenate([self.half, self.unit]) * STEP
         moved = len(size) if parameters else nx
