@@ -18,8 +18,8 @@ class PredictiveMemory(Memory):
     """A memory that returns the outputs expected in the next step, and predictions of later ones.
 
     It has the filters of :class:`Memory` for all outputs and angles. Cosine and sine of an angle are filtered too,
-    because a torque may depend on them. ``weights``, (features, width), multiply the features [signals, w, v, 1]. The
-    first columns give each output's or angle's expected change in a step, the other columns the further predictions.
+    because a torque may depend on them. ``weights``, (features, width), multiply the signals, filters w and v, and 1.
+    The first columns give each output's or angle's expected change in a step, the others the further predictions.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class PredictiveMemory(Memory):
         n, features = x.shape
         if n < SAMPLES * features:
             raise ValueError(
-                f"{n} samples are followed by {last} more in their episode, and {SAMPLES * features} are needed: take "
+                f"the fit needs {SAMPLES * features} samples with {last} later ones in their episode, got {n}: take "
                 "more steps or shorter time constants"
             )
         signals = [episode[:, self._targets] for episode in episodes]

@@ -204,7 +204,7 @@ def angle_entries(values: Any) -> tuple[Any, ...]:
     pairs = [_is_sequence(value) for value in values]
     for value, pair in zip(values, pairs):
         if pair and len(value) != 2:
-            raise ValueError(f"a pair of angles must be a cosine and a sine, such as (0, 1), got {shown(value)}")
+            raise ValueError(f"a pair in angles must be a cosine and a sine, such as (0, 1), got {shown(value)}")
     names = iter(
         _entries("angles", [name for value, pair in zip(values, pairs) for name in (value if pair else (value,))])
     )
@@ -249,8 +249,8 @@ def _check(space: Space, source: str) -> None:
     for leaf in _leaves(space):
         if _is_image(leaf):
             raise ValueError(
-                f"{source} is an image, {leaf}: turn it into a vector by an encoder inside, with "
-                "gymnasium.wrappers.TransformObservation, or name only other entries in measured=[...]"
+                f"{source} is an image, {leaf}: turn it into a vector by an encoder in a wrapper "
+                "inside, such as gymnasium.wrappers.TransformObservation, or name only other entries in measured=[...]"
             )
         if not isinstance(leaf, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
             raise ValueError(

@@ -61,8 +61,8 @@ class KKLObserver(RecordEstimates):
     gate : float, optional
         Largest innovation, in multiples of its standard deviation. The observer treats outputs with larger innovations
         as missing; :attr:`rejected` counts them. In the first window (:attr:`Motion.window`, 0.5 s for the maps that
-        ship) after a reset without ``x0``, the gate is open. It also opens after a divergence, and for an output beyond
-        it for a whole window, until the output fits: estimates follow a lasting jump. A gate needs a map that tracks.
+        ship) after a reset without ``x0``, the gate is open. After a divergence or a whole window of rejections it
+        opens until the output fits, so estimates follow a lasting jump. A gate needs a map that tracks.
     delay : int, default 0
         Samples by which outputs arrive late. ``step(y, u)`` takes the output of ``delay`` samples ago and the input
         held since the last sample; the motion model then predicts the current state. A delay needs a map that tracks.

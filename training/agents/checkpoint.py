@@ -26,7 +26,7 @@ class Checkpoint(BaseCallback):
     """Writes a checkpoint and the learning curve at the end of a training and, at intervals, between two rollouts.
 
     A checkpoint holds networks, optimisers, counters, the scaling of observations and returns, the replay buffer, the
-    learning curve, the memory's weights and the steps from which an observer is learned. It holds neither environments
+    learning curve, the memory's weights and the recorded samples that train an observer. It holds neither environments
     nor random generators: a resumed training begins new episodes with other random numbers. The learning curve has a
     row for each episode: steps, CPU seconds and return.
     """

@@ -51,7 +51,7 @@ class TorchTracker(Module):
         self.put(levels=factors.levels, ages=factors.ages, factors=factors.factors[0], most=factors.factors[-1])
 
     def covariance(self, state: Tensor, age: Tensor, share: Tensor, process_share: Tensor) -> Tensor:
-        """Return calibrated covariances (n, nx^2) at ages (n, 1) and noise levels (n, 1), relative to the largest."""
+        """Return calibrated covariances (n, nx^2) at ages (n, 1), for noise levels (n, 1) as shares of the largest."""
         table = self.factors + process_share.clamp(max=1.0)[..., None] * (self.most - self.factors)
         factor = between(age, self.ages, between(share, self.levels, table).log()[..., None]).exp()
         return factor * (self._unpacked(state)[1] * self.units).flatten(0, 1).T
@@ -97,7 +97,7 @@ class TorchTracker(Module):
     def supervise(self, tracked: Tracked, x_hat: Tensor, covariance: Callable[[Tensor], Tensor]) -> Tensor:
         """Use T_inv's estimates (nx, n) after a divergence, and in the first window if their covariance is smaller."""
         x, P, nis, square, seen, trend = tracked
-        # The cause of a divergence may have disturbed z, too: the age of T_inv's covariance is at most a window.
+        # The cause of a divergence may have disturbed z, too: take T_inv's covariance at an age of at most a window.
         learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)
         lost, learned = ~(nis <= self.numbers["limit"]), learned.reshape(P.shape) / self.units
         of_learned, own = (eliminated(each)[0].diagonal().log().sum(1) for each in (learned, P))
@@ -132,7 +132,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return V and white, which correct to mean + V white and P - V V^T, the expected outputs, and V's validity."""
+        """Return V, white, expected outputs and V's validity; mean + V white and P - V V^T are corrected."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)
