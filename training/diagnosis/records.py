@@ -107,7 +107,7 @@ class Observability:
                 text += f" from {steps if one.window else 'y alone'}"
             if not np.isnan(one.errors[0]):
                 errors = [f"{error(each)} at noise {show_level(level)}" for level, each in zip(self.noise, one.errors)]
-                text += f"; error {', '.join(errors)}"
+                text += f"; error {'; '.join(errors)}"
             yield Finding("observability", verdict, text, advice)
         for warning in self.warnings:
             text, _, advice = warning.partition("; ")
