@@ -23,7 +23,7 @@ def source_of(env: Any) -> str:
 
 
 def check_autoreset(env: Any) -> None:
-    """Raise ValueError if ``env`` contains an Autoreset wrapper, whose step may start the next episode."""
+    """Raise ValueError for an Autoreset wrapper, whose step may start the next episode, except inside Async vectors."""
     base = env.unwrapped
     for one in base.envs if isinstance(base, gym.vector.SyncVectorEnv) else [env]:
         while isinstance(one, gym.Wrapper):

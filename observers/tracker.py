@@ -12,11 +12,11 @@ from observers.motion import Motion
 from observers.unscented import add, factor, shift, solved, transformed, whitened
 
 # The two limits of Supervision follow from these quantiles of the normal distribution. Beyond the limit of the NIS, the
-# tracker discards its estimate; beyond the limit of the trend's mean square, it only inflates the covariance. This mean
-# square is more skewed than chi-square: for white innovations it exceeds its limit with probability 2e-4, not 1e-5.
+# tracker discards its estimate; beyond that of the trend (the innovations' running mean), it inflates P. The trend's
+# mean square is more skewed than chi-square: white innovations exceed its limit with probability 2e-4, not 1e-5.
 _DIVERGED = 6.0  # for the NIS, with tail probability 1e-9
 _COLOURED = 4.265  # for the mean square of the trend, with tail probability 1e-5
-_TREND = 0.25  # time constant of the trend, the innovations' running mean, in multiples of Motion.window
+_TREND = 0.25  # time constant of the trend, in multiples of Motion.window
 _LONG = 4.0  # time constant of the mean square of the trend, in multiples of Motion.window
 INFLATION = 10.0  # factor by which the covariance grows if innovations are not white
 RELINEARISATIONS = 2  # of each step in the first window; with 0, noise-free errors are 40 to 80 % larger
@@ -169,7 +169,7 @@ class Tracker:
         V, white = whitened(y - expected, S, cross, np.isnan(y))
         new = rows[:, self.nis + 2] < self.supervision.window
         for _ in range(RELINEARISATIONS if new.any() else 0):
-            # The sample corrects the state before the step by G white, too (Rauch, Tung and Striebel, 1965).
+            # The sample corrects the state before the step by G @ white, too (Rauch, Tung and Striebel, 1965).
             G = across @ solved(moved, V)
             spread = add(P, G, G, -1.0)
             around, curved, of_start = predict(shift(x, G, white), spread)

@@ -49,7 +49,7 @@ class Config:
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
     """Real eigenvalues of A, in 1/s; B is all ones for each output."""
     pairs: tuple[tuple[Annotated[float, Field(lt=0)], Positive], ...] = ()
-    """Complex pairs a +- iw of eigenvalues of A, as (a, w) in 1/s and rad/s; a pair averages noise at frequency w."""
+    """Eigenvalue pairs a +- iw of A, as (a, w) in 1/s and rad/s. Slow pairs at frequencies of y average its noise."""
     dt: Positive = 0.01
     """Sampling interval in seconds."""
     trajectories: Count = 500
@@ -98,7 +98,7 @@ class Config:
     """Whether an input-aware map has a second inverse of z_y alone, used until an input acts; never with a policy."""
     lead_in_input: NotNegative = 0.0
     """Before some trajectories without inputs, inputs lead the start out of X: constant inputs, up to this multiple of
-    their bounds, for 20 times the system's pace; with 0, random inputs within their bounds for 10 times the pace."""
+    their bounds, for 20 of the system's time units (pace); with 0, random inputs within bounds for 10 units."""
     process_noise_share: Share = 0.35
     """Share of trajectories with process noise (input-aware); with 0, its level is not an input of T_inv."""
     measurement_noise_max: Levels = 1.0

@@ -90,7 +90,7 @@ class TaskOptions:
     frames: Annotated[int | None, hint("8")] = None
     """Number of stacked observations, each with the action before it."""
     no_past_actions: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Leave past actions out of z, traces and stacked."""
+    """Leave past actions out of z, traces and stacked observations."""
     angles: Annotated[tuple[Annotated[tuple[int, ...], _PAIR], ...], tyro.conf.UseAppendAction, hint("none")] = ()
     """Entries of the cosine and the sine of a measured angle, as in 0,1; repeat the option for each angle. z then holds
     the unwrapped angle."""
@@ -133,7 +133,7 @@ class Train:
     observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
     """For environments without --observer: number of first steps, from which an observer is learned. Without noise the
     agent also learns in these steps, from true hidden signals, and only the latest 100,000 steps serve the observer.
-    With noise the actions are random. For z with noise, the option fits z's weights to so many random steps."""
+    With noise the actions are random. For z with noise, z's weights are fitted to this many random steps."""
     aggregate: int = 0
     """Number of refits of the observer to the agent's own steps while the agent learns from estimates. If it is not 0,
     the agent does not explore in the last twentieth of all steps, and a last refit follows."""

@@ -20,7 +20,7 @@ MIN_STEPS = 10  # least number of samples of a motion
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in the direction
 VAGUE = 0.3  # a larger error without noise, in standard deviations of the state, is a note
-# A state has a symmetry if its error is at most LOCALLY by the equations, but at least GLOBALLY by neighbours in z.
+# Under a symmetry a state's least error is <= LOCALLY, but predicting it from samples of similar z errs by >= GLOBALLY.
 LOCALLY, GLOBALLY = 0.1, 0.3
 
 

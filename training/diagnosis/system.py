@@ -18,7 +18,7 @@ from training.trajectories.motions import DRIVEN, Controller, random_inputs, und
 
 COMPARED = 100  # number of points of X, and of 2X, at which the equations are evaluated
 POINTS = 1000  # number of points of X at which outputs are evaluated
-MOTIONS = 100  # number of motions, half of which are driven if the system has inputs
+MOTIONS = 100  # number of motions; if the system has inputs and no policy is given, half are driven
 MANY = 0.5  # a larger share of motions that leave the bounds is a problem
 # Change of y in one sample, in standard deviations of y: a problem above COARSE, a note above JERKY, SMOOTH is advised.
 COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1

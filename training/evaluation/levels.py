@@ -38,7 +38,7 @@ def multiple(system: System, factor: float) -> Level:
 
 
 def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
-    """Return the given level or, cut to the map's range, the system's own (its largest if the map takes one level)."""
+    """Return ``given`` or, cut to the map's range, the system's level (the noisiest output's if the map takes one)."""
     if given is not None:
         return noise_levels("measurement_noise", given, system.ny)
     own = multiple(system, 1.0)
