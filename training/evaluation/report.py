@@ -21,16 +21,14 @@ def write_report(path: Path, result: Result, source: Source | System) -> None:
     if isinstance(source, System):
         source = SimulatedSource(source, settings_of(artifact.training))
     names = source.model.state_names if isinstance(source, SimulatedSource) else (artifact.signals or {})["hidden"]
-    chosen = list[int]()
     try:
         runs = source.runs(report=lambda done: None)
         # Recorded runs differ in length, and NaN fills up the shorter ones; there may be only one longest run.
         length = np.isfinite(runs.x).all(-1).sum(0)
-        longest = np.flatnonzero(length == length.max())
-        by_noise = longest[np.argsort(runs.process_noise[longest], kind="stable")]
-        chosen = by_noise[[0, -1][: len(by_noise)]].tolist()
+        by_noise = sorted(np.flatnonzero(length == length.max()).tolist(), key=lambda run: runs.process_noise[run])
+        chosen = by_noise[:: max(1, len(by_noise) - 1)]  # the first and the last
     except TooFewRunsError:
-        names = ()
+        names, chosen = (), []
     with drawing(path, 12, 3.2 + 1.5 * len(names)) as figure:
         grid = figure.add_gridspec(1 + len(names), max(1, len(chosen)), height_ratios=[2.0, *[1.0] * len(names)])
         ax: Any = figure.add_subplot(grid[0, :])

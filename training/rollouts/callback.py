@@ -151,8 +151,7 @@ class KKLTrainingCallback(BaseCallback):
             )
         self.artifact, self._config = artifact, config
         # A tracking observer is judged under the noise that it sees, which the recorded outputs may lack.
-        noisy = self._outputs != "y" and artifact.motion is not None
-        self._level = used[0].measurement_noise if noisy else 0.0
+        self._level = used[0].measurement_noise if self._outputs != "y" and artifact.motion is not None else 0.0
 
     def _on_training_start(self) -> None:
         for row in range(self.training_env.num_envs):

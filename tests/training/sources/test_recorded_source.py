@@ -207,6 +207,9 @@ def test_what_is_held_out():
     assert [len(record.t) for record in kept + held_out] == [70, 70, 30, 30]
     assert held_out[0].t[0] == records[0].t[70]
     assert split(records, 0.0, 0) == (records, [])
+    short = records[0].part(slice(3))
+    kept, held_out = split([short, records[1]], 0.3, 0)
+    assert (kept[0], [record.name for record in held_out]) == (short, [records[1].name])
 
 
 def test_the_rate_of_signals_is_their_angular_frequency():
