@@ -81,11 +81,7 @@ PROFILES: dict[str, Profile] = {
         # Fast modes follow the jumps of y, and slow ones average its noise; this range gave the smallest errors.
         eigenvalues=_spaced(15, -0.4, -20.0),
         # Slower modes would have a rougher T; more modes average more of the noise.
-        spinn_settings={
-            "eigenvalues": _spaced(11, -4.0, -16.0),
-            "noise_free_share": 0.2,
-            "high_noise_emphasis": 4.5,
-        },
+        spinn_settings={"eigenvalues": _spaced(11, -4.0, -16.0), "noise_free_share": 0.2, "high_noise_emphasis": 4.5},
         # High noise levels are drawn more often, as they make the phase hard to estimate. Inputs within their bound
         # cannot drive the oscillator out of X, so stronger inputs lead some starts out of it.
         settings={"lead_in_input": 4.0, "noise_free_share": 0.05, "high_noise_emphasis": 4.0},
@@ -192,11 +188,8 @@ def preset(
     own, paper, uncertain = profile(system), name == "paper", given.get("uncertain")
     usual = zip(np.broadcast_to(system.measurement_noise, system.ny).tolist(), system.output_range, strict=True)
     largest = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]  # the system's noise may be 0
-    chosen: dict[str, Any] = {
-        "dt": system.dt,
-        "duration": system.duration,
-        "measurement_noise_max": noise_levels("measurement_noise_max", largest, system.ny),
-    }
+    levels = noise_levels("measurement_noise_max", largest, system.ny)
+    chosen: dict[str, Any] = {"dt": system.dt, "duration": system.duration, "measurement_noise_max": levels}
     if pipeline == "input-aware":
         chosen |= own.settings
         if size == "large":
@@ -220,8 +213,7 @@ def preset(
 
 def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
     """Return an input-aware map's real eigenvalues of A: the profile's, or else ones from the system's rate and dt."""
-    chosen = profile(system).eigenvalues
-    if chosen is not None:
+    if (chosen := profile(system).eigenvalues) is not None:
         return chosen
     fastest = min(1.5 * system.typical_rate, (FASTEST_OF_STEPS if system.discrete else FASTEST_MODE) / dt)
     spaced = evenly_spaced(4 * system.nx + 3, -fastest / 22.5, -fastest)

@@ -200,8 +200,8 @@ def summary(result: "Result") -> list[str]:
     ]
     if covariance is None:
         lines[-1] += ", without covariances"
-    if errors := artifact.training.get("held_out_errors"):
-        each = ", ".join(f"{name} {error:.3g}" for name, error in errors.items())
-        after = artifact.training["held_out_after"]
-        lines.append(f"rms error / standard deviation on held-out records: {each} (after {after:.2g} s of transient)")
+    if (errors := artifact.training.get("held_out_errors")) is not None:
+        each, after = (f"{name} {error:.3g}" for name, error in errors.items()), artifact.training["held_out_after"]
+        known = ", ".join(each) or "unknown, as they hold too few samples"
+        lines.append(f"rms error / standard deviation on held-out records: {known} (after {after:.2g} s of transient)")
     return lines

@@ -16,6 +16,7 @@ ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # field of Record: fiel
 MAX_SAMPLE = 1e100  # largest valid sample, so that sums of squares stay finite
 LONGEST_GAP = 3.0  # longest gap, in steps of the grid, in which samples are interpolated
 ROUNDING = 1e-6  # tolerance of times, in steps of the grid
+MOST_STEPS = 1000  # largest number of steps of a grid for each sample; a jump of the time is longer than any gap
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,12 @@ def resampled(record: Record, dt: float | None = None) -> Record:
     if not 0 < dt <= record.duration * (1 + ROUNDING):
         raise ValueError(f"{record.name}: dt = {dt:g} s must lie between 0 and its duration, {record.duration:g} s")
     steps = int(np.floor(record.duration / dt + ROUNDING))
+    if steps > MOST_STEPS * len(record.t):
+        row = int(np.diff(record.t).argmax())
+        raise ValueError(
+            f"{record.name}: column {record.signals.time}, row {row + 2}: {record.t[row + 1]:.10g} comes after "
+            f"{record.t[row]:.10g} s; split the record at this jump of the time, or correct it"
+        )
     t = np.minimum(record.t[0] + dt * np.arange(steps + 1), record.t[-1])
     signals, columns = record.signals, [] if record.x is None else list(record.x.T)
     y = [_interpolated(record, name, values, t, smooth=False) for name, values in zip(signals.measured, record.y.T)]

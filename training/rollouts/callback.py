@@ -27,7 +27,7 @@ from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a shorter training than the first, as there are many refits
-LONGEST = 250  # largest number of steps in a piece; longer episodes are cut, so that parts of each can be held out
+LONGEST = 250  # steps of a piece, or two settling times; longer episodes are cut, so that parts can be held out
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class KKLTrainingCallback(BaseCallback):
     the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
     replaces the old one unless the new one's error on that share is larger. Filters keep their states. A refit takes
     place only after a rehearsal, or as an algorithm begins to collect a rollout, lest an on-policy batch mix observers.
-    Episodes are cut into parts of 250 steps, and a refit needs a part as long as the filter's settling time.
+    It needs a kept and a held-out episode as long as the filter's settling time; otherwise the callback warns.
 
     The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square, divided by
     standard deviations), and ``kkl/error_before``, that of the observer before the refit.
@@ -151,8 +151,7 @@ class KKLTrainingCallback(BaseCallback):
             )
         self.artifact, self._config = artifact, config
         # A tracking observer is judged under the noise that it sees, which the recorded outputs may lack.
-        noisy = self._outputs != "y" and artifact.motion is not None
-        self._level = used[0].measurement_noise if noisy else 0.0
+        self._level = used[0].measurement_noise if self._outputs != "y" and artifact.motion is not None else 0.0
 
     def _on_training_start(self) -> None:
         for row in range(self.training_env.num_envs):
@@ -198,10 +197,15 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._gathering.steps + self._every
         kept, held_out = self._gathering.records()
         memory = settling_time(self.artifact.filter)
-        # Earlier records may be long enough without the agent's episodes, but only the agent's episodes are held out.
-        needed = (kept, held_out) if self._before and self._config.held_out else (kept,)
+        needed = (kept, held_out) if self._config.held_out else (kept,)
         if all(any(record.duration >= memory for record in records) for records in needed):
             self._refit(kept, held_out)
+        else:
+            warnings.warn(
+                f"the observer in use stays: no kept or no held-out episode lasts {memory:.3g} s, the settling time of "
+                "its filter; make episodes longer, or learn the first observer with faster eigenvalues",
+                stacklevel=2,
+            )
 
     def _refit(self, kept: list[Record], held_out: list[Record]) -> None:
         old = self.artifact
@@ -270,6 +274,7 @@ class Gathering:
         names, self._environment = artifact.signals or {}, artifact.environment or {}
         self._signals = Signals("t", *(tuple(names[role]) for role in ROLES.values()))
         self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
+        self._longest = longest = max(LONGEST, 2 * math.ceil(settling_time(artifact.filter) / self._dt))
         self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
         self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; the open one by row
         self._made = self.steps = 0
@@ -281,8 +286,8 @@ class Gathering:
             check_alike(record, known, self._environment, "the observer's rollouts")
             y, x, u = (getattr(resampled(record, self._dt), letter) for letter in "yxu")
             u = u if self._signals.inputs else np.zeros((len(y), 0))
-            for begin in range(0, len(y) - 1, LONGEST):
-                rows, steps = slice(begin, begin + LONGEST + 1), slice(begin, min(begin + LONGEST, len(y) - 1))
+            for begin in range(0, len(y) - 1, longest):
+                rows, steps = slice(begin, begin + longest + 1), slice(begin, min(begin + longest, len(y) - 1))
                 self._pieces.append(_Piece(record.name, False, [*y[rows]], [*x[rows]], [*u[steps]]))
 
     def begin(self, row: int, info: Mapping[str, Any]) -> None:
@@ -302,10 +307,10 @@ class Gathering:
         piece, sample = self._open[row], int(info["sample"])
         if piece.y and sample != piece.sample + 1:
             raise ValueError(
-                f"environment {row} showed sample {sample} after {piece.sample}: put wrappers that skip steps, such as "
-                "ActionRepeat, inside KKLObservation while observers are refitted"
+                f"environment {row} showed sample {sample} after {piece.sample}: a refit needs all samples, so leave out "
+                "wrappers that skip steps, such as ActionRepeat"
             )
-        if len(piece.u) == LONGEST:
+        if len(piece.u) == self._longest:
             piece = self._new(row, piece.y[-1:], piece.x[-1:])
         if piece.y:
             piece.u.append(info["u"])

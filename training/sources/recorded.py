@@ -260,9 +260,8 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
         rate, length = signal_rate(records), np.median([record.duration for record in records])
         slowest = min(max(SLOWEST * rate, RECORD_MEMORIES * SETTLED / length), rate)
         spaced = evenly_spaced(MODES, -slowest, -min(FASTEST * rate, FASTEST_MODE / dt))
-    levels = tuple(
-        float(f"{RECORDED_NOISE * size:.3g}") for size in np.nanstd(np.concatenate([r.y for r in records]), 0)
-    )
+    spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
+    levels = tuple(float(f"{RECORDED_NOISE * size:.3g}") for size in spread)
     still = [name for name, level in zip(records[0].signals.measured, levels) if not level]
     if still and "measurement_noise_max" not in given:
         raise ValueError(f"{', '.join(still)} never changes: leave it out of the measured signals")
@@ -288,9 +287,9 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
         chosen = generator(Stream.VALIDATION, seed).permutation(len(records))[:count]
         return [r for i, r in enumerate(records) if i not in chosen], [records[i] for i in sorted(chosen)]
     ends = [min(max(2, round((1 - share) * len(record.t))), len(record.t) - 2) for record in records]
-    return (
-        [record.part(slice(None, end)) for record, end in zip(records, ends)],
-        [record.part(slice(end, None)) for record, end in zip(records, ends)],
+    return (  # fewer than four samples are kept whole
+        [record.part(slice(None, end)) if end > 1 else record for record, end in zip(records, ends)],
+        [record.part(slice(end, None)) for record, end in zip(records, ends) if end > 1],
     )
 
 

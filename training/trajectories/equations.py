@@ -106,7 +106,8 @@ def field_expression(system: System, *, inputs: bool = True) -> Expression:
     def evaluated(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return np.stack([np.broadcast_to(value, len(x)) for value in traced(x.T, u.T)], -1)
 
-    return _expression(system, traced, evaluated, "step(x, u)" if system.discrete else "f(x)", inputs=inputs)
+    what = "step(x, u)" if system.discrete else "f(x) + g(x) u" if nu else "f(x)"
+    return _expression(system, traced, evaluated, what, inputs=inputs)
 
 
 def _expression(

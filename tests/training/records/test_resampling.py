@@ -64,6 +64,12 @@ def test_states_may_be_missing():
     assert np.isnan(second.x[:, 0]).sum() == 130
 
 
+def test_a_jump_of_the_time_is_no_gap():
+    t = T + 1e9 * (np.arange(len(T)) >= 100)
+    with pytest.raises(ValueError, match=r"a: column t, row 101: 1000000005 comes after 4\.98 s; split the record"):
+        resampled(record(t))
+
+
 def test_dt_that_does_not_fit():
     with pytest.raises(ValueError, match=r"a: column y1: too few samples are within 3 dt = 0.003 s"):
         resampled(record(jittery()[1:], y=np.sin(T[1:])[:, None]), 0.001)

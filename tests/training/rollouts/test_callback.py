@@ -1,6 +1,7 @@
 """Observers that are refitted on an agent's own episodes."""
 
 import dataclasses
+from contextlib import nullcontext
 from functools import partial
 from types import SimpleNamespace
 
@@ -38,8 +39,8 @@ def wrapped(env_id, path, **kwargs):
     return KKLObservation(gym.make(env_id, **kwargs), path)
 
 
-def vector(env_id, path, n=4, of=DummyVecEnv):
-    return make_vec_env(partial(wrapped, env_id, str(path)), n, seed=0, vec_env_cls=of)
+def vector(env_id, path, n=4, of=DummyVecEnv, **kwargs):
+    return make_vec_env(partial(wrapped, env_id, str(path), **kwargs), n, seed=0, vec_env_cls=of)
 
 
 def ppo(env, steps=64, **policy):
@@ -73,6 +74,19 @@ def test_a_refit_lowers_the_error(pendulum, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2
     assert "refitted the observer at step 1024" in lines[0]
+
+
+def test_pieces_are_longer_than_the_settling_time_of_a_slow_filter(tmp_path):
+    """It settles after 345 steps; where episodes are shorter, a warning gives the reason why there is no refit."""
+    few, told = {"steps": 1000, "members": 1, "inverse_steps": 20}, []
+    long = {"eigenvalues": (-0.4, -4.0, -20.0), "env_kwargs": {"max_episode_steps": 500}}
+    training.learn("Pendulum-v1", measured=[0, 1], hidden=[2], out=tmp_path, **long, **few, **TINY)
+    path, options = tmp_path / "Pendulum-v1.safetensors", {"inverse_steps": 20, "on_refit": told.append}
+    with pytest.warns(UserWarning, match=r"lasts 17\.3 s, the settling time .* make episodes longer, or .*eigenvalues"):
+        ppo(vector("Pendulum-v1", path), 100).learn(900, KKLTrainingCallback(800, **options))
+    assert told == []
+    ppo(vector("Pendulum-v1", path, max_episode_steps=500), 100).learn(2000, KKLTrainingCallback(1600, **options))
+    assert [refit.steps for refit in told] == [1600]
 
 
 def test_environments_in_processes_of_their_own(pendulum, asked):
@@ -200,12 +214,13 @@ def test_a_rehearsal_is_played_as_the_agent_will_act(spied, asked, monkeypatch):
 
 @pytest.mark.parametrize(("memory", "before", "times"), [(7.0, True, 2), (8.0, True, 0), (8.0, False, 0)])
 def test_a_refit_is_judged_by_the_agents_own_episodes(spied, asked, monkeypatch, memory, before, times):
-    """While none that is held out is long enough, records from before are no reason for a refit."""
+    """While none that is held out is long enough, records from before are no reason for a refit: a warning instead."""
     env = spied()
     signals, column = Signals("t", ("obs[0]",), ("action[0]",), ("obs[1]",)), np.zeros((100, 1))
     long = Record("long", np.arange(100.0), *[column] * 3, signals, environment=asked.artifact.environment)
     monkeypatch.setattr(module, "settling_time", lambda linear: memory)
-    ppo(env, 50).learn(150, KKLTrainingCallback(50, records=[long] * before))
+    with nullcontext() if times else pytest.warns(UserWarning, match="the observer in use stays"):
+        ppo(env, 50).learn(150, KKLTrainingCallback(50, records=[long] * before))
     assert len(asked.found) == times
 
 
@@ -247,7 +262,7 @@ def test_environments_that_are_refused(pendulum, tmp_path):
         (gym.make("Pendulum-v1"), {}, r"the environment has none: wrap each environment"),
         (wrapped("Pendulum-v1", tmp_path / "plain.safetensors"), {}, "holds no settings of its training"),
         (hiding, {}, r"environment 0 has no 'x': KKLObservation gives the true obs\[2\] as 'x'"),
-        (ActionRepeat(wrapped("Pendulum-v1", pendulum), 2), {}, "showed sample 4 after 2: put wrappers that skip"),
+        (ActionRepeat(wrapped("Pendulum-v1", pendulum), 2), {}, "showed sample 4 after 2: a refit needs all samples"),
         (noise, {"measurement_noise_max": 0.01}, r"measurement_noise_max = 0\.01 is less than the noise 0\.05"),
         (wrapped("Pendulum-v1", pendulum), {"held_out": 0.0}, "held_out must be positive, got 0"),
         (two, {}, "has signals"),

@@ -54,9 +54,9 @@ def test_a_start_that_is_known(path):
 
 
 def test_a_refit_without_enough_held_out_is_left_out(path):
-    model = agent(path, 1, 220)
+    model = agent(path, 1, 240)  # an episode of 200 steps is kept, and 40 steps of the next are held out
     with pytest.warns(UserWarning, match="the observer in use stays: too few steps are held out"):
-        model.learn(440, KKLTrainingCallback(220))
+        model.learn(480, KKLTrainingCallback(240))
 
 
 def test_a_refit_learns_the_flow_again(path, monkeypatch):

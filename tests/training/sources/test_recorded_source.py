@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from recorded_runs import SIGNALS, SMALL, swing
 from rich.console import Console
 from scipy.linalg import solve_discrete_are
@@ -14,6 +15,7 @@ from observers import Artifact, KKLObserver
 from training import RecordedSource, recorded_preset, train
 from training.calibration import chi_square, squared_distance
 from training.evaluation.report import write_report
+from training.lessons import Result
 from training.records import Record, resampled
 from training.sources.recorded import linear_output, recorded_errors, signal_rate, split
 
@@ -115,6 +117,20 @@ def test_without_enough_that_is_held_out_there_are_no_covariances(tmp_path):
         write_report(tmp_path / "report.png", result, source)  # of the losses alone, where nothing is held out
 
 
+@pytest.mark.parametrize("lengths", [[600] * 3, [600, 900]], ids=["alike", "one-longest"])
+def test_the_report_draws_no_motion_twice(tracking, monkeypatch, tmp_path, lengths):
+    """The longest held-out motions are drawn: two, or one if the others are shorter."""
+    drawn, records = [], [both(seed, n=n) for seed, n in enumerate(lengths)]
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure))
+    source = RecordedSource(records, recorded_preset(records, SMALL), "spring")
+    write_report(tmp_path / "report.png", Result(tracking, {"inverse": [(1, 1.0), (2, 0.5)]}, {}), source)
+    positions = [ax.lines[0].get_ydata() for ax in drawn[0].axes[1:] if ax.get_ylabel() == "position"]
+    for x, record in zip(positions, (records[0], records[-1]) if len(lengths) == 3 else records[1:], strict=True):
+        ends = resampled(record, source.dt).x[-len(x) :, 0]
+        np.testing.assert_allclose(x, ends)
+        assert len(x) >= 0.1 * len(record.t)
+
+
 def test_resuming_makes_the_same_observer(tmp_path):
     records, options = [both(seed) for seed in range(3)], {"members": 2, "inverse_steps": 20, "flow_steps": 20}
     first, _ = trained(records, tmp_path, **options)
@@ -191,6 +207,9 @@ def test_what_is_held_out():
     assert [len(record.t) for record in kept + held_out] == [70, 70, 30, 30]
     assert held_out[0].t[0] == records[0].t[70]
     assert split(records, 0.0, 0) == (records, [])
+    short = records[0].part(slice(3))
+    kept, held_out = split([short, records[1]], 0.3, 0)
+    assert (kept[0], [record.name for record in held_out]) == (short, [records[1].name])
 
 
 def test_the_rate_of_signals_is_their_angular_frequency():

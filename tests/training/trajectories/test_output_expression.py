@@ -12,7 +12,7 @@ from linear_system import Oscillator
 from kkl_gym import System, get_system
 from kkl_gym.elementary import abs as absolute
 from kkl_gym.elementary import atan2, clip, cos, exp, log, maximum, minimum, sign, sin, sqrt, tan, tanh, where
-from training.trajectories.equations import output_expression, output_matrix
+from training.trajectories.equations import field_expression, output_expression, output_matrix
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,15 @@ def test_outputs_that_cannot_be_written_down(h, match):
     kind = type("Odd", (Oscillator,), {"name": "odd", "h": h})
     with pytest.raises(ValueError, match=rf"(?s)observer of 'odd' cannot hold h\(x\).*{match}"):
         output_expression(kind())
+
+
+def test_a_message_about_inputs_does_not_blame_f_alone():
+    def g(self, x):
+        return [[math.sin(x[0])], [1.0]]
+
+    pushed = type("Pushed", (Oscillator,), {"name": "pushed", "u_max": (1.0,), "g": g})
+    with pytest.raises(ValueError, match=r"cannot hold f\(x\) \+ g\(x\) u as an expression: g\(x\) of 'pushed' failed"):
+        field_expression(pushed())
 
 
 def test_output_matrix_of_linear_and_other_outputs():
