@@ -36,8 +36,7 @@ def check(
     measurement_noise: Sequence[Level] | None = None,
 ) -> Iterator[Finding]:
     """Yield the findings of all checks: whether the system works in environments, training and evaluation."""
-    first = list(CHECKS)[:2]
-    equations = [finding for name in first for finding in _findings(name, Subject(of, np.nan, np.nan))]
+    equations = [finding for name in list(CHECKS)[:2] for finding in _findings(name, Subject(of, np.nan, np.nan))]
     yield from equations
     if any(finding.verdict == "problem" for finding in equations):
         yield Finding("equations", "note", "all other checks are left out", "correct the equations first")

@@ -1,17 +1,16 @@
 """Which states a system's outputs determine: locally, by the equations, and globally, by simulated motions."""
 
-import contextlib
 from collections.abc import Iterator
 
 import numpy as np
 
-from training.diagnosis.finding import RESOLUTION, Finding, error
-from training.diagnosis.records import AS_GOOD, DETERMINED, of_records
-from training.diagnosis.system import Subject
+from kkl_gym.simulate import simulate
+from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
+from training.diagnosis.records import AS_GOOD, DETERMINED, left_by
+from training.diagnosis.system import POINTS, Subject, of_X
 from training.evaluation.levels import show_level
 from training.kalman import ExtendedKalmanFilter
 from training.presets import eigenvalues
-from training.records import Record
 from training.sources.simulated import unknown_start
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
@@ -19,9 +18,10 @@ MIN_STEPS = 10  # least number of samples of a motion
 # A direction of x is a problem or a note if this share of its initial standard deviation is left at a motion's end.
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in the direction
-VAGUE = 0.3  # a larger error without noise, in standard deviations of the state, is a note
-# Under a symmetry a state's least error is <= LOCALLY, but predicting it from samples of similar z errs by >= GLOBALLY.
+VAGUE, NOTHING = 0.3, 1.0  # larger errors, without and with noise, in standard deviations of the state, are notes
+# Under a symmetry a state's least error is <= LOCALLY, but predicting it from motions of similar y errs by >= GLOBALLY.
 LOCALLY, GLOBALLY = 0.1, 0.3
+WINDOWS, MAX_SAMPLES = 7, 100  # numbers of windows, each half as long as the one before, and of samples of y in each
 
 
 def observability(subject: Subject) -> Iterator[Finding]:
@@ -33,8 +33,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
     late = weights[len(weights) // 2 :]
     late += max(0, round(subject.duration / subject.dt) + 1 - len(weights)) / len(late)
     least = np.average(errors, axis=1, weights=weights)
-    findings = _unseen(names, left)
-    findings |= _symmetries(subject, least[0])
+    findings = _unseen(names, left) | _symmetries(subject, least[0])
     yield from findings.values()
     for i, name in enumerate(names):
         if any(i in states for states in findings) or np.isnan(least[0, i]):
@@ -43,9 +42,12 @@ def observability(subject: Subject) -> Iterator[Finding]:
         first = int((exact <= max(DETERMINED, AS_GOOD * exact.min())).argmax())
         shares = [f"{error(least[0, i])} without noise (reached after {first * subject.dt:.3g} s)"]
         shares += [f"{error(one[i])} at noise {show_level(level)}" for level, one in zip(subject.noise, least[1:])]
-        text = f"{name}: at best an error of {', '.join(shares)}, in its standard deviations"
-        if least[0, i] > VAGUE:
-            yield Finding("observability", "note", text, f"let h measure another quantity that depends on {name}")
+        text = f"{name}: at best an error of {'; '.join(shares)}; in its standard deviations"
+        blind = [show_level(level) for level, one in zip(subject.noise, least[1:, i]) if one >= NOTHING]
+        if blind or least[0, i] > VAGUE:
+            text += f"; at noise {blind[0]}, y shows nothing of it" if blind else ""
+            advice = f"{'reduce the noise, or ' if blind else ''}let h measure another quantity that depends on {name}"
+            yield Finding("observability", "note", text, advice)
         else:
             yield Finding("observability", "ok", text)
 
@@ -85,11 +87,9 @@ def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], F
             states = [names[i] for i in involved]
             of = states[0] if len(states) == 1 else f"a combination of {' and '.join(states)}"
             advice = f"let h measure {' or '.join(states)} too, or leave that state out"
-            findings[tuple(involved.tolist())] = (
-                Finding("observability", "problem", f"y does not determine {of}", advice)
-                if share > UNSEEN
-                else Finding("observability", "note", f"y hardly determines {of}", advice)
-            )
+            verdict: Verdict = "problem" if share > UNSEEN else "note"
+            text = f"y {'does not determine' if share > UNSEEN else 'hardly determines'} {of}"
+            findings[tuple(involved.tolist())] = Finding("observability", verdict, text, advice)
     return findings
 
 
@@ -101,17 +101,20 @@ def spectrum(subject: Subject) -> Iterator[Finding]:
 
 
 def _symmetries(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Finding]:
-    """Return a finding on the states that y determines locally but not globally, as under a symmetry."""
-    system, x = subject.system, subject.followed[0]
-    t = subject.dt * np.arange(len(x))
-    records = [Record("motion", t, system.output(one), x=one) for one in np.moveaxis(x, 1, 0)]
-    # of_records raises if the motions are too short, or if an output never moves.
-    with contextlib.suppress(ValueError):
-        confused = (exact <= LOCALLY) & (of_records(records, measurement_noise=[]).errors[0].min(0) >= GLOBALLY)
-        if confused.any() and not subject.policy:
-            names = ", ".join(name for name, here in zip(system.state_names, confused) if here)
-            text = f"{names}: y determines them near each state, but distant states have nearly the same y, as under a "
-            advice = "let h measure what the symmetry changes, or estimate only what it leaves unchanged"
-            found = Finding("observability", "problem", f"{text}symmetry", advice)
-            return {tuple(np.flatnonzero(confused).tolist()): found}
-    return {}
+    """Return a finding on states that y determines only locally, as motions under the same inputs show."""
+    system, u = subject.system, subject.followed[1][:MAX_STEPS, :1]
+    x = simulate(system, of_X(system, POINTS), len(u), subject.dt, u=np.repeat(u, POINTS, 1), step=subject.step)
+    x = x[:, np.isfinite(x[-1]).all(-1)]
+    if subject.policy or x.shape[1] < POINTS // 2:
+        return {}
+    y, errors = system.output(x), np.full(system.nx, np.nan)
+    y = (y - y.mean(1, keepdims=True)) / system.output_range
+    for window in (len(u) // 2**k for k in range(WINDOWS)):
+        U, size, _ = np.linalg.svd(np.hstack(list(y[: window + 1 : window // MAX_SAMPLES + 1])), full_matrices=False)
+        z, end = np.sqrt(len(U)) * U[:, size > RESOLUTION * size[0]], x[window]
+        errors = np.fmin(errors, left_by(z[::2], end[::2], z[1::2], end[1::2]))
+    confused = np.flatnonzero((exact <= LOCALLY) & (errors >= GLOBALLY)).tolist()
+    names = ", ".join(system.state_names[i] for i in confused)
+    text = f"{names}: y determines them near each state, but distant states have nearly the same y, as under a symmetry"
+    advice = "let h measure what the symmetry changes, or estimate only what it leaves unchanged"
+    return {tuple(confused): Finding("observability", "problem", text, advice)} if confused else {}

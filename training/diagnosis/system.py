@@ -88,8 +88,8 @@ class Subject:
 
     @property
     def followed(self) -> tuple[np.ndarray, np.ndarray]:
-        """States and inputs of the motions of the first kind that stay within the bounds."""
-        rows = np.flatnonzero(self.stay[: MOTIONS // len(self.kinds)])
+        """States and inputs of the motions that stay within the bounds, driven ones if the system has inputs."""
+        rows = np.flatnonzero(self.stay & (np.arange(MOTIONS) >= MOTIONS - MOTIONS // len(self.kinds)))
         return self.motions[0][:, rows], self.motions[1][:, rows]
 
 
@@ -181,16 +181,14 @@ def bounds(subject: Subject) -> Iterator[Finding]:
 def sampling(subject: Subject) -> Iterator[Finding]:
     """Check how much the outputs change from sample to sample."""
     dt, y, change = subject.dt, subject.y, 0.0
-    text, advice = f"dt = {dt:g} s, motions of {subject.duration:g} s", ""
-    verdict: Verdict = "ok"
+    text = f"dt = {dt:g} s, motions of {subject.duration:g} s"
     if y.size and np.any(moving := (spread := np.sqrt(y.var(0).mean(0))) > 0):
         change = (np.sqrt((np.diff(y, axis=0) ** 2).mean((0, 1)))[moving] / spread[moving]).max()
         text += f"; y changes by {percent(change)} of its standard deviation from sample to sample"
-    if change > JERKY:
-        verdict, advice = "note", "samples are few"
-        if change > COARSE:
-            verdict, advice = "problem", "the motion between samples is lost"
-        advice += "" if subject.system.discrete else f": take dt = {dt * SMOOTH / change:.1g} s"
+    verdict: Verdict = "problem" if change > COARSE else "note" if change > JERKY else "ok"
+    advice = {"problem": "the motion between samples is lost", "note": "samples are few", "ok": ""}[verdict]
+    if advice and not subject.system.discrete:
+        advice += f": take dt = {dt * SMOOTH / change:.1g} s"
     yield Finding("sampling", verdict, text, advice)
 
 

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -219,9 +220,10 @@ def test_equations_that_divide_by_zero_in_the_middle_of_X():
 
 @dataclass(frozen=True)
 class ThroughThird(Lorenz):
-    """Seen through x3, which (x1, x2) -> (-x1, -x2) leaves as it is."""
+    """Seen through x3, which (x1, x2) -> (-x1, -x2) leaves as it is, as does the input on x3."""
 
     name: ClassVar[str] = "lorenz_through_x3"
+    G: ClassVar = ((0.0,), (0.0,), (1.0,))
 
     def h(self, x):
         return (x[2],)
@@ -232,3 +234,26 @@ def test_a_symmetry_is_no_poor_observability():
     assert [one.verdict for one in found] == ["problem", "ok"]
     assert found[0].found.startswith("x1, x2: y determines them near each state, but distant states")
     assert not any("near each state" in one.found for one in findings(Lorenz(), "observability", duration=6.0))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"f": lambda self, x: (-x[0], 0.0 * x[0]), "g": lambda self, x: ((x[1],), (0.0,))},  # x1' = -x1 + x2 u
+        {"h": lambda self, x: (x[0] ** 2,)},  # without input, x and -x have the same y
+    ],
+)
+def test_what_only_an_input_makes_visible(changes):
+    assert {one.verdict for one in findings(made(**changes), "observability", duration=10.0)} == {"ok"}
+    if "h" in changes:
+        found = one(made(**NO_INPUT | changes), "observability", duration=10.0).found
+        assert found.startswith("x1, x2: y determines them near each state")
+
+
+def test_noise_that_hides_a_state():
+    system = made(h=lambda self, x: (x[0], x[1]), measurement_noise=(300.0, 200.0))
+    for name, found in zip(("x1", "x2"), findings(system, "observability")):
+        assert found.verdict == "note"
+        assert re.search(r"; 1\d\d % at noise 300, 200; in its standard deviations; ", found.found)
+        assert found.found.endswith("at noise 300, 200, y shows nothing of it")
+        assert found.advice == f"reduce the noise, or let h measure another quantity that depends on {name}"

@@ -31,9 +31,10 @@ def oscillator():
 def test_chaotic_motions_are_followed_as_by_riccatis_recursion():
     system = get_system("lorenz")
     subject = Subject(system, 0.02, 20.0, noise=(0.5,))
-    found, x = least_errors(subject)[0][1], subject.followed[0][:, :FOLLOWED]
+    found, (x, u) = least_errors(subject)[0][1], (each[:, :FOLLOWED] for each in subject.followed)
     n, before = x.shape[1], x[:-1].reshape(-1, 3)
-    ends = [simulate(system, before + side * row, 1, 0.02)[1] for row in np.eye(3) for side in (1e-4, -1e-4)]
+    held = u.reshape(1, -1, 1)
+    ends = [simulate(system, before + side * row, 1, 0.02, u=held)[1] for row in np.eye(3) for side in (1e-4, -1e-4)]
     steps = np.stack([(ends[2 * j] - ends[2 * j + 1]) / 2e-4 for j in range(3)], -1).reshape(-1, n, 3, 3)
     P, H, left = np.broadcast_to(unknown_start(system)[1], (n, 3, 3)), np.array([[0.0, 1.0, 0.0]]), []
     for step in (np.broadcast_to(np.eye(3), (n, 3, 3)), *steps):
@@ -65,6 +66,7 @@ def test_least_errors_do_not_depend_on_the_units_of_states(oscillator):
     other = made(
         X=((4.0, 6.0), (6000.0, 8000.0)),
         bounds=((-25.0, 35.0), (-23000.0, 37000.0)),
+        G=((0.0,), (1000.0,)),
         f=lambda self, x: (1e-3 * x[1] - 7.0, -1e3 * (x[0] - 5.0)),
     )
     for found, expected in zip(of(other, 0.3), oscillator):
