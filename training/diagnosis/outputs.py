@@ -13,6 +13,7 @@ from training.kalman import ExtendedKalmanFilter
 from training.presets import eigenvalues
 from training.records import Record
 from training.sources.simulated import unknown_start
+from training.trajectories.motions import how_to_stay
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
 MIN_STEPS = 10  # least number of samples of a motion
@@ -60,8 +61,7 @@ def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
     x, u = subject.followed[0][: MAX_STEPS + 1, :FOLLOWED], subject.followed[1][:MAX_STEPS, :FOLLOWED]
     (length, n, nx), start = x.shape, unknown_start(system)[1]
     if 2 * n < FOLLOWED:
-        advice = "widen the bounds, shrink X, shorten the motions, or pass a policy that holds the system (--policy)"
-        raise ValueError(f"only {n} motions from X stayed within the bounds; {advice}")
+        raise ValueError(f"only {n} motions from X stayed within the bounds; {how_to_stay(system, subject.policy)}")
     if length < MIN_STEPS:
         few = f"motions of {subject.duration:g} s have only {length - 1} samples of {subject.dt:g} s"
         raise ValueError(f"{few}; take a longer duration, or a smaller dt")

@@ -173,7 +173,7 @@ BLIND = NO_INPUT | {
         ("equations", "problem", {"u_max": (1.0, 1.0), "G": ((0.0, 0.0), (1.0, 0.0))}, {}, "input 2 moves no state",
          "give column 2 of G"),
         ("bounds", "problem", UPRIGHT, LONG, "50 of 50 free and 50 of 50 driven leave the bounds",
-         "widen the bounds, shrink X, or take a policy"),
+         "widen the bounds, shrink X, shorten the motions, reduce u_max, or give a policy"),
         ("sampling", "note", {}, {"dt": 0.7, "duration": 60.0}, "dt = 0.7 s", "samples are few: take dt = 0.1 s"),
         ("sampling", "problem", {}, {"dt": 1.5, "duration": 60.0}, "dt = 1.5 s",
          "the motion between samples is lost: take dt = 0.1 s"),  # 2 pi / 0.1: some sixty samples a period
@@ -195,9 +195,10 @@ def test_what_is_wrong_is_found_and_how_to_change_it(name, verdict, changes, opt
 
 def test_a_system_that_only_a_policy_holds():
     upright = made(**UPRIGHT)
-    assert findings(upright, "bounds", policy=controller(upright), **LONG)[0].verdict == "ok"
+    assert findings(upright, "bounds", policy=controller(upright, upright.dt), **LONG)[0].verdict == "ok"
     found = one(upright, "bounds", policy=lambda x: np.zeros((len(x), 1)), **LONG)
     assert "100 of 100 under the policy leave the bounds" in found.found
+    assert found.advice.endswith("reduce u_max, or reduce dt")
 
 
 def test_starts_of_another_shape_end_the_check():
