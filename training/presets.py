@@ -130,15 +130,14 @@ def controller(system: System, dt: float) -> Controller:
 def named_policy(system: System, name: str, dt: float | None) -> Controller:
     """Load and check a policy: the system's controller, held over dt or the default, or a script's function."""
     if ":" not in name and name != "controller":
-        raise ValueError(
-            f"unknown policy {name!r}{suggestion(name, ['controller'])}: give controller, or script.py:function"
-        )
+        similar = suggestion(name, ["controller"])
+        raise ValueError(f"unknown policy {name!r}{similar}: give controller, or script.py:function")
     try:
         policy = controller(system, dt or system.dt) if name == "controller" else load_function(name)
     except np.linalg.LinAlgError as error:
         raise ValueError(
             f"no linear-quadratic regulator holds {system.name} at its target {system.target} ({error}): set another "
-            "target, or give a policy of your own as script.py:function"
+            "target, reduce dt, or give a policy of your own as script.py:function"
         ) from error
     return checked_policy(policy, system, name)
 

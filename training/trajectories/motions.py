@@ -200,8 +200,7 @@ def draw_process_noise(
     system: System, level: float | np.ndarray, *, n: int, steps: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw process noise (steps, n, nx) of levels (n,), uniform in a box and held over each sampling interval."""
-    bound = np.multiply.outer(level, system.scale)
-    return np.asarray(bound * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))
+    return np.asarray(np.multiply.outer(level, system.scale) * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))
 
 
 def under_policy(
@@ -254,8 +253,7 @@ def how_to_stay(system: System, policy: Controller | None) -> str:
     """Return advice for motions, perhaps under a policy, that leave the bounds."""
     if not system.nu:
         return "widen the bounds, shrink X, or shorten the motions"
-    other = "a policy that holds the system (--policy)" if not policy else "another policy"
-    last = f"give {other}" if system.discrete or not policy else "reduce dt"
+    last = "reduce dt" if policy and not system.discrete else "give a policy that holds the system (--policy)"
     return f"widen the bounds, shrink X, shorten the motions, reduce u_max, or {last}"
 
 
