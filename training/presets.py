@@ -135,10 +135,8 @@ def named_policy(system: System, name: str, dt: float | None) -> Controller:
     try:
         policy = controller(system, dt or system.dt) if name == "controller" else load_function(name)
     except np.linalg.LinAlgError as error:
-        raise ValueError(
-            f"no linear-quadratic regulator holds {system.name} at its target {system.target} ({error}): set another "
-            "target, reduce dt, or give a policy of your own as script.py:function"
-        ) from error
+        text = f"no linear-quadratic regulator holds {system.name} at its target {system.target} ({error})"
+        raise ValueError(f"{text}: set another target, reduce dt, or give a policy as script.py:function") from error
     return checked_policy(policy, system, name)
 
 

@@ -226,7 +226,8 @@ def under_policy(
     """
     n, u_max = len(x0), np.array(system.u_max)
     signals = partial(random_inputs, system, n, steps, dt=dt, rng=rng, kinds=POLICY_KINDS)
-    error = signals(bounds=system.scale) * np.exp(rng.uniform(*np.log(POLICY_ERROR), n))[:, None]
+    least, largest = np.log(POLICY_ERROR)
+    error = signals(bounds=system.scale) * np.exp(rng.uniform(least, largest, n))[:, None]
     exploration = signals(bounds=(1.0,) * system.nu) * EXPLORATION * rng.random(n)[:, None]
     error[:, own] = exploration[:, own] = 0.0
     u = np.zeros((steps, n, system.nu))
