@@ -307,8 +307,8 @@ class Gathering:
         piece, sample = self._open[row], int(info["sample"])
         if piece.y and sample != piece.sample + 1:
             raise ValueError(
-                f"environment {row} showed sample {sample} after {piece.sample}: a refit needs all samples, so leave out "
-                "wrappers that skip steps, such as ActionRepeat"
+                f"environment {row} showed sample {sample} after {piece.sample}: a refit needs all samples, so leave "
+                "out wrappers that skip steps, such as ActionRepeat"
             )
         if len(piece.u) == self._longest:
             piece = self._new(row, piece.y[-1:], piece.x[-1:])
