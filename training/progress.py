@@ -74,7 +74,7 @@ class ProgressBars(Progress):
         """Write a line for each task whose next line is due, or that has ended after at least a minute."""
         with self._lock:
             for task in self.tasks:
-                passed = task.elapsed or 0.0
+                passed = (task.finished_time if task.finished else task.elapsed) or 0.0
                 due = self._due.get(task.id, FIRST_LINE)
                 if due < math.inf and passed >= (FIRST_LINE if task.finished else due):
                     self._due[task.id] = math.inf if task.finished else passed + NEXT_LINE

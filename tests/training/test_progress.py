@@ -56,6 +56,16 @@ def test_what_is_no_terminal_gets_a_line_now_and_then(clock):
     assert "simulating [lorenz]: 2 of 4, 2:00:00 passed, 2:00:00 left" in written(clock, steps=4, seconds=3600.0)
 
 
+def test_a_phase_that_has_ended_keeps_its_duration(clock):
+    console = console_of(terminal=False)
+    with ProgressBars(console, get_time=clock) as progress:
+        for seconds in (10.0, 80.0):
+            with progress.phase(f"{seconds:g} s"):
+                clock.now += seconds
+        clock.now += 100.0
+    assert console.file.getvalue() == "80 s: 1 of 1, 0:01:20 passed\n"
+
+
 def test_what_went_before_an_interruption_does_not_count_as_speed(clock):
     lines = written(clock, steps=200, completed=80)
     assert lines[0] == "simulating [lorenz]: 140 of 200, 0:01:00 passed, 0:01:00 left"

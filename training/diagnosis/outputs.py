@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from training.diagnosis.finding import RESOLUTION, Finding, error
+from training.diagnosis.finding import RESOLUTION, Finding, Verdict, error
 from training.diagnosis.records import AS_GOOD, DETERMINED, of_records
 from training.diagnosis.system import Subject
 from training.evaluation.levels import show_level
@@ -20,7 +20,7 @@ MIN_STEPS = 10  # least number of samples of a motion
 # A direction of x is a problem or a note if this share of its initial standard deviation is left at a motion's end.
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in the direction
-VAGUE = 0.3  # a larger error without noise, in standard deviations of the state, is a note
+VAGUE, NOTHING = 0.3, 1.0  # larger errors, without and with noise, in standard deviations of the state, are notes
 # Under a symmetry a state's least error is <= LOCALLY, but predicting it from samples of similar z errs by >= GLOBALLY.
 LOCALLY, GLOBALLY = 0.1, 0.3
 
@@ -44,9 +44,12 @@ def observability(subject: Subject) -> Iterator[Finding]:
         first = int((exact <= max(DETERMINED, AS_GOOD * exact.min())).argmax())
         shares = [f"{error(least[0, i])} without noise (reached after {first * subject.dt:.3g} s)"]
         shares += [f"{error(one[i])} at noise {show_level(level)}" for level, one in zip(subject.noise, least[1:])]
-        text = f"{name}: at best an error of {', '.join(shares)}, in its standard deviations"
-        if least[0, i] > VAGUE:
-            yield Finding("observability", "note", text, f"let h measure another quantity that depends on {name}")
+        text = f"{name}: at best an error of {'; '.join(shares)}, in its standard deviations"
+        blind = [show_level(level) for level, one in zip(subject.noise, least[1:, i]) if one >= NOTHING]
+        if blind or least[0, i] > VAGUE:
+            text += f"; at noise {blind[0]}, y shows nothing of it" if blind else ""
+            advice = f"{'reduce the noise, or ' if blind else ''}let h measure another quantity that depends on {name}"
+            yield Finding("observability", "note", text, advice)
         else:
             yield Finding("observability", "ok", text)
 
@@ -85,11 +88,9 @@ def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], F
             states = [names[i] for i in involved]
             of = states[0] if len(states) == 1 else f"a combination of {' and '.join(states)}"
             advice = f"let h measure {' or '.join(states)} too, or leave that state out"
-            findings[tuple(involved.tolist())] = (
-                Finding("observability", "problem", f"y does not determine {of}", advice)
-                if share > UNSEEN
-                else Finding("observability", "note", f"y hardly determines {of}", advice)
-            )
+            verdict: Verdict = "problem" if share > UNSEEN else "note"
+            text = f"y {'does not determine' if share > UNSEEN else 'hardly determines'} {of}"
+            findings[tuple(involved.tolist())] = Finding("observability", verdict, text, advice)
     return findings
 
 
@@ -110,8 +111,9 @@ def _symmetries(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Fi
         confused = (exact <= LOCALLY) & (of_records(records, measurement_noise=[]).errors[0].min(0) >= GLOBALLY)
         if confused.any() and not subject.policy:
             names = ", ".join(name for name, here in zip(system.state_names, confused) if here)
-            text = f"{names}: y determines them near each state, but distant states have nearly the same y, as under a "
+            same = f"nearly the same y{' without input' if system.nu else ''}"
+            text = f"{names}: y determines them near each state, but distant states have {same}, as under a symmetry"
             advice = "let h measure what the symmetry changes, or estimate only what it leaves unchanged"
-            found = Finding("observability", "problem", f"{text}symmetry", advice)
+            found = Finding("observability", "problem", text, advice)
             return {tuple(np.flatnonzero(confused).tolist()): found}
     return {}

@@ -320,12 +320,12 @@ class Gathering:
         self.steps += 1
 
     def records(self) -> tuple[list[Record], list[Record]]:
-        """Drop the oldest pieces beyond ``keep`` steps; return kept and held-out records, with unfinished episodes."""
+        """Drop the oldest closed pieces beyond ``keep`` steps; return kept and held-out records, also unfinished."""
         total, first = 0, len(self._pieces)
         while first and (not total or total + len(self._pieces[first - 1].u) <= self._keep):
             first -= 1
             total += len(self._pieces[first].u)
-        del self._pieces[:first]
+        self._pieces[:first] = [each for each in self._pieces[:first] if id(each) in map(id, self._open.values())]
         known = [piece for piece in self._pieces if piece.u and not np.isnan(piece.x).all()]
         kept, held_out = ([self._record(piece) for piece in known if piece.held_out == held] for held in (False, True))
         return kept, held_out

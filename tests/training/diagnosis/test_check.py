@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -233,3 +234,12 @@ def test_a_symmetry_is_no_poor_observability():
     assert [one.verdict for one in found] == ["problem", "ok"]
     assert found[0].found.startswith("x1, x2: y determines them near each state, but distant states")
     assert not any("near each state" in one.found for one in findings(Lorenz(), "observability", duration=6.0))
+
+
+def test_noise_that_hides_a_state():
+    system = made(h=lambda self, x: (x[0], x[1]), measurement_noise=(300.0, 200.0))
+    for name, found in zip(("x1", "x2"), findings(system, "observability")):
+        assert found.verdict == "note"
+        assert re.search(r"; 1\d\d % at noise 300, 200, in its standard deviations; ", found.found)
+        assert found.found.endswith("at noise 300, 200, y shows nothing of it")
+        assert found.advice == f"reduce the noise, or let h measure another quantity that depends on {name}"

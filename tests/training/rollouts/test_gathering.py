@@ -27,6 +27,17 @@ def test_episodes_are_cut_and_the_oldest_are_forgotten(spy):
     assert len(gathering.records()[0][-1].t) == 4
 
 
+def test_an_unfinished_episode_is_not_forgotten(spy):
+    gathering = Gathering(Artifact.read(spy), keep=10, held_out=0.0)
+    for row, steps in ((0, 5), (1, 10)):
+        gathering.begin(row, sample(0))
+        for k in range(1, steps + 1):
+            gathering.add(row, sample(k))
+    gathering.records()
+    gathering.add(0, sample(6))
+    assert [len(record.t) for record in gathering.records()[0]] == [7, 11]
+
+
 def test_pieces_have_their_role_for_good(spy):
     gathering = Gathering(Artifact.read(spy), keep=10_000, held_out=0.2)
     roles = {}
