@@ -96,7 +96,7 @@ def main(
         console=Console(),
     )
 
-    act = controller(learned.identified.system)  # designed for the identified model, because the plant is unknown
+    act = controller(learned.identified.system, plant.dt)  # for the identified model, because the plant is unknown
     observer = observers.load(str(out / "van_der_pol.safetensors"), NOISE)
 
     def on_estimate(x: np.ndarray, info: dict[str, np.ndarray]) -> np.ndarray:

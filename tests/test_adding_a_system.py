@@ -87,7 +87,7 @@ from training.presets import controller
 assert list(ENV_IDS)[-1] == "fitzhugh_nagumo" and ENV_IDS["fitzhugh_nagumo"] == "KKLFitzHughNagumo-v0"
 system = get_system("fitzhugh_nagumo")
 assert np.allclose(system.f(system.target), 0.0, atol=1e-12)
-assert np.allclose(controller(system)(np.array([system.target])), 0.0)
+assert np.allclose(controller(system, system.dt)(np.array([system.target])), 0.0)
 assert preset(system, "input-aware", "fast").eigenvalues[0] == -0.1
 assert observers.load("fitzhugh_nagumo", 0.5, monitor=True).artifact.system == "fitzhugh_nagumo"
 agent = Agent.read("runs/first-look/agent/agent.safetensors")

@@ -43,11 +43,11 @@ class Profile:
     large_settings: Mapping[str, Any] = field(default_factory=dict)
     uncertain_settings: Mapping[str, Any] = field(default_factory=dict)
     spinn_settings: Mapping[str, Any] = field(default_factory=dict)
-    controller: Callable[[System], Controller] = linear_quadratic
+    controller: Callable[[System, float], Controller] = linear_quadratic
     fault_deadline: float | None = None
 
 
-def homogeneous(system: System) -> Controller:
+def homogeneous(system: System, dt: float) -> Controller:
     """Return the feedback u = b x1 - 2 (x2 + cbrt(a x1)), saturated, for the system x1' = a x2^3, x2' = -b x1 + u.
 
     There is no linear-quadratic regulator, as the linearisation at the origin cannot be stabilised. This feedback
@@ -58,8 +58,7 @@ def homogeneous(system: System) -> Controller:
 
     def act(x: np.ndarray) -> np.ndarray:
         x1, x2 = x[:, :1], x[:, 1:]
-        action: np.ndarray = np.clip((b * x1 - 2.0 * (x2 + np.cbrt(a * x1))) / u_max, -1.0, 1.0)
-        return action
+        return np.asarray(np.clip((b * x1 - 2.0 * (x2 + np.cbrt(a * x1))) / u_max, -1.0, 1.0))
 
     return act
 
@@ -121,26 +120,23 @@ def profile(system: System) -> Profile:
     return PROFILES.get(system.name, Profile())
 
 
-def controller(system: System) -> Controller:
+def controller(system: System, dt: float) -> Controller:
     """Return the feedback that drives a system to its target: the profile's, or else a saturated LQ regulator."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs to control it by")
-    return profile(system).controller(system)
+    return profile(system).controller(system, dt)
 
 
-def named_policy(system: System, name: str) -> Controller:
-    """Load and check a policy: the system's controller, or a function of a script."""
+def named_policy(system: System, name: str, dt: float | None) -> Controller:
+    """Load and check a policy: the system's controller, held over dt or the default, or a script's function."""
     if ":" not in name and name != "controller":
-        raise ValueError(
-            f"unknown policy {name!r}{suggestion(name, ['controller'])}: give controller, or script.py:function"
-        )
+        similar = suggestion(name, ["controller"])
+        raise ValueError(f"unknown policy {name!r}{similar}: give controller, or script.py:function")
     try:
-        policy = controller(system) if name == "controller" else load_function(name)
+        policy = controller(system, dt or system.dt) if name == "controller" else load_function(name)
     except np.linalg.LinAlgError as error:
-        raise ValueError(
-            f"no linear-quadratic regulator holds {system.name} at its target {system.target} ({error}): set another "
-            "target, or give a policy of your own as script.py:function"
-        ) from error
+        text = f"no linear-quadratic regulator holds {system.name} at its target {system.target} ({error})"
+        raise ValueError(f"{text}: set another target, reduce dt, or give a policy as script.py:function") from error
     return checked_policy(policy, system, name)
 
 

@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
+from unstable_system import Falling
 
-from kkl_gym import SYSTEMS, get_system
+from kkl_gym import SYSTEMS, System, get_system
 from training.agents.environments import vector
 from training.agents.play import play
 from training.agents.tasks import TASKS, TOLERANCE, control_task, get_task, scores, successes
 from training.presets import Profile, controller, profile
 from training.trajectories.equations import linearised
-from training.trajectories.motions import linear_quadratic
+from training.trajectories.motions import INPUT_WEIGHT, linear_quadratic
 
 
 def nothing(obs):
@@ -20,7 +22,7 @@ def test_a_system_of_ones_own_has_the_defaults_and_no_controller_without_input(s
     own = get_system(f"{script}:Pendulum")
     assert profile(own) == Profile()
     with pytest.raises(ValueError, match="pendulum has no inputs"):
-        controller(own)
+        controller(own, own.dt)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -34,14 +36,54 @@ def test_linearisation_equals_finite_differences(name):
     assert B.tolist() == [list(row) for row in system.G]
 
 
-@pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
-def test_the_linear_quadratic_regulator_stabilises_the_target(name):
-    system = get_system(name)
-    A, B, _ = linearised(system, system.target)
-    act = linear_quadratic(system)
+def gain(system, act):
     step = 1e-6 * np.eye(system.nx)
-    K = (act(np.array(system.target) - step) - act(np.array(system.target) + step)) * system.u_max / 2e-6
-    assert (np.linalg.eigvals(A - B @ K.T).real < 0).all()
+    return (act(np.array(system.target) - step) - act(np.array(system.target) + step)).T * system.u_max / 2e-6
+
+
+class Diagonal(System):
+    """x1' = 40 x1 + u1, x2' = -200 x2 + u2."""
+
+    name, X, bounds, u_max = "diagonal", ((-1, 1), (-2, 2)), ((-9, 9), (-9, 9)), (10.0, 10.0)
+    G = ((1.0, 0.0), (0.0, 1.0))
+
+    def f(self, x):
+        return 40.0 * x[0], -200.0 * x[1]
+
+    def h(self, x):
+        return (x[0],)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.1])
+def test_the_regulator_of_fast_modes_has_the_closed_loop_in_closed_form(dt):
+    """For a mode a with input gain b, held over dt, and r = R / Q: z + 1 / z = a + (1 + b^2 / r) / a."""
+    rates, ratio = np.array([40.0, -200.0]), INPUT_WEIGHT / 100.0 * np.array([1.0, 4.0])
+    a = np.exp(rates * dt)
+    b = (a - 1.0) / rates
+    half = (a + (1.0 + b**2 / ratio) / a) / 2.0
+    closed = np.diag(a) - np.diag(b) @ gain(Diagonal(), linear_quadratic(Diagonal(), dt))
+    assert closed == pytest.approx(np.diag(1.0 / (half + np.sqrt(half**2 - 1.0))), abs=1e-7)
+
+
+def test_the_regulator_of_a_double_integrator_is_that_of_scipy():
+    class Double(Falling):
+        name = "double"
+
+        def f(self, x):
+            return x[1], 0.0
+
+    dt, system = 0.5, Double()
+    A, B = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2], [dt]])
+    Q, R = np.diag(1.0 / np.square(system.scale)), np.array([[INPUT_WEIGHT / 25.0]])
+    P = solve_discrete_are(A, B, Q, R)
+    expected = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    assert gain(system, linear_quadratic(system, dt)) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
+def test_the_linear_quadratic_regulator_saturates_away_from_the_target(name):
+    system = get_system(name)
+    act = linear_quadratic(system, system.dt)
     assert act(np.array([system.target])).tolist() == [[0.0]]
     assert np.abs(act(np.random.default_rng(0).uniform(*system.box(), (50, system.nx)))).max() == 1.0
 
@@ -50,7 +92,7 @@ def test_the_linear_quadratic_regulator_stabilises_the_target(name):
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol"])
 def test_the_state_feedback_succeeds_where_nothing_fails(name):
     task, n, system = TASKS[name], 20, get_system(name)
-    episodes = play(vector(task, n), controller(system), seed=0)
+    episodes = play(vector(task, n), controller(system, task.repeat * task.env_kwargs["dt"]), seed=0)
     idle = play(vector(task, n), nothing, seed=0)
     assert (episodes.x[0] == idle.x[0]).all()
     assert episodes.x.shape == (task.steps + 1, n, system.nx)
@@ -97,6 +139,6 @@ def test_what_is_refused():
 
 def test_the_law_of_reverse_duffing_follows_its_parameters():
     """Where x2 is on its way, -cbrt(a x1), the input replaces the drift by one that stays there."""
-    act = controller(get_system("reverse_duffing", {"a": 8.0, "b": 0.5}))
+    act = controller(get_system("reverse_duffing", {"a": 8.0, "b": 0.5}), 0.01)
     assert act(np.array([[1e-3, -0.2]])) == pytest.approx(0.5e-3)
     assert act(np.array([[-0.5, 0.3]])) == pytest.approx(np.clip(-0.25 - 2.0 * (0.3 - 4.0 ** (1 / 3)), -1, 1))

@@ -49,7 +49,7 @@ def test_the_regulator_of_a_map_holds_it():
             return [1.004 * xi for xi in super().step(x, u)]
 
     system = Growing()
-    act = controller(system)
+    act = controller(system, DT)
     x = simulate(system, np.full((1, 2), 0.1), 1000, DT, lambda _, x: act(x) * system.u_max)
     assert np.abs(x[-1]).max() < 1e-3
     assert np.abs(simulate(system, x[0], 1000, DT)[-1]).max() > 1.0

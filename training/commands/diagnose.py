@@ -117,7 +117,7 @@ class Diagnose:
             if not str(error).startswith("unknown system"):
                 raise
             raise ValueError(f"{error}; an environment needs --measured and --hidden") from error
-        policy = named_policy(system, self.policy) if self.policy else None
+        policy = named_policy(system, self.policy, self.dt) if self.policy else None
         progress.add_task(f"checking {system.name}", total=None)
         levels = self.measurement_noise
         yield from check(system, dt=self.dt, duration=self.duration, policy=policy, measurement_noise=levels)

@@ -293,7 +293,7 @@ def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> C
         return None
     if not artifact.nu:
         raise ValueError(f"the policy {name!r} needs an observer with inputs; this one has no inputs")
-    policy = named_policy(system, name)
+    policy = named_policy(system, name, artifact.filter.dt)
     return blind(policy, system.nx) if np.any(artifact.training.get("bias", 0.0)) else policy
 
 

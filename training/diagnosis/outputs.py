@@ -12,6 +12,7 @@ from training.evaluation.levels import show_level
 from training.kalman import ExtendedKalmanFilter
 from training.presets import eigenvalues
 from training.sources.simulated import unknown_start
+from training.trajectories.motions import how_to_stay
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
 MIN_STEPS = 10  # least number of samples of a motion
@@ -33,7 +34,8 @@ def observability(subject: Subject) -> Iterator[Finding]:
     late = weights[len(weights) // 2 :]
     late += max(0, round(subject.duration / subject.dt) + 1 - len(weights)) / len(late)
     least = np.average(errors, axis=1, weights=weights)
-    findings = _unseen(names, left) | _symmetries(subject, least[0])
+    # Under a policy, motions from other starts have other inputs.
+    findings = _unseen(names, left) | ({} if subject.policy else _symmetries(subject, least[0]))
     yield from findings.values()
     for i, name in enumerate(names):
         if any(i in states for states in findings) or np.isnan(least[0, i]):
@@ -42,7 +44,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
         first = int((exact <= max(DETERMINED, AS_GOOD * exact.min())).argmax())
         shares = [f"{error(least[0, i])} without noise (reached after {first * subject.dt:.3g} s)"]
         shares += [f"{error(one[i])} at noise {show_level(level)}" for level, one in zip(subject.noise, least[1:])]
-        text = f"{name}: at best an error of {'; '.join(shares)}; in its standard deviations"
+        text = f"{name}: at best an error of {'; '.join(shares)}, in its standard deviations"
         blind = [show_level(level) for level, one in zip(subject.noise, least[1:, i]) if one >= NOTHING]
         if blind or least[0, i] > VAGUE:
             text += f"; at noise {blind[0]}, y shows nothing of it" if blind else ""
@@ -62,8 +64,7 @@ def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
     x, u = subject.followed[0][: MAX_STEPS + 1, :FOLLOWED], subject.followed[1][:MAX_STEPS, :FOLLOWED]
     (length, n, nx), start = x.shape, unknown_start(system)[1]
     if 2 * n < FOLLOWED:
-        advice = "widen the bounds, shrink X, shorten the motions, or pass a policy that holds the system (--policy)"
-        raise ValueError(f"only {n} motions from X stayed within the bounds; {advice}")
+        raise ValueError(f"only {n} motions from X stayed within the bounds; {how_to_stay(system, subject.policy)}")
     if length < MIN_STEPS:
         few = f"motions of {subject.duration:g} s have only {length - 1} samples of {subject.dt:g} s"
         raise ValueError(f"{few}; take a longer duration, or a smaller dt")
@@ -104,8 +105,8 @@ def _symmetries(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Fi
     """Return a finding on states that y determines only locally, as motions under the same inputs show."""
     system, u = subject.system, subject.followed[1][:MAX_STEPS, :1]
     x = simulate(system, of_X(system, POINTS), len(u), subject.dt, u=np.repeat(u, POINTS, 1), step=subject.step)
-    x = x[:, np.isfinite(x[-1]).all(-1)]
-    if subject.policy or x.shape[1] < POINTS // 2:
+    x = x[:, np.isfinite(np.dstack([x, system.output(x)])).all((0, 2))]
+    if x.shape[1] < POINTS // 2:
         return {}
     y, errors = system.output(x), np.full(system.nx, np.nan)
     y = (y - y.mean(1, keepdims=True)) / system.output_range

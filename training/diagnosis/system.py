@@ -14,7 +14,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.diagnosis.finding import Finding, Verdict, percent
 from training.evaluation.levels import Level
-from training.trajectories.motions import DRIVEN, Controller, random_inputs, under_policy
+from training.trajectories.motions import DRIVEN, Controller, how_to_stay, random_inputs, under_policy
 
 COMPARED = 100  # number of points of X, and of 2X, at which the equations are evaluated
 POINTS = 1000  # number of points of X at which outputs are evaluated
@@ -173,9 +173,8 @@ def bounds(subject: Subject) -> Iterator[Finding]:
     parts = [f"{one.sum()} of {len(one)} {kind}" for one, kind in zip(counts, subject.kinds)]
     when = subject.dt * np.median(np.isfinite(x[:, lost]).all(-1).sum(0))
     text = f"of {followed}, {' and '.join(parts)} leave the bounds, after {when:.3g} s at the median"
-    verdict: Verdict = "problem" if max(one.mean() for one in counts) > MANY else "note"
-    advice = "widen the bounds, shrink X, or take a policy that holds the system (--policy)"
-    yield Finding("bounds", verdict, text, advice)
+    many = max(one.mean() for one in counts) > MANY
+    yield Finding("bounds", "problem" if many else "note", text, how_to_stay(subject.system, subject.policy))
 
 
 def sampling(subject: Subject) -> Iterator[Finding]:

@@ -53,7 +53,8 @@ class SimulatedSource:
 
     def __init__(self, system: System, config: Config) -> None:
         self.config, self.system = config, system
-        self.policy = None if config.policy is None else blind(named_policy(system, config.policy), system.nx)
+        policy = None if config.policy is None else named_policy(system, config.policy, config.dt)
+        self.policy = policy and blind(policy, system.nx)
         if np.any(config.bias):
             system = with_bias(system, config.bias)
         self.ranges, self.model, self.plant = {}, system, system

@@ -116,11 +116,8 @@ class Motions:
             pending, tried = np.concatenate([pending, rows[~inside]]), tried + count
             stayed = n - len(pending)
             if len(pending) and tried >= FIRST and stayed < FEWEST_INSIDE * tried:
-                raise ValueError(
-                    f"of {tried} trajectories of {steps * self.dt:g} s only {stayed} stayed within bounds = "
-                    f"{system.bounds}; widen the bounds, shrink X, shorten the trajectories, or give a policy that "
-                    "holds the system (--policy)"
-                )
+                few = f"of {tried} trajectories of {steps * self.dt:g} s only {stayed} stayed within bounds"
+                raise ValueError(f"{few} = {system.bounds}; {how_to_stay(system, self.policy)}")
             report(stayed)
             yield x[:, inside], u[:, inside], level[inside], near[inside]
 
@@ -203,8 +200,7 @@ def draw_process_noise(
     system: System, level: float | np.ndarray, *, n: int, steps: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw process noise (steps, n, nx) of levels (n,), uniform in a box and held over each sampling interval."""
-    bound = np.multiply.outer(level, system.scale)
-    return np.asarray(bound * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))
+    return np.asarray(np.multiply.outer(level, system.scale) * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))
 
 
 def under_policy(
@@ -254,16 +250,24 @@ def recording_ages(steps: int, n: int) -> np.ndarray:
     return np.unique(ages.round()).astype(int)
 
 
-def linear_quadratic(system: System) -> Controller:
-    """Return a saturated LQ regulator at the target, with weights 1/scale^2 (Q) and INPUT_WEIGHT/u_max^2 (R)."""
+def how_to_stay(system: System, policy: Controller | None) -> str:
+    """Return advice for motions, perhaps under a policy, that leave the bounds."""
+    if not system.nu:
+        return "widen the bounds, shrink X, or shorten the motions"
+    last = "reduce dt" if policy and not system.discrete else "give a policy that holds the system (--policy)"
+    return f"widen the bounds, shrink X, shorten the motions, reduce u_max, or {last}"
+
+
+def linear_quadratic(system: System, dt: float) -> Controller:
+    """Return a saturated LQ regulator at the target, of weights 1/scale^2 and INPUT_WEIGHT/u_max^2, held over dt."""
     target, u_max = np.array(system.target), np.array(system.u_max)
     A, B, _ = linearised(system, system.target)
     Q, R = np.diag(1.0 / np.square(system.scale)), np.diag(INPUT_WEIGHT / u_max**2)
-    if system.discrete:
-        P = scipy.linalg.solve_discrete_are(A, B, Q, R)
-        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    else:
-        K = np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R))
+    if not system.discrete:
+        held = scipy.linalg.expm(dt * np.block([[A, B], [np.zeros((system.nu, system.nx + system.nu))]]))
+        A, B = held[: system.nx, : system.nx], held[: system.nx, system.nx :]
+    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     return lambda x: np.clip(-(x - target) @ K.T / u_max, -1.0, 1.0)
 
 

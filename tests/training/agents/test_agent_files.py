@@ -79,7 +79,7 @@ def test_mismatches_are_errors(saved, tmp_path):
         on_map.make(1)
     assert on_map.make(1, observer=str(tmp_path / "moved.safetensors"))
     shutil.copy(saved(noise=False), path)
-    with pytest.raises(AgentError, match="trained with another observer"):
+    with pytest.raises(AgentError, match="not trained with the observer"):
         on_map.make(1)
     with pytest.raises(AgentError, match="trained with target = "):
         replace(agent(task=task, information="state"), rules={**rules(task), "target": [1.0, 1.0]}).make(1)

@@ -174,7 +174,7 @@ BLIND = NO_INPUT | {
         ("equations", "problem", {"u_max": (1.0, 1.0), "G": ((0.0, 0.0), (1.0, 0.0))}, {}, "input 2 moves no state",
          "give column 2 of G"),
         ("bounds", "problem", UPRIGHT, LONG, "50 of 50 free and 50 of 50 driven leave the bounds",
-         "widen the bounds, shrink X, or take a policy"),
+         "widen the bounds, shrink X, shorten the motions, reduce u_max, or give a policy"),
         ("sampling", "note", {}, {"dt": 0.7, "duration": 60.0}, "dt = 0.7 s", "samples are few: take dt = 0.1 s"),
         ("sampling", "problem", {}, {"dt": 1.5, "duration": 60.0}, "dt = 1.5 s",
          "the motion between samples is lost: take dt = 0.1 s"),  # 2 pi / 0.1: some sixty samples a period
@@ -196,9 +196,10 @@ def test_what_is_wrong_is_found_and_how_to_change_it(name, verdict, changes, opt
 
 def test_a_system_that_only_a_policy_holds():
     upright = made(**UPRIGHT)
-    assert findings(upright, "bounds", policy=controller(upright), **LONG)[0].verdict == "ok"
+    assert findings(upright, "bounds", policy=controller(upright, upright.dt), **LONG)[0].verdict == "ok"
     found = one(upright, "bounds", policy=lambda x: np.zeros((len(x), 1)), **LONG)
     assert "100 of 100 under the policy leave the bounds" in found.found
+    assert found.advice.endswith("reduce u_max, or reduce dt")
 
 
 def test_starts_of_another_shape_end_the_check():
@@ -254,6 +255,6 @@ def test_noise_that_hides_a_state():
     system = made(h=lambda self, x: (x[0], x[1]), measurement_noise=(300.0, 200.0))
     for name, found in zip(("x1", "x2"), findings(system, "observability")):
         assert found.verdict == "note"
-        assert re.search(r"; 1\d\d % at noise 300, 200; in its standard deviations; ", found.found)
+        assert re.search(r"; 1\d\d % at noise 300, 200, in its standard deviations; ", found.found)
         assert found.found.endswith("at noise 300, 200, y shows nothing of it")
         assert found.advice == f"reduce the noise, or let h measure another quantity that depends on {name}"

@@ -16,13 +16,13 @@ SYSTEM = Falling()
 
 def exact(x):
     """What the policy does on the true states."""
-    return controller(SYSTEM)(x[:-1].reshape(-1, 2)).reshape(len(x) - 1, -1, 1) * SYSTEM.u_max
+    return controller(SYSTEM, SYSTEM.dt)(x[:-1].reshape(-1, 2)).reshape(len(x) - 1, -1, 1) * SYSTEM.u_max
 
 
 def test_inputs_are_the_policys_on_a_wrong_state_or_its_own():
     rng, own = np.random.default_rng(0), np.arange(40) % 3 == 1
     x0 = SYSTEM.draw_starts(rng, 40)
-    x, u = under_policy(SYSTEM, controller(SYSTEM), x0, steps=300, dt=SYSTEM.dt, rng=rng, own=own)
+    x, u = under_policy(SYSTEM, controller(SYSTEM, SYSTEM.dt), x0, steps=300, dt=SYSTEM.dt, rng=rng, own=own)
     apart = np.abs(u - exact(x)).max((0, 2))
     np.testing.assert_array_equal(apart == 0, own)
     assert np.median(apart[~own]) > 0.2
@@ -40,7 +40,7 @@ def test_actions_that_are_no_numbers_are_an_error():
 def test_a_policy_that_fails_on_the_way_says_where(tmp_path):
     script = tmp_path / "mine.py"
     script.write_text("def hold(x):\n    return x[:, :1] if len(x) < 30 else x.gain if len(x) == 30 else x\n")
-    policy = named_policy(SYSTEM, f"{script}:hold")
+    policy = named_policy(SYSTEM, f"{script}:hold", SYSTEM.dt)
     for n, message in ((30, r"\(30, 2\): AttributeError: .*line 2 \(`return"), (40, r"shape \(40, 1\), got \(40, 2\)")):
         with pytest.raises(ValueError, match=message):
             policy(np.full((n, 2), 0.3))
@@ -50,7 +50,9 @@ def test_an_unstable_plant_is_held_by_a_policy_alone():
     free, rng = Motions(SYSTEM, SYSTEM.dt, 1000, ("steps",), process_noise_share=0.5), np.random.default_rng(0)
     with pytest.raises(ValueError, match="--policy"):
         free.drawn(120, rng)
-    x, u, level, _ = replace(free, policy=controller(SYSTEM)).drawn(30, rng)
+    with pytest.raises(ValueError, match=r"stayed within bounds = .*; widen .* reduce u_max, or reduce dt$"):
+        replace(free, policy=lambda x: np.ones((len(x), 1))).drawn(120, rng)
+    x, u, level, _ = replace(free, policy=controller(SYSTEM, SYSTEM.dt)).drawn(30, rng)
     assert x.shape[1] == 30
     np.testing.assert_array_equal((u == exact(x)).all((0, 2)), np.arange(x.shape[1]) % POLICYS_OWN == 0)
     assert level.any()
@@ -70,7 +72,7 @@ def test_what_is_no_policy(tmp_path):
         (Autonomous(), "numpy:zeros_like", "no inputs"),
     ):
         with pytest.raises(ValueError, match=message):
-            named_policy(system, name)
+            named_policy(system, name, None)
 
 
 def test_a_system_that_no_regulator_holds():
@@ -80,5 +82,5 @@ def test_a_system_that_no_regulator_holds():
         "G": ((0.0,), (1.0,), (0.0,)),
     }
     equations = {"name": "uncontrolled", "f": lambda self, x: (*Falling.f(self, x[:2]), x[2])}
-    with pytest.raises(ValueError, match="policy of your own"):
-        named_policy(type("Uncontrolled", (Falling,), sizes | equations)(), "controller")
+    with pytest.raises(ValueError, match=r"reduce dt, or give a policy as script\.py:function"):
+        named_policy(type("Uncontrolled", (Falling,), sizes | equations)(), "controller", None)
