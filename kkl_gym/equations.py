@@ -239,5 +239,5 @@ def _misfit(value: Any, like: Any) -> str:
     if dtype is not None and np.shape(like) != np.shape(value):
         return f"an array of shape {tuple(np.shape(value))}, where components of x have shape {tuple(np.shape(like))}"
     return f"{shown(value)}, of type {type(value).__name__}" + (
-        ": equations of symbols take kkl_gym.elementary in place of NumPy" if is_of("sympy", "Basic", like) else ""
+        ": equations also take symbols; use kkl_gym.elementary, not NumPy" if is_of("sympy", "Basic", like) else ""
     )

@@ -109,7 +109,7 @@ class Config:
     """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
     measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
     windows: Count = 8000
-    """Number of samples at each time since the filter's start (recorded motions)."""
+    """Number of recorded states for each time since the filter's start; it starts that long before each."""
     members: Count = 1
     """Number of networks with different seeds, averaged into one wide network, as they extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()
@@ -201,7 +201,7 @@ def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
     """Return the configuration in an artifact's training metadata, with some settings changed."""
     settings = {name: training[name] for name in setting_types() if training.get(name) is not None}
     if not {"pipeline", "eigenvalues"} <= set(settings):
-        raise ValueError("the observer holds no settings of its training, so it cannot be trained again")
+        raise ValueError("the observer holds no settings of its training, which this needs")
     return Config(**{**_validated(settings, "the observer's training"), **changes})
 
 

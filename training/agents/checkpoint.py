@@ -34,7 +34,7 @@ class Checkpoint(BaseCallback):
     def __init__(self, path: Path, fingerprint: str, *, resume: bool) -> None:
         super().__init__()
         self.path, self._fingerprint, self._curve_path = path, fingerprint, path.with_name(CURVE)
-        self.resumed = self.restarts = 0  # resumptions of the training, and restarts of its episodes
+        self.resumed = self.restarts = 0  # resumptions, and times that all environments were made again
         self.spent = 0  # number of random steps before the algorithm's first step
         self.privileged = False  # whether the agent sees true hidden signals instead of estimates
         self.records: Callable[[], Sequence[Record]] = list  # returns the records to save
@@ -115,7 +115,7 @@ class Checkpoint(BaseCallback):
 
 
 def _moments(scaling: VecNormalize | None) -> dict[str, Any]:
-    """Return the running moments that normalise observations and returns."""
+    """Return the running moments by which observations and rewards are scaled."""
     if scaling is None:
         return {}
     pairs: dict[str, Any] = {name: getattr(scaling, name) for name in ("obs_rms", "ret_rms")}

@@ -26,7 +26,7 @@ def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
 class Cost(VectorWrapper):
     """Replaces the reward by minus the cost (:func:`paid`), for systems that do not define their own reward.
 
-    Far from the target the reward 1/(1 + 4c) is flat, while the cost c still has a gradient.
+    Far from the target the reward 1/(1 + 4c) is flat, while the cost c has a gradient until it is limited.
     """
 
     def __init__(self, env: VectorEnv, task: Task) -> None:

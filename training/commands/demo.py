@@ -144,7 +144,7 @@ def play(
         x_hat=x_hat[:, : system.nx],  # without an estimated bias
         spinn=load(f"{system.name}-spinn", level).estimate(y) if ships else None,
         y=y,
-        # The median leaves out the first step, which compiles or loads machine code.
+        # The first step, which compiles or loads machine code, hardly changes the median.
         seconds=float(np.median(seconds)),
     )
 
