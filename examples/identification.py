@@ -1,4 +1,4 @@
-"""Identify parameters and train an observer from outputs only, and compare them with the simulated plant.
+"""Identify a simulated plant from its outputs only, train an observer on the result, and print the errors of both.
 
 The records hold only t and y. First guesses of the parameters are 25 to 50 % off::
 

@@ -185,8 +185,8 @@ def _table_of_environments(
         "# Agents in any environment",
         "",
         "Return: interquartile mean over agents. In brackets the normalised return, where 0 is random actions and 1 "
-        "agents that see the full state without noise, with a bootstrap 95 % interval; then the number of agents. The "
-        f"steps from which an observer was learned count.{partial}",
+        "agents that see the full state without noise, with a bootstrap 95 % interval; then the number of agents. "
+        f"Steps that trained an observer count as training steps.{partial}",
         "",
         *files.table([*heads, "random"], rows),
         "",
