@@ -17,8 +17,8 @@ from kkl_gym.system import Components, System, dot, rate_under
 from observers.checks import check_dt
 
 # Largest rate * substep where a system has a formula for its rate. It is half of the largest value at which every
-# shipped system, from anywhere in twice its training box, keeps the error after 10 s below 1e-5 of the motion's size
-# (tests/kkl_gym/test_simulate.py).
+# shipped system, from anywhere in twice its training box, keeps the error after 10 s (Lorenz: 2 s) below 1e-5 of the
+# motion's size (tests/kkl_gym/test_simulate.py).
 RATE_STEP = 0.4
 # This is a millionth less than 1 / RATE_STEP. Without this margin, two rates that differ only by rounding could get
 # different numbers of substeps where rate * dt / RATE_STEP is a power of two.

@@ -109,7 +109,7 @@ class Config:
     """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
     measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
     windows: Count = 8000
-    """Number of recorded states for each time since the filter's start; it starts that long before each."""
+    """Number of recorded states for each time since reset; the filter starts that long before each state (records)."""
     members: Count = 1
     """Number of networks with different seeds, averaged into one wide network, as they extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()
@@ -124,7 +124,7 @@ class Config:
     runs: Annotated[int, Field(ge=100)] = 400
     """Number of simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability of an alarm in a fault-free motion of the calibration's length (systems: 20 times the pace)."""
+    """Probability of an alarm in a fault-free motion as long as a calibration motion (systems: 20 times the pace)."""
     truncation: Positive = 1e-6
     """epsilon: the forward map's data begins once the filter's start adds at most this to z (spinn, paper sec. 5.2)."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
