@@ -350,9 +350,10 @@ def check_interval(system: System, dt: float) -> None:
     if not system.discrete:
         rate = float(rate_under(system, tuple(np.mean(system.X, axis=1).tolist()), system.u_max))
         if rate * dt * PER_RATE > MAX_SUBSTEPS:
+            longest = 0.95 * MAX_SUBSTEPS / PER_RATE / rate  # the two digits below may be rounded up by 5 %
             raise SubstepsError(
                 f"{system.name} changes at a rate of {rate:.4g}/s in the middle of X, for which dt = {dt:g} s would "
-                f"need more than {MAX_SUBSTEPS} substeps: take dt <= {MAX_SUBSTEPS / PER_RATE / rate:.2g} s"
+                f"need more than {MAX_SUBSTEPS} substeps: take dt <= {longest:.2g} s"
             )
     elif not math.isclose(dt, system.dt, rel_tol=1e-9):
         raise ValueError(f"{system.name} makes only steps of dt = {system.dt} s: got dt = {dt}")
