@@ -95,7 +95,7 @@ class Config:
     (n, nu) in [-1, 1], as script.py:function or module:function. It sees states with errors and explores, except in one
     trajectory in twelve. With a policy, no motions without inputs are simulated."""
     free_inverse: bool = True
-    """Whether an input-aware map has a second inverse of z_y alone, used until an input acts; never with a policy."""
+    """Whether an input-aware map has a second inverse of z_y alone, used until an input acts; none with a policy."""
     lead_in_input: NotNegative = 0.0
     """Before some trajectories without inputs, inputs lead the start out of X: constant inputs, up to this multiple of
     their bounds, for 20 of the system's time units (pace); with 0, random inputs within bounds for 10 units."""
