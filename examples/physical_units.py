@@ -1,6 +1,6 @@
 """Three plants in physical units: minutes and seconds, kelvin and mol/l, volts and amperes.
 
-Scales, sampling and noise have their defaults, which follow from the equations and the training box::
+Scales, sampling and noise have defaults that follow from the equations and the training box. Try::
 
     kkl-gym diagnose examples/physical_units.py:StirredTank
     kkl-gym train examples/physical_units.py:StirredTank

@@ -34,10 +34,10 @@ FARTHEST = 10.0  # largest factor between a parameter without limits and its fir
 class Identify:
     """Learn a plant's unknown parameters, and an observer for it, from records of its outputs and inputs.
 
-    No recorded state is needed. Multiple shooting fits the parameters, with standard errors, and the initial state of
-    each window of the records, searched from random states in the training box. The observer is then trained on
-    simulated motions of the identified plant. --observer adapts an observer to a plant that differs from the
-    observer's model, with the settings of the observer's training.
+    No recorded state is needed. Multiple shooting fits the parameters and the initial state of each window of the
+    records. It searches initial states from random ones in the training box, and gives the parameters' standard errors.
+    The observer is then trained on simulated motions of the identified plant. --observer adapts an observer to a plant
+    that differs from the observer's model, with the settings of the observer's training.
 
     The folder, runs/NAME-identified or with --observer runs/NAME-adapted, receives parameters.json, identification.png
     (residuals, and predictions of held-out records), NAME.safetensors, report.png, checkpoints and log.txt. Parameters
