@@ -1,4 +1,4 @@
-"""Dask and Ray: systems that a notebook defines reach their workers by value."""
+"""Dask and Ray: workers get systems that a notebook defines by value."""
 
 import gymnasium as gym
 import pytest

@@ -1,4 +1,4 @@
-"""What is read of observations and actions, against Gymnasium's own flattening."""
+"""Numbers read from observations and actions, against Gymnasium's own flattening."""
 
 import gymnasium as gym
 import numpy as np
@@ -66,7 +66,7 @@ def test_bounds_that_are_the_largest_floats_are_none(dtype):
     assert inputs(spaces.Box(-largest, largest, (2,), dtype))(np.array([3.0, -0.5])).tolist() == [3.0, -0.5]
 
 
-def test_what_is_measured_and_angles():
+def test_measured_entries_and_angles():
     space = spaces.Box(-6.0, 6.0, (4,))
     values = np.array([0.1, 2.0, -3.0, 9.0])
     assert outputs(space, [2, 0])(values).tolist() == [-3.0, 0.1]
@@ -115,7 +115,7 @@ MIXED = spaces.Dict(camera=IMAGE, place=spaces.Box(-1, 1, (2,)), word=spaces.Tex
     (MIXED, ["speed"], (), "has keys 'camera', 'place', 'word'"),
     (spaces.Sequence(spaces.Discrete(2)), None, (), "only Box, Discrete"),
 ])  # fmt: skip
-def test_what_cannot_be_measured_says_what_to_do(space, measured, angles, match):
+def test_errors_for_unmeasurable_entries_name_the_fix(space, measured, angles, match):
     with pytest.raises(ValueError, match=match):
         outputs(space, measured, angles)
 

@@ -1,4 +1,4 @@
-"""Standard deviations beside the estimate, in single and vector environments."""
+"""Standard deviations of the estimate in observations of single and vector environments."""
 
 import gymnasium as gym
 import numpy as np

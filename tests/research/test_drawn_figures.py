@@ -1,4 +1,4 @@
-"""The figures of the pages: both themes are there, and their colours are those of the style."""
+"""The figures of the pages exist in both themes, and have the colours of the style."""
 
 import re
 from pathlib import Path
@@ -14,11 +14,11 @@ from training import figures as styles
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [*DOCS.rglob("*.md"), ROOT / "README.md"]
-LIGHT_ALONE = {"figures/qube.png"}  # examples/research/figures.py says why
+LIGHT_ALONE = {"figures/qube.png"}  # examples/research/figures.py gives the reason
 
 
 def pictures(pattern):
-    """Pictures that pages name, by their places under docs/."""
+    """Paths relative to docs/ of the pictures that pages link to by a pattern."""
     names = set()
     for page in PAGES:
         for name in re.findall(pattern, page.read_text(encoding="utf-8")):

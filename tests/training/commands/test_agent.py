@@ -1,4 +1,4 @@
-"""``kkl-gym agent``: episodes, systems of one's own, any environment; tests/training/agents has the rest."""
+"""``kkl-gym agent``: episodes, user systems, any environment; tests/training/agents tests the functions behind it."""
 
 from functools import partial
 
@@ -36,7 +36,7 @@ def test_an_agent_is_played_on_the_episodes_of_a_seed(capsys):
     for seed in ("0", "0", "1"):
         main(["agent", "evaluate", "lorenz", "--episodes", "2", "--seed", seed])
         lines = capsys.readouterr().out.splitlines()
-        shown.append("\n".join(line for line in lines if " passed" not in line))  # progress, on a slow machine
+        shown.append("\n".join(line for line in lines if " passed" not in line))  # no progress lines of slow machines
     assert "±" in shown[0]
     assert "holds the target" in shown[0]
     assert shown[0] == shown[1] != shown[2]

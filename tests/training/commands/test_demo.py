@@ -69,12 +69,12 @@ def test_a_moving_picture(tmp_path, monkeypatch, capsys):
 
 
 def push(x):
-    """Push as far as the input goes."""
+    """A policy with the largest input."""
     return np.ones((len(x), 1))
 
 
-def test_the_policy_of_its_training_acts(tmp_path):
-    """An oscillator without damping comes to rest under its regulator, about u = 0.5 when pushed, alone nowhere."""
+def test_the_demo_uses_the_policy_of_the_training(tmp_path):
+    """The undamped oscillator rests at 0 under its regulator, near u = 0.5 when pushed, and never without a policy."""
     artifact, pushed = random_artifact(system=OWN, dt=0.02), f"{__file__}:push"
     late = {}
     for policy in (None, "controller", pushed):

@@ -1,4 +1,4 @@
-"""Pieces of episodes that refits are made of."""
+"""Pieces of episodes for refits."""
 
 import numpy as np
 from rollout_observers import observer_of
@@ -19,8 +19,8 @@ def test_episodes_are_cut_and_the_oldest_are_forgotten(spy):
         gathering.add(0, sample(k))
     records, held_out = gathering.records()
     assert (gathering.steps, held_out) == (3 * LONGEST + 2, [])
-    assert [len(record.t) - 1 for record in records] == [LONGEST, 2]  # a third would be more than are kept
-    assert records[0].y[0, 0] == 2 * LONGEST  # the next piece begins with the last sample
+    assert [len(record.t) - 1 for record in records] == [LONGEST, 2]  # a third piece would exceed the limit
+    assert records[0].y[0, 0] == 2 * LONGEST  # a piece begins with the last sample of the one before
     assert records[1].y[0, 0] == 3 * LONGEST == records[0].y[-1, 0]
     np.testing.assert_allclose(records[0].u[:-1, 0], 0.1 * records[0].y[1:, 0])
     gathering.add(0, sample(3 * LONGEST + 3))
@@ -53,7 +53,7 @@ def test_pieces_have_their_role_for_good(spy):
     assert roles["Spy-v0, piece 1"] == 1
 
 
-def test_what_comes_from_before_is_brought_to_the_observers_form(spy):
+def test_earlier_records_are_converted_for_the_observer(spy):
     artifact, count = Artifact.read(spy), np.arange(400.0)
     signals = Signals("seconds", ("obs[0]",), ("action[0]",), ("obs[1]",))
     column = count[:, None]

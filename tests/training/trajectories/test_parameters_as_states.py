@@ -1,4 +1,4 @@
-"""A system whose parameters are states."""
+"""Systems with parameters as additional states."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from training.trajectories.parameters import NOMINAL_SHARE, relative_ranges, wit
 
 @dataclass(frozen=True)
 class Motor(System):
-    """One whose input matrix and output hold parameters."""
+    """A system with parameters in the input matrix and in the output."""
 
     gain: float = 2.0
     offset: float = 0.5
@@ -80,10 +80,10 @@ def test_trainings_have_the_nominal_parameters_or_some_towards_the_ends():
     own = [system.sigma, system.beta]
     nominal = (drawn == own).all(-1)
     assert nominal.mean() == pytest.approx(NOMINAL_SHARE**2, abs=0.02)
-    assert (nominal == (drawn == own).any(-1)).all()  # both or neither
+    assert (nominal == (drawn == own).any(-1)).all()  # both parameters are nominal, or neither
     share = (drawn[~nominal] / own - 1) / [0.1, 0.3]
     assert np.abs(share).max() <= 1 + 1e-12
-    for part in (0.5, 0.9):  # of the half-width; the sine of an even angle stays below it so often
+    for part in (0.5, 0.9):  # shares of the half-width: sines of uniform angles
         assert (np.abs(share) < part).mean(0) == pytest.approx(2 * np.arcsin(part) / np.pi, abs=0.02)
     assert np.corrcoef(share.T)[0, 1] == pytest.approx(0, abs=0.03)
 
