@@ -28,7 +28,7 @@ from training.run import CHECKPOINT, LOG_EVERY, load_checkpoint
 pytestmark = pytest.mark.long
 
 KILLS = int(os.environ.get("KILLS", "100"))
-INTERRUPTIONS = 0.2  # of the kills
+INTERRUPTIONS = 0.2  # share of the kills
 ROOT = Path(__file__).parents[2]
 
 # The command line with a checkpoint as often as possible, and a byte in a journal for each batch of a training of
@@ -92,7 +92,7 @@ class Train:
 class TrainAgent:
     """The training of an agent, compared by its metadata: a resumed agent differs from an uninterrupted one."""
 
-    interval = 32  # steps of its environments
+    interval = 32  # steps of the environments between two checkpoints
 
     def arguments(self, out):
         timesteps = str(4 * 256 * self.interval)

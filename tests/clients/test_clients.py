@@ -65,7 +65,7 @@ def test_rl_zoo3(algorithm, env_id, row, tmp_path, monkeypatch):
     np.testing.assert_allclose(actions, agent.predict(obs, deterministic=True)[0], atol=1e-5)
 
 
-# Gymnasium 1 asks for an argument that files of CleanRL leave out, also on Gymnasium's own environments.
+# Gymnasium 1 requires an argument that CleanRL's scripts omit; they fail on Gymnasium's own environments too.
 WITH_DEFAULT = """
 import runpy, sys
 from gymnasium.wrappers import TransformObservation

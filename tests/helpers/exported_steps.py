@@ -41,7 +41,7 @@ def _in_doubles(artifact):
 
 @cache
 def mapped(index):
-    """A map of MAPS, outputs and inputs (steps, 3, .), and estimates; no input acts in the first row."""
+    """A map of MAPS, outputs and inputs (steps, 3, .), and estimates; the inputs of the first row are zero."""
     options, activation = MAPS[index]
     artifact = random_artifact(**options)
     mlp = replace(artifact.inverse.mlp, activation=activation)

@@ -1,4 +1,4 @@
-"""A linear system on which everything is known in closed form."""
+"""A linear system with closed forms of T, T_inv and its motion."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -70,7 +70,7 @@ class Reactor(System):
 
 @dataclass(frozen=True)
 class TwoUnits(Oscillator):
-    """The oscillator with an output in another unit, and one that is not linear: y = [1000 x1, x1 + x2^2 / 2]."""
+    """The oscillator with an output in other units and a nonlinear output: y = [1000 x1, x1 + x2^2 / 2]."""
 
     name: ClassVar[str] = "two-units"
 
@@ -87,7 +87,7 @@ REACTOR_OFFSET, REACTOR_SCALE = np.array([300.0, 1e-3]), np.array([20.0, 1e-3]) 
 
 
 def reactor_observer(dt=0.05, offset=0.0, gain=1.0):
-    """An artifact for the reactor, exact but for an error of the temperature and a factor on the concentration.
+    """An artifact for the reactor, exact but for an `offset` of the temperature and a `gain` of the concentration.
 
     The filter gets y in K: T(x) = M (x - offset) / scale in units of 20 K, plus the filter's response to 300 K.
     """

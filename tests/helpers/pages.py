@@ -26,8 +26,6 @@ def name(page):
 
 @dataclass(frozen=True)
 class Block:
-    """A block of code on a page."""
-
     page: Path
     comments: dict[str, str]
     language: str
@@ -51,8 +49,6 @@ class Block:
 
 @dataclass(frozen=True)
 class Page:
-    """A page."""
-
     path: Path
 
     @cached_property

@@ -104,7 +104,7 @@ def elsewhere():
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.fixed_dictionaries({part: st.sampled_from(choices) for part, choices in BODIES.items()}), st.booleans())
-def test_a_class_arrives_in_a_new_process_as_it_was(elsewhere, choices, instance):
+def test_a_class_is_unchanged_in_a_new_process(elsewhere, choices, instance):
     made = defined(choices)
     system = made() if instance else made
     assert elsewhere(cloudpickle.dumps(system)) == looked_at(system)
@@ -142,7 +142,7 @@ def test_workers_play_systems_of_a_notebook(played, which):
     assert played(make) == start(make)
 
 
-def test_a_class_that_states_nothing_is_looked_at_when_it_is_used():
+def test_a_class_without_declarations_is_checked_at_its_first_use():
     class Empty(System):
         pass
 

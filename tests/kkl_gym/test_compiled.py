@@ -240,7 +240,7 @@ def episode(env, seed, steps, gain=0.5):
 
 
 @pytest.mark.parametrize("system", ["lorenz", Pendulum()], ids=str)
-def test_episodes_are_the_same_with_it_and_without(system):
+def test_episodes_are_the_same_with_and_without_compilation(system):
     env = KKLEnv(system)
     in_python, compiled = (episode(env, 3, SOON + 300) for _ in range(2))
     for a, b in zip(in_python, compiled, strict=True):

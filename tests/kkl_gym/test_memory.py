@@ -122,7 +122,7 @@ def test_nothing_underflows_while_a_memory_fills():
 
 
 @pytest.mark.parametrize("shape", [(), (4,)])
-def test_of_angles_it_is_remembered_how_far_they_have_turned(shape):
+def test_features_of_angles_depend_on_the_unwrapped_angles(shape):
     (y, unwrapped), u = turning(40, *shape), signals(39, *shape, 2, seed=1)
     assert np.ptp(unwrapped[..., 1:], axis=0).min() > 2 * np.pi
     seen, plain = run(of_angles(), y, u), run(memory(3, 2, (1, 3), (2,)), unwrapped, u)

@@ -210,7 +210,7 @@ def test_a_change_on_the_way_is_noticed_and_other_wrappers_are_not(saved):
     with pytest.raises(ValueError, match=r"DroppingInPlace.*changes observations"):
         env.step([0.0])
     quiet = gym.wrappers.TransformReward(RecordEpisodeStatistics(gym.make("KKLVanDerPol-v0")), lambda r: 2.0 * r)
-    for inner in (quiet, KKLObservation(quiet, saved(), estimate="z")):  # an observer around another one
+    for inner in (quiet, KKLObservation(quiet, saved(), estimate="z")):  # also around another observer
         env = KKLObservation(inner, saved())
         env.reset(seed=0)
         env.step([0.0])

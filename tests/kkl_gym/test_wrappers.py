@@ -92,7 +92,7 @@ def test_known_starts_need_a_map_with_a_motion_or_T(saved):
             kind(env, saved(system="lorenz"), known_start=True)
 
 
-def test_where_z_is_shown_it_does_not_track():
+def test_wrappers_that_show_z_track_only_for_a_monitor_or_a_known_start():
     def tracks(**options):
         env = KKLObservation(KKLEnv("lorenz"), **options)
         env.reset(seed=0)
@@ -104,7 +104,7 @@ def test_where_z_is_shown_it_does_not_track():
     assert tracks(estimate="z", known_start=True)
 
 
-def test_the_environment_is_left_as_it_was(saved):
+def test_wrappers_do_not_change_the_environment(saved):
     bare, env = gym.make("KKLRossler-v0"), wrapped(saved, "rossler")
     x0, x1 = bare.reset(seed=2)[1]["x"], env.reset(seed=2)[1]["x"]
     assert np.array_equal(x0, x1)

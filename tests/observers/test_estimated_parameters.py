@@ -64,7 +64,7 @@ def test_an_observer_fits_every_plant_of_its_range(make_artifact):
         artifact.check("van_der_pol", {}, dt=0.01, ny=1, nu=1)
 
 
-def test_ranges_that_make_no_sense(make_artifact):
+def test_invalid_ranges_of_parameters(make_artifact):
     artifact = make_artifact(estimated=True)
     for ranges in ({"mu": (3.1, 3.3)}, {"nu": (3.1, 3.3)}, {"mu": (2.0, np.nan)}, {"mu": 3.0}, [3.0], {}):
         with pytest.raises(ArtifactError, match="parameter"):

@@ -90,7 +90,7 @@ def test_conditions_combine():
     assert Expression([["+", 1, 2, ["x", 0], 4], ["maximum", 1, ["x", 0], 3]])(np.array([5.0])).tolist() == [12, 5]
 
 
-def test_where_it_is_not_defined_there_are_no_warnings():
+def test_undefined_values_give_no_warnings():
     undefined = Expression([["sqrt", ["x", 0]], ["log", ["x", 1]], ["**", ["x", 1], -1], ["**", 10, ["**", 10, 10]]])
     first, *others = undefined(np.array([-1.0, 0.0])).tolist()
     assert math.isnan(first)

@@ -35,7 +35,7 @@ def test_a_sample_that_is_far_off_hardly_moves_an_estimate_with_a_gate(name):
     assert (np.abs(plain.estimate(far) - plain.estimate(y)) / scale).max() > 1.0
 
 
-def test_a_jump_that_stays_is_believed():
+def test_the_gate_accepts_a_jump_that_stays():
     x, y = motions("lorenz", 1200)
     x[600:], y[600:] = np.roll(x, 1, axis=1)[600:], np.roll(y, 1, axis=1)[600:]
     observer = load("lorenz", 0.5, gate=5.0)

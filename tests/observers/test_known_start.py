@@ -68,7 +68,7 @@ def test_mismatch_is_the_part_of_the_transient_outside_the_image_of_T():
             assert (expected > 5e-3).all()
     observer.reset(y[0], x[0])
     assert (observer.mismatch < 1e-6).all()
-    observer.advance(y[0] + 5.0)  # a sensor that jumps
+    observer.advance(y[0] + 5.0)  # a jump of the sensor
     assert (observer.mismatch > 1e-3).all()
 
 

@@ -121,7 +121,7 @@ def test_impossible_levels_of_limits():
             limits_of_two(levels=np.array(wrong, dtype=float))
 
 
-def test_residuals_where_the_output_is_not_defined_count_as_none(make_artifact):
+def test_residuals_are_zero_where_the_output_is_undefined(make_artifact):
     artifact = dataclasses.replace(make_artifact(), h=Expression([["log", ["x", 0]]]))
     x_hat, y = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]), np.full((3, 1), 0.5)
     assert artifact.residual(y, x_hat).ravel().tolist() == [0.0, 0.0, 0.5]

@@ -79,7 +79,7 @@ def test_batches_equal_their_rows_and_records_their_steps(make_artifact, batch, 
         assert np.allclose(z[index], observer.z, rtol=1e-12, atol=1e-13)
 
 
-def test_an_estimate_leaves_the_state_alone_and_takes_a_last_row_of_u_more_and_none(make_artifact):
+def test_estimate_keeps_the_observers_state_and_accepts_one_more_row_of_u_or_no_u(make_artifact):
     observer = KKLObserver(make_artifact())
     y, u = record(observer, 10)
     expected = observer.estimate(y, u)
@@ -121,7 +121,7 @@ def test_until_an_input_acts_the_map_of_free_motion_is_in_use(make_artifact):
         assert np.allclose(step_by_step(alone, y[:, row], u[:, row]), expected[:, row], **CLOSE)
 
 
-def test_a_missing_sample_holds_the_last_where_the_output_is_not_known(make_artifact):
+def test_a_missing_sample_holds_the_last_if_the_output_map_is_unknown(make_artifact):
     coasting, holding = begun(make_artifact())
     for _ in range(3):
         assert np.array_equal(coasting.step(None, [0.1]), holding.step([0.7], [0.1]))

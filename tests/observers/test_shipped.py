@@ -56,7 +56,7 @@ def test_the_worst_start_of_many_beyond_x_is_found_and_kept(name):
 
 
 @pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
-def test_a_few_false_samples_are_forgotten(name):
+def test_estimates_recover_from_a_few_outliers(name):
     """Outliers inflate the covariance far beyond the motions to which the flow was fitted."""
     observer = observers.load(name)
     system = get_system(observer.artifact.system)

@@ -111,7 +111,7 @@ def test_files_have_the_rights_that_the_umask_gives(tmp_path, monkeypatch):
         assert stat.S_IMODE((tmp_path / str(umask) / "b.txt").stat().st_mode) == rights
 
 
-def test_the_file_is_on_disk_before_it_takes_its_place_and_the_folder_after(tmp_path, monkeypatch):
+def test_the_file_is_synchronised_before_it_is_renamed_and_the_folder_after(tmp_path, monkeypatch):
     events, fsync, replace, opened = [], os.fsync, os.replace, os.open
 
     def recorded_fsync(descriptor):
@@ -167,7 +167,7 @@ def test_missing_files_and_folders(tmp_path):
         read("a\0b")
 
 
-def test_damage_is_noticed_wherever_it_is(path):
+def test_damage_is_noticed_at_any_byte(path):
     whole = path.read_bytes()
     for length in range(len(whole)):
         path.write_bytes(whole[:length])

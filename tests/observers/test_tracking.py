@@ -187,7 +187,7 @@ def test_known_starts(t_is_there):
         KKLObserver(replace(artifact, forward=None), LEVEL, tracking=False).reset(y[0], x[0])
 
 
-def test_maps_are_replaced_while_it_runs():
+def test_maps_are_replaced_during_a_run():
     observer, x, y = settled()
     x_hat, P = observer.decode(), observer.covariance
     observer.replace(tracking_observer(by="flow", x_scale=(1.0, 3.0)))
@@ -223,7 +223,7 @@ def test_covariances_are_multiplied_by_factors_of_level_and_age():
 
 
 @pytest.mark.parametrize("options", [{}, {"outputs": 2, "process": True, "free_inverse": True}], ids=str)
-def test_without_tracking_it_is_the_map_without_a_motion(options):
+def test_tracking_false_equals_the_map_without_a_motion(options):
     artifact = tracking(**options)
     bare, (y, u) = replace(artifact, motion=None), signals(artifact, 30, (3,))
     y[5:9, 1], y[12, :, 0] = np.nan, np.nan

@@ -88,7 +88,7 @@ def test_the_notebooks_measure_by_hand():
     assert component_smape(x, x_hat)[0] == pytest.approx((200 + 200 + 0 + 200 / 3) / 4)
 
 
-def test_a_quick_run_of_two_methods_stands_beside_an_earlier_one(toy, tmp_path):
+def test_a_quick_run_with_the_option_beside_includes_an_earlier_run(toy, tmp_path):
     """A second run adds a method, and fails with other settings."""
     (script, log), first, second = toy, tmp_path / "first", tmp_path / "second"
     quick = ("benchmark", "--quick", "--systems", "lorenz", "--jobs", "1", "--methods")

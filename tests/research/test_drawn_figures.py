@@ -34,7 +34,7 @@ def test_pages_show_pictures_that_are_there_in_both_themes():
     assert not [name for name in shown - LIGHT_ALONE if not (DOCS / in_theme(name, "dark")).exists()]
 
 
-def test_every_picture_is_shown_and_drawn():
+def test_every_picture_is_on_a_page_and_in_figures():
     there = {path.relative_to(DOCS).as_posix() for ending in ("png", "gif") for path in DOCS.rglob(f"*.{ending}")}
     assert there == {in_theme(name, theme) for name in FIGURES for theme in ("light", "dark")} | LIGHT_ALONE
     assert pictures(r"\]\(([^)\s]+\.(?:png|gif))\)") == set(FIGURES) | LIGHT_ALONE

@@ -143,7 +143,7 @@ def test_a_filter_that_leaves_the_bounds_restarts_without_the_others(filters):
 
 
 @pytest.mark.parametrize("P", [np.diag([1.0, -1e-3]), np.full((2, 2), np.nan)])
-def test_a_ukf_whose_covariance_is_invalid_restarts_without_the_others(P):
+def test_a_ukf_restarts_only_the_row_with_an_invalid_covariance(P):
     observer, untouched = (of_van_der_pol(UnscentedKalmanFilter) for _ in range(2))
     y = np.array([[0.7], [-0.4]])
     for one in (observer, untouched):

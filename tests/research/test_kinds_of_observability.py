@@ -86,7 +86,7 @@ def test_timed_agents_are_compared_and_not_trained_again(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["parameters", "delay"])
-def test_an_agent_sees_estimates_of_the_state_as_it_is_now(tmp_path, monkeypatch, kind):
+def test_an_agent_sees_estimates_of_the_present_state(tmp_path, monkeypatch, kind):
     monkeypatch.setattr(kinds, "OBSERVER_STEPS", 2_000)
     monkeypatch.setattr(kinds, "LAST_EPISODES", 2)
     make_small(monkeypatch)

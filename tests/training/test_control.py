@@ -18,7 +18,7 @@ def nothing(obs):
     return np.zeros((len(obs), 1))
 
 
-def test_a_system_of_ones_own_has_the_defaults_and_no_controller_without_input(script):
+def test_a_user_system_has_the_defaults_and_no_controller_without_input(script):
     own = get_system(f"{script}:Pendulum")
     assert profile(own) == Profile()
     with pytest.raises(ValueError, match="pendulum has no inputs"):

@@ -162,7 +162,7 @@ def test_another_run_is_not_resumed(whole):
 def test_an_artifact_of_spinn_has_a_forward_map_and_no_motion(whole):
     folder, result, printed = whole["spinn"]
     artifact = result.artifact
-    assert "track" not in printed  # spinn maps do not track by design
+    assert "track" not in printed  # no message, since spinn maps never track
     assert (artifact.motion, artifact.nu, artifact.forward.mlp.inputs) == (None, 0, 2)
     assert artifact.inverse.error_covariance is not None
     assert (artifact.training["pipeline"], artifact.training["seed"]) == ("spinn", 0)

@@ -21,7 +21,7 @@ def test_paper_preset_has_the_papers_table():
     assert all(value < 0 for value in presets.eigenvalues(Oscillator(), 0.01))
 
 
-def test_spinn_of_a_system_of_ones_own_forgets_its_start_and_looks_for_no_spectrum_that_is_given(monkeypatch):
+def test_spinn_of_a_user_system_has_fast_modes_and_keeps_a_given_spectrum(monkeypatch):
     for duration in (50.0, 200.0):
         config = preset(Oscillator(), "spinn", "fast", changes={"duration": duration, "width": None})
         assert -max(config.eigenvalues) * duration >= 30

@@ -90,7 +90,7 @@ def test_a_refused_training_leaves_no_log(tmp_path):
 
 
 @pytest.mark.parametrize("console", [None, console_of(terminal=True)])
-def test_a_log_has_lines_whatever_is_drawn(console, clock, tmp_path):
+def test_a_log_has_lines_with_and_without_bars(console, clock, tmp_path):
     log = tmp_path / "run" / "log.txt"
     work(ProgressBars(console, log, get_time=clock), clock, steps=100)
     with suppress(ValueError), progress_bars(console, log) as progress:

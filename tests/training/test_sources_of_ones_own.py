@@ -73,7 +73,7 @@ class Spring:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_source_of_ones_own_is_enough(known):
+def test_a_user_defined_source_suffices(known):
     source = Spring(known)
     artifact = train(source, device=CPU).artifact
     assert (artifact.motion.equations is not None, artifact.training["judged"]) == (known, "spring")

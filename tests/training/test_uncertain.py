@@ -51,7 +51,7 @@ def test_an_observer_for_uncertain_plants_holds_on_another():
     assert late["many", "model"] < 2.5 * late["one", "model"]  # loose, at this toy size
 
 
-def test_it_identifies_the_plant_while_it_runs():
+def test_the_observer_estimates_the_plants_parameter():
     system, artifact = Undamped(), trained(stiffness=0.3)
     assert artifact.estimated_parameters == ("stiffness",)
     assert artifact.parameter_ranges == {"stiffness": (2.8, 5.2)}

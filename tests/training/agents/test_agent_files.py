@@ -63,7 +63,7 @@ def test_a_file_holds_the_agent(changes, tmp_path):
         ({"training": {"seed": "x/../../out"}}, "seed must be a whole number"),
     ],
 )
-def test_an_agent_that_makes_no_sense_is_refused(changes, message):
+def test_invalid_agents_are_refused(changes, message):
     with pytest.raises(AgentError, match=message):
         agent(**changes)
 

@@ -74,7 +74,7 @@ def test_states_and_outputs_are_taken_from_the_target_over_the_scale():
     assert output_deviation(system)({"y": np.array([[system.target[1]]])}).tolist() == [[0.0]]
 
 
-def test_error_bars_are_shown_by_their_size():
+def test_error_bars_are_shown_as_logarithms():
     env = make(VAN_DER_POL, "x_hat_std", N, observer="van_der_pol")
     env.reset(seed=0)
     obs, *_, info = env.step(np.zeros((N, 1)))

@@ -24,7 +24,7 @@ def settings(algorithm, name):
 
 @pytest.mark.parametrize(("name", "x0"), [("van_der_pol", None), ("rossler", [-44.0, -17.0, 212.0])])
 def test_one_environment_is_a_row_of_the_task(name, x0):
-    """Of what an agent sees and is paid, with the environment made as rl-zoo3 makes it; from x0 it escapes."""
+    """Observations and rewards are equal, with the environment made as by rl-zoo3; the motion from x0 escapes."""
     one = OnTask(gym.make(ENV_IDS[name], **settings("ppo", name)["env_kwargs"]))
     rows = Cost(make(TASKS[name], "x_hat", 2, observer=name), TASKS[name])
     options = None if x0 is None else {"x0": x0}

@@ -25,7 +25,7 @@ CART = HIDDEN_VELOCITIES["CartPole-v1"]
 
 
 @pytest.fixture(autouse=True)
-def _nothing_is_compiled(monkeypatch):
+def _small_and_without_compilation(monkeypatch):
     monkeypatch.setattr("kkl_gym.vector.batch_step", lambda system: SamplingStep(partial(advance_batch, system)))
     make_small(monkeypatch)
 
@@ -42,7 +42,7 @@ def test_an_agent_is_played_on_the_episodes_of_a_seed(capsys):
     assert shown[0] == shown[1] != shown[2]
 
 
-def test_an_agent_for_a_system_of_ones_own(saved, script):
+def test_an_agent_for_a_user_system(saved, script):
     main(["agent", "train", OWN, "--observer", saved(system=OWN), "--timesteps", "1"])
     path = "runs/agents/oscillator-x_hat-0/agent.safetensors"
     agent = Agent.read(path)

@@ -28,7 +28,7 @@ def test_all_that_ship(tmp_path, capsys):
     assert (tmp_path / "estimates.png").stat().st_size > 10_000
 
 
-def test_a_system_of_ones_own(saved, tmp_path, capsys):
+def test_a_user_system(saved, tmp_path, capsys):
     system = f"{linear_system.__file__}:Autonomous"
     observer = saved(system=system, dt=0.02)
     main(["demo", system, "--observer", observer, "--out", ".", "--duration", "1", "--measurement-noise", "0.2"])

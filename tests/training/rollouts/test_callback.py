@@ -54,20 +54,20 @@ def in_use(env):
 
 
 def test_a_refit_lowers_the_error(pendulum, tmp_path, capsys):
-    refits_done, path = [], tmp_path / "newer.safetensors"
+    results, path = [], tmp_path / "newer.safetensors"
     env = vector("Pendulum-v1", pendulum)
     first = in_use(env)[0]
-    options = {"path": path, "on_refit": refits_done.append, "verbose": 1}
+    options = {"path": path, "on_refit": results.append, "verbose": 1}
     refits = KKLTrainingCallback(1000, **options, inverse_steps=200, width=32)
     refits.init_callback(model := ppo(VecNormalize(env, norm_reward=False)))
     assert refits.artifact is first
     model.learn(2100, refits)
     assert in_use(env) == [refits.artifact] * 4
-    assert [refit.steps for refit in refits_done] == [1024, 2048]
-    assert refits_done[0].taken
-    last = [refit for refit in refits_done if refit.taken][-1]  # a second refit may be worse, and is then dropped
-    assert last.error < 0.4 * refits_done[0].before
-    assert refits_done[-1].artifact is last.artifact is refits.artifact
+    assert [refit.steps for refit in results] == [1024, 2048]
+    assert results[0].taken
+    last = [refit for refit in results if refit.taken][-1]  # a second refit may be worse, and is then dropped
+    assert last.error < 0.4 * results[0].before
+    assert results[-1].artifact is last.artifact is refits.artifact
     assert refits.artifact.training["held_out_errors"]["obs[2]"] == pytest.approx(last.error)
     assert refits.artifact.training["eigenvalues"] == tuple(first.training["eigenvalues"])
     assert Artifact.read(path).training["held_out_errors"] == refits.artifact.training["held_out_errors"]
@@ -78,15 +78,15 @@ def test_a_refit_lowers_the_error(pendulum, tmp_path, capsys):
 
 def test_pieces_are_longer_than_the_settling_time_of_a_slow_filter(tmp_path):
     """The filter settles after 345 steps; if episodes are shorter, a warning gives the reason for a missing refit."""
-    few, refits_done = {"steps": 1000, "members": 1, "inverse_steps": 20}, []
+    few, results = {"steps": 1000, "members": 1, "inverse_steps": 20}, []
     long = {"eigenvalues": (-0.4, -4.0, -20.0), "env_kwargs": {"max_episode_steps": 500}}
     training.learn("Pendulum-v1", measured=[0, 1], hidden=[2], out=tmp_path, **long, **few, **TINY)
-    path, options = tmp_path / "Pendulum-v1.safetensors", {"inverse_steps": 20, "on_refit": refits_done.append}
+    path, options = tmp_path / "Pendulum-v1.safetensors", {"inverse_steps": 20, "on_refit": results.append}
     with pytest.warns(UserWarning, match=r"lasts 17\.3 s, the settling time .* make episodes longer, or .*eigenvalues"):
         ppo(vector("Pendulum-v1", path), 100).learn(900, KKLTrainingCallback(800, **options))
-    assert refits_done == []
+    assert results == []
     ppo(vector("Pendulum-v1", path, max_episode_steps=500), 100).learn(2000, KKLTrainingCallback(1600, **options))
-    assert [refit.steps for refit in refits_done] == [1600]
+    assert [refit.steps for refit in results] == [1600]
 
 
 def test_environments_in_processes_of_their_own(pendulum, asked):
@@ -188,9 +188,9 @@ def test_a_training_that_goes_on(spied, asked):
 
 
 def test_a_rehearsal_is_played_as_the_agent_will_act(spied, asked, monkeypatch):
-    env, refits_done = VecNormalize(spied(2)), []
+    env, results = VecNormalize(spied(2)), []
     model = ppo(env, 50, log_std_init=1.5)
-    refits = KKLTrainingCallback(100, keep=30, rehearsal=30, on_refit=refits_done.append)
+    refits = KKLTrainingCallback(100, keep=30, rehearsal=30, on_refit=results.append)
     predict, acted = model.predict, []
 
     def noted(*given, **options):
@@ -208,7 +208,7 @@ def test_a_rehearsal_is_played_as_the_agent_will_act(spied, asked, monkeypatch):
         check_spied(records)
         played = [round(float(u), 5) for u in np.ravel(acted)]
         assert {round(float(u), 5) for record in records for u in record.u[:-1, 0] * 2 + 1} <= {*played}
-    assert [refit.steps for refit in refits_done] == [100, 230, 330, 460]
+    assert [refit.steps for refit in results] == [100, 230, 330, 460]
     assert len(acted) == 60
 
 
@@ -258,7 +258,7 @@ def test_environments_that_are_refused(pendulum, tmp_path):
     other.save(tmp_path / "other.safetensors")
     two = DummyVecEnv([partial(wrapped, "Pendulum-v1", pendulum)] * 2)
     two.envs[1] = wrapped("Pendulum-v1", tmp_path / "other.safetensors")
-    for env, settings, refits_done in (
+    for env, settings, message in (
         (gym.make("Pendulum-v1"), {}, r"the environment has none: wrap each environment"),
         (wrapped("Pendulum-v1", tmp_path / "plain.safetensors"), {}, "holds no settings of its training"),
         (hiding, {}, r"environment 0 has no 'x': KKLObservation gives the true obs\[2\] as 'x'"),
@@ -268,11 +268,11 @@ def test_environments_that_are_refused(pendulum, tmp_path):
         (two, {}, "has signals"),
         (wrapped("Pendulum-v1", pendulum), {"width": -1}, "width"),
     ):
-        with pytest.raises(ValueError, match=refits_done):
+        with pytest.raises(ValueError, match=message):
             ppo(env, 10).learn(20, KKLTrainingCallback(100, **settings))
 
 
-def test_arguments_that_make_no_sense():
+def test_invalid_arguments_of_the_callback():
     for arguments, message in (
         ({"every": 10.5}, "every must be"),
         ({"records": ["a"]}, r"records must be a list of training\.records\.Record, got"),

@@ -13,7 +13,7 @@ def sample(k):
     return {"y": np.array([float(k)]), "u": np.array([0.1 * k]), "x": np.array([-float(k)]), "sample": k}
 
 
-def test_episodes_are_cut_and_the_oldest_are_forgotten(spy):
+def test_episodes_are_cut_and_the_oldest_are_dropped(spy):
     gathering = Gathering(Artifact.read(spy), keep=2 * LONGEST, held_out=0.0)
     gathering.begin(0, {"y": np.zeros(1)})
     for k in range(1, 3 * LONGEST + 3):
@@ -28,7 +28,7 @@ def test_episodes_are_cut_and_the_oldest_are_forgotten(spy):
     assert len(gathering.records()[0][-1].t) == 4
 
 
-def test_an_unfinished_episode_is_not_forgotten(spy):
+def test_an_unfinished_episode_is_not_dropped(spy):
     gathering = Gathering(Artifact.read(spy), keep=10, held_out=0.0)
     for row, steps in ((0, 5), (1, 10)):
         gathering.begin(row, sample(0))

@@ -58,7 +58,7 @@ def test_ranges_about_the_values():
     assert with_parameters(lorenz, {}) is lorenz
 
 
-def test_ranges_that_make_no_sense():
+def test_invalid_ranges_are_refused():
     for system, widths, message in (
         (Lorenz(), {"nu": 0.1}, "no parameter 'nu' to be uncertain; it has sigma, rho, beta"),
         (Lorenz(beta=0.0), {"all": 0.1}, "beta of lorenz is 0, which has no relative range: exclude it by beta=0"),
@@ -88,7 +88,7 @@ def test_trainings_have_the_nominal_parameters_or_some_towards_the_ends():
     assert np.corrcoef(share.T)[0, 1] == pytest.approx(0, abs=0.03)
 
 
-def test_a_bias_of_an_output_is_a_state_that_stands_still():
+def test_a_bias_of_an_output_is_a_constant_state():
     system = with_bias(Motor(gain=3.0, offset=0.25), 0.5)
     assert (system.nx, system.state_names[1:], system.X[1]) == (2, ("y1_bias",), (-0.5, 0.5))
     x0 = np.array([[0.4, -0.3]])
