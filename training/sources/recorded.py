@@ -188,7 +188,7 @@ class RecordedSource:
         }
 
     def tracking(self) -> dict[str, Any]:
-        """Return the arguments of observers.Motion that records fix; ValueError if tracking is impossible."""
+        """Return the arguments of observers.Motion that records determine; ValueError if tracking is impossible."""
         if self.config.arbitrary_zero:
             raise ValueError(
                 f"a tracker compares {', '.join(self.config.arbitrary_zero)} with its prediction, so the zero matters: "
