@@ -1,8 +1,8 @@
 import os
 
-os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame opens no window
-os.environ.setdefault("MPLBACKEND", "agg")  # nor does Matplotlib, whatever order tests run in
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy and torch: more threads than cores get in each other's way
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame must not open a window
+os.environ.setdefault("MPLBACKEND", "agg")  # Matplotlib must not open a window, in any order of tests
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # set before NumPy and torch load; more threads than cores are slow
 
 import pytest
 from random_artifacts import random_artifact
@@ -15,7 +15,7 @@ def make_artifact():
 
 @pytest.fixture(scope="session")
 def saved(tmp_path_factory):
-    """save(system, ...) -> path of a file that holds random_artifact(system, ...)."""
+    """save(system=..., ...) returns the path of a file that holds random_artifact(system=..., ...)."""
     folder, paths = tmp_path_factory.mktemp("maps"), {}
 
     def save(**options):
@@ -58,7 +58,7 @@ class NoSystem:
 
 @pytest.fixture(scope="session")
 def script(tmp_path_factory):
-    """Path of a user's script with an autonomous system, Pendulum."""
+    """Path of a script that defines an autonomous system, Pendulum."""
     path = tmp_path_factory.mktemp("user") / "pendulum_script.py"
     path.write_text(AUTONOMOUS)
     return path

@@ -1,4 +1,4 @@
-"""docs/guides/own_system.md, followed literally in a copy of the packages."""
+"""The steps in docs/guides/own_system.md, followed literally in a copy of the packages."""
 
 import dataclasses
 import os
@@ -15,21 +15,21 @@ from training.presets import Profile
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "guides" / "own_system.md").read_text()
 
-# The line above a block says what to do with it.
+# The line above a block of code tells the reader how to use the block.
 NEW = re.compile(r"New file `(?P<path>[^`]+)`:")
 EDIT = re.compile(r"In `(?P<path>[^`]+)`, (?P<where>below|in place of) the line that begins with `(?P<line>[^`]+)`:")
 SCRIPT, LOOK, FULL = "This runs now:", "For a first look", "In full"
 
 
 def blocks():
-    """What each block is for, its language, and its text."""
+    """The line above each block of code, its language, and its text."""
     found = re.findall(r"([^\n]+)\n\n```(\w+)\n(.*?)```\n", PAGE, re.DOTALL)
     assert len(found) == PAGE.count("```") // 2
     return found
 
 
 def edit(text, where, line, new):
-    """The text with something below or in place of its first line that begins so."""
+    """Insert `new` below the first line that begins with `line`, or in its place."""
     lines = text.splitlines(keepends=True)
     at = next(i for i, one in enumerate(lines) if one.startswith(line))
     lines[at] = lines[at] + new if where == "below" else new
@@ -38,7 +38,7 @@ def edit(text, where, line, new):
 
 @pytest.mark.slow
 def test_following_the_page_adds_a_system(tmp_path):
-    """Everything is done but the commands in full. One test, so that it is done once."""
+    """All steps except the full trainings, in one test, which copies the packages once."""
     root = tmp_path
     for package in ("kkl_gym", "observers", "training"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -67,7 +67,7 @@ def test_following_the_page_adds_a_system(tmp_path):
         elif label.startswith(LOOK):
             do("sh", "-e", "-c", text)
         else:
-            assert label.startswith(FULL), f"nothing says what to do with\n{text}"
+            assert label.startswith(FULL), f"no instruction above\n{text}"
             assert language == "sh"
     for check in (("check",), ("format", "--check")):
         do(sys.executable, "-m", "ruff", *check, *sorted(written))

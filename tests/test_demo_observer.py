@@ -1,4 +1,4 @@
-"""The demo's observer in JavaScript, run by Node, against the same in Python."""
+"""The demo's observer in JavaScript, run by Node, against KKLObserver."""
 
 import json
 import runpy
@@ -21,14 +21,14 @@ write_step = runpy.run_path(str(DEMO / "step_file.py"))["write_step"]
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="there is no Node.js, node")
 
 
-def replayed(exported, folder, y, u, told=None):
-    """What JavaScript makes of a record, in which NaN is missing."""
+def replayed(exported, folder, y, u, levels=None):
+    """Estimates, scores and covariances of the JavaScript observer along a record; NaN marks missing outputs."""
     write_step(folder / "step.safetensors", exported)
     shutil.copy(DEMO / "kkl_observer.js", folder / "kkl_observer.mjs")
     rows = [None if np.isnan(row).all() else [None if np.isnan(value) else value for value in row] for row in y]
     done = subprocess.run(
         ["node", REPLAY, folder / "kkl_observer.mjs", folder / "step.safetensors"],
-        input=json.dumps({"y": rows, "u": u.tolist(), "noise": told}),
+        input=json.dumps({"y": rows, "u": u.tolist(), "noise": levels}),
         capture_output=True,
         text=True,
     )
@@ -37,7 +37,7 @@ def replayed(exported, folder, y, u, told=None):
 
 
 def watched(artifact, y, u, levels, **options):
-    """Estimates and scores along a record."""
+    """Estimates and scores of KKLObserver along a record."""
     observer = KKLObserver(artifact, levels, monitor=True, **options)
     x_hat, score = [observer.reset(y[0])], [0.0]
     for sample, held in zip(y[1:], u, strict=False):
@@ -63,7 +63,7 @@ def test_equations_of_all_operations(tmp_path):
     assert apart(exported, replayed(exported, tmp_path, y, u)["x_hat"], expected) < 1e-9
 
 
-def test_process_noise_that_t_inv_is_not_told_counts_for_the_filter(tmp_path):
+def test_process_noise_that_is_no_feature_of_t_inv_changes_the_tracker(tmp_path):
     exported, y, u, _ = tracked(0)
     other = replace(exported, process_noise=2.0)
     found = replayed(other, tmp_path, y[:200], u[:200])["x_hat"]
@@ -71,13 +71,13 @@ def test_process_noise_that_t_inv_is_not_told_counts_for_the_filter(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["lorenz", "lorenz-spinn"])
-def test_what_ships_with_its_monitor_and_missing_samples(name, tmp_path):
+def test_shipped_maps_with_monitor_and_missing_samples(name, tmp_path):
     exported = Exported.read(name)
     y, u = motion(exported.artifact, 900)
     y = y + np.random.default_rng(0).normal(scale=0.2, size=y.shape)
     y[300:350] = np.nan
-    y[700:] = y[700]  # frozen
-    found = replayed(exported, tmp_path, y, u, told=[0.2, 0.01])
+    y[700:] = y[700]  # a frozen sensor
+    found = replayed(exported, tmp_path, y, u, levels=[0.2, 0.01])
     x_hat, score = watched(exported.artifact, y, u, 0.2, process_noise=0.01)
     assert apart(exported, found["x_hat"], x_hat) < 1e-4
     assert 0 < max(score[:700]) < 1 < score[-1]
@@ -92,7 +92,7 @@ def test_several_outputs_of_which_one_is_missing(make_artifact, tmp_path):
     artifact = replace(artifact, C=np.array([[1.0, 0.5], [0.0, 2.0]]), limits=limits)
     y, u = noise(artifact, 200)
     y[100:120, 1] = y[140:160, 0] = np.nan
-    found = replayed(exported_of(artifact, tmp_path), tmp_path, y, u, told=[[0.3, 0.9]])
+    found = replayed(exported_of(artifact, tmp_path), tmp_path, y, u, levels=[[0.3, 0.9]])
     x_hat, score = watched(artifact, y, u, (0.3, 0.9))
     assert np.abs(found["x_hat"] - x_hat).max() < 1e-3
     assert np.allclose(found["score"], score, rtol=1e-4)
@@ -109,7 +109,7 @@ def error_bars_of_trackers(make_artifact):
         artifact = tracking(**KINDS[index])
         y, u = signals(artifact, 200)
         y[3:9] = np.nan
-        u[7:] += 0.1  # from within the window on
+        u[7:] += 0.1  # from a sample within the first window
         yield artifact, y, u
 
 
@@ -117,9 +117,9 @@ def error_bars_of_trackers(make_artifact):
 def test_error_bars(cases, make_artifact, tmp_path):
     for artifact, y, u in cases(make_artifact):
         exported, process = exported_of(artifact, tmp_path), artifact.process_noise_max is not None
-        told = replace(exported, measurement_noise=0.7, process_noise=0.05 if process else exported.process_noise)
-        found = replayed(exported, tmp_path, y, u, told=(0.7, 0.05) if process else (0.7,))["covariance"]
-        for k, observer in enumerate(stepped(told, y, u)):
+        other = replace(exported, measurement_noise=0.7, process_noise=0.05 if process else exported.process_noise)
+        found = replayed(exported, tmp_path, y, u, levels=(0.7, 0.05) if process else (0.7,))["covariance"]
+        for k, observer in enumerate(stepped(other, y, u)):
             expected = observer.covariance
             assert np.allclose(found[k], expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max()), k
 
@@ -144,7 +144,7 @@ REFUSED = f"""
 """
 
 
-def test_what_is_no_sample_or_input_is_refused(make_artifact, tmp_path):
+def test_invalid_samples_and_inputs_are_refused(make_artifact, tmp_path):
     write_step(tmp_path / "step.safetensors", exported_of(make_artifact(), tmp_path))
     shutil.copy(DEMO / "kkl_observer.js", tmp_path / "kkl_observer.mjs")
     done = subprocess.run(["node", "--input-type=module", "-e", REFUSED], cwd=tmp_path, capture_output=True, text=True)

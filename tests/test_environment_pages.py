@@ -1,4 +1,4 @@
-"""The pages of the four environments have the boxes, bounds and parameters of the systems."""
+"""The pages of the four environments show the boxes, bounds and parameters of the systems."""
 
 import re
 from pathlib import Path

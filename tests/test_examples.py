@@ -1,4 +1,4 @@
-"""The examples, and what docs/guides/your_system.md says of a system of one's own."""
+"""The examples, and the commands and code of docs/guides/your_system.md."""
 
 import re
 import runpy
@@ -72,7 +72,7 @@ def test_own_task(tmp_path):
     assert 50 < found["x_hat"] < 2000
 
 
-# What makes each of the commands for a system of one's own a matter of seconds.
+# Options with which each command for a user's system takes seconds.
 SMALL = {
     "diagnose": "",
     "train": "--set trajectories=20 duration=5 samples=20 width=4 batch=64 inverse_steps=9 runs=100",
@@ -86,7 +86,7 @@ SMALL = {
 
 
 def do(line, more=MappingProxyType({})):
-    """Run a command line of a page, made small; returns the command's name."""
+    """Run a command line of a page with small sizes; return the command's name."""
     words = line.partition("#")[0].split()
     research = words[:3] == ["python", "-m", "examples.research"]
     assert research or words[0] == "kkl-gym"
@@ -108,7 +108,7 @@ def test_the_system_on_the_page_is_that_of_the_example():
 
 
 @pytest.mark.slow
-def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
+def test_the_page_on_your_system(tmp_path, capsys, monkeypatch):
     shutil.copytree(EXAMPLES, tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     own, agent, registered = re.findall(r"```python\n(.*?)```", USED, re.DOTALL)
@@ -141,7 +141,7 @@ def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
+def test_the_page_on_unstable_plants(tmp_path, capsys, monkeypatch):
     shutil.copytree(EXAMPLES, tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     (commands,) = re.findall(r"```sh\n(.*?)```", OTHER_PLANTS, re.DOTALL)
@@ -156,7 +156,7 @@ def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
 def test_cart_pole(tmp_path, capsys):
     errors = example("cart_pole")(inverse_steps=1000, trajectories=200, out=tmp_path)
     assert (errors < 0.15).all()
-    assert "after 10 s" in capsys.readouterr().out  # and so it has not fallen
+    assert "after 10 s" in capsys.readouterr().out  # the pole has not fallen
 
 
 @pytest.mark.slow
@@ -169,7 +169,7 @@ def test_circle_pendulum(tmp_path):
 def test_adaptation(tmp_path, capsys):
     sizes = {"records": 6, "seconds": 12.0, "inverse_steps": 40, "trajectories": 40}
     found = example("adaptation")("van_der_pol", noise=0.1, **sizes, out=tmp_path)
-    assert abs(found.parameters["mu"]) < 1.0  # from 9 % off
+    assert abs(found.parameters["mu"]) < 1.0  # % off; the guess is 9 % off
     assert found.trained < found.adapted < found.shipped
     assert "% off" in capsys.readouterr().out
 
@@ -179,13 +179,13 @@ def test_from_csv(tmp_path, capsys):
     sizes = {"seconds": 4.0, "inverse_steps": 400, "trajectories": 60}
     mu, with_estimate, with_state = example("from_csv")(**sizes, out=tmp_path)
     assert abs(mu - 3.3) < 0.4
-    assert with_state < with_estimate < 0.3  # 0.38 without control
+    assert with_state < with_estimate < 0.3  # without control: 0.38
     assert (tmp_path / "record-0.csv").read_text().startswith("t,u,y\n")
     assert "with x_hat" in capsys.readouterr().out
 
 
 def test_memory(capsys):
-    """What it prints is what it returns, and all is seeded; to learn something takes longer."""
+    """The example prints the returns, and all randomness is seeded; a useful training would take longer."""
     sizes = {"steps": 150, "episodes": 2}
     returns = example("memory")(**sizes)
     printed = re.findall(r"(.*): mean return (-\d+) ± ", capsys.readouterr().out)
@@ -196,4 +196,4 @@ def test_memory(capsys):
 
 def test_sb3_agent():
     reward = example("sb3_agent")(num_envs=2, steps=256)
-    assert example("sb3_agent")(num_envs=2, steps=256) == reward  # everything random is seeded
+    assert example("sb3_agent")(num_envs=2, steps=256) == reward  # all randomness is seeded

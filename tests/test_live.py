@@ -1,4 +1,4 @@
-"""``examples/live.py``: what its window shows, on a canvas in memory."""
+"""``examples/live.py``, drawn on a canvas in memory."""
 
 import linear_system
 import matplotlib
@@ -19,7 +19,7 @@ def live_of(system, observer=None, noise=None):
 
 
 def drawn(live, figure):
-    """The pixels of the figure with what moves on it, and what is written of the score."""
+    """The pixels of the figure with its moving artists, and the text of the score."""
     figure.draw_without_rendering()
     score = live.draw()[-1].get_text()
     for artist in live.artists:
@@ -43,7 +43,7 @@ def test_frames_follow_the_motion():
     assert live.history[-1][3] > 1
     assert drawn(live, figure)[1].endswith("a fault?")
     live.advance(400)
-    assert len(live.history) == 1201  # twelve seconds
+    assert len(live.history) == 1201  # 12 s
 
 
 def test_keys_and_sliders():
@@ -68,7 +68,7 @@ def test_keys_and_sliders():
     assert faults == ["bias", "drop-out", "freeze", "none"]
     for _ in range(20):
         live.press("up")
-    assert live.env.observer.measurement_noise == live.sensor.level == 1.0  # where the map knows no more
+    assert live.env.observer.measurement_noise == live.sensor.level == 1.0  # the map's largest level
     live.press("n")
     assert len(live.history) == 1
     live.press("q")
@@ -79,7 +79,7 @@ class Slow(linear_system.Oscillator):
     name, dt = "slow", 1.0
 
 
-def test_slow_systems_of_ones_own_move_at_the_pace_of_those_that_ship(saved):
+def test_slow_user_systems_move_at_the_pace_of_shipped_systems(saved):
     own = f"{__file__}:Slow"
     live, figure = live_of(own, saved(system=own, dt=1.0))
     assert (live.clock, live.seconds) == (0.01, 1200.0)

@@ -1,4 +1,4 @@
-"""What the pages show works: code runs, commands, options and names exist, links lead somewhere."""
+"""Checks of the pages: code runs, commands, options and names exist, and links have targets."""
 
 import ast
 import importlib
@@ -19,7 +19,7 @@ from examples.research.__main__ import COMMANDS as OF_RESEARCH
 from training.cli import COMMANDS, EXTRAS, read
 
 RESEARCH = "python -m examples.research"
-# Commands of others, which are taken on trust.
+# Commands of other projects, which the tests do not check.
 OF_OTHERS = {"cc", "cd", "cp", "printf", "sleep", "srun", "./van_der_pol"}
 
 
@@ -30,7 +30,7 @@ def own(page):
 
 @pytest.fixture
 def playground(tmp_path, monkeypatch):
-    """A folder in which blocks of code run, with the examples; agents learn, and people play, for a few steps only."""
+    """A folder with the examples for blocks of code; training of agents and interactive play take a few steps only."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     from sb3_contrib import RecurrentPPO
@@ -38,7 +38,7 @@ def playground(tmp_path, monkeypatch):
 
     def briefly(learn):
         def few_steps(agent, total_timesteps, *rest, **more):
-            agent.n_epochs = 1  # which off-policy agents have not, and do not ask for
+            agent.n_epochs = 1  # off-policy agents ignore this attribute
             return learn(agent, 2, *rest, **more)
 
         return few_steps
@@ -68,10 +68,10 @@ def numbers(text):
 
 
 def run(blocks, page):
-    """Run blocks one after the other, in one namespace."""
+    """Run blocks in order in one namespace."""
     module = types.ModuleType("__main__")
     for block in blocks:
-        for code in (block.said.get("first", ""), block.small):
+        for code in (block.comments.get("first", ""), block.small):
             try:
                 exec(compile(code, f"<a block of {name(page)}>", "exec"), module.__dict__)
             except ModuleNotFoundError as error:
@@ -82,15 +82,15 @@ def run(blocks, page):
 
 @pytest.mark.parametrize("page", [page for page in PAGES if own(page)], ids=name)
 def test_code_runs(page, playground, capsys):
-    """All blocks of a page in one namespace, but for those that train, of which the names are looked up."""
+    """Run all blocks of a page in one namespace; for blocks that train, only look up their names."""
     run([block for block in own(page) if not block.needs_training], page)
     printed = numbers(capsys.readouterr().out)
     for block in Page(page).blocks:
-        if "printed" in block.said:
+        if "printed" in block.comments:
             shown = numbers(block.text)
             starts = range(len(printed) - len(shown) + 1)
             furthest = [np.abs(np.subtract(printed[first:][: len(shown)], shown)).max() for first in starts]
-            assert min(furthest, default=np.inf) <= float(block.said["printed"]), f"{printed} was printed"
+            assert min(furthest, default=np.inf) <= float(block.comments["printed"]), f"{printed} was printed"
     for block in own(page):
         if block.needs_training:
             look_up(block)
@@ -103,7 +103,7 @@ def test_code_that_trains_runs(page, playground):
 
 
 def look_up(block):
-    """Find what a block imports, the attributes of modules that it names, and the arguments by which it calls them."""
+    """Check that a block's imports, attributes of modules and keyword arguments exist, without running the block."""
     tree = ast.parse(block.text)
     known = {package: importlib.import_module(package) for package in ("kkl_gym", "observers", "training")}
     for node in ast.walk(tree):
@@ -126,14 +126,14 @@ def look_up(block):
                 assert given <= {one.name for one in accepted}, f"{name(block.page)}: {ast.unparse(node)}"
 
 
-def test_what_others_run_they_run():
+def test_pages_with_their_own_test_are_named_there():
     for page in PAGES:
         if test := Page(page).elsewhere:
             assert page.name in (ROOT / test).read_text(), f"{test} never names {name(page)}"
 
 
 def test_commands_exist():
-    """Every line is one that the parsers take; nothing is run."""
+    """The parsers accept every command line; no command runs."""
     lines = {tuple(words): page for page in PAGES for words in Page(page).commands}
     makefile = (ROOT / "Makefile").read_text()
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
@@ -163,7 +163,7 @@ def test_commands_exist():
 
 
 def test_commands_in_sentences_exist():
-    """There a command may lack what it needs, but has no option that there is not."""
+    """In sentences, commands may lack required arguments, but must not have unknown options."""
     sections = runpy.run_path(str(ROOT / "docs" / "site" / "commands.py"))["sections"]
     written = "\n".join([*sections("kkl-gym", COMMANDS), *sections(RESEARCH, OF_RESEARCH)])
     parts = re.split(r"^##+ `(.*)`$", written, flags=re.MULTILINE)[1:]
@@ -171,14 +171,14 @@ def test_commands_in_sentences_exist():
     for page in PAGES:
         for prog, shown in re.findall(rf"`(?:\w+=\w+ )?(kkl-gym|{RESEARCH})\s([^`]*)`", Page(page).prose):
             words = re.match(r"agent [a-z]+|[a-z][\w-]*|", shown)[0]
-            if words:  # and not an option of all, or a word in the place of any command
+            if words:  # else a global option, or a placeholder for a command
                 where = f"{name(page)}: {prog} {shown}"
                 assert f"{prog} {words}" in options, where
                 assert set(re.findall(r"(?<!\S)--[\w-]+", shown)) - {"--help"} <= options[f"{prog} {words}"], where
 
 
-def stands_for_something(dotted):
-    """Whether a module, what it defines, or a field of a class has this name."""
+def exists(dotted):
+    """Whether a dotted name is that of a module, of a definition in a module, or of a field of a class."""
     owner, _, field = dotted.rpartition(".")
     try:
         resolve_name(dotted)
@@ -190,19 +190,19 @@ def stands_for_something(dotted):
 
 
 def test_names_in_sentences_exist():
-    """Of files and folders, ``training/kalman.py:ExtendedKalmanFilter``, and ``observers.Artifact.read``."""
+    """Names of files and folders, such as ``training/kalman.py:ExtendedKalmanFilter``, and dotted names."""
     ours = r"(?:examples|kkl_gym|observers|tests|training)"
     for page in (page for page in PAGES if not Page(page).elsewhere):
         shown = re.findall(r"`([^`\n]+)`", Page(page).prose)
         for path, _, inside in (one.partition(":") for one in shown if re.match(rf"{ours}/[\w/]*(/|\.py)(:|$)", one)):
             assert (ROOT / path).exists(), f"{name(page)}: {path}"
             dotted = ".".join([*path.removesuffix(".py").split("/"), inside])
-            assert not inside or stands_for_something(dotted), f"{name(page)}: {path}:{inside}"
+            assert not inside or exists(dotted), f"{name(page)}: {path}:{inside}"
         for one in filter(None, (re.match(rf"{ours}(\.[A-Za-z_]\w*)+(?=$|\()", one) for one in shown)):
-            assert stands_for_something(one[0]), f"{name(page)}: {one[0]}"
+            assert exists(one[0]), f"{name(page)}: {one[0]}"
 
 
-def test_links_lead_somewhere():
+def test_targets_of_links_exist():
     for page in PAGES:
         text = re.sub(r"`[^`\n]*`", "", Page(page).prose)
         links = re.findall(r"\]\(([^)\s]+)\)|\b(?:href|src|srcset)=\"([^\"]+)\"", text)
@@ -227,7 +227,7 @@ NO_PROSE = {
 
 
 def sentences(text):
-    """Those of paragraphs and list items."""
+    """Yield the sentences of paragraphs and list items."""
     for pattern, instead in NO_PROSE.items():
         text = re.sub(pattern, instead, text, flags=re.DOTALL | re.MULTILINE)
     for block in re.split(r"\n\s*\n", text):
@@ -247,7 +247,7 @@ def test_no_sentence_has_more_than_35_words():
     found = ["One link, by Wu et al. 2023, e.g. code!", "Two.", "An *item.", "And more"]
     assert list(filter(None, sentences(page))) == found
     for page in PAGES:
-        if page.name not in {"table.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"}:  # commands write tables
+        if page.name not in {"table.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"}:  # commands write table.md
             for sentence in sentences(Page(page).text):
                 words = [word for word in sentence.split() if any(map(str.isalnum, word))]
                 assert len(words) <= 35, f"{name(page)}: {sentence}"

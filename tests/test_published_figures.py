@@ -1,4 +1,4 @@
-"""Figures on pages are those of the files in docs/results."""
+"""Numbers on the pages are those of the files in docs/results."""
 
 from functools import cache
 from pathlib import Path
@@ -27,7 +27,7 @@ def row(title, cells):
 
 
 def text(value):
-    """Three digits, and never more than two behind the point, as the tables have them."""
+    """Format a number as in the tables: three digits, at most two decimals."""
     return f"{value:.2f}" if value < 10 else f"{value:.1f}"
 
 
@@ -36,7 +36,7 @@ def from_to(shares):
 
 
 def of_evaluation(file, kind, column, starts, driven, noise):
-    """Medians by system over the runs of a condition. Rows of a Kalman filter follow those of the system's observer."""
+    """Median of a column by system, over the runs of a condition; rows without a system belong to the one above."""
     rows = results(file)
     systems = rows.observer.str.extract(f"^({'|'.join(SYSTEMS)})")[0].ffill()
     rows = rows[(rows.starts == starts) & (rows.driven == driven) & (rows.measurement_noise == noise)]
@@ -49,7 +49,7 @@ def of_evaluation(file, kind, column, starts, driven, noise):
 
 
 def of_benchmark():
-    """Medians of starts in X, by system, method and level of noise."""
+    """Median SMAPE for starts in X, by system, method and noise level."""
     rows = results("benchmark/results")
     return rows[rows.starts == "X"].groupby(["system", "method", "noise"]).smape.median()
 
@@ -74,7 +74,7 @@ CONDITIONS = [
 
 
 def of_all(kind, column, condition):
-    """Cells of the default observers, of T_inv alone, and of the Kalman filter, which ran on accuracy alone."""
+    """Cells: default observer / T_inv alone / Kalman filter, which only the accuracy runs have."""
     columns = [
         of_evaluation(f"tracking/{kind}", "", column, *condition),
         of_evaluation(ALONE[kind], "T_inv alone", column, *condition),
@@ -133,7 +133,7 @@ def test_the_page_on_agents_has_the_commands_table():
 
 
 def calibration(system, starts, driven, span):
-    """Rows of the default map's calibration by level of noise."""
+    """Rows of the default map's calibration, one for each noise level."""
     rows = results(f"tracking/{system}")
     return rows[(rows.starts == starts) & (rows.driven == driven) & (rows.span == span)]
 
@@ -154,7 +154,7 @@ def test_coverage_and_nees():
     ) in page(ACCURACY)
 
 
-def test_the_benchmark_has_what_ships():
+def test_the_benchmark_has_the_shipped_observers():
     benchmark, medians = page("docs/results/benchmark.md"), of_benchmark()
     for title, method in (
         ("the same, as shipped (`NAME-large`)", "shipped-large"),
@@ -164,7 +164,7 @@ def test_the_benchmark_has_what_ships():
         assert row(title, cells) in benchmark
 
 
-def test_what_is_said_of_tuned_kalman_filters():
+def test_ratios_to_tuned_kalman_filters():
     medians = of_benchmark().unstack("method")
     ratios = {
         (rival, noise): from_to((medians["shipped"] / medians[rival]).xs(noise, level="noise"))

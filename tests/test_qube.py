@@ -1,4 +1,4 @@
-"""examples/qube.py: on runs of its own model, and on the device's where they lie."""
+"""examples/qube.py on simulated runs, and on the measured runs where these are available."""
 
 import os
 import runpy
@@ -11,7 +11,7 @@ import pytest
 from kkl_gym.simulate import simulate
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-sys.path.insert(0, str(EXAMPLES))  # as `python examples/qube.py` has it
+sys.path.insert(0, str(EXAMPLES))  # as with `python examples/qube.py`
 QUBE = runpy.run_path(str(EXAMPLES / "qube.py"))
 sys.path.remove(str(EXAMPLES))
 
@@ -19,7 +19,7 @@ sys.path.remove(str(EXAMPLES))
 def energy(model, x):
     alpha, arm, pendulum = x.T[1:4]
     half = model.pendulum_length / 2
-    tip = model.arm_length * arm - half * np.cos(alpha) * pendulum  # its middle, along the circle
+    tip = model.arm_length * arm - half * np.cos(alpha) * pendulum  # velocity of the pendulum's middle along the circle
     around = half * np.sin(alpha) * arm
     up = half * np.sin(alpha) * pendulum
     own = model.pendulum_mass * model.pendulum_length**2 / 12 * (pendulum**2 + (np.sin(alpha) * arm) ** 2)
@@ -42,7 +42,7 @@ MODEL = QUBE["BothAngles"](
 
 
 def write_runs(folder, model):
-    """Runs of a model, in files as the device's."""
+    """Write simulated runs of a model as files in the format of the measured runs."""
     rng = np.random.default_rng(0)
     runs = range(1, 13)
     x0 = np.stack([np.zeros(12), rng.uniform(1, 5, 12), rng.uniform(-2, 2, 12), rng.uniform(-5, 5, 12)], -1)
@@ -59,7 +59,7 @@ def write_runs(folder, model):
 def test_dry_friction_holds_the_arm_and_the_spring_turns_it():
     at_rest = np.array([[0.02, np.pi, 0.0, 0.0]])
     held = simulate(QUBE["Qube"](arm_friction=2e-4, arm_spring=5e-4), at_rest, 250, 0.004)[-1, 0]
-    assert held[0] == pytest.approx(0.02, abs=0.006)  # smooth friction creeps
+    assert held[0] == pytest.approx(0.02, abs=0.006)  # the smoothed friction lets the arm creep
     turned = simulate(QUBE["Qube"](arm_spring=5e-4), at_rest, 250, 0.004)[-1, 0]
     assert turned[0] < 0.01
 
@@ -90,14 +90,14 @@ def test_parameters_are_found_again(tmp_path, model, guess):
 
 
 @pytest.mark.slow
-def test_a_filter_that_is_started_remembers_and_is_taken_back(tmp_path, monkeypatch):
-    """From estimates that are opposite at first, and later off by 0.3 rad, which is no reason."""
+def test_the_guided_filter_restarts_after_a_wrong_start_and_ignores_small_offsets(tmp_path, monkeypatch):
+    """The guiding estimates are opposite at first, which restarts the filter, and later off by 0.3 rad."""
     write_runs(tmp_path, STICKS)
     records = QUBE["read"](tmp_path, (1, 2, 3))
     truth = {record.name: record.x for record in records}
     wrong, blind, c, s = round(0.5 / 0.004), round(1.6 / 0.004), np.cos(0.3), np.sin(0.3)
 
-    def said(observer, record):
+    def guiding(observer, record):
         x = truth[record.name].copy()
         x[:wrong, :2] *= -1.0
         cosine, sine = x[blind:, :2].T
@@ -105,7 +105,7 @@ def test_a_filter_that_is_started_remembers_and_is_taken_back(tmp_path, monkeypa
         x[blind:, 2:] = 0.0
         return x
 
-    monkeypatch.setitem(QUBE["guided"].__globals__, "estimates", said)
+    monkeypatch.setitem(QUBE["guided"].__globals__, "estimates", guiding)
     found = QUBE["guided"](None, STICKS, 0.0, records)
     for x_hat, record in zip(found, records, strict=True):
         assert x_hat.shape == record.x.shape
@@ -129,7 +129,7 @@ def test_on_runs_of_its_own_model(tmp_path, capsys, monkeypatch):
         assert np.isfinite(found[name]).all()
     assert not np.allclose(found[QUBE["ALONE"]], found[QUBE["BOTH"]])
     of_filters = [found[f"extended Kalman filter, {kind} model"] for kind in ("published", "fitted")]
-    assert (of_filters[0] < 0.6).all()  # of the model that made the runs
+    assert (of_filters[0] < 0.6).all()  # the model that simulated the runs
     assert np.isfinite(of_filters[1]).all()
     assert not np.allclose(*of_filters)
     assert found["finite differences"][3] < 0.01

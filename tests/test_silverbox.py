@@ -1,4 +1,4 @@
-"""The Silverbox example: its model of the input between samples, and, where the data lie, the whole of it."""
+"""The Silverbox example: the model of the input between samples, and the whole example where the data are available."""
 
 import os
 import runpy
@@ -9,7 +9,7 @@ import pytest
 
 from kkl_gym.simulate import simulate
 
-DATA = "KKL_GYM_SILVERBOX"  # SNLS80mV.csv, which is not part of the project
+DATA = "KKL_GYM_SILVERBOX"  # path of SNLS80mV.csv, which is not in the repository
 MODULE = runpy.run_path(str(Path(__file__).parent.parent / "examples" / "silverbox.py"))
 
 
@@ -32,7 +32,7 @@ def test_three_samples_act_as_a_smooth_input():
     smooth = error(before=-1 / 6, after=1 / 3)
     assert smooth < 0.01 * np.std(x[:, 0, 0])
     assert error() > 20 * smooth
-    assert error(after=0.5) > 2 * smooth  # the mean of the interval's ends
+    assert error(after=0.5) > 2 * smooth  # linear interpolation
 
 
 def test_a_file_of_another_length_is_refused(tmp_path):
@@ -43,9 +43,9 @@ def test_a_file_of_another_length_is_refused(tmp_path):
             MODULE["read"](path)
 
 
-@pytest.mark.skipif(DATA not in os.environ, reason=f"{DATA} does not say where SNLS80mV.csv lies")
+@pytest.mark.skipif(DATA not in os.environ, reason=f"{DATA} is not set to the path of SNLS80mV.csv")
 def test_ahead_of_published_errors_on_the_measured_data(tmp_path, capsys):
     errors = MODULE["main"](Path(os.environ[DATA]), out=tmp_path)
     assert (np.array(errors) < MODULE["PUBLISHED"]["NARX (SysIdentPy)"]).all()
-    assert "extrapolation" in capsys.readouterr().out  # a narrow terminal breaks the line before it
+    assert "extrapolation" in capsys.readouterr().out  # a narrow terminal wraps the line before this word
     assert (tmp_path / "silverbox.png").stat().st_size > 10_000

@@ -1,4 +1,4 @@
-"""The site: its reference is whole and new, and its links hold where GitHub's do. `make docs` builds it."""
+"""The site, which `make docs` builds: the reference is complete and up to date, and links work as on GitHub."""
 
 import ast
 import re
@@ -19,7 +19,7 @@ REPOSITORY = "https://host/repository"
 HOOKS = runpy.run_path(str(DOCS / "site" / "hooks.py"))
 
 
-def test_the_page_of_commands_is_new():
+def test_the_page_of_commands_is_up_to_date():
     page = runpy.run_path(str(DOCS / "site" / "commands.py"))["page"]()
     assert page == (DOCS / "reference" / "commands.md").read_text(), "make docs writes the page"
     width = "fast 20, paper 512; spinn: fast 128, paper 512; records: 96 |\n"
@@ -88,7 +88,7 @@ def test_notebooks_are_pages():
 
 
 @pytest.mark.parametrize("path", HOOKS["NOTEBOOKS"], ids=lambda path: path.stem)
-def test_notebooks_are_whole_without_outputs_and_find_what_they_import(path):
+def test_notebooks_are_valid_without_outputs_and_their_imports_work(path):
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     for page in (DOCS / "start" / "notebooks.md", ROOT / "examples" / "README.md"):

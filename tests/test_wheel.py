@@ -1,4 +1,4 @@
-"""The wheel in an environment with nothing but what it asks for."""
+"""The wheel, installed in an environment with its dependencies only."""
 
 import os
 import re
@@ -55,7 +55,7 @@ def pip(*arguments):
 
 
 def made(folder):
-    """The folder of commands of an environment in which the wheel is installed."""
+    """Install the wheel in a new environment; return the folder of the environment's commands."""
     reached = pip("download", "--retries", "1", "--no-deps", "--dest", folder, *PROJECT["build-system"]["requires"])
     if reached.returncode:
         pytest.skip(f"no package index: {reached.stderr.strip().splitlines()[-1]}")
@@ -70,7 +70,7 @@ def made(folder):
 
 
 def test_the_wheel_without_extras(tmp_path):
-    """One test, so that processes which share the work do not each build the wheel."""
+    """One test, so that only one of several test processes builds the wheel."""
     commands = made(tmp_path)
     used = run(commands / "python", "-I", "-W", "error", "-c", USE)
     assert not used.returncode, used.stderr

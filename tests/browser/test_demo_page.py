@@ -1,4 +1,4 @@
-"""The demo in the browser: it is built, served from this machine, and run in headless Chromium."""
+"""The demo in the browser: the tests build the page, serve it from this machine and run it in headless Chromium."""
 
 import functools
 import http.server
@@ -67,7 +67,7 @@ def browser():
 
 @pytest.fixture
 def page(browser, address):
-    """The page, under which nothing may be asked of other hosts or go to the console as an error."""
+    """The page; a request to another host or an error in the console fails the test."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     opened, asked, complaints = context.new_page(), [], []
     opened.on("request", lambda request: asked.append(request.url))

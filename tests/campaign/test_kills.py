@@ -1,6 +1,6 @@
-"""Commands killed at random moments: nothing is damaged, and no more than a checkpoint interval is done again.
+"""Commands killed at random moments: no file is damaged, and at most one checkpoint interval of work is repeated.
 
-KILLS says how many kills there are; without it a hundred. One in five is an interruption, Ctrl-C.
+The environment variable KILLS sets the number of kills, 100 by default. One in five is an interruption, Ctrl-C.
 """
 
 import json
@@ -28,10 +28,10 @@ from training.run import CHECKPOINT, LOG_EVERY, load_checkpoint
 pytestmark = pytest.mark.long
 
 KILLS = int(os.environ.get("KILLS", "100"))
-INTERRUPTIONS = 0.2  # of the kills
+INTERRUPTIONS = 0.2  # share of the kills
 ROOT = Path(__file__).parents[2]
 
-# The command line with a checkpoint whenever there may be one, and a byte in a journal for each batch of a training of
+# The command line with a checkpoint as often as possible, and a byte in a journal for each batch of a training of
 # maps, or for each step of the environments on which an agent learns.
 COMMAND = """
 import os, sys
@@ -65,7 +65,7 @@ training.cli.main(arguments)
 
 
 class Train:
-    """A command, what of its work has been kept at any time, and what must be the same as without kills."""
+    """A command, the work that its checkpoints keep, and the results that kills must not change."""
 
     interval = LOG_EVERY  # batches between two checkpoints
 
@@ -74,7 +74,7 @@ class Train:
         return ["train", "van_der_pol", *sizes.split(), "--resume", "--out", str(out)]
 
     def kept(self, out):
-        """Units of work that need not be done again; raises ValueError if a file is damaged."""
+        """Return the units of work that a checkpoint keeps; raise ValueError if a file is damaged."""
         for path in out.glob("van_der_pol.safetensors"):
             Artifact.read(path)
         for path in out.glob("config.json"):
@@ -90,9 +90,9 @@ class Train:
 
 
 class TrainAgent:
-    """The same of an agent; those that went on are others, of the same training."""
+    """The training of an agent, compared by its metadata: a resumed agent differs from an uninterrupted one."""
 
-    interval = 32  # steps of its environments
+    interval = 32  # steps of the environments between two checkpoints
 
     def arguments(self, out):
         timesteps = str(4 * 256 * self.interval)
@@ -114,7 +114,7 @@ class TrainAgent:
 
 
 def run(scenario, out, journal, signal_number=None, after=None):
-    """Start the command and kill it; returns whether it was, the work that it did, and what it said."""
+    """Start the command and kill it; return whether it was killed, the work that it did, and its messages."""
     with subprocess.Popen(
         [sys.executable, "-c", COMMAND, str(journal), *scenario.arguments(out)],
         cwd=out.parent,
@@ -124,23 +124,23 @@ def run(scenario, out, journal, signal_number=None, after=None):
         text=True,
     ) as process:
         while signal_number == signal.SIGINT and process.poll() is None and not journal.exists():
-            time.sleep(0.01)  # what Python itself says of an interruption at its beginning is not ours
+            time.sleep(0.01)  # an interruption while Python starts prints Python's own traceback
         try:
-            _, said = process.communicate(timeout=after)
+            _, messages = process.communicate(timeout=after)
         except subprocess.TimeoutExpired:
             process.send_signal(signal_number)
-            _, said = process.communicate(timeout=120.0)
+            _, messages = process.communicate(timeout=120.0)
     killed = process.returncode != 0
-    assert not killed or (signal_number and process.returncode in (-signal_number, 128 + signal_number)), said
-    if signal_number == signal.SIGINT and not said:  # all is done, and Python was on its way out
+    assert not killed or (signal_number and process.returncode in (-signal_number, 128 + signal_number)), messages
+    if signal_number == signal.SIGINT and not messages:  # the work was done, and Python was shutting down
         killed = False
-    return killed, journal.stat().st_size if journal.exists() else 0, said
+    return killed, journal.stat().st_size if journal.exists() else 0, messages
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends signals")
 @pytest.mark.parametrize("scenario", [Train(), TrainAgent()], ids=["train", "agent train"])
 def test_kills(scenario, tmp_path):
-    """Kill and resume in one folder until the command is done, and begin again in another."""
+    """Kill and resume in one folder until the command is done, then start again in another."""
     rng, counts, journals = random.Random(0), Counter(), (tmp_path / f"journal-{i}" for i in count())
     began = time.monotonic()
     run(scenario, tmp_path / "whole", next(journals))
@@ -152,18 +152,18 @@ def test_kills(scenario, tmp_path):
         number = signal.SIGINT if rng.random() < INTERRUPTIONS else signal.SIGKILL
         halves = set(out.rglob(f"{UNFINISHED}*"))
         after = None if last else rng.uniform(0.0, seconds)
-        killed, work, said = run(scenario, out, next(journals), number, after)
+        killed, work, messages = run(scenario, out, next(journals), number, after)
         if not killed:
             assert scenario.result(out) == expected
-            if not kept:  # kills are to be anywhere in a run, on a machine as busy as it is now
+            if not kept:  # the duration of a run on this machine, for kills at any moment of a run
                 seconds = time.monotonic() - began
             counts["done"], out = counts["done"] + 1, None
             continue
         counts["kills"] += 1
         if number == signal.SIGINT:
             counts["interruptions"] += 1
-            assert re.fullmatch("kkl-gym: interrupted.*\n", said)
-            assert not set(out.rglob(f"{UNFINISHED}*")) - halves  # it leaves no temporary file
+            assert re.fullmatch("kkl-gym: interrupted.*\n", messages)
+            assert not set(out.rglob(f"{UNFINISHED}*")) - halves  # the command leaves no temporary file
         now = scenario.kept(out)
         assert kept + work - now <= scenario.interval
         kept = now

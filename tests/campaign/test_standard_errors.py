@@ -1,4 +1,4 @@
-"""Standard errors of identified parameters, against repetitions of the whole identification."""
+"""Standard errors of identified parameters, against repetitions of the identification."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Steps from twice the training boxes under bounded inputs: all that is returned is finite and within its space."""
+"""Steps from twice the training boxes under bounded inputs: all returned arrays are finite and within their spaces."""
 
 from collections import Counter
 from itertools import count, product
@@ -19,14 +19,14 @@ def twice(name):
 
 
 def actions(rng, shape):
-    """Random inputs, those at their bounds and those to be clipped."""
+    """Random inputs, inputs at their bounds, and inputs beyond the bounds, which environments clip."""
     drawn = rng.uniform(-1, 1, shape).astype(np.float32)
     kind = rng.integers(3)
     return drawn if kind == 0 else np.sign(drawn) if kind == 1 else 3 * drawn
 
 
 def check(env, obs, info):
-    """All rows of what is returned, in a few operations each."""
+    """Check the arrays that an environment returned for all rows."""
     space = getattr(env, "single_observation_space", env.observation_space)
     low, high = np.array(env.unwrapped.system.bounds).T
     assert obs.dtype == np.float32
@@ -36,7 +36,7 @@ def check(env, obs, info):
 
 
 def run(envs, steps, seed):
-    """Make some steps of every row; returns how many of them moved, and how many episodes there were."""
+    """Step every row; return the number of steps in which a row moved, and the number of episodes."""
     rng, counts, mode = np.random.default_rng(seed), Counter(), envs.metadata["autoreset_mode"]
     check(envs, *envs.reset(seed=seed))
     over = np.zeros(envs.num_envs, dtype=bool)
@@ -58,7 +58,7 @@ def run(envs, steps, seed):
 
 
 def campaign(total, rows, length):
-    """At least that many steps, shared out among all systems and CASES; returns counts by system."""
+    """Make at least `total` steps, divided among all systems and CASES; return counts by system."""
     found, seeds = {name: Counter() for name in SYSTEMS}, count()
     share = total / len(SYSTEMS) / len(CASES)
     for name, (mode, levels, observe) in product(SYSTEMS, CASES):
@@ -66,7 +66,7 @@ def campaign(total, rows, length):
             name, rows, **levels, observe=observe, start_box=twice(name), autoreset_mode=mode, max_episode_steps=length
         )
         counts = Counter()
-        while counts["steps"] < share:  # more than once where rows waited
+        while counts["steps"] < share:  # again if rows waited for a reset: waiting counts no step
             counts += run(envs, int(np.ceil((share - counts["steps"]) / rows)), next(seeds))
         found[name] += counts
     return found

@@ -1,4 +1,4 @@
-"""The table of what ran: a row for each test, kept from one virtual environment to the next."""
+"""The table of clients that ran: a row for each test, kept from one virtual environment to the next."""
 
 import json
 from importlib.metadata import version
@@ -12,20 +12,20 @@ NAMES = ("client", "version", "ran", "steps", "result", "gymnasium")
 
 @pytest.fixture
 def row(record_property):
-    """Says of a client what the table will: its name, its version, what ran, and the steps that it took."""
+    """A function that records the row of a client: its name, its version, the task that ran and its number of steps."""
 
-    def say(client, its_version, ran, steps=""):
-        said = {"client": client, "version": its_version, "ran": ran, "steps": steps, "gymnasium": version("gymnasium")}
-        for name, value in said.items():
+    def record(client, its_version, ran, steps=""):
+        row = {"client": client, "version": its_version, "ran": ran, "steps": steps, "gymnasium": version("gymnasium")}
+        for name, value in row.items():
             record_property(name, value)
 
-    return say
+    return record
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item, call):
     report = yield
-    said = dict(report.user_properties)
+    row = dict(report.user_properties)
     if call.when == "call" and item.get_closest_marker("clients"):
         if report.passed:
             result = "ok"
@@ -33,8 +33,8 @@ def pytest_runtest_makereport(item, call):
             result = f"not run: {report.longrepr[2].removeprefix('Skipped: ')}"
         else:
             result = f"failed: {str(call.excinfo.value).splitlines()[0] if str(call.excinfo.value) else call.excinfo}"
-        if said:  # else the client is of another virtual environment
-            _keep(item.nodeid, {**said, "result": result})
+        if row:  # a skipped client, of another virtual environment, records none
+            _keep(item.nodeid, {**row, "result": result})
     return report
 
 

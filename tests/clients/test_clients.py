@@ -1,4 +1,4 @@
-"""Programs of others, as they are, on our environments: `make clients` runs them in an environment of their own."""
+"""Unmodified training programs on this package's environments; `make clients` runs them in their own environment."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ ACTIONS = 1000
 
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch):
-    """The module of our id, where this process and those that it starts look for modules."""
+    """Put a module that registers our ids where this process and its child processes look for modules."""
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.setenv("PYTHONPATH", f"{ROOT / 'examples'}:{ROOT}:{os.environ.get('PYTHONPATH', '')}")
 
@@ -38,8 +38,8 @@ def output_of(*command, cwd):
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
 @pytest.mark.parametrize("env_id", ENV_IDS.values())
 def test_rl_zoo3(algorithm, env_id, row, tmp_path, monkeypatch):
-    """Our settings as they are, for one rollout of PPO or a few hundred updates of SAC."""
-    if find_spec("rl_zoo3") is None:  # which, imported, changes Gymnasium's TimeLimit for all that follows
+    """The package's own settings, for one rollout of PPO or a few hundred updates of SAC."""
+    if find_spec("rl_zoo3") is None:  # not imported here: importing rl_zoo3 replaces Gymnasium's TimeLimit
         pytest.skip("rl_zoo3 is not installed")
     from stable_baselines3 import PPO, SAC
 
@@ -52,20 +52,20 @@ def test_rl_zoo3(algorithm, env_id, row, tmp_path, monkeypatch):
     command = f"-m rl_zoo3.train --algo {algorithm} --env {env_id} --gym-packages kkl_gym --eval-freq -1 -f {tmp_path}"
     printed = output_of(*command.split(), "--conf-file", settings, "-n", str(steps), "--device", "cpu", cwd=tmp_path)
     assert "training.agents.OnTask" in printed
-    for module in (gym.wrappers, gym.wrappers.common):  # as they were, once this is over
+    for module in (gym.wrappers, gym.wrappers.common):  # restored after this test
         monkeypatch.setattr(module, "TimeLimit", module.TimeLimit)
     made = PPO if algorithm == "ppo" else SAC
     agent = made.load(tmp_path / algorithm / f"{env_id}_1" / f"{env_id}.zip", device="cpu")
     assert agent.num_timesteps == steps
     name = next(name for name in ENV_IDS if ENV_IDS[name] == env_id)
     path = tmp_path / algorithm / f"{env_id}_1" / f"{env_id}.zip"
-    ours = from_sb3(path, TASKS[name])  # that it fits, among other things
+    ours = from_sb3(path, TASKS[name])  # raises an error if the agent does not fit the task
     obs = np.random.default_rng(0).normal(size=(20, ours.inputs)).astype(np.float32)
     actions = ours.policy(agent.action_space)(obs)
     np.testing.assert_allclose(actions, agent.predict(obs, deterministic=True)[0], atol=1e-5)
 
 
-# Gymnasium 1 asks for an argument that files of CleanRL leave out, also on Gymnasium's own environments.
+# Gymnasium 1 requires an argument that CleanRL's scripts omit; they fail on Gymnasium's own environments too.
 WITH_DEFAULT = """
 import runpy, sys
 from gymnasium.wrappers import TransformObservation
@@ -76,7 +76,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 
 def test_cleanrl(row, tmp_path):
-    """Any single file that takes --env-id and --total-timesteps; CleanRL's own have no package for Python 3.11."""
+    """Any script that takes --env-id and --total-timesteps; CleanRL's own scripts have no package for Python 3.11."""
     pytest.importorskip("tensorboard")
     pytest.importorskip("tyro")
     path = os.environ.get("CLEANRL", "")

@@ -1,4 +1,4 @@
-"""Dask and Ray: systems that a notebook defines reach their workers by value."""
+"""Dask and Ray: workers get systems that a notebook defines by value."""
 
 import gymnasium as gym
 import pytest
@@ -26,7 +26,7 @@ def on_ray():
 
 
 @pytest.mark.parametrize("cluster", ["on_dask", "on_ray"])
-def test_workers_play_what_a_notebook_defines(cluster, request):
+def test_workers_run_systems_that_a_notebook_defines(cluster, request):
     def start(system):
         return gym.make("kkl_gym:kkl_gym/Own-v0", system=system).reset(seed=0)[0].tolist()
 

@@ -1,4 +1,4 @@
-"""The code in docs/guides/clients.md, each block where what it imports is installed."""
+"""The code in docs/guides/clients.md; a block runs only where the packages that it imports are installed."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""RLlib, which pins Gymnasium, in an environment of its own: `make clients` runs it."""
+"""RLlib, which pins Gymnasium: `make clients` runs this test in an environment of its own."""
 
 import runpy
 from importlib.metadata import version

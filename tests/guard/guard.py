@@ -1,8 +1,8 @@
-"""What must not change while the code does: estimates, errors, trainings, dynamics, names.
+"""Regression guard: stored estimates, errors, trainings, dynamics, arrays and public names.
 
-``python tests/guard/guard.py`` measures all of it and compares it with the files beside this one; ``make test`` does so
-for the parts that take seconds. If a change is meant to move digits, renew the part in a commit of its own, which says
-why: ``python tests/guard/guard.py --renew estimates``.
+``python tests/guard/guard.py`` measures all parts and compares them with the files in this folder; ``make test``
+compares the parts that take seconds. If a change is meant to move digits, renew the part in a separate commit
+whose message gives the reason: ``python tests/guard/guard.py --renew estimates``.
 """
 
 import argparse
@@ -27,15 +27,15 @@ VARIANTS = ("", "-large", "-spinn")
 NOISE = 0.5
 DT = 0.01
 EVERY = 40  # number of samples between two stored estimates
-# Estimates come from networks of float32, whose rounding differs between processors: 1e-5 of the widths of X.
-# Equations are in float64, and these runs are short enough for chaos not to matter.
+# Largest differences in widths of X. Estimates come from float32 networks, whose rounding differs between processors.
+# Dynamics are in float64; the runs are too short for chaos to amplify rounding.
 CLOSE = {"estimates": 1e-5, "dynamics": 1e-9}
-SAME_ERROR = 0.02  # relative tolerance of medians of errors: chaos amplifies the rounding of other processors
-SHORT_TRAINING, LUCKY = 1.15, 3.0  # a short training may err by these factors more, or less
+SAME_ERROR = 0.02  # relative tolerance of median errors: chaos amplifies the rounding of other processors
+SHORT_TRAINING, LUCKY = 1.15, 3.0  # largest factors by which a short training's error may rise and fall
 
 
 def records(system):
-    """Outputs and inputs of four kinds of motion from starts in X: clean, noisy, driven, and with missing samples."""
+    """Yield outputs and inputs of four kinds of runs from X: clean, noisy, driven, and with missing samples."""
     from kkl_gym.simulate import simulate
 
     rng = np.random.default_rng(20_000)
@@ -52,7 +52,7 @@ def records(system):
 
 
 def follow(observer, y, u):
-    """Estimates and covariances of an observer along records, every few samples."""
+    """Estimates and covariances of an observer along records, at every EVERY-th sample."""
     kept = []
     for k in range(len(y)):
         if k == 0:
@@ -81,7 +81,7 @@ def estimates():
         low, high = kkl_gym.get_system(name).box()
         for variant in VARIANTS:
             for kind in ("clean", "noisy", "driven", "missing"):
-                alone = False if variant == "-large" else None  # its T_inv, without a model
+                alone = False if variant == "-large" else None  # T_inv alone, no tracking
                 observer = observers.load(name + variant, 0.0 if kind == "clean" else NOISE, tracking=alone)
                 kept = follow(observer, held[f"{name}/{kind}/y"], held[f"{name}/{kind}/u"])
                 widths = high - low
@@ -128,7 +128,7 @@ def dynamics():
 
 
 def arrays():
-    """A digest of the arrays in every file that ships, whatever they are called there."""
+    """A digest of the arrays in every shipped file, independent of the arrays' names."""
     from safetensors.numpy import load_file
 
     folders = (
@@ -143,7 +143,7 @@ def arrays():
 
 
 def names():
-    """Everything that is public by name."""
+    """The public names of the packages, the environments, the maps and the commands."""
     import training
     import training.agents
     from training.cli import COMMANDS
@@ -157,7 +157,7 @@ def names():
 
 
 def errors():
-    """Medians of held-out errors in % over 20 s, of every map that ships: starts in X and 2X, inputs, process noise."""
+    """Median held-out errors in % over 20 s of every shipped map: starts in X and 2X, inputs, process noise."""
     from training import errors, unseen_trajectories
 
     cases = {
@@ -173,7 +173,7 @@ def errors():
             unseen = unseen_trajectories(system, DT, n=40, duration=20.0, seed=11, **motions)
             for variant in VARIANTS:
                 artifact = observers.load(name + variant).artifact
-                if variant == "-large":  # T_inv alone, without a model
+                if variant == "-large":  # no tracking
                     artifact = dataclasses.replace(artifact, motion=None)
                 if case == "driven" and not artifact.nu:
                     continue
@@ -219,7 +219,7 @@ def trainings():
 
 
 def oscillator(path, seed):
-    """Write a record of p'' = -p + u, u held over a second: time, position, force, speed."""
+    """Write a record of p'' = -p + u, where u is constant for a second at a time: time, position, force, speed."""
     rng = np.random.default_rng(seed)
     dt, steps = 0.05, 600
     c, s = np.cos(dt), np.sin(dt)
@@ -271,7 +271,7 @@ def differences(part):
 
 
 def renew(part):
-    """Keep what a part measures now."""
+    """Measure a part and store its values."""
     found = (QUICK | SLOW)[part]()
     if part in CLOSE:
         np.savez_compressed(FOLDER / f"{part}.npz", **found)
@@ -280,10 +280,9 @@ def renew(part):
 
 
 def run():
-    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(QUICK | SLOW)}; all by default")
-    parser.add_argument("--renew", action="store_true", help="keep what is measured now")
+    parser.add_argument("--renew", action="store_true", help="store the measured values")
     arguments = parser.parse_args()
     if unknown := {*arguments.parts} - {*(QUICK | SLOW)}:
         parser.error(f"unknown parts: {', '.join(sorted(unknown))}; there are {', '.join(QUICK | SLOW)}")

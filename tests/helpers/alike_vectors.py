@@ -1,22 +1,22 @@
-"""Two vector environments side by side, of which the second is Gymnasium's own of single environments."""
+"""Comparison of a vector environment with Gymnasium's own vector of single environments."""
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-# What rounding in float32 makes of values of some ten, which hangs on the size of the batch and on the processor.
-# It is that of T_inv, and of T where starts are known.
+# Tolerance for the float32 networks T_inv and T (known starts), whose values are about ten: their rounding depends on
+# the size of the batch and on the processor.
 NETWORK = 1e-4
 
 
 def assert_same(ours, theirs, at="", z=1e-9):
-    """Equal to rounding, that of z to ``z``, where ``theirs`` reports something; ours may report more."""
+    """Assert that ``ours`` holds all values of ``theirs`` to rounding, and z to the tolerance ``z``."""
     if isinstance(theirs, tuple):
         for i, (one, other) in enumerate(zip(ours, theirs, strict=True)):
             assert_same(one, other, f"{at}[{i}] ", z)
     elif isinstance(theirs, dict):
         for key, value in theirs.items():
             if not key.startswith("_"):
-                rows = theirs.get(f"_{key}", ...)  # of all, in an observation
+                rows = theirs.get(f"_{key}", ...)  # an observation has no mask: all rows
                 assert rows is ... or (ours[f"_{key}"] == rows).all(), f"{at}_{key}"
                 if key in ("final_obs", "final_info"):
                     assert_same(ours[key], value, f"{at}{key}.", z)
@@ -36,9 +36,9 @@ def assert_same(ours, theirs, at="", z=1e-9):
 
 
 def compare(ours, theirs, actions, mode, mask_at=(5,), z=1e-9, infos=None):
-    """The same calls to both; some rows are reset on the way, so that episodes end at different times.
+    """Make the same calls to both and compare the results; resets of some rows make episodes end at different times.
 
-    Of ``info`` what ``infos`` names is compared, or all. Returns the steps and rows in which episodes end.
+    Of ``info`` the keys in ``infos`` are compared, or all. Returns the steps and rows in which episodes end.
     """
 
     def compared(*results, at=""):

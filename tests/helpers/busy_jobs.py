@@ -1,4 +1,4 @@
-"""Jobs for worker processes: they sleep, fail, or kill the process that they run in, and count these processes."""
+"""Jobs for worker processes: a job sleeps, fails or kills its process, and records the processes that ran it."""
 
 import os
 import signal
@@ -6,14 +6,14 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-WAIT = 120.0  # seconds, for processes that import much on a busy machine
-# By the names of jobs that raise them.
+WAIT = 120.0  # seconds: processes with many imports start slowly on a busy machine
+# Exceptions by the names of the jobs that raise them.
 ERRORS = {"bad": ValueError("this one is bad"), "silent": ValueError(), "leaving": SystemExit("enough")}
 
 
 @dataclass(frozen=True)
 class Busy:
-    """A job that sleeps, after it has killed its process as often as it is to."""
+    """A job that kills its process in its first `kills` runs, and then sleeps."""
 
     name: str
     folder: Path
@@ -22,13 +22,13 @@ class Busy:
 
     @property
     def processes(self):
-        """Numbers of the processes that it has run in."""
+        """Ids of the processes that have run this job."""
         path = self.folder / self.name
         return [int(line) for line in path.read_text().split()] if path.exists() else []
 
 
 def work(job):
-    """Do a job."""
+    """Run a job; worker processes import this function."""
     with (job.folder / job.name).open("a") as file:
         file.write(f"{os.getpid()}\n")
     if job.name in ERRORS:
@@ -39,7 +39,7 @@ def work(job):
 
 
 def until(condition):
-    """Wait for something."""
+    """Wait until the condition holds, for WAIT seconds at most."""
     began = time.monotonic()
     while not condition():
         assert time.monotonic() - began < WAIT
@@ -47,7 +47,7 @@ def until(condition):
 
 
 def alive(process):
-    """Whether a process, by its number, runs (and not only waits to be buried)."""
+    """Whether a process, given by its id, runs and is no zombie."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:

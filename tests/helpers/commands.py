@@ -1,4 +1,4 @@
-"""Commands in this process."""
+"""Research commands, run in this process."""
 
 from examples.research.__main__ import COMMANDS
 from training.cli import main

@@ -13,14 +13,14 @@ needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C 
 
 
 def written(exported, folder):
-    """The path of its source, beside which its other files are."""
+    """Write the C files of an observer; return the path of the source."""
     for name, text in c_files(exported).items():
         (folder / name).write_text(text, encoding="utf-8")
     return folder / f"{exported.name}.c"
 
 
 def compiled(exported, folder, *options, main=None):
-    """The program around an exported observer, its own or another."""
+    """Compile an exported observer with its own main file or with `main`; return the path of the program."""
     program, source = folder / "program", written(exported, folder)
     command = ["cc", *WARNINGS, "-O1", *options, source, main or source.with_name(f"{exported.name}_main.c")]
     done = subprocess.run([*command, "-lm", "-o", program], capture_output=True, text=True)
@@ -33,7 +33,7 @@ def fed(program, text):
 
 
 def estimates(program, y, u):
-    """What the program prints for a record."""
+    """The estimates that the program prints for a record."""
     rows = np.concatenate([u[:-1], y[1:]], axis=-1).tolist()
     done = fed(program, "\n".join(" ".join(map(repr, row)) for row in [y[0].tolist(), *rows]) + "\n")
     assert (done.returncode, done.stderr) == (0, "")

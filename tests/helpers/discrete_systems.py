@@ -12,12 +12,12 @@ from kkl_gym import System
 
 DT = 0.02
 PHI = expm(F * DT)
-GAMMA = np.linalg.solve(F, PHI - np.eye(2)) @ [0.0, 1.0]  # what an input does that is held over a sample
+GAMMA = np.linalg.solve(F, PHI - np.eye(2)) @ [0.0, 1.0]  # effect of an input that is constant over a sample
 
 
 @dataclass(frozen=True)
 class Sampled(System):
-    """The oscillator between samples, in closed form."""
+    """The oscillator from sample to sample, in closed form."""
 
     name: ClassVar[str] = "sampled"
     X: ClassVar = Oscillator.X
@@ -37,7 +37,7 @@ class Sampled(System):
 
 @dataclass(frozen=True)
 class Turning(System):
-    """Turns by omega dt in a sample; what is measured is in other units."""
+    """A rotation by omega dt per sample; the output is x1 times a gain."""
 
     omega: float = 1.0
     gain: float = 1.0

@@ -1,4 +1,4 @@
-"""A random covariance of T_inv's error for any artifact that depends on the measurement noise."""
+"""Random covariances of T_inv's error, for artifacts that depend on the measurement noise."""
 
 from dataclasses import replace
 

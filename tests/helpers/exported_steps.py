@@ -1,4 +1,4 @@
-"""What exports are compared with: the observer's step in doubles throughout, and signals for it."""
+"""References for exported observers: KKLObserver's step in double precision, and signals for it."""
 
 import copy
 from contextlib import contextmanager
@@ -20,7 +20,7 @@ from observers.names import resolve
 from training.export.exported import Exported
 
 _ACTIVE = {"tanh": np.tanh, "silu": lambda h: h / (1 + np.exp(-h)), "relu": lambda h: h * (h > 0)}
-# Options of random_artifact that exports have to get right, with activations.
+# Options of random_artifact, and activations, for which exports are compared.
 MAPS = (
     ({"inputs": False, "noise": False, "age": False}, "relu"),
     ({"pair": True, "outputs": 2, "process": True, "free_inverse": True}, "silu"),
@@ -41,7 +41,7 @@ def _in_doubles(artifact):
 
 @cache
 def mapped(index):
-    """A map of MAPS, outputs and inputs (steps, 3, .), and estimates; no input acts in the first row."""
+    """A map of MAPS, outputs and inputs (steps, 3, .), and estimates; the inputs of the first row are zero."""
     options, activation = MAPS[index]
     artifact = random_artifact(**options)
     mlp = replace(artifact.inverse.mlp, activation=activation)
@@ -55,16 +55,16 @@ def mapped(index):
 
 @cache
 def tracked(index):
-    """An observer of KINDS, a record of which some is missing, and estimates: it is lost on the way, and inflated."""
+    """An observer of KINDS, a record with gaps, and estimates; the tracker diverges and inflates its covariance."""
     exported = _in_doubles(tracking(**KINDS[index]))
     y, u = of_floats(exported.artifact, OFF[1] + 50)
-    y[2:9] = y[700:720] = y[300::7, 0] = np.nan  # from the start on, where T_inv has learned less than it is old
+    y[2:9] = y[700:720] = y[300::7, 0] = np.nan  # gaps: right after the start, later, and in single outputs
     expected, std, taken = [], [], 0
     with doubles():
         for k, observer in enumerate(stepped(exported, y, u)):
             expected.append(observer.decode())
             std.append(observer.std)
-            if 600 <= k < 700:  # where T_inv's estimate is taken if the tracker is lost, and not otherwise
+            if 600 <= k < 700:  # after the jump, T_inv re-initialises a tracker that has diverged
                 taken += np.allclose(expected[-1], t_inv(observer), rtol=1e-9)
     assert taken > 1
     assert (np.divide(std[1:], std[:-1]).max(1)[OFF[0] :] > 2.5).any()
@@ -91,7 +91,7 @@ OPERATIONS = [
 
 
 def operated(*others):
-    """An observer that tracks by all operations of expressions, a record, and estimates."""
+    """A tracking observer whose equations use all operations of expressions, a record, and estimates."""
     artifact = tracking(by="discrete")
     steps = ["*", 0.002, ["+", *OPERATIONS, *others]]
     field = Expression([["+", ["*", 0.95, X], steps], ["+", ["*", 0.95, V], ["*", 0.05, X], steps]])
@@ -102,14 +102,14 @@ def operated(*others):
 
 
 def t_inv(observer):
-    """What T_inv alone says of the filter's state of an observer that tracks, within the bounds of the motion."""
+    """T_inv's estimate from the filter state of a tracking observer, clipped to the bounds of the motion."""
     alone, motion = copy.copy(observer), observer.artifact.motion
     alone.replace(replace(observer.artifact, motion=None))
     return np.clip(alone.decode(), motion.low, motion.high)
 
 
 def noise(artifact, steps, rows=()):
-    """Outputs and inputs that floats hold exactly; the inputs begin after a third of the steps."""
+    """Random outputs and inputs that float32 represents exactly; the inputs are zero in the first third."""
     rng = np.random.default_rng(1)
     y = rng.normal(scale=3.0, size=(steps, *rows, artifact.ny)).astype(np.float32).astype(float)
     u = rng.normal(size=(steps, *rows, artifact.nu)).astype(np.float32).astype(float)
@@ -118,9 +118,9 @@ def noise(artifact, steps, rows=()):
 
 
 def motion(artifact, steps, runs=1):
-    """The output along runs of a shipped system, end to end, under inputs that are held for a second.
+    """Outputs and inputs along concatenated runs of a shipped system, with inputs that are constant for 1 s at a time.
 
-    No input acts in the first fifth.
+    The inputs are zero in the first fifth.
     """
     system, dt, rng = kkl_gym.get_system(artifact.system), artifact.filter.dt, np.random.default_rng(2)
     length, held = -(-steps // runs), round(1.0 / dt)
@@ -139,7 +139,7 @@ def motion(artifact, steps, runs=1):
 
 
 def network(mlp, h):
-    """A network in doubles."""
+    """Evaluate a network in double precision."""
     h = h.astype(float)
     for i, (weight, bias) in enumerate(mlp.layers):
         h = (_ACTIVE[mlp.activation](h) if i else h) @ weight.astype(float) + bias
@@ -148,7 +148,7 @@ def network(mlp, h):
 
 @contextmanager
 def doubles():
-    """Makes observers compute all in doubles, as far as NumPy computes it."""
+    """Make observers compute in double precision wherever they use NumPy."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MLP, "__call__", network)
         patch.setattr(decoder, "np", SimpleNamespace(**{**vars(np), "float32": float}))
@@ -156,7 +156,7 @@ def doubles():
 
 
 def stepped(exported, y, u):
-    """The observer at each sample of a record, of which some may be missing."""
+    """Yield the observer after each sample of a record; samples may be missing."""
     levels = exported.measurement_noise, exported.process_noise
     observer = KKLObserver(exported.artifact, levels[0], process_noise=levels[1], compiled=False)
     for k, sample in enumerate(y):
@@ -168,36 +168,36 @@ def stepped(exported, y, u):
 
 
 def in_doubles(exported, y, u):
-    """Estimates along a record, (steps, ..., nx), and of parameters behind them."""
+    """Estimates along a record, (steps, ..., nx + number of estimated parameters), in double precision."""
     with doubles():
         return in_python(replace(exported, precision="float"), y, u)
 
 
 def in_python(exported, y, u):
-    """Those of KKLObserver (float), or those of :func:`in_doubles` (double)."""
+    """Estimates along a record by KKLObserver, in the precision of the export."""
     artifact = exported.artifact
     if exported.precision == "double":
         return in_doubles(exported, y, u)
     if artifact.motion is not None:
         return np.array([observer.decode() for observer in stepped(exported, y, u)])
-    if artifact.estimated_parameters:  # one map says both
+    if artifact.estimated_parameters:  # T_inv then estimates states and parameters together
         artifact = replace(artifact, parameter_ranges={}, estimated_parameters=())
     observer = KKLObserver(artifact, exported.measurement_noise, process_noise=exported.process_noise, compiled=False)
     return observer.estimate(y, u)
 
 
 def apart(exported, x_hat, expected):
-    """The largest difference of estimates, in scales."""
+    """The largest difference of estimates in units of T_inv's x_scale."""
     return (abs(x_hat - expected) / exported.artifact.inverse.x_scale).max()
 
 
 def apart_at_all_levels(name, precision, step, steps=100_000, length=5000):
-    """The largest difference that a shipped map's export makes in runs of so many samples, laid end to end.
+    """The largest difference between a shipped map's export and KKLObserver, in concatenated runs of `length` samples.
 
-    At no measurement noise, at what is usual, and at the most that the map knows of. ``step`` gives estimates for an
-    exported map, outputs and inputs.
+    Measurement noise is zero, the system's usual level and the map's largest level in turn. ``step`` returns estimates
+    for an exported map, outputs and inputs.
 
-    Returns the largest as a part of each estimate's range in the runs, and as a part of its scale.
+    Returns the difference divided by the range of the estimates in the runs, and by their scale.
     """
     artifact = Artifact.read(resolve(name))
     y, u = motion(artifact, steps, runs=-(-steps // length))

@@ -1,4 +1,4 @@
-"""Systems with kinks and jumps, and all functions of ``kkl_gym.elementary``."""
+"""Systems with kinks and jumps; together they use all functions of ``kkl_gym.elementary``."""
 
 from dataclasses import dataclass
 

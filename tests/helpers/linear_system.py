@@ -1,4 +1,4 @@
-"""A linear system on which everything is known in closed form."""
+"""A linear system with closed forms of T, T_inv and its motion."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -53,7 +53,7 @@ class TwoOutputs(Oscillator):
 
 @dataclass(frozen=True)
 class Reactor(System):
-    """The oscillator in mixed units: a temperature of 300 K, give or take 20, and 1e-3 mol/l, give or take as much."""
+    """The oscillator in mixed units: a temperature of 300 +- 20 K, and a concentration of (1 +- 1) 1e-3 mol/l."""
 
     name: ClassVar[str] = "reactor"
     state_names: ClassVar = ("T in K", "c in mol/l")
@@ -70,7 +70,7 @@ class Reactor(System):
 
 @dataclass(frozen=True)
 class TwoUnits(Oscillator):
-    """The oscillator with an output in another unit, and one that is not linear: y = [1000 x1, x1 + x2^2 / 2]."""
+    """The oscillator with an output in other units and a nonlinear output: y = [1000 x1, x1 + x2^2 / 2]."""
 
     name: ClassVar[str] = "two-units"
 
@@ -83,13 +83,13 @@ def sylvester(A, B, C=C):
     return solve_sylvester(-A, F, B @ C)
 
 
-REACTOR_OFFSET, REACTOR_SCALE = np.array([300.0, 1e-3]), np.array([20.0, 1e-3])  # of the oscillator's states in it
+REACTOR_OFFSET, REACTOR_SCALE = np.array([300.0, 1e-3]), np.array([20.0, 1e-3])  # K, mol/l
 
 
 def reactor_observer(dt=0.05, offset=0.0, gain=1.0):
-    """An artifact for the reactor, exact but for an error of the temperature and a factor on the concentration.
+    """An artifact for the reactor, exact but for an `offset` of the temperature and a `gain` of the concentration.
 
-    The filter is fed y in K: T(x) = M (x - offset) / scale in units of 20 K, and beside it what 300 K leave.
+    The filter gets y in K: T(x) = M (x - offset) / scale in units of 20 K, plus the filter's response to 300 K.
     """
     exact = exact_observer(dt)
     linear, inverse = exact.filter, exact.inverse
@@ -107,7 +107,7 @@ def reactor_observer(dt=0.05, offset=0.0, gain=1.0):
 def exact_observer(dt=0.05, C=C, name="oscillator"):
     """An artifact for the oscillator with y = C x, T(x) = M x and T_inv(z) = L z with L M = 1, exact but for float32.
 
-    L is the pseudo-inverse of M for one output; for several it is the left inverse that passes least noise on.
+    L is the pseudo-inverse of M for one output; for several it is the left inverse that amplifies noise least.
     """
     ny = len(C)
     linear = LinearFilter(np.kron(np.eye(ny), np.diag([-1.0, -2.5, -4.0])), np.kron(np.eye(ny), np.ones((3, 1))), dt)

@@ -1,4 +1,4 @@
-"""Systems as the cells of a notebook define them, which no other process can import."""
+"""Systems defined as in the cells of a notebook: no other process can import them."""
 
 from dataclasses import dataclass
 

@@ -1,6 +1,6 @@
-"""What is shown on the Markdown pages of the repository: blocks of code, command lines, links.
+"""Contents of the repository's Markdown pages: blocks of code, command lines, links.
 
-A comment above a block of Python says how it is run, where it is not run as it stands: CONTRIBUTING.md lists them.
+A comment above a block of Python changes how the tests run the block; CONTRIBUTING.md lists these comments.
 """
 
 import re
@@ -20,24 +20,22 @@ COMMENT = re.compile(r"<!--\s*(slow|small|first|printed)\b:?\s*(.*?)\s*-->", re.
 
 
 def name(page):
-    """Of a page, for people."""
+    """The path of a page relative to the repository."""
     return page.relative_to(ROOT).as_posix()
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block of code on a page."""
-
     page: Path
-    said: dict[str, str]
+    comments: dict[str, str]
     language: str
     text: str
 
     @property
     def small(self):
-        """The text with small sizes."""
+        """The code with the smaller sizes that its comment gives."""
         text = self.text
-        for change in filter(None, self.said.get("small", "").split("; ")):
+        for change in filter(None, self.comments.get("small", "").split("; ")):
             large, _, little = change.partition(" -> ")
             assert large in text, f"{name(self.page)} has no {large!r} to make small in\n{text}"
             text = text.replace(large, little)
@@ -46,29 +44,25 @@ class Block:
     @property
     def needs_training(self):
         """Whether only the slow tests run it."""
-        return "slow" in self.said
+        return "slow" in self.comments
 
 
 @dataclass(frozen=True)
 class Page:
-    """A page."""
-
     path: Path
 
     @cached_property
     def text(self):
-        """All of it."""
         return self.path.read_text(encoding="utf-8")
 
     @property
     def elsewhere(self):
-        """The test that runs its blocks, if that is not the one of the pages."""
+        """The test that runs the page's blocks, if that is not test_pages.py."""
         found = re.match(r"<!-- run by (\S+) -->", self.text)
         return found and found[1]
 
     @cached_property
     def blocks(self):
-        """All of its blocks."""
         found = [
             Block(self.path, dict(COMMENT.findall(comments)), language, text)
             for comments, language, text in BLOCK.findall(self.text)
@@ -83,13 +77,13 @@ class Page:
 
     @property
     def anchors(self):
-        """Where its titles are, as GitHub and the site name the places."""
+        """Anchors of the titles, named as GitHub and the site name them."""
         titles = re.findall(r"^#+ (.*)$", self.prose, re.MULTILINE)
         return {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
 
     @property
     def commands(self):
-        """Words of each command in the blocks for a shell, without comments."""
+        """Yield the words of each command in the shell blocks, without comments."""
         for block in self.blocks:
             if block.language == "sh":
                 for line in block.text.replace("\\\n", " ").splitlines():

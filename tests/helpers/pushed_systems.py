@@ -10,7 +10,7 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Pendulum(System):
-    """An input matrix that depends on the state; numbers of class and module; a numerical rate."""
+    """A state-dependent input matrix, constants of the class and of the module, and a numerical rate."""
 
     damping: float = 0.1
 
@@ -32,7 +32,7 @@ class Pendulum(System):
 
 
 class TwoInputs(Pendulum):
-    """A constant input matrix, and a rate in closed form."""
+    """A constant input matrix and a rate in closed form."""
 
     name = "two_inputs"
     G = ((0.0, 0.1), (1.0, 0.7))

@@ -1,4 +1,4 @@
-"""T of reverse Duffing, by integrating backward in time."""
+"""T of the reverse Duffing system, by integration backward in time."""
 
 import numpy as np
 from scipy.integrate import solve_ivp

@@ -1,4 +1,4 @@
-"""Observers with weights that nobody trained."""
+"""Observers with random weights."""
 
 from itertools import pairwise
 
@@ -28,7 +28,7 @@ def random_artifact(
     outputs=1,
     estimated=False,
 ):
-    """A whole observer for a system with weights that nobody trained; of several outputs each has a level of noise."""
+    """A complete observer for a system with random weights; each of several outputs has its own noise level."""
     system = get_system(system)
     uncertain = system.parameters if estimated else {}
     scale = np.array([*system.scale, *uncertain.values()])
@@ -39,7 +39,7 @@ def random_artifact(
         A[:2, :2] = [[-1.0, 4.0], [-4.0, -1.0]]
     linear = LinearFilter(A, rng.normal(size=(nz, outputs)), dt, system.nu if inputs else 0)
     modes = linear.size - 1
-    told = (
+    features = (
         "z_y",
         *(["z_u"] if linear.nu else []),
         *(["measurement_noise"] if noise else []),
@@ -50,7 +50,7 @@ def random_artifact(
     each, largest = (outputs,) * (outputs > 1), tuple(range(1, outputs + 1)) if outputs > 1 else 1.0
     inverse = InverseMap(
         mlp=random_mlp(rng, modes + noise * outputs + process + age, len(scale)),
-        features=told,
+        features=features,
         z_offset=rng.normal(size=linear.size),
         whiten=rng.normal(size=(modes, linear.size)),
         noise_gain=rng.uniform(0.1, 1.0, (*each, modes)),
@@ -75,7 +75,7 @@ def random_artifact(
         else None,
         free_inverse=InverseMap(
             mlp=random_mlp(rng, nz + noise * outputs + process, len(scale)),
-            features=tuple(name for name in told if name not in ("z_u", "age")),
+            features=tuple(name for name in features if name not in ("z_u", "age")),
             z_offset=rng.normal(size=nz),
             whiten=rng.normal(size=(nz, nz)),
             noise_gain=rng.uniform(0.1, 1.0, (*each, nz)),

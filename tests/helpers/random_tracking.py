@@ -1,4 +1,4 @@
-"""Observers that track by a motion that is the truth, beside a T_inv of random weights."""
+"""Tracking observers with the true motion and a T_inv of random weights."""
 
 import itertools
 from dataclasses import replace
@@ -9,9 +9,9 @@ from random_artifacts import random_artifact
 
 from observers import MLP, Equations, Expression, Factors, Flow, Motion
 
-JUMPS = (600, 605)  # samples that no motion explains
-OFF = (1200, 1400)  # samples that swing, so that innovations agree with one another
-# Options of :func:`tracking` that compiled and exported steps have to get right.
+JUMPS = (600, 605)  # samples with an offset, after which the tracker diverges
+OFF = (1200, 1400)  # samples with a slow oscillation: correlated innovations
+# Options of :func:`tracking` for which compiled and exported steps are compared.
 KINDS = (
     {},
     {"by": "flow"},
@@ -25,7 +25,7 @@ KINDS = (
 
 
 def an_equation(nx, nu, dt, discrete=False):
-    """A damped pendulum whose input acts by its position, which may drive a third state; Euler's if it is discrete."""
+    """A damped pendulum with a position-dependent input gain; a third state if nx is 3; Euler steps if `discrete`."""
     angle, speed = ["x", 0], ["x", 1]
     pushed = ["*", ["+", 2.0, ["cos", angle]], ["u", 0]] if nu else 0.0
     field = [["*", 4.0, speed], ["+", ["*", -4.0, ["sin", angle]], ["*", -0.5, speed], pushed]]
@@ -37,7 +37,7 @@ def an_equation(nx, nu, dt, discrete=False):
 
 
 def a_flow(nx, nu, seed=0):
-    """A damped rotation, bent a little by a network."""
+    """A damped rotation plus a small network."""
     rng, sizes = np.random.default_rng(seed), (nx + nu, 13, 11, nx)
     mlp = MLP(
         [rng.normal(size=(b, a)) / a**0.5 for a, b in itertools.pairwise(sizes)],
@@ -55,9 +55,9 @@ def a_flow(nx, nu, seed=0):
 
 
 def tracking(by="equations", outputs=1, inputs=True, nonlinear=False, surer=0.0, **options):
-    """An observer with a T_inv of random weights, whose motion is by "equations", "discrete" ones or a "flow".
+    """An observer with a T_inv of random weights; its motion is by "equations", "discrete" equations or a "flow".
 
-    T_inv's standard deviation is e^-``surer`` times what it would be; options are those of random_artifact.
+    ``surer`` divides T_inv's standard deviation by e^surer; options are those of random_artifact.
     """
     artifact = random_artifact(inputs=inputs, outputs=outputs, **options)
     artifact = with_error_bars(artifact, factor=np.exp(-2.0 * surer))
@@ -90,7 +90,7 @@ def tracking(by="equations", outputs=1, inputs=True, nonlinear=False, surer=0.0,
 
 
 def signals(artifact, steps, batch=()):
-    """Outputs along the motion with noise, which jump once and swing later, and inputs."""
+    """Noisy outputs along the motion, with an offset in JUMPS and an oscillation in OFF, and inputs."""
     rng, motion, dt = np.random.default_rng(1), artifact.motion, artifact.filter.dt
     u = np.sin(np.cumsum(0.3 * rng.normal(size=(steps, *batch, artifact.nu)), axis=0))
     u[: steps // 10] = 0.0
@@ -106,5 +106,5 @@ def signals(artifact, steps, batch=()):
 
 
 def of_floats(artifact, steps):
-    """The same as floats hold them exactly."""
+    """The signals rounded to float32."""
     return (each.astype(np.float32).astype(float) for each in signals(artifact, steps))

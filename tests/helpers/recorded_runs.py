@@ -1,4 +1,4 @@
-"""Recorded runs of a plant that is known in closed form, and the sizes of a quick fit to them."""
+"""Recorded runs of a plant with a closed-form solution, and settings for a quick fit to them."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ SMALL = {
 
 
 def swing(seed, n=600, dt=0.05, jitter=0.0):
-    """A mass on a spring under a force that is held: p'' = -p + u, measured at uneven times."""
+    """A run of p'' = -p + u with a piecewise constant force; `jitter` makes the sampling times uneven."""
     rng = np.random.default_rng(seed)
     t = dt * (np.arange(n) + jitter * rng.uniform(-1, 1, n))
     u = np.repeat(rng.uniform(-1, 1, n // 20), 20)
@@ -31,7 +31,7 @@ def swing(seed, n=600, dt=0.05, jitter=0.0):
 
 
 def as_csv(path, record):
-    """Write a record as a table with its names."""
+    """Write a record as a CSV file with a header of its signals."""
     signals = record.signals
     names = [signals.time, *signals.measured, *signals.inputs, *signals.hidden]
     columns = np.column_stack([record.t, record.y, record.u, record.x])

@@ -1,4 +1,4 @@
-"""Observers for environments of others, with weights that nobody trained."""
+"""Observers with random weights for any Gymnasium environment."""
 
 from itertools import pairwise
 
@@ -8,7 +8,7 @@ from observers import MLP, Artifact, InverseMap, LinearFilter
 
 
 def observer_of(env_id, measured, hidden, inputs, *, dt=1.0, kwargs=None, rates=(0.3, 1.0, 3.0)):
-    """A whole observer; nothing of it but the signals fits the environment."""
+    """A complete observer; only its signals fit the environment."""
     rng, rates = np.random.default_rng(0), np.array(rates) / dt
     ny = len(measured)
     A, B = -np.diag(np.tile(rates, ny)), np.kron(np.eye(ny), rates[:, None])

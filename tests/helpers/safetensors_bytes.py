@@ -1,4 +1,4 @@
-"""safetensors files by hand, with what the library would not write."""
+"""safetensors files written by hand, with contents that the library would refuse to write."""
 
 import hashlib
 import json
@@ -16,7 +16,7 @@ def content(tensors, metadata=None):
 
 
 def sealed(whole, key):
-    """The bytes of a file with the checksum that belongs to them, as of a file of the kind ``key``."""
+    """The bytes of a file with its checksum under ``key``-sha256 in the metadata."""
     end = 8 + int.from_bytes(whole[:8], "little")
     header, data = json.loads(whole[8:end]), whole[end:]
     header["__metadata__"][f"{key}-sha256"] = hashlib.sha256(_whole(header, data)).hexdigest()
@@ -24,7 +24,7 @@ def sealed(whole, key):
 
 
 def with_arrays(arrays, key, described):
-    """The bytes of a file of arrays and what describes them, an object or a text."""
+    """The bytes of a file of arrays with a description, a JSON object or a text, under ``key``."""
     text = described if isinstance(described, str) else json.dumps(described)
     return sealed(serialise(arrays, metadata={key: text}), key)
 

@@ -1,4 +1,4 @@
-"""Settings with which agents and their observers are learned in no time, and badly."""
+"""Tiny settings, with which agents and their observers train fast and badly."""
 
 from training import calibration as calibrate
 from training.agents import learning, observing
@@ -24,7 +24,7 @@ def make_small(monkeypatch):
 
     def settings_of(name):
         known = {"default": SETTINGS.get(name) or written(name)["default"]}
-        return known | ({"Pendulum-v1": SETTINGS[name]} if name == "sac" else {})  # SAC's, as in the files
+        return known | ({"Pendulum-v1": SETTINGS[name]} if name == "sac" else {})  # as in sac.yml
 
     monkeypatch.setattr(learning, "settings_of", settings_of)
     monkeypatch.setattr(observing, "SETTINGS", OBSERVERS)

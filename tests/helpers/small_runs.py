@@ -1,4 +1,4 @@
-"""Configurations and data of a size for tests."""
+"""Configurations and data of small sizes."""
 
 from dataclasses import replace
 from functools import cache
@@ -31,7 +31,7 @@ SIZES = {
 def toy(system, pipeline="input-aware", **changes):
     """A configuration that trains within a second."""
     steps = {"inverse_steps": 200}
-    if pipeline == "spinn":  # modes that are forgotten within the 20 s of such runs
+    if pipeline == "spinn":  # modes whose transient decays within the 20 s of such runs
         steps |= {"forward_steps": 200, "eigenvalues": papers_spectrum(system)}
     return replace(preset(system, pipeline, "fast"), **SIZES | steps | changes)
 
@@ -41,7 +41,7 @@ BATCHES = Config("input-aware", (-1.0,), measurement_noise_max=1.0, batch=4096)
 
 @cache
 def open_loop(process_noise_share=0.0):
-    """Batches along trajectories of Van der Pol's oscillator, the trajectories, and the filter beside them."""
+    """Batches along trajectories of Van der Pol's oscillator, the trajectories, and the filter."""
     linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
     motions = Motions(VanDerPol(), 0.01, 500, KINDS, process_noise_share=process_noise_share)
     ages, rng = recording_ages(500, 40), np.random.default_rng(0)
@@ -57,7 +57,7 @@ def open_loop(process_noise_share=0.0):
 
 
 def untrained(sampler, linear):
-    """A network with weights that nobody trained, and the observer that it makes."""
+    """A network with random weights, and an observer with this network."""
     torch.manual_seed(0)
     inputs = sampler(torch.Generator()).inputs.shape[1]
     network = Network(inputs, 2, width=8, depth=1, activation="tanh")

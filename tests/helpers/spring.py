@@ -1,4 +1,4 @@
-"""A plant whose parameters are identified."""
+"""A plant for tests of identification."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -8,7 +8,7 @@ from kkl_gym.system import System
 
 @dataclass(frozen=True)
 class Spring(System):
-    """A damped spring with a force."""
+    """A mass on a damped spring, driven by a force."""
 
     stiffness: float = 4.0
     damping: float = 0.3

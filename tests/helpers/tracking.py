@@ -1,4 +1,4 @@
-"""An observer of the oscillator that tracks by the exact motion, beside the Kalman filter that it then is."""
+"""A tracking observer of the oscillator with the exact motion, and the Kalman filter that it must equal."""
 
 from dataclasses import replace
 
@@ -8,14 +8,14 @@ from scipy.linalg import expm
 
 from observers import MLP, Equations, ErrorCovariance, Expression, Factors, Flow, Motion
 
-DT, PROCESS, STD = 0.05, 0.02, 0.3  # s, standard deviation that noise of level 1 adds at each sample, that of T_inv
+DT, PROCESS, STD = 0.05, 0.02, 0.3  # s; standard deviations: of process noise of level 1 per sample, and of T_inv
 AGE_MAX = 1.0  # s
 ONE = Factors(np.zeros(1), np.zeros(1), np.ones((1, 1, 1)))
 X_OFFSET, X_SCALE, U_SCALE = np.array([0.3, -0.1]), np.array([2.0, 0.5]), 0.5
 
 
 def exact_motion(dt=DT):
-    """Phi and Gamma of x_next = Phi x + Gamma u, with u on x2 and held."""
+    """Phi and Gamma of x_next = Phi x + Gamma u, where u acts on x2' and is constant between samples."""
     whole = np.zeros((3, 3))
     whole[:2, :2], whole[1, 2] = F, 1.0
     moved = expm(whole * dt)
@@ -23,7 +23,7 @@ def exact_motion(dt=DT):
 
 
 def exact_flow(dt=DT, nu=0, x_scale=X_SCALE):
-    """The oscillator's motion in scaled states, with a network that adds nothing."""
+    """The oscillator's motion as a flow in scaled states; the network returns zero."""
     (Phi, Gamma), x_scale = exact_motion(dt), np.asarray(x_scale)
     moved = Phi - np.eye(2)
     linear = [
@@ -36,7 +36,7 @@ def exact_flow(dt=DT, nu=0, x_scale=X_SCALE):
 
 
 def exact_equations(dt=DT, nu=0):
-    """The oscillator between samples, in discrete time."""
+    """The oscillator from sample to sample, as equations in discrete time."""
     Phi, Gamma = exact_motion(dt)
     return Equations(
         Expression(
@@ -50,7 +50,7 @@ def exact_equations(dt=DT, nu=0):
 
 
 def linear_motion(by="equations", nu=0, ny=1, factors=ONE, x_scale=X_SCALE):
-    """The exact motion in all that a tracker needs; the start is as unsure as T_inv."""
+    """The exact motion with all settings of a tracker; the initial covariance is that of T_inv."""
     moved = {"equations": exact_equations(nu=nu)} if by == "equations" else {"flow": exact_flow(DT, nu, x_scale)}
     return Motion(
         **moved,
@@ -70,9 +70,9 @@ def linear_motion(by="equations", nu=0, ny=1, factors=ONE, x_scale=X_SCALE):
 
 
 def plain_observer(outputs=C):
-    """The exact observer as a map that depends on measurement noise and age, and uses neither; it takes no input.
+    """The exact observer, without input, as a map with the features measurement noise and age, which it ignores.
 
-    Its covariance is that of a standard deviation of 0.3 of each state.
+    Its error covariance has a standard deviation of 0.3 for each state.
     """
     exact = exact_observer(DT, outputs)
     weight = np.hstack([exact.inverse.mlp.weights[0], np.zeros((2, 2))])
@@ -91,19 +91,19 @@ def plain_observer(outputs=C):
 
 
 def tracking_observer(outputs=C, **options):
-    """The observer with the exact motion, without input; options are those of :func:`linear_motion`."""
+    """:func:`plain_observer` with the exact motion; options are those of :func:`linear_motion`."""
     return replace(plain_observer(outputs), motion=linear_motion(ny=len(outputs), **options))
 
 
 def of_t_inv(artifact, std):
-    """The artifact with another standard deviation of T_inv."""
+    """Return the artifact with another standard deviation of T_inv."""
     covariance = std**2 * np.eye(artifact.nx)[None, None]
     error = ErrorCovariance(np.zeros(1), np.zeros(1), covariance)
     return replace(artifact, inverse=replace(artifact.inverse, error_covariance=error))
 
 
 class KalmanFilter:
-    """The textbook's, for the same motion and noise."""
+    """The textbook Kalman filter, for the same motion and noise."""
 
     def __init__(self, x, P, level, outputs=C):
         self.x, self.P, self.H = x, P, outputs

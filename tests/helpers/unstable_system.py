@@ -1,4 +1,4 @@
-"""A plant that no random input holds."""
+"""An unstable plant: random inputs do not keep it within its bounds."""
 
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""Systems whose equations fail where they are evaluated on something else than floats."""
+"""Systems whose equations fail when they are evaluated on anything but floats."""
 
 import math
 
@@ -6,7 +6,7 @@ from kkl_gym import System
 
 
 class Late(System):
-    """Functions of ``math``, which take floats alone."""
+    """Uses functions of ``math``, which take floats only."""
 
     name = "late"
     X = ((0.5, 1.0), (-2.0, 2.0))
@@ -25,7 +25,7 @@ class Late(System):
 
 
 class Branching(Late):
-    """A decision, which floats alone allow."""
+    """Uses an `if` on a state, which works for floats only."""
 
     name = "branching"
 
@@ -36,7 +36,7 @@ class Branching(Late):
 
 
 class Wide(Late):
-    """A component too many."""
+    """Returns one component too many."""
 
     name = "wide"
 

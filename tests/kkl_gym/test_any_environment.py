@@ -1,4 +1,4 @@
-"""Observers from rollouts around the environments that these are of."""
+"""Observers trained from rollouts, used as wrappers of their environments."""
 
 from dataclasses import replace
 from functools import partial
@@ -34,7 +34,7 @@ def saved(tmp_path):
 
 
 @pytest.mark.parametrize("estimate", ["x", "z"])
-def test_shows_what_is_measured_and_what_the_observer_says_of_it(saved, estimate):
+def test_observations_hold_the_measured_signals_and_the_estimate(saved, estimate):
     artifact, plain = PENDULUM(), gym.make("Pendulum-v1")
     env = KKLObservation(gym.make("Pendulum-v1"), saved(artifact), estimate=estimate)
     raw, _ = plain.reset(seed=5)
@@ -64,7 +64,7 @@ def test_is_an_environment_that_is_made_again_from_its_specification(saved):
     env = KKLObservation(gym.make("CartPole-v1"), saved(CART_POLE()))
     check_env(env, skip_render_check=True)
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
-    assert np.isinf(again.observation_space.high[-1])  # the observation does not show it
+    assert np.isinf(again.observation_space.high[-1])  # a state that is not in the observation has no bound
     obs, _ = env.reset(seed=1)
     same, _ = again.reset(seed=1)
     np.testing.assert_array_equal(obs, same)
@@ -78,12 +78,12 @@ def test_wrong_environments_of_artifacts():
 
 def test_other_environments_are_refused(saved):
     path = saved(PENDULUM())
-    for env, told in (
+    for env, message in (
         (gym.make("CartPole-v1"), "made for the environment 'Pendulum-v1', but this is 'CartPole-v1'; an observer is"),
         (gym.make("Pendulum-v1", g=3.0), r"Pendulum-v1 with arguments {}, but this is {'g': 3.0}"),
         (gym.make("Pendulum-v1").unwrapped.__class__(), "has no specification"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             KKLObservation(env, path)
     with pytest.raises(ArtifactError, match="fits only Pendulum-v1"):
         PENDULUM().require_system()
@@ -105,8 +105,8 @@ def test_rows_of_a_vector_are_single_environments(saved, mode):
     assert len(compare(envs, rows, actions, mode, infos={"final_obs", "y"})) > 3
 
 
-class Told(gym.Env):
-    """A counter that shows itself. ``info`` says its square, not at resets, and what is to be hidden in silence."""
+class Counter(gym.Env):
+    """A counter in the observation; ``info`` has its square after steps, not after resets, and never if `silent`."""
 
     observation_space = gym.spaces.Box(-99.0, 99.0, (2,))
     action_space = gym.spaces.Discrete(2)
@@ -126,16 +126,16 @@ class Told(gym.Env):
 
 
 @pytest.fixture
-def told():
-    gym.register("Told-v0", entry_point=Told, disable_env_checker=True)
-    yield partial(gym.make, "Told-v0")
-    gym.registry.pop("Told-v0")
+def counter():
+    gym.register("Counter-v0", entry_point=Counter, disable_env_checker=True)
+    yield partial(gym.make, "Counter-v0")
+    gym.registry.pop("Counter-v0")
 
 
-def test_hidden_signals_of_vectors(saved, told):
-    path = saved(observer_of("Told-v0", ["obs[0]"], ["obs[1]", "info[square]"], ["action[1]"]))
+def test_hidden_signals_of_vectors(saved, counter):
+    path = saved(observer_of("Counter-v0", ["obs[0]"], ["obs[1]", "info[square]"], ["action[1]"]))
     mode = AutoresetMode.SAME_STEP
-    envs = KKLVectorObservation(SyncVectorEnv([told] * 2, autoreset_mode=mode), path)
+    envs = KKLVectorObservation(SyncVectorEnv([counter] * 2, autoreset_mode=mode), path)
     envs.reset(seed=0)
     for k in range(1, 12):
         *_, info = envs.step(np.array([0, 1]))
@@ -145,10 +145,10 @@ def test_hidden_signals_of_vectors(saved, told):
         assert seen["_x"].all()
         np.testing.assert_array_equal(seen["u"], [[0.0], [1.0]])
         if count == 5:
-            assert not info.get("_x", np.zeros(2)).any()  # of the reset, that says no square
+            assert not info.get("_x", np.zeros(2)).any()  # the info of a reset has no square
 
 
-def test_hidden_signals_that_are_not_shown(saved, told):
+def test_info_has_no_x_where_a_hidden_signal_is_not_available(saved, counter):
     path, plain = saved(PENDULUM()), gym.make("Pendulum-v1")
     two = gym.spaces.Box(-1.0, 1.0, (2,))
     for show, space in ((lambda obs: obs * [1, 1, np.nan], None), (lambda obs: obs[:2], two)):
@@ -156,8 +156,8 @@ def test_hidden_signals_that_are_not_shown(saved, told):
         _, first = env.reset(seed=0)
         *_, info = env.step(np.zeros(1, np.float32))
         assert "x" not in {**first, **info}
-    silent = saved(observer_of("Told-v0", ["obs[0]"], ["info[square]"], [], kwargs={"silent": True}))
-    envs = KKLVectorObservation(SyncVectorEnv([partial(told, silent=True)] * 2), silent)
+    silent = saved(observer_of("Counter-v0", ["obs[0]"], ["info[square]"], [], kwargs={"silent": True}))
+    envs = KKLVectorObservation(SyncVectorEnv([partial(counter, silent=True)] * 2), silent)
     envs.reset(seed=0)
     assert "x" not in envs.step(np.array([0, 1]))[-1]
 
@@ -177,7 +177,7 @@ def test_the_observer_is_replaced_at_once(saved, tmp_path):
     np.testing.assert_allclose(envs.step(np.array([1]))[-1]["x_hat"], expected, rtol=1e-5)
 
 
-def test_wrappers_that_change_what_actions_mean(saved):
+def test_wrappers_that_change_the_meaning_of_actions(saved):
     path = saved(PENDULUM())
     for wrap in (ClipAction, partial(DiscretizeAction, bins=3)):
         with pytest.raises(ArtifactError, match=r"a wrapper inside takes .*: the observer would misread them; put"):
@@ -202,13 +202,13 @@ def test_vectors_that_are_refused(saved):
         KKLVectorObservation(different, path)
     with pytest.raises(ValueError, match="KKLVectorMemory"):
         KKLVectorObservation(gym.make_vec("CartPole-v1", num_envs=2))
-    told = observer_of("Pendulum-v1", ["info[angle]"], ["obs[2]"], [], dt=0.05)
+    artifact = observer_of("Pendulum-v1", ["info[angle]"], ["obs[2]"], [], dt=0.05)
     with pytest.raises(ValueError, match=r"measures info\[angle\], which vectors do not report"):
-        KKLVectorObservation(SyncVectorEnv([partial(gym.make, "Pendulum-v1")] * 2), saved(told))
+        KKLVectorObservation(SyncVectorEnv([partial(gym.make, "Pendulum-v1")] * 2), saved(artifact))
 
 
 class Losing(gym.ObservationWrapper):
-    """Loses the second entry of every other observation, but not of the first."""
+    """Replaces the second entry of every other observation by NaN, beginning with the second observation."""
 
     lost = True
 
@@ -218,7 +218,7 @@ class Losing(gym.ObservationWrapper):
 
 
 @pytest.mark.parametrize("vectors", [False, True])
-def test_what_is_missing_of_an_observation_is_passed_over(saved, vectors):
+def test_the_observer_skips_missing_entries_of_an_observation(saved, vectors):
     artifact = PENDULUM()
     if vectors:
         env = KKLVectorObservation(SyncVectorEnv([lambda: Losing(gym.make("Pendulum-v1"))] * 2), saved(artifact))
@@ -233,4 +233,4 @@ def test_what_is_missing_of_an_observation_is_passed_over(saved, vectors):
         assert np.isnan(info["y"][..., 1]).all() == (k % 2 == 0)
         np.testing.assert_allclose(info["x_hat"], expected.step(info["y"], info["u"]))
         assert np.isfinite(obs).all()
-        assert k % 2 or np.array_equal(obs[..., 1], before[..., 1])  # held
+        assert k % 2 or np.array_equal(obs[..., 1], before[..., 1])  # the last value is held

@@ -1,4 +1,4 @@
-"""Bad arguments are refused by a ValueError that names the argument, and the target goes on as if never asked."""
+"""Invalid arguments raise a ValueError that names the argument, and leave the target's state unchanged."""
 
 import math
 from decimal import Decimal
@@ -34,7 +34,7 @@ WEIGHTS, BIASES = [np.ones((4, 2)), np.ones((1, 4))], [np.ones(4), np.ones(1)]
 
 
 def arrays_unlike(good, *more):
-    """Values that no array of that shape with real numbers is."""
+    """Invalid values for an array of real numbers with the shape of `good`."""
     good = np.asarray(good, dtype=float)
     strange = [good.astype(kind) for kind in ("U8", "bool", "c16", "O")] + [good.astype("i8").astype("M8[s]")]
     shapes = [np.concatenate([good, good], axis=-1), good.sum() + np.zeros(())]
@@ -135,7 +135,7 @@ huge, seeds = [np.array([math.inf]), np.array([1e16])], (1.5, -1, "x", True, [1,
 
 
 def later(target):
-    """What follows from the state of a target."""
+    """Results of later calls, which depend on the state of the target."""
     if isinstance(target, KKLObserver):
         rows = target.z.shape[:-1]
         return [target.step(np.full((*rows, 1), 0.5), np.full((*rows, 1), 0.1)), target.step(None)]

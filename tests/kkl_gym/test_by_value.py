@@ -1,4 +1,4 @@
-"""Systems that a script or a notebook defines reach other processes by value."""
+"""Systems that a script or a notebook defines are pickled by value for other processes."""
 
 import multiprocessing
 import shutil
@@ -19,7 +19,7 @@ from notebook_systems import springs
 import kkl_gym
 from kkl_gym import KKLEnv, System
 
-# One class is made of one choice of each; the choices may not depend on each other.
+# A test class combines one choice of each kind; the choices must be independent of one another.
 BODIES = {
     "decorator": ["", "@dataclass(frozen=True)"],
     "base": ["System", "VanDerPol", "Parent", "Mixin, System"],
@@ -66,7 +66,7 @@ OWN = "X = ((-1, 1), (-2, 2))\n    bounds = ((-9, 9), (-9, 9))\n    u_max = (2.0
 
 
 def defined(choices):
-    """The class of a choice, as the cell of a notebook or a function in it defines it."""
+    """The class for some choices, defined as in the cell of a notebook or in a function."""
     base, own = choices["base"], {} if "System" not in choices["base"] else {"own": OWN}
     if base == "System":
         own["equations"] = "f, h = Mixin.f, Mixin.h"
@@ -84,7 +84,7 @@ def defined(choices):
 
 
 def looked_at(system):
-    """A motion of a system, and what it declares."""
+    """A trajectory of a system, and its declared attributes."""
     env = KKLEnv(system)
     env.reset(seed=3)
     motion = [env.step(np.array([action])) for action in (0.3, -1.0)]
@@ -104,7 +104,7 @@ def elsewhere():
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.fixed_dictionaries({part: st.sampled_from(choices) for part, choices in BODIES.items()}), st.booleans())
-def test_a_class_arrives_in_a_new_process_as_it_was(elsewhere, choices, instance):
+def test_a_class_is_unchanged_in_a_new_process(elsewhere, choices, instance):
     made = defined(choices)
     system = made() if instance else made
     assert elsewhere(cloudpickle.dumps(system)) == looked_at(system)
@@ -142,7 +142,7 @@ def test_workers_play_systems_of_a_notebook(played, which):
     assert played(make) == start(make)
 
 
-def test_a_class_that_states_nothing_is_looked_at_when_it_is_used():
+def test_a_class_without_declarations_is_checked_at_its_first_use():
     class Empty(System):
         pass
 

@@ -1,4 +1,4 @@
-"""Sampling intervals in machine code, of single states and of batches, against those in Python and NumPy."""
+"""Compiled steps over a sampling interval, for single states and batches, against Python and NumPy."""
 
 import copy
 import logging
@@ -32,7 +32,7 @@ def compiler():
 
 @dataclass(frozen=True)
 class Elementary(System):
-    """All there is in kkl_gym.elementary."""
+    """All functions in kkl_gym.elementary."""
 
     name = "elementary"
     X = ((-2, 2), (0.5, 3), (-1, 1))
@@ -42,7 +42,7 @@ class Elementary(System):
         a, b, c = x
         a = where((c > 0.2) | (b == 1.0), a + 0.1 * c, a)
         return (
-            tanh(b) * where(a > b, c, 1) - clip(a, -1, 1) + 1.0 / (1.0 + 1.0 / abs(x[0])),  # at 0 Python raises
+            tanh(b) * where(a > b, c, 1) - clip(a, -1, 1) + 1.0 / (1.0 + 1.0 / abs(x[0])),  # Python raises at 0
             exp(-abs(b)) - log(1.0 + a * a) + maximum(a, c) / 3 - 0.3 * tan(0.1 * c),
             sqrt(abs(a)) - sign(c) * minimum(b, 1.0),
         )
@@ -53,7 +53,7 @@ class Elementary(System):
 
 @dataclass(frozen=True, eq=False)
 class Decaying(System):
-    """A state that compiles in no time; two of these are never equal, nor are their parameters seen by ==."""
+    """A single state that compiles fast; `==` compares neither two of these systems nor their parameters."""
 
     a: float = 1.0
 
@@ -77,7 +77,7 @@ def variant(f, name="variant", of=Decaying, **variables):
 
 
 def points(system, n=200, seed=0, factor=2.0):
-    """States, inputs and process noise."""
+    """Random states, inputs and process noise."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(*system.box(factor), (n, system.nx)).T
     u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None]
@@ -89,7 +89,7 @@ def rows(*arrays):
 
 
 def moved(step_of, system, dt=DT):
-    """The next states of a few, by one of both steps, and by Python or NumPy."""
+    """The next states of a few points, by a compiled step, and by Python or NumPy."""
     x, u, w = points(system, 5)
     if step_of is batch_step:
         return batch_step(system)(x, u, w, dt), advance_batch(system, x, u, w, dt)
@@ -102,13 +102,13 @@ def test_a_batchs_step_is_numpys(system):
     step = batch_step(system)
     x, u, w = points(system)
     kinks = np.array([-1.5, -1.0, -0.5, 0.0, 0.3, 1.0, 1.5])
-    x[0, :7], x[1, 7:14] = kinks, kinks  # where the equations of KINKED[1] change
+    x[0, :7], x[1, 7:14] = kinks, kinks  # the kinks of KINKED[1]
     for dt in (DT, 0.2):
         before, got = x.copy(), step(x, u, w, dt)
         assert got.flags.c_contiguous
         assert (x == before).all()
         assert np.allclose(got, advance_batch(system, x, u, w, dt), rtol=1e-11, atol=1e-11, equal_nan=True)
-    for wild in (math.nan, math.inf, 1e200):  # which loses its row alone
+    for wild in (math.nan, math.inf, 1e200):  # makes only its own row NaN
         lost = x.copy()
         lost[:, 1] = wild
         with warnings.catch_warnings():
@@ -134,8 +134,8 @@ def test_a_single_step_is_pythons_to_the_last_bit(system):
 
 
 @pytest.mark.parametrize("pole", [(1.0, 0.5), (0.5, 0.0)])
-def test_divisions_by_zero_lose_their_row_only(pole):
-    """A negative power, too, at which Numba raises whatever the error model is."""
+def test_a_division_by_zero_makes_its_own_row_nan_only(pole):
+    """Also for a negative power of zero, at which Numba raises an error in every error model."""
     box = {"X": ((0.5, 1), (0.5, 1)), "bounds": ((-5, 5), (-5, 5)), "rate": lambda self, x: 1.0}
     system, x = variant(lambda self, x: (1.0 / (x[0] - 1.0), 1e-3 * x[1] ** -2), **box), np.array([pole, (0.5, 0.5)]).T
     assert batch_step(system).obstacle is None
@@ -145,7 +145,7 @@ def test_divisions_by_zero_lose_their_row_only(pole):
 
 
 def compared(unit, second):
-    """Equations that look at what kind of number they are given."""
+    """Equations that treat symbols differently from numbers, by checking the type of the state."""
 
     def f(self, x):
         return (((0.0 if isinstance(x[0], float | np.ndarray) else unit) + x[0]) / second,)
@@ -162,7 +162,7 @@ def compared(unit, second):
     (single_step, variant(lambda self, x: (x[0] ** 3,)), "there is a power or a remainder"),
     (single_step, variant(lambda self, x: (math.sin(x[0]),)), "use kkl_gym.elementary.sin"),
 ])  # fmt: skip
-def test_what_cannot_be_compiled_goes_on_and_the_log_says_why_once(step_of, system, why, caplog):
+def test_equations_that_do_not_compile_run_in_python_and_the_log_gives_the_reason_once(step_of, system, why, caplog):
     with caplog.at_level(logging.INFO, "kkl_gym"):
         assert why in step_of(system).obstacle
         assert step_of(system).obstacle
@@ -174,7 +174,7 @@ def test_what_cannot_be_compiled_goes_on_and_the_log_says_why_once(step_of, syst
 
 
 class Chain(Decaying):
-    """Loops, helpers, a table and arrays, which leave no trace in the program that they make."""
+    """Equations with loops, helpers, a table and arrays; the traced program contains only arithmetic."""
 
     name, X, bounds = "chain", ((-1, 1),) * 3, ((-9, 9),) * 3
 
@@ -186,7 +186,7 @@ class Chain(Decaying):
 
 
 @pytest.mark.parametrize("step_of", [single_step, batch_step])
-def test_programs_are_what_equations_do_however_they_are_written(step_of):
+def test_traced_programs_equal_equations_with_loops_and_arrays(step_of):
     assert step_of(Chain()).obstacle is None
     np.testing.assert_allclose(*moved(step_of, Chain()), rtol=1e-12)
 
@@ -220,7 +220,7 @@ CHANGES = [
 
 
 @pytest.mark.parametrize(("where", "name", "value"), CHANGES)
-def test_what_the_equations_read_is_looked_up_anew(where, name, value, monkeypatch):
+def test_changed_globals_and_attributes_of_equations_recompile(where, name, value, monkeypatch):
     before, _ = moved(single_step, Decaying())
     monkeypatch.setattr(where, name, value)
     after, expected = moved(single_step, Decaying())
@@ -240,7 +240,7 @@ def episode(env, seed, steps, gain=0.5):
 
 
 @pytest.mark.parametrize("system", ["lorenz", Pendulum()], ids=str)
-def test_episodes_are_the_same_with_it_and_without(system):
+def test_episodes_are_the_same_with_and_without_compilation(system):
     env = KKLEnv(system)
     in_python, compiled = (episode(env, 3, SOON + 300) for _ in range(2))
     for a, b in zip(in_python, compiled, strict=True):
@@ -260,10 +260,10 @@ def test_an_environment_that_is_given_another_system_takes_its_equations():
     one.system = other.system
     (_, reward, *_, info), (_, expected, *_, there) = one.step([0.3]), other.step([0.3])
     assert (info["x"] == there["x"]).all()
-    assert reward == expected  # at the other's target
+    assert reward == expected  # for the other target
     with pytest.raises(ValueError, match="exchanged for another 'lorenz', got Rossler"):
         one.system = get_system("rossler")
-    with pytest.raises(EquationError):  # which has no such target
+    with pytest.raises(EquationError):  # this target does not exist
         one.system = get_system("lorenz").replace({"rho": 0.5})
     assert one.system is other.system
     for name in ("dt", "measurement_noise", "process_noise"):

@@ -1,4 +1,4 @@
-"""Class variables of a user's system: what is taken, and what is said of mistakes."""
+"""Class variables of a user's system: valid values, and messages for mistakes."""
 
 import math
 import re
@@ -24,7 +24,7 @@ def test_defaults_follow_from_the_box():
     assert cls.X_centre == (1.0, 0.0)
 
 
-def test_a_parameter_that_is_not_declared_anew_is_refused():
+def test_a_parameter_that_a_subclass_does_not_redeclare_is_refused():
     with pytest.raises(TypeError, match=r"Softer: mu = 1\.0 does not change the parameter mu: write mu: float = 1\.0"):
 
         class Softer(VanDerPol):
@@ -40,7 +40,7 @@ def test_a_parameter_that_is_not_declared_anew_is_refused():
     assert dataclass(frozen=True)(Annotated)().mu == 1.0
 
 
-def test_what_would_be_lost_is_refused_of_parents_too():
+def test_attributes_that_would_be_lost_are_refused_in_parents_too():
     with pytest.raises(TypeError, match="Tank defines __init__, and a copy would lack what __init__ sets"):
         declared(__init__=lambda self: None)
     hardware = type("Hardware", (), {"__init__": lambda self: None})

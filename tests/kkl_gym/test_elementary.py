@@ -1,4 +1,4 @@
-"""Functions that serve floats, arrays, tensors and symbols alike."""
+"""Functions that accept floats, arrays, tensors and symbols."""
 
 import math
 
@@ -8,7 +8,7 @@ import pytest
 from kkl_gym import elementary
 
 sympy, torch = pytest.importorskip("sympy"), pytest.importorskip("torch")
-# Name, the function on floats, and a range of arguments.
+# Name, reference function on floats, range of arguments.
 FUNCTIONS = {
     "sin": (math.sin, -10, 10),
     "cos": (math.cos, -10, 10),
@@ -82,7 +82,7 @@ def test_where_and_clip_choose_alike(x):
 def test_where_of_two_numbers_is_precise():
     assert elementary.where(True, np.array([1.0]), 0.0).tolist() == [1.0]
     x = torch.tensor([1.0, -1.0])
-    assert elementary.where(x > 0, 0.1, 0.2).tolist() == [0.1, 0.2]  # which float32 would round
+    assert elementary.where(x > 0, 0.1, 0.2).tolist() == [0.1, 0.2]  # not rounded to float32
     assert elementary.where(x > 0, x, 0.1).dtype == torch.float32
     assert elementary.where(x > 0, 0.1, x.double()).dtype == torch.float64
 
@@ -105,6 +105,6 @@ EXTREMES = [
 def test_extremes_are_alike_and_silent(name, x, expected):
     function = getattr(elementary, name)
     for kind in (float, np.float64, torch.tensor, np.array):
-        with np.errstate(invalid="ignore"):  # of the sine of an infinite array alone
+        with np.errstate(invalid="ignore"):  # from the sine of an infinite array
             value = function(*map(kind, np.atleast_1d(x).tolist()))
         assert float(value) == pytest.approx(expected, nan_ok=True)

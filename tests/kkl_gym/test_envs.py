@@ -24,7 +24,7 @@ ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler
 
 
 def play(env, steps, seed=None, actions=None, reset=True):
-    """Observations, rewards, and the last two of y and x of an episode under seeded actions."""
+    """Rows (observation, reward, y, x) of an episode with seeded or given actions."""
     rng = np.random.default_rng(0)
     out = []
     if reset:
@@ -52,8 +52,8 @@ def test_checkers_are_content(name, observe):
 @both
 def test_equal_seeds_give_equal_episodes(name, observe):
     a, b = (gym.make(ENV_IDS[name], observe=observe) for _ in range(2))
-    play(b, 10, seed=5)  # whatever came before
-    first = play(a, 150, seed=3)  # longer than two blocks of noise
+    play(b, 10, seed=5)  # an earlier episode must not matter
+    first = play(a, 150, seed=3)  # more than two blocks of noise
     second = play(a, 20)
     assert np.array_equal(first, play(b, 150, seed=3))
     assert np.array_equal(second, play(b, 20))
@@ -172,7 +172,7 @@ def test_an_interval_too_long_to_simulate_is_an_error_of_its_own():
     for dt in (1e5, 1e300):
         with pytest.raises(SubstepsError, match=r"lorenz changes at a rate of 15\.48/s .* take dt <= 1.6e"):
             KKLEnv("lorenz", dt=dt)
-    env = KKLEnv("lorenz", dt=1600.0)  # suits the middle of X, but not all states
+    env = KKLEnv("lorenz", dt=1600.0)  # stable in the middle of X, not everywhere
     env.reset(options={"x0": [1.0, 1.0, 20.0]})
     with pytest.raises(SubstepsError, match="65536 substeps are not enough for dt = 1600 s"):
         env.step(np.zeros(1))
@@ -188,13 +188,13 @@ def test_measurement_noise_has_the_stated_deviation():
             *_, info = env.step(np.zeros(1))
     assert np.mean(v) == pytest.approx(0.0, abs=0.04)
     assert np.std(v) == pytest.approx(0.5, rel=0.05)
-    assert np.mean(np.multiply(v[1:], v[:-1])) == pytest.approx(0.0, abs=0.025)  # white
-    assert len(np.unique(np.round(v, 9))) == len(v) > 4 * NOISE_BLOCK  # nor do blocks of it repeat
+    assert np.mean(np.multiply(v[1:], v[:-1])) == pytest.approx(0.0, abs=0.025)  # uncorrelated
+    assert len(np.unique(np.round(v, 9))) == len(v) > 4 * NOISE_BLOCK  # blocks of noise do not repeat
 
 
 @pytest.mark.parametrize(("name", "level"), [("lorenz", None), ("rossler", 0.3)])
 def test_process_noise_is_bounded_and_uniform(name, level):
-    """w recovered from what the noise adds to a short interval; x' = f(x) + w makes x gain w dt + O(dt^2)."""
+    """Recover w from the effect of the noise over a short interval: x' = f(x) + w adds w dt + O(dt^2) to x."""
     dt = 1e-5
     env = KKLEnv(name, dt=dt, process_noise=level)
     system = env.system
@@ -262,7 +262,7 @@ def test_import_is_light_and_registers_once():
 
 
 @pytest.mark.parametrize("n", [3, 6, 7, 20])
-def test_outputs_bounds_hold_all_corners_and_what_lies_between(n):
+def test_outputs_bounds_hold_all_corners_and_the_states_between(n):
     class Chain(System):
         name = "chain"
         X, bounds = ((-1, 1),) * n, ((-2, 2),) * n

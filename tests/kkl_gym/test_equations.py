@@ -1,4 +1,4 @@
-"""Mistakes in a user's equations: each is said with system, equation, file, line and the way out."""
+"""Mistakes in a user's equations: each message names the system, the equation, file and line, and the fix."""
 
 import itertools
 import math
@@ -51,7 +51,7 @@ def tank(tmp_path):
 
 
 def line_of(path, text):
-    """Number of the last line of a script that holds a text."""
+    """Number of the last line of a script that contains `text`."""
     return max(i for i, line in enumerate(path.read_text().splitlines(), 1) if text in line)
 
 
@@ -78,7 +78,7 @@ def test_an_equation_that_raises(tank, f, texts):
     message = str(raised.value)
     assert message.startswith(f"f(x) of 'tank' failed in {path}, line {line_of(path, f)} (`return {f}`): ")
     assert all(text in message for text in texts)
-    assert str(pickle.loads(pickle.dumps(raised.value))) == message  # as from worker processes
+    assert str(pickle.loads(pickle.dumps(raised.value))) == message  # errors from worker processes arrive pickled
 
 
 @pytest.mark.parametrize(("changes", "match"), [
@@ -115,7 +115,7 @@ def test_a_definition_that_is_wrong(tank, changes, match):
 )  # fmt: skip
 def test_a_script_that_is_wrong(tank, old, new, message):
     path = tank(head=HEAD.replace(old, new))
-    for _ in range(2):  # a script that fails is not half loaded
+    for _ in range(2):  # a failed script does not stay half loaded
         with pytest.raises(ValueError, match=re.escape(message)):
             get_system(f"{path}:Tank")
 
@@ -142,7 +142,7 @@ none = np.zeros((1, 7))
         lambda: KKLVectorEnv(Late(), 3),
     ],
 )
-def test_every_way_to_evaluate_arrays_says_where(call):
+def test_all_evaluations_of_arrays_name_the_place(call):
     with pytest.raises(EquationError, match=LATE):
         call()
     for step_of in (single_step, batch_step):
@@ -150,7 +150,7 @@ def test_every_way_to_evaluate_arrays_says_where(call):
 
 
 class Draining(Late):
-    """A tank that runs empty, after which its level is no number any more."""
+    """A tank that runs empty; then the square root of its level is no longer real."""
 
     name = "draining"
 
@@ -185,7 +185,7 @@ def test_equations_that_write_to_the_state(tank):
         KKLEnv(f"{path}:Tank")
 
 
-def test_where_leaves_out_what_is_divided_by_zero():
+def test_where_avoids_a_division_by_zero():
     class Cardinal(Draining):
         name = "cardinal"
 

@@ -1,4 +1,4 @@
-"""``render_mode="human"``: a window that shows a motion as fast as it is, and playing with keys."""
+"""``render_mode="human"``: a window that shows the motion in real time, and playing with keys."""
 
 import sys
 
@@ -16,7 +16,7 @@ pytest.importorskip("matplotlib")
 
 @pytest.fixture
 def shown(monkeypatch):
-    """The frames that windows show."""
+    """A list that collects the frames which windows show."""
     frames = []
     flip = pygame.display.flip
     monkeypatch.setattr(pygame.display, "flip", lambda: (frames.append(shot()), flip()))
@@ -52,7 +52,7 @@ def test_it_is_open_from_reset_to_close(shown):
 
 @pytest.mark.parametrize("estimate", ["x", "z"])
 def test_the_outermost_observer_draws(estimate, shown, saved):
-    """Its estimates of x; of z alone there are none to draw."""
+    """The frame contains the estimate of x; an observer of z alone has no estimate to draw."""
     outer = {"observer": saved(age=False), "estimate": estimate}
     windows, arrays = (
         ActionRepeat(KKLObservation(KKLObservation(KKLEnv("van_der_pol", render_mode=mode), saved()), **outer), 4)
@@ -82,8 +82,8 @@ def test_keys_for_people():
     assert (two["w"], two["aw"], two["ds"]) == ([0.0, 1.0], [-1.0, 1.0], [1.0, -1.0])
 
 
-def test_what_another_environment_has_closed_opens_again(shown):
-    """As a training environment's window does after an evaluation: a process has one window."""
+def test_a_window_that_another_environment_closed_opens_again(shown):
+    """A process has one window: an evaluation closes the window of the training environment."""
     env, other = (gym.make("KKLVanDerPol-v0", render_mode="human") for _ in range(2))
     env.reset(seed=0)
     other.reset(seed=0)
@@ -92,7 +92,7 @@ def test_what_another_environment_has_closed_opens_again(shown):
     env.step(np.zeros(1, np.float32))
     env.step(np.zeros(1, np.float32))
     assert len(shown) == before + 1
-    other.close()  # a window that is no longer its own
+    other.close()  # has no effect: the window is now that of `env`
     assert pygame.display.get_init()
     env.close()
     assert not pygame.display.get_init()

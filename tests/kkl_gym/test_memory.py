@@ -1,4 +1,4 @@
-"""The filters of the memory against integration, closed forms and worst signals."""
+"""The filters of the memory against integration, closed forms and worst-case signals."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def memory(ny=2, nu=1, outputs=(1, 2, 4, 8), inputs=(1, 4)):
 
 
 def of_angles():
-    """Of five outputs; the third is no angle."""
+    """A memory of five outputs; the third is not an angle."""
     return Memory(5, 2, [(3, 1), (0, 4)], time_constants=(1, 3), input_time_constants=(2,))
 
 
@@ -29,7 +29,7 @@ def signals(steps, *shape, seed=0):
 
 
 def turning(steps, *shape, seed=0):
-    """Five outputs of two angles that turn around more than once, and these angles, unwrapped."""
+    """Five outputs of two angles that make more than one turn, and these angles, unwrapped."""
     rng = np.random.default_rng(seed)
     angles = rng.uniform(-np.pi, np.pi, (*shape, 2)) + rng.uniform(-2.5, 2.5, (steps, *shape, 2)).cumsum(0)
     other = rng.normal(size=(steps, *shape, 1))
@@ -62,13 +62,12 @@ def test_the_filters_are_those_that_integration_finds(outputs, inputs):
 
 
 @banks
-def test_a_steady_motion_looks_from_the_first_step_on_as_after_sixty_four_more(outputs, inputs):
-    """That is what the past before the first output is taken for."""
+def test_a_steady_motion_is_extrapolated_into_the_past(outputs, inputs):
     filters, rate = memory(2, 1, outputs, inputs), np.array([[0.3, -2.0]])
     shown = run(filters, np.arange(40.0)[:, None] * rate + 5.0, np.zeros((39, 1)))[:, 2:]
     tau = np.array(outputs)[:, None]
     for k in (1, 2, 20, 39):
-        w = tau * (1 - np.exp(-(k + 64) / tau)) * rate  # a low-pass lags behind a ramp by tau, in the end
+        w = tau * (1 - np.exp(-(k + 64) / tau)) * rate  # lag behind a ramp since 64 samples before y_0
         assert np.allclose(shown[k, : 2 * tau.size], (filters.mixing @ w).ravel(), rtol=1e-5, atol=1e-5)
 
 
@@ -77,12 +76,12 @@ def test_coordinates_are_uncorrelated_and_of_unit_size_for_wandering_signals(out
     found = memory(1, 1, outputs, inputs)
     m, covariance = len(outputs), 0.0
     for correlation in np.geomspace(2 * outputs[0], 8 * outputs[-1], 6):
-        stays = np.exp(-1 / correlation)  # y_k+1 = stays y_k + noise, and w as the docstring says
+        stays = np.exp(-1 / correlation)  # y_k+1 = stays y_k + noise, w as in the docstring
         transition = np.block([[stays, np.zeros((1, m))], [found.rise[:, None] * (stays - 1), np.diag(found.decay)]])
         drive = np.concatenate([[1.0], found.rise])[:, None] * np.sqrt(1 - stays**2)
         covariance = covariance + solve_discrete_lyapunov(transition, drive @ drive.T)[1:, 1:] / 6
     assert np.allclose(found.mixing @ covariance @ found.mixing.T, np.eye(m), atol=1e-6)
-    assert np.array_equal(abs(found.mixing) > 1e-9, np.tri(m, dtype=bool)[:, ::-1])  # the slowest alone, one more each
+    assert np.array_equal(abs(found.mixing) > 1e-9, np.tri(m, dtype=bool)[:, ::-1])  # one filter more each
     assert (found.mixing[range(m), range(m - 1, -1, -1)] > 0).all()
 
 
@@ -91,7 +90,7 @@ def test_noise_is_amplified_at_most_threefold(shortest, ratio):
     most = 1 + int(np.log(9_999 / shortest) / np.log(ratio))
     for m in {1, 2, min(4, most), most}:
         found = memory(1, 0, shortest * ratio ** np.arange(m), ())
-        later = ((found.decay - 1) * found.rise)[:, None]  # when a pulse of y has come and gone
+        later = ((found.decay - 1) * found.rise)[:, None]  # response after a pulse of y has ended
         of_filters = found.rise[:, None] * found.rise + solve_discrete_lyapunov(np.diag(found.decay), later @ later.T)
         assert 0.5 < np.sqrt((found.mixing @ of_filters @ found.mixing.T).diagonal().max()) < 3.0
 
@@ -123,7 +122,7 @@ def test_nothing_underflows_while_a_memory_fills():
 
 
 @pytest.mark.parametrize("shape", [(), (4,)])
-def test_of_angles_it_is_remembered_how_far_they_have_turned(shape):
+def test_features_of_angles_depend_on_the_unwrapped_angles(shape):
     (y, unwrapped), u = turning(40, *shape), signals(39, *shape, 2, seed=1)
     assert np.ptp(unwrapped[..., 1:], axis=0).min() > 2 * np.pi
     seen, plain = run(of_angles(), y, u), run(memory(3, 2, (1, 3), (2,)), unwrapped, u)

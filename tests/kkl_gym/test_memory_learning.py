@@ -1,4 +1,4 @@
-"""Agents learn with a memory where an observation is a Dict: a goal beside the state, an image beside the state."""
+"""Agents learn with a memory from Dict observations: the state with a goal or with an image."""
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +12,7 @@ DT = 0.2
 
 
 class Mass(gym.Env):
-    """A mass on a line, pushed to a goal; its place is measured, its velocity is not."""
+    """A mass on a line, pushed to a goal; its position is measured, its velocity is hidden."""
 
     action_space = spaces.Box(-1.0, 1.0, (1,))
 
@@ -43,7 +43,7 @@ class Mass(gym.Env):
         if not self._image:
             return {"observation": place, "achieved_goal": place, "desired_goal": goal}
         image = np.zeros((1, 36, 36), np.uint8)
-        image[..., : round(18 * (1 + self.goal))] = 255  # a bar up to the goal
+        image[..., : round(18 * (1 + self.goal))] = 255  # a bar whose end is at the goal
         return {"observation": place, "image": image}
 
 

@@ -1,4 +1,4 @@
-"""The memory around Gymnasium's own environments, single and in vectors."""
+"""The memory wrappers on Gymnasium's own environments, single and in vectors."""
 
 import copy
 import pickle
@@ -17,7 +17,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from kkl_gym import OWN_ID, KKLMemory, KKLVectorEnv, KKLVectorMemory
 
 modes = pytest.mark.parametrize("mode", list(AutoresetMode))
-# What bare environments draw from the checkers, too: unbounded observations, actions that are not in [-1, 1].
+# Warnings of the checkers for the bare environments too: unbounded observations, actions beyond [-1, 1].
 pytestmark = [
     pytest.mark.filterwarnings(f"ignore:{message}")
     for message in (
@@ -32,7 +32,7 @@ pytestmark = [
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """MuJoCo writes its warnings into the folder in which it runs."""
+    """Run in another folder: MuJoCo writes its warnings into the working directory."""
     monkeypatch.chdir(tmp_path)
 
 
@@ -49,7 +49,7 @@ def elsewhere(tmp_path, monkeypatch):
 def test_checkers_are_content(env_id, package):
     pytest.importorskip(package)
     check_env(KKLMemory(gym.make(env_id)), skip_render_check=True)
-    if env_id != "BipedalWalker-v3":  # whose reward is no float, bare either
+    if env_id != "BipedalWalker-v3":  # the bare environment's reward is not a float
         pytest.importorskip("stable_baselines3.common.env_checker").check_env(KKLMemory(gym.make(env_id)))
 
 
@@ -76,13 +76,13 @@ def test_specs_copies_and_pickles_go_on_alike(env_id, arguments):
     for twins in (first, steps):
         assert np.array_equal(*twins)
     assert not np.array_equal(first[0], steps[0])
-    if env_id == "Pendulum-v1":  # in the midst of an episode
+    if env_id == "Pendulum-v1":  # in the middle of an episode
         for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
             assert np.array_equal(twin.step(action)[0], copy.deepcopy(env).step(action)[0])
 
 
 class Walk(gym.Env):
-    """A walk in a Dict of all kinds, of random length, that says so in its observation."""
+    """A random walk of random length with Dict observations; the entry `way` is an angle."""
 
     observation_space = spaces.Dict(
         place=spaces.Box(-np.inf, np.inf, (2,)),
@@ -117,7 +117,7 @@ class Walk(gym.Env):
         (AutoresetMode.SAME_STEP, AsyncVectorEnv, ["way"]),
     ],
 )
-def test_rows_begin_anew_in_every_autoreset_mode(mode, kind, angles):
+def test_rows_restart_in_every_autoreset_mode(mode, kind, angles):
     arguments = {"measured": ["place", "mark", "way"], "angles": angles, "time_constants": [1, 5]}
     ours = KKLVectorMemory(kind([Walk] * 3, autoreset_mode=mode), **arguments)
     theirs = kind([lambda: KKLMemory(Walk(), **arguments)] * 3, autoreset_mode=mode)
@@ -128,7 +128,7 @@ def test_rows_begin_anew_in_every_autoreset_mode(mode, kind, angles):
 
 @modes
 def test_native_vectors_that_wait_for_their_reset(mode):
-    """In the package's own vectors rows that have ended stay as they are until they are reset."""
+    """In the package's own vectors, the state of an ended row is constant until its reset."""
     options = {"observe": "output", "max_episode_steps": 5}
     envs = KKLVectorEnv(Henon(), 3, autoreset_mode=mode, **options)
     single = partial(gym.make, OWN_ID, system=Henon(), **options)
@@ -138,7 +138,7 @@ def test_native_vectors_that_wait_for_their_reset(mode):
 
 
 @pytest.mark.parametrize("poison", [np.nan, -1e20])
-def test_what_would_poison_the_memory_is_an_error_that_names_it(poison):
+def test_invalid_values_raise_an_error_that_names_them(poison):
     env = KKLMemory(Walk(), measured=["place"])
     env.reset(seed=0)
     env.unwrapped.poison = poison
@@ -154,7 +154,7 @@ def test_what_would_poison_the_memory_is_an_error_that_names_it(poison):
         envs.step(envs.action_space.sample())
 
 
-def test_wrong_environments_say_what_to_do():
+def test_errors_for_invalid_environments_name_the_fix():
     envs = gym.make_vec("CartPole-v1", num_envs=2)
     with pytest.raises(ValueError, match=r"KKLVectorMemory"):
         KKLMemory(envs)
@@ -166,7 +166,7 @@ def test_wrong_environments_say_what_to_do():
 
 
 def dial(high=180.0, low=None, **arguments):
-    """A memory of a dial that turns by 0.1 turns in each step, in other units than rad."""
+    """A memory of a dial that makes 0.1 turns per step, measured in units other than rad."""
 
     class Dial(gym.Env):
         observation_space = spaces.Box(-high if low is None else low, high, (1,))
@@ -189,7 +189,7 @@ def test_the_period_of_angles_follows_from_the_bounds_or_is_given():
     for env in (dial(np.pi), dial(180.0), dial(4095.0, 0.0, period=4096)):
         env.reset()
         shown.append([env.step(0)[0][2:] for _ in range(30)])
-    assert np.allclose(shown[0], shown[0][-1], atol=0.03)  # a steady turn
+    assert np.allclose(shown[0], shown[0][-1], atol=0.03)  # constant speed
     for other in shown[1:]:
         assert np.allclose(shown[0], other, atol=1e-3)
     for low, high in [(0.0, 4095.0), (-0.5, 0.5), (-1.0, 1.0), (-45.0, 45.0), (-3600.0, 3600.0)]:  # counts, turns, ...
@@ -204,7 +204,7 @@ def test_the_period_of_angles_follows_from_the_bounds_or_is_given():
 @modes
 def test_missing_values_are_held_within_an_episode(mode):
     class Losing(Walk):
-        """Loses the second place in every third step, and never the first sample."""
+        """Replaces the second entry of `place` by NaN in every third step, never in the first sample."""
 
         observation_space = spaces.Box(-np.inf, np.inf, (2,))
 
@@ -232,7 +232,7 @@ def test_missing_values_are_held_within_an_episode(mode):
 
 
 def test_a_dict_stays_a_dict():
-    """With images and other keys as they are, in memory of its own, and with cosine and sine where angles are none."""
+    """Images and other keys are unchanged copies; the memory has the cosine and sine of entries named as angles."""
     env = KKLMemory(Walk(), angles=["way"], input_time_constants=())
     first = env.reset(seed=0)[0]
     assert first in env.observation_space
@@ -243,13 +243,13 @@ def test_a_dict_stays_a_dict():
     assert np.array_equal(first["place"], place)
     assert np.allclose(second["memory"][:2], [np.cos(second["way"][0]), np.sin(second["way"][0])])
     flat = KKLMemory(gym.wrappers.FilterObservation(Walk(), ["place"]), measured=[0, 1])
-    assert np.array_equal(flat.reset(seed=0)[0][:2], place)  # entries are shown flat
+    assert np.array_equal(flat.reset(seed=0)[0][:2], place)  # the observation is flattened
     with pytest.raises(ValueError, match="a key named memory"):
         KKLMemory(env)
 
 
 class Reusing(Walk):
-    """Writes each observation into the same arrays."""
+    """Returns the same arrays as every observation."""
 
     seen = None
 

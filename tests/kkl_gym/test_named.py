@@ -69,7 +69,7 @@ def test_of_a_dict_entries_that_are_not_read_are_not_looked_at():
     ("info[speed][2]", {"speed": [1.0, 2.0]}, "holds 2 numbers there"),
     ("info[speed]", {"speed": "fast"}, "real numbers"),
 ])  # fmt: skip
-def test_what_info_does_not_hold(name, info, match):
+def test_missing_entries_of_info_are_named(name, info, match):
     with pytest.raises(ValueError, match=match):
         Reader(PLAIN, [name], source="Env-v0")(np.zeros((2, 2)), info)
 

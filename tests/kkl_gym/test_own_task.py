@@ -1,4 +1,4 @@
-"""A system's own reward and ends of episodes."""
+"""Rewards and terminations that a system defines."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ from kkl_gym.elementary import where
 
 
 class Cart(System):
-    """Pushed towards 1, where an episode ends; beyond -3 it is lost."""
+    """A cart whose episode ends successfully at 1; below -3 it is lost."""
 
     name = "cart"
     X, bounds, u_max, G = ((-1.0, 0.5), (-1.0, 1.0)), ((-3.0, 9.0), (-9.0, 9.0)), (2.0,), ((0.0,), (1.0,))

@@ -1,4 +1,4 @@
-"""The memory under noise: what it keeps of the filters, and how well that tells a hidden rate."""
+"""The memory under noise: learned weights of the filters, and how well the features determine a hidden rate."""
 
 import gymnasium as gym
 import numpy as np
@@ -27,7 +27,7 @@ def pendulum(**arguments):
 
 
 def steps(env, n, seed=1):
-    """What is shown and the noiseless observation, at random actions."""
+    """Observations with the memory, and noiseless observations, under random actions."""
     env.action_space.seed(seed)
     shown, hidden = [env.reset(seed=seed)[0]], [env.env.hidden]
     for _ in range(n):
@@ -45,21 +45,21 @@ def weights():
 
 
 def residual(shown, hidden):
-    """Rms of what a linear map of what is shown leaves, on the second half of the samples."""
+    """Rms error of a linear regression of `hidden` on `shown`, on the second half of the samples."""
     x, half = np.c_[shown, np.ones(len(shown))], len(shown) // 2
     fitted = np.linalg.lstsq(x[:half], hidden[:half], rcond=None)[0]
     return np.sqrt(((x[half:] @ fitted - hidden[half:]) ** 2).mean(0))
 
 
-def test_four_numbers_tell_the_rate_under_noise(weights):
-    """Two more than cosine and sine are kept, and they tell as much as a filter that knows the noise can."""
+def test_four_features_determine_the_rate_under_noise(weights):
+    """Two features besides cosine and sine are about as good as a filter that knows the noise."""
     shown, hidden = steps(pendulum(weights=weights), 4_000)
     assert shown.shape[1] == 4
     plain, same = steps(pendulum(), 4_000)
     assert np.array_equal(hidden, same)
-    assert residual(shown, hidden[:, 2]) < 0.4 < 0.5 < residual(plain, hidden[:, 2])  # of about 3 rad/s
+    assert residual(shown, hidden[:, 2]) < 0.4 < 0.5 < residual(plain, hidden[:, 2])  # rad/s, out of about 3
     turn = np.arctan2(*hidden[:, 1::-1].T) - np.arctan2(*shown[:, 1::-1].T)
-    assert np.sqrt((np.angle(np.exp(1j * (turn + 0.05 * hidden[:, 2]))) ** 2).mean()) < 0.09  # of the next sample
+    assert np.sqrt((np.angle(np.exp(1j * (turn + 0.05 * hidden[:, 2]))) ** 2).mean()) < 0.09  # rad
     assert np.allclose(shown[100:, 2:].std(0), 1, atol=0.3)
 
 

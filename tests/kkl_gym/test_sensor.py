@@ -1,4 +1,4 @@
-"""The sensor of environments against closed forms, and what reaches the observer."""
+"""The sensor of environments against closed forms, and the samples that the observer gets."""
 
 import copy
 import json
@@ -33,7 +33,7 @@ ALL = {
 
 
 class Drifting(System):
-    """Two outputs, of which each moves by itself."""
+    """Two outputs that move independently."""
 
     name, X, bounds = "drifting", ((-1, 1), (-1, 1)), ((-100, 100), (-100, 100))
     u_max, G = (1.0,), ((1.0,), (0.0,))
@@ -49,7 +49,7 @@ class Drifting(System):
 
 
 def record(system="van_der_pol", steps=300, n=6, seed=0, **options):
-    """Outputs without noise, samples and observations, (steps + 1, n, ...), of n seeds from seed on."""
+    """Noiseless outputs, samples and observations, (steps + 1, n, ...), for n consecutive seeds."""
     env, clean = KKLVectorEnv(system, n, **options), kkl_gym.get_system(system).output
     obs, info = env.reset(seed=seed)
     found = [(clean(info["x"]), info["y"], obs)]
@@ -83,7 +83,7 @@ def test_every_third_step_and_drop_outs():
     there = np.arange(len(y)) % 3 == 0
     assert np.array_equal(y[there], plain[there])
     assert np.isnan(y[~there]).all()
-    assert np.array_equal(obs[1::3], obs[0:-1:3])  # held
+    assert np.array_equal(obs[1::3], obs[0:-1:3])  # the last value is held
     assert np.isfinite(obs).all()
     _, y, _ = record(steps=2000, sensor=Sensor(drop_out=0.3))
     lost = np.isnan(y[1:])
@@ -156,7 +156,7 @@ def test_checkers_are_content(gym_id, own):
 
 
 @pytest.mark.parametrize("kind", ["single", "vector"])
-def test_the_observer_takes_what_the_sensor_reads(kind, saved, make_artifact):
+def test_the_observer_gets_the_samples_of_the_sensor(kind, saved, make_artifact):
     if kind == "single":
         env = KKLObservation(KKLEnv("van_der_pol", sensor=ALL), saved())
     else:
@@ -181,7 +181,7 @@ CHANGING = [
 
 
 class DroppingInPlace(gym.Wrapper):
-    """Overwrites observations from the third step on."""
+    """Overwrites observations in place from the third step on."""
 
     def step(self, action):
         obs, *rest, info = self.env.step(action)
@@ -210,7 +210,7 @@ def test_a_change_on_the_way_is_noticed_and_other_wrappers_are_not(saved):
     with pytest.raises(ValueError, match=r"DroppingInPlace.*changes observations"):
         env.step([0.0])
     quiet = gym.wrappers.TransformReward(RecordEpisodeStatistics(gym.make("KKLVanDerPol-v0")), lambda r: 2.0 * r)
-    for inner in (quiet, KKLObservation(quiet, saved(), estimate="z")):  # an observer around another one
+    for inner in (quiet, KKLObservation(quiet, saved(), estimate="z")):  # also around another observer
         env = KKLObservation(inner, saved())
         env.reset(seed=0)
         env.step([0.0])

@@ -23,7 +23,7 @@ DT = 0.01
 
 
 class Flushed(System):
-    """A reactor whose input dilutes it: x' = -0.02 x + (1 - x) u, which the input alone makes fast."""
+    """A reactor that its input dilutes, x' = -0.02 x + (1 - x) u: slow without the input, fast with it."""
 
     name = "flushed"
     X = ((0.0, 1.0),)
@@ -67,7 +67,7 @@ def test_accuracy_from_twice_the_training_box(name, duration, find):
 
 
 class Relaxing(System):
-    """Van der Pol's oscillator at mu = 200: jumps within 0.01 s between parts that are slow and stiff."""
+    """Van der Pol's oscillator at mu = 200: slow, stiff phases with jumps of 0.01 s between them."""
 
     name = "relaxing"
     X, bounds = ((-2.5, 2.5), (-800.0, 800.0)), ((-9.0, 9.0), (-6000.0, 6000.0))
@@ -80,7 +80,7 @@ class Relaxing(System):
 
 
 class Reacting(Relaxing):
-    """Robertson's reaction, whose fastest part takes 3e-5 of the interval."""
+    """Robertson's reaction; its fastest phase lasts 3e-5 of the interval."""
 
     name = "reacting"
     X, bounds = ((0.0, 1.0), (0.0, 1e-4), (0.0, 1.0)), ((-1.0, 2.0), (-1.0, 1.0), (-1.0, 2.0))
@@ -91,7 +91,7 @@ class Reacting(Relaxing):
 
 
 class Clocked(Relaxing):
-    """x2' is a sine of time, which is a state: slopes halfway agree whatever the step."""
+    """x2' is a sine of time, which is a state: slopes at the midpoint agree for all step sizes."""
 
     name = "clocked"
     X, bounds = ((0.0, 10.0), (-1.0, 1.0)), ((-1e3, 1e3), (-1e3, 1e3))
@@ -103,7 +103,7 @@ class Clocked(Relaxing):
 @pytest.mark.parametrize(("system", "dt", "duration"), [
     (Relaxing(), 0.01, 1.0), (Reacting(), 0.1, 1.0), (Clocked(), 0.05, 5.0),
 ], ids=lambda value: getattr(value, "name", value))  # fmt: skip
-def test_accuracy_of_what_is_stiff_or_driven_by_time(system, dt, duration):
+def test_accuracy_of_stiff_and_time_driven_systems(system, dt, duration):
     x0 = system.draw_starts(np.random.default_rng(0), 4)
     found = simulate(system, x0, round(duration / dt), dt)
     times = np.linspace(0.0, duration, len(found))
@@ -164,7 +164,7 @@ def test_a_jump_takes_a_few_substeps():
             return x[1], -x[0] - 0.5 * sign(x[1])
 
     found = simulate(Rubbing(), [[1.0, 1.0]], 300, DT)
-    assert np.abs(found[-1]).max() < 0.6  # where friction holds it
+    assert np.abs(found[-1]).max() < 0.6  # friction stops the mass there
     assert len(calls) / 300 < 1000
 
 
@@ -176,7 +176,7 @@ def test_escape_leaves_nan_rows_and_no_warning():
         x = simulate(system, x0, 200, DT)
     gone = np.isnan(x).any(-1)
     assert np.isnan(x[gone]).all()
-    assert (np.diff(gone.astype(int), axis=0) >= 0).all()  # once gone, for good
+    assert (np.diff(gone.astype(int), axis=0) >= 0).all()  # a lost row stays lost
     assert gone[-1].tolist() == [True, False, True, False]
     low, high = np.array(system.bounds).T
     assert ((x[~gone] >= low) & (x[~gone] <= high)).all()
@@ -202,7 +202,7 @@ class Rated(Igniting):
 
 
 @pytest.mark.parametrize("system", [Igniting(), Rated()], ids=lambda s: s.name)
-def test_what_ignites_within_an_interval_is_followed_and_not_lost(system):
+def test_a_reaction_that_ignites_within_an_interval_is_resolved(system):
     dt = 1.0
     starts = np.array([(1.0, 0.0), (0.7, 2.0)])
     expected = np.array(
@@ -256,8 +256,8 @@ def test_wrong_arguments_raise(wrong, match):
         simulate(Lorenz(), **arguments)
 
 
-def test_what_an_input_speeds_up_is_followed():
-    """The closed form: x runs to u / (u + 0.02) at the rate u + 0.02."""
+def test_a_reactor_that_its_input_makes_fast_is_resolved():
+    """In closed form, x tends to u / (u + 0.02) at the rate u + 0.02."""
     system, dt, x0 = Flushed(), 1.0, 0.2
     for u in (0.8, 4.0, 40.0, 400.0):
         end = u / (u + 0.02)
@@ -267,14 +267,14 @@ def test_what_an_input_speeds_up_is_followed():
         for step in (batch_step(system), functools.partial(advance_batch, system)):
             found = step(np.full((1, 3), x0), np.full((1, 3), u), np.zeros((1, 3)), dt)
             np.testing.assert_allclose(found, expected, rtol=1e-6)
-    assert Flushed().typical_rate == pytest.approx(400.02, rel=1e-6)  # from which the default dt follows
+    assert Flushed().typical_rate == pytest.approx(400.02, rel=1e-6)  # sets the default dt
 
 
 def test_a_compiled_step_may_take_the_steps():
     pytest.importorskip("numba")
     system, rng = Lorenz(), np.random.default_rng(0)
     x0, u = system.draw_starts(rng, 50, 2.0), rng.uniform(-10, 10, (40, 50, 1))
-    x0[:5] *= 100.0  # which are lost
+    x0[:5] *= 100.0  # these rows diverge
     compiled, in_numpy = (simulate(system, x0, 40, DT, u=u, step=step) for step in (batch_step(system), None))
     assert np.isnan(compiled[-1]).any(1).sum() == np.isnan(in_numpy[-1]).any(1).sum() > 0
     np.testing.assert_allclose(compiled, in_numpy, rtol=1e-8)

@@ -1,4 +1,4 @@
-"""What is read of observations and actions, against Gymnasium's own flattening."""
+"""Numbers read from observations and actions, against Gymnasium's own flattening."""
 
 import gymnasium as gym
 import numpy as np
@@ -53,7 +53,7 @@ def test_values_are_read_as_gymnasium_flattens_them_and_bounded_actions_are_scal
     assert np.allclose(act(stacked(space, values), (6,)), expected)
 
 
-def test_actions_beyond_the_bounds_count_as_the_bounds_and_half_a_bound_is_none():
+def test_actions_are_clipped_to_two_sided_bounds_only():
     bounds = np.array([[-2.0, 0.0, 1.0], [2.0, np.inf, 1.0]], np.float32)
     read = inputs(spaces.Box(*bounds))
     assert read([9.0, 7.0, 1.0]).tolist() == [1.0, 7.0, 0.0]
@@ -61,12 +61,12 @@ def test_actions_beyond_the_bounds_count_as_the_bounds_and_half_a_bound_is_none(
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_bounds_that_are_the_largest_floats_are_none(dtype):
+def test_bounds_at_the_largest_float_count_as_unbounded(dtype):
     largest = np.finfo(dtype).max
     assert inputs(spaces.Box(-largest, largest, (2,), dtype))(np.array([3.0, -0.5])).tolist() == [3.0, -0.5]
 
 
-def test_what_is_measured_and_angles():
+def test_measured_entries_and_angles():
     space = spaces.Box(-6.0, 6.0, (4,))
     values = np.array([0.1, 2.0, -3.0, 9.0])
     assert outputs(space, [2, 0])(values).tolist() == [-3.0, 0.1]
@@ -115,7 +115,7 @@ MIXED = spaces.Dict(camera=IMAGE, place=spaces.Box(-1, 1, (2,)), word=spaces.Tex
     (MIXED, ["speed"], (), "has keys 'camera', 'place', 'word'"),
     (spaces.Sequence(spaces.Discrete(2)), None, (), "only Box, Discrete"),
 ])  # fmt: skip
-def test_what_cannot_be_measured_says_what_to_do(space, measured, angles, match):
+def test_errors_for_unmeasurable_entries_name_the_fix(space, measured, angles, match):
     with pytest.raises(ValueError, match=match):
         outputs(space, measured, angles)
 

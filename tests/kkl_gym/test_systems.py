@@ -1,4 +1,4 @@
-"""The shipped systems' equations, rates and targets, and how systems are found by name."""
+"""The shipped systems' equations, rates and targets, and the lookup of systems by name."""
 
 import sys
 
@@ -90,7 +90,7 @@ def test_targets():
         _ = Rossler(a=10, b=10).target
     system = Rossler()
     roots = np.roots([system.a, system.c, system.b])
-    assert system.target[1] == pytest.approx(roots[np.abs(roots).argmin()])  # the inner equilibrium
+    assert system.target[1] == pytest.approx(roots[np.abs(roots).argmin()])  # the equilibrium nearest to 0
 
 
 @everyone

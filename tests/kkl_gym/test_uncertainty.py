@@ -1,4 +1,4 @@
-"""Standard deviations beside the estimate, in single and vector environments."""
+"""Standard deviations of the estimate in observations of single and vector environments."""
 
 import gymnasium as gym
 import numpy as np
@@ -55,7 +55,7 @@ def test_vector_is_single(path, mode):
                 info, obs = info["final_info"], np.stack(info["final_obs"])
 
 
-def test_where_there_is_none(path, saved):
+def test_errors_of_observers_without_covariances(path, saved):
     plain = saved(system="van_der_pol", dt=0.01)
     env = gym.make("KKLVanDerPol-v0")
     with pytest.raises(ArtifactError, match="no covariance"):

@@ -26,7 +26,7 @@ from kkl_gym.simulate import advance_batch
 
 modes = pytest.mark.parametrize("mode", list(AutoresetMode))
 N, MANY_ROWS = 4, 128
-ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler, within a few steps
+ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler; escapes within a few steps
 
 
 def actions(steps, n=N, seed=0):
@@ -59,14 +59,14 @@ def sync(name, mode, n=N, **options):
 @pytest.mark.parametrize(("name", "observe"), [("lorenz", "state"), ("van_der_pol", "output")])
 def test_rows_are_single_environments(name, mode, observe):
     ends = compare(vector(name, mode, observe=observe), sync(name, mode, observe=observe), actions(60), mode)
-    assert len({k for k, _ in ends}) > 2  # at different times
+    assert len({k for k, _ in ends}) > 2  # episodes end at different times
     assert {row for _, row in ends} == set(range(N))
 
 
 @pytest.mark.parametrize("estimate", ["x", "z"])
 @modes
-def test_many_rows_are_as_few(estimate, mode, saved):
-    """Where filter, observations and the shipped map, which tracks, are compiled."""
+def test_many_rows_equal_few_rows(estimate, mode, saved):
+    """With a compiled filter, compiled observations and a shipped map that tracks."""
     path = None if estimate == "x" else saved(system="lorenz")
     many, few = (KKLVectorObservation(vector("lorenz", mode, n=n), path, estimate=estimate) for n in (MANY_ROWS, N))
     results = [many.reset(seed=7), few.reset(seed=7)]
@@ -78,7 +78,7 @@ def test_many_rows_are_as_few(estimate, mode, saved):
             tolerance = NETWORK if key == "x_hat" else 1e-9
             assert np.allclose(info[key][:N], info_few[key], rtol=tolerance, atol=tolerance), key
         ended = results[1][2] | results[1][3] if len(results[1]) == 5 else np.zeros(N, dtype=bool)
-        if mode is AutoresetMode.DISABLED and ended.any() and next(waits) % 3 == 2:  # some steps after the end
+        if mode is AutoresetMode.DISABLED and ended.any() and next(waits) % 3 == 2:  # reset a few steps after the end
             mask = np.arange(MANY_ROWS) % 2 == next(halves) % 2
             masks = mask, mask[:N]
             results = [env.reset(options={"reset_mask": mask}) for env, mask in zip((many, few), masks, strict=True)]
@@ -148,7 +148,7 @@ def test_the_observer_inside_gymnasiums_async_vector(saved):
 
 
 @modes
-@pytest.mark.parametrize(("steps", "estimate"), [(20, None), (23, "x")])  # the latter ends within a repeat
+@pytest.mark.parametrize(("steps", "estimate"), [(20, None), (23, "x")])  # 23: ends within a repeat
 def test_action_repeat(mode, steps, estimate, saved):
     path = None if estimate is None else saved()
     inner = vector("van_der_pol", "Disabled", steps)
@@ -223,7 +223,7 @@ def test_reset_is_required():
 
 @modes
 def test_results_are_copies(mode, saved):
-    """Overwriting all that a call returned changes nothing that follows."""
+    """Overwriting returned arrays does not change later results."""
     one, two = (KKLVectorObservation(vector("van_der_pol", mode, 3), saved()) for _ in range(2))
 
     def spoil(value):
@@ -266,9 +266,9 @@ def test_frames_are_those_of_single_environments(saved):
         for one, two in zip(mine, other, strict=True):
             assert one.shape == (480, 480, 3)
             assert one.dtype == np.uint8
-            assert np.abs(one.astype(int) - two).max() <= 1  # estimates agree to rounding
+            assert np.abs(one.astype(int) - two).max() <= 1  # rounding of the estimates may shift a colour by one
         for env in both:
-            if k == 2:  # episodes then end at different times
+            if k == 2:  # so that episodes end at different times
                 env.reset(options={"reset_mask": np.array([True, False])})
             env.step(action)
 
@@ -284,7 +284,7 @@ def test_a_repeat_inside_the_observer_is_noticed(saved):
             env.step(np.zeros(env.action_space.shape))
 
 
-def test_what_changes_info_inside_the_observer_is_named(saved):
+def test_wrappers_that_change_info_inside_the_observer_are_named(saved):
     inner = gym.wrappers.vector.DictInfoToList(KKLVectorEnv("van_der_pol", 2))
     with pytest.raises(ValueError, match=r"DictInfoToList.*changes info: put wrappers such as DictInfoToList"):
         KKLVectorObservation(inner, saved()).reset(seed=0)
@@ -313,7 +313,7 @@ def test_a_blind_map_under_action(saved):
     env.step(np.zeros((N, 1)))
     with pytest.raises(ValueError, match="takes no inputs"):
         env.step(np.ones((N, 1)))
-    with pytest.raises(ValueError, match="reset after an error"):  # it has missed a sample
+    with pytest.raises(ValueError, match="reset after an error"):  # the observer has missed a sample
         env.step(np.zeros((N, 1)))
 
 

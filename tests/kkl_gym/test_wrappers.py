@@ -50,7 +50,7 @@ def test_checkers_are_content(name, estimate, options, saved):
 
 @pytest.mark.parametrize(("name", "noise", "inputs"), [("lorenz", 0.5, True), ("rossler", 0.0, False)])
 def test_estimates_are_timed_as_the_observers(name, noise, inputs, saved, make_artifact):
-    """The wrapper's x_hat, from y_k+1 and the u_k that led to it, equals the bare observer fed from the infos."""
+    """The wrapper's x_hat, from y_k+1 and u_k, equals that of a bare observer with y and u from the infos."""
     env = wrapped(saved, name, env={"measurement_noise": noise}, inputs=inputs, ignore_input=True)
     bare, space = KKLObserver(make_artifact(name, inputs=inputs), noise), env.unwrapped.plant.state_space
     obs, info = env.reset(seed=1)
@@ -59,14 +59,14 @@ def test_estimates_are_timed_as_the_observers(name, noise, inputs, saved, make_a
         assert np.array_equal(info["x_hat"], x_hat)
         assert np.array_equal(info["z"], bare.z)
         assert np.array_equal(obs, np.clip(x_hat, space.low, space.high).astype(np.float32))
-        obs, _, _, _, info = env.step(2 * action)  # some are clipped
+        obs, _, _, _, info = env.step(2 * action)  # the environment clips some inputs
         infos.append(info)
         x_hat = bare.step(info["y"], info["u"] if inputs else None)
     y, found = (np.array([info[key] for info in infos]) for key in ("y", "x_hat"))
     u = np.array([info["u"] for info in infos[1:]]) if inputs else None
     assert np.allclose(bare.estimate(y, u), found, rtol=1e-5, atol=1e-4)
     if inputs:
-        assert not np.allclose(bare.estimate(y, np.roll(u, 1, 0)), found, rtol=1e-3)  # a shift by one would show
+        assert not np.allclose(bare.estimate(y, np.roll(u, 1, 0)), found, rtol=1e-3)  # shifted by one sample
 
 
 @pytest.mark.parametrize("estimate", ["x", "z"])
@@ -92,7 +92,7 @@ def test_known_starts_need_a_map_with_a_motion_or_T(saved):
             kind(env, saved(system="lorenz"), known_start=True)
 
 
-def test_where_z_is_shown_it_does_not_track():
+def test_wrappers_that_show_z_track_only_for_a_monitor_or_a_known_start():
     def tracks(**options):
         env = KKLObservation(KKLEnv("lorenz"), **options)
         env.reset(seed=0)
@@ -104,7 +104,7 @@ def test_where_z_is_shown_it_does_not_track():
     assert tracks(estimate="z", known_start=True)
 
 
-def test_the_environment_is_left_as_it_was(saved):
+def test_wrappers_do_not_change_the_environment(saved):
     bare, env = gym.make("KKLRossler-v0"), wrapped(saved, "rossler")
     x0, x1 = bare.reset(seed=2)[1]["x"], env.reset(seed=2)[1]["x"]
     assert np.array_equal(x0, x1)
@@ -141,7 +141,7 @@ def test_each_output_has_its_level(make_artifact, tmp_path):
     system, path = f"{linear_system.__file__}:TwoOutputs", str(tmp_path / "two.safetensors")
     dataclasses.replace(make_artifact(outputs=2), system="two-outputs", parameters={}).save(path)
     plain = gym.make("kkl_gym:kkl_gym/Own-v0", system=system)
-    assert KKLObservation(plain, path).observer.measurement_noise == (0.1, 0.3)  # the environment's
+    assert KKLObservation(plain, path).observer.measurement_noise == (0.1, 0.3)  # the level of the environment
     env = KKLObservation(plain, path, measurement_noise=np.array([0.2, 0.4]))
     for again in (env, gym.make(EnvSpec.from_json(env.spec.to_json()))):
         assert again.observer.measurement_noise == (0.2, 0.4)
@@ -160,12 +160,12 @@ def test_the_default_observer_is_the_systems():
 
 
 @pytest.mark.parametrize("level", [None, 0.15])
-def test_the_map_is_told_the_environments_process_noise(saved, level):
+def test_the_map_gets_the_environments_process_noise(saved, level):
     path = saved(process=True)
     env = KKLObservation(KKLEnv("van_der_pol", process_noise=level), path)
     many = KKLVectorObservation(KKLVectorEnv("van_der_pol", 2, process_noise=level), path)
     right, wrong = (
-        KKLObserver(Artifact.read(path), 0.5, process_noise=told) for told in (0.05 if level is None else level, 0.01)
+        KKLObserver(Artifact.read(path), 0.5, process_noise=noise) for noise in (0.05 if level is None else level, 0.01)
     )
     _, info = env.reset(seed=0)
     assert np.array_equal(info["x_hat"], right.reset(info["y"]))
@@ -178,7 +178,7 @@ def test_vectors_that_differ_in_process_noise(saved):
     mixed = SyncVectorEnv([lambda level=level: KKLEnv("van_der_pol", process_noise=level) for level in (0.0, 0.1)])
     with pytest.raises(ValueError, match=r"differ in process_noise, 0\.0 and 0\.1"):
         KKLVectorObservation(mixed, path)
-    silent = KKLVectorObservation(mixed, saved())  # a map that does not ask
+    silent = KKLVectorObservation(mixed, saved())  # a map without this feature
     before = silent.observer.artifact
     assert silent.observer.process_noise == 0.0
     with pytest.raises(ValueError, match="differ in process_noise"):
@@ -195,7 +195,7 @@ def test_action_repeat_sums_rewards(saved):
         assert reward == pytest.approx(sum(step[1] for step in steps), rel=1e-12)
         assert type(reward) is float
         assert np.array_equal(obs, steps[-1][0])
-        for key in ("x", "y", "u", "x_hat", "z"):  # the observer saw every sample
+        for key in ("x", "y", "u", "x_hat", "z"):  # every sample reached the observer
             assert np.array_equal(info[key], steps[-1][-1][key])
 
 
@@ -210,4 +210,4 @@ def test_render_shows_the_estimate_and_the_input(saved):
     assert (still != env.unwrapped.render()).any()
     assert (env.render() == still).all()
     env.step(np.ones(1, np.float32))
-    assert (env.render()[430:460] != still[430:460]).any()  # the bar of the input
+    assert (env.render()[430:460] != still[430:460]).any()  # the bar that shows the input

@@ -27,7 +27,7 @@ def contents(path):
 
 
 def rewrite(path, change):
-    """The file again with tensors and metadata changed in place by change(tensors, meta)."""
+    """Change the tensors and metadata of a file in place by change(tensors, meta)."""
     tensors, meta = contents(path)
     change(tensors, meta)
     path.write_bytes(with_arrays(tensors, "kkl-gym", meta))
@@ -45,10 +45,10 @@ def raises_naming(path, words=""):
 
 
 def same(one, other):
-    """Whether two artifacts, or parts of them, are the same to the last bit."""
+    """Whether two artifacts, or parts of them, are equal to the last bit."""
     if isinstance(one, LinearFilter):
         return (one.dt, one.nu) == (other.dt, other.nu) and same([one.A, one.B], [other.A, other.B])
-    if isinstance(one, MLP):  # in float32, which weights become
+    if isinstance(one, MLP):  # weights are stored in float32
         return one.activation == other.activation and same(one.layers, other.layers)
     if dataclasses.is_dataclass(one):
         names = [entry.name for entry in dataclasses.fields(one)]
@@ -98,15 +98,14 @@ def test_round_trip(options, make_artifact, tmp_path):
     lambda a: dataclasses.replace(a, parameter_ranges={"mu": (2.0, 4.0)}),
     *(lambda a, kind=kind: tracking(**kind) for kind in TRACKING),
 ])  # fmt: skip
-def test_round_trip_of_what_need_not_be_there(more, make_artifact, tmp_path):
+def test_round_trip_of_optional_parts(more, make_artifact, tmp_path):
     artifact = more(make_artifact())
     artifact.save(tmp_path / "map.safetensors")
     assert same(Artifact.read(tmp_path / "map.safetensors"), artifact)
 
 
 @pytest.mark.parametrize("name", shipped())
-def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
-    """The format is what it was: every array, key and digit."""
+def test_shipped_files_are_read_and_written_without_a_change(name, tmp_path):
     Artifact.read(resolve(name)).save(tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == resolve(name).read_bytes()
 
@@ -140,8 +139,8 @@ def paths(described, begin=()):
 
 
 @pytest.mark.parametrize("by", ["equations", "flow"])
-def test_nothing_stands_in_for_what_a_file_lacks(by, tmp_path):
-    """A unit or a factor that is missing would change estimates."""
+def test_missing_tensors_and_keys_have_no_defaults(by, tmp_path):
+    """A default unit or factor would change estimates silently."""
     path = tmp_path / "map.safetensors"
     tracking(by, outputs=2, process=True, free_inverse=True).save(path)
     whole, (tensors, meta) = path.read_bytes(), contents(path)
@@ -150,7 +149,7 @@ def test_nothing_stands_in_for_what_a_file_lacks(by, tmp_path):
         with raises_naming(path):
             Artifact.read(path)
         path.write_bytes(whole)
-    for key in set(paths(meta)) - {("motion",), ("free_inverse",)}:  # which need not be there as a whole
+    for key in set(paths(meta)) - {("motion",), ("free_inverse",)}:  # these are optional as a whole
         path.write_bytes(with_arrays(tensors, "kkl-gym", without(meta, key)))
         with raises_naming(path):
             Artifact.read(path)

@@ -1,4 +1,4 @@
-"""Machine code against NumPy, which is the reference."""
+"""Compiled steps against the reference in NumPy."""
 
 import copy
 import functools
@@ -36,7 +36,7 @@ def static():
 
 
 def along(observer, y, u, masks):
-    """Estimates and covariances along a record, with all that may happen on the way."""
+    """Estimates and covariances along a record with gaps, restarts, masked rows and changes of noise levels."""
     found, batch = [], y.shape[1:-1]
     observer.reset(y[0])
     for k in range(1, len(y)):
@@ -58,7 +58,7 @@ def along(observer, y, u, masks):
 
 
 def assert_alike(found, expected, within):
-    """Estimates in units of their standard deviations, and covariances in units of themselves."""
+    """Compare estimates in units of their standard deviations, and covariances in units of the variances."""
     (x, P), (x_expected, P_expected) = found, expected
     size = np.sqrt(P_expected.diagonal(0, -2, -1))
     assert np.isfinite(x_expected).all()
@@ -77,20 +77,20 @@ def record(artifact, steps, batch=()):
 
 @pytest.mark.parametrize("batch", [(), (ROWS,)])
 @pytest.mark.parametrize("kind", KINDS, ids=str)
-def test_all_that_may_happen(kind, batch):
-    """T_inv's networks are in float32."""
+def test_records_with_gaps_restarts_masks_and_new_levels(kind, batch):
+    """The tolerance is that of T_inv's float32 networks."""
     artifact = tracking(**kind)
     y, u, masks = record(artifact, 200 if batch else JUMPS[1] + 100, batch)
     if batch:
-        y[150:155, ::3] += 9.0  # where trackers are lost
+        y[150:155, ::3] += 9.0  # makes trackers diverge
     found, expected = (along(KKLObserver(artifact, 0.1, compiled=choice), y, u, masks) for choice in (True, False))
     assert_alike(found, expected, 1e-3)
-    assert not np.array_equal(found[1], expected[1])  # not the same arithmetic
+    assert not np.array_equal(found[1], expected[1])  # compiled steps round differently
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind.get("by") != "flow"], ids=str)
 def test_trackers_agree_to_rounding(kind):
-    """Of a T_inv that is never surer, along a record with gaps, and by steps, which take several rows at once."""
+    """A T_inv with large covariances never takes over; a record with gaps, and steps of several rows at once."""
     artifact = tracking(**{**kind, "surer": -9.0})
     y, u, _ = record(artifact, 200, (ROWS,))
     y[5::7] = y[3::5, 1, 0] = np.nan
@@ -103,7 +103,7 @@ def test_trackers_agree_to_rounding(kind):
 
 
 def constant(inverse):
-    """A T_inv whose last layer ignores its inputs, so that float32 rounds nothing."""
+    """A T_inv whose last layer ignores its inputs, so that float32 adds no rounding."""
     *weights, last = inverse.mlp.weights
     return replace(inverse, mlp=MLP([*weights, 0.0 * last], inverse.mlp.biases, inverse.mlp.activation))
 
@@ -123,14 +123,14 @@ def mixed(observer, y, u, rows):
 
 @pytest.mark.parametrize(("kind", "gate"), [(KINDS[0], None), (KINDS[5], 4.0), (KINDS[7], 4.0)], ids=str)
 def test_rows_of_all_ages_agree_to_rounding(kind, gate):
-    """Seventeen rows are two whole groups of lanes and one that is not; no row depends on its neighbours."""
+    """Seventeen rows fill two groups of vector lanes and a part of a third; no row depends on its neighbours."""
     artifact = tracking(**kind)
     y, u, _ = record(artifact, 90, (17,))
     maps = {name: constant(each) for name in ("inverse", "free_inverse") if (each := getattr(artifact, name))}
     artifact = replace(artifact, **maps)
     rows, k = np.arange(17), np.arange(90)[:, None]
     gaps = np.random.default_rng(4).random(y.shape) < 0.2
-    gaps[0] = gaps[(rows + k) % 80 == 20] = False  # first samples are whole
+    gaps[0] = gaps[(rows + k) % 80 == 20] = False  # first samples must be complete
     y[70, ::4] += 3.0
     y[gaps] = np.nan
     fast, slow = (KKLObserver(artifact, 0.1, gate=gate, compiled=choice) for choice in (True, False))
@@ -145,7 +145,7 @@ def test_rows_of_all_ages_agree_to_rounding(kind, gate):
 
 
 def test_undefined_outputs_may_be_missing():
-    """The tracker predicts by its motion where h is undefined at the state and its output is missing."""
+    """The tracker predicts with missing outputs even at states where h is undefined."""
     artifact = tracking(outputs=2, nonlinear=True)
     h = Expression([artifact.h.components[0], ["log", ["+", 1.0, ["x", 0]]]])
     found = []
@@ -156,8 +156,8 @@ def test_undefined_outputs_may_be_missing():
     np.testing.assert_allclose(*found, rtol=1e-9)
 
 
-def test_machine_code_serves_no_other_sizes(monkeypatch):
-    """It would read beyond the arrays, or exceed the stack; without a compiler, NumPy serves."""
+def test_compiled_steps_refuse_other_sizes(monkeypatch):
+    """Compiled code would read beyond the arrays or overflow the stack; without a compiler, NumPy takes over."""
     estimator = KKLObserver(EQUATIONS(), 0.1, compiled=True).estimator
     state = estimator.advance(estimator.start(3), np.zeros((3, 2)))
     for rows, y, u in ((3, (2, 2), (2, 1)), (3, (3, 2), (2, 1)), (3, (3, 1), (3, 1)), (2, (3, 2), (3, 1))):
@@ -215,7 +215,7 @@ def test_100_000_samples_of_every_shipped_map(name):
 @pytest.mark.parametrize("activation", sorted(REFERENCE))
 @pytest.mark.parametrize("width", [5, 16])
 def test_networks(activation, width):
-    """Of a width that no loop likes too, far into where the activation is flat."""
+    """Also widths that are no multiple of the vector lanes, and inputs far into the flat parts of the activation."""
     rng = np.random.default_rng(0)
     sizes = [3, width, width + 1, 2]
     mlp = MLP(
@@ -250,7 +250,7 @@ def test_activations_to_the_last_digits(activation):
     assert np.isnan(h[-1])
     x, h = x[:-1], h[:-1]
     expected = REFERENCE[activation](x.astype(float))
-    assert (np.abs(h - expected) <= 1e-6 * np.abs(x)).all()  # silu of -30 is a difference, in NumPy as well
+    assert (np.abs(h - expected) <= 1e-6 * np.abs(x)).all()  # silu of -30 suffers cancellation, in NumPy too
     assert (np.abs(h - expected) <= 1e-6 * np.abs(expected))[x >= -1].all()
     if activation == "tanh":
         assert (np.abs(h - expected) <= 3e-7 * np.abs(expected)).all()
@@ -276,7 +276,7 @@ pickle.dump(found, sys.stdout.buffer)
 """
 
 
-def test_what_is_compiled_goes_where_numba_is_not():
+def test_pickled_compiled_observers_load_without_numba():
     there, expected = [], []
     for make, batch in itertools.product((EQUATIONS, FLOW, static), ((), (ROWS,))):
         artifact = make()
@@ -288,7 +288,7 @@ def test_what_is_compiled_goes_where_numba_is_not():
         there.append(pickle.loads(pickle.dumps((observer, y[30:], u[30:]))))
         others = [copy.deepcopy(observer), copy.copy(observer), pickle.loads(pickle.dumps(observer))]
         expected.append([observer.step(y[k], u[k]) for k in range(30, 60)])
-        for other in others:  # to the last bit where Numba is
+        for other in others:  # copies agree to the last bit where Numba is installed
             assert np.array_equal([other.step(y[k], u[k]) for k in range(30, 60)], expected[-1])
             np.testing.assert_array_equal(other.covariance, observer.covariance)
     command = [sys.executable, "-c", NO_NUMBA]
@@ -301,7 +301,7 @@ def test_what_is_compiled_goes_where_numba_is_not():
 
 @pytest.mark.parametrize("batch", [(), (2000,)])
 def test_threads_do_not_share_memory(batch):
-    """Trackers of one artifact, and records of one observer."""
+    """Threads use trackers of one artifact, and estimate records by one observer."""
     artifact, shared, found = FLOW(), KKLObserver(static(), 0.1, compiled=True), {}
     y, u, _ = record(artifact, 40, batch)
 
@@ -323,8 +323,8 @@ def test_threads_do_not_share_memory(batch):
 
 
 @pytest.mark.parametrize(("batch", "compiled"), [((), False), ((), True), ((2,), False), ((ROWS,), True)])
-def test_a_covariance_that_breaks_down_is_lost(batch, compiled):
-    """Where outputs are all but exact, rounding makes some of them none."""
+def test_t_inv_replaces_a_covariance_that_is_not_positive_definite(batch, compiled):
+    """With almost exact outputs, rounding makes some covariances indefinite."""
     artifact, tiny = FLOW(), np.full(2, 1e-9)
     changes = {"least_measurement_noise": np.full(1, 1e-13), "error": tiny, "process_noise": tiny}
     artifact = replace(artifact, motion=replace(artifact.motion, **changes))
@@ -342,8 +342,8 @@ def test_a_covariance_that_breaks_down_is_lost(batch, compiled):
     assert taken
 
 
-def test_a_run_compiles_nothing_in_its_midst():
-    """Whatever may come: inputs that are read-only or have strides, missing samples, restarts, other levels."""
+def test_nothing_compiles_after_the_first_steps():
+    """Inputs may be read-only or strided, samples may be missing, rows may restart, and noise levels may change."""
     artifact = EQUATIONS()
     observer, other = (KKLObserver(artifact, 0.1, compiled=choice) for choice in (True, False))
     frozen, y = np.array([0.2]), np.array([0.1, 0.2])

@@ -1,4 +1,4 @@
-"""The covariance of the estimate's error: interpolation, batches, files, and no cost unless it is asked for."""
+"""The covariance of the estimate's error: interpolation, batches and files."""
 
 import dataclasses
 import pickle
@@ -13,7 +13,7 @@ OPTIONS = {"process": True, "free_inverse": True}
 
 
 def by_hand(error, level, age):
-    """Entry by entry, of a level in multiples of the largest."""
+    """Interpolate a covariance entry by entry; `level` is a fraction of the largest level."""
     flat = error.covariance.reshape(len(LEVELS), len(AGES), -1)
     by_age = [[np.interp(level, LEVELS, column) for column in at.T] for at in flat.swapaxes(0, 1)]
     return np.reshape([np.interp(age, AGES, column) for column in np.transpose(by_age)], error.covariance.shape[2:])
@@ -59,7 +59,7 @@ def test_grids_and_values_that_do_not_fit():
         values[1, 2] = wrong
         with pytest.raises(ArtifactError, match="must be positive definite"):
             ErrorCovariance(LEVELS, AGES, values)
-    units = np.array([1e-9, 1e9])  # definite, whatever the units of the states
+    units = np.array([1e-9, 1e9])  # positive definite in any units of the states
     ErrorCovariance(LEVELS, AGES, error.covariance * np.outer(units, units))
 
 
@@ -67,7 +67,7 @@ def test_grids_and_values_that_do_not_fit():
 def test_single_and_batch_are_those_of_the_map_in_use(make_artifact, options):
     artifact, rng = with_error_bars(make_artifact(**options)), np.random.default_rng(1)
     y, u = rng.normal(size=(9, 6, artifact.ny)), rng.normal(size=(8, 6, artifact.nu))
-    u[:, :3] = 0.0  # three rows of free motion beside three of driven motion
+    u[:, :3] = 0.0  # three rows of free and three of driven motion
     batch, singles = KKLObserver(artifact, 0.2), [KKLObserver(artifact, 0.2) for _ in range(6)]
     share, _ = artifact.inverse.shares(0.2)
     for k in range(9):
@@ -87,7 +87,7 @@ def test_single_and_batch_are_those_of_the_map_in_use(make_artifact, options):
     np.testing.assert_array_equal(along[-1], batch.covariance)
 
 
-def test_without_it_or_before_a_sample(make_artifact):
+def test_errors_without_a_covariance_and_before_the_first_sample(make_artifact):
     plain = KKLObserver(make_artifact("van_der_pol"))
     plain.reset([0.1])
     for ask in (lambda: plain.covariance, lambda: plain.std, lambda: plain.estimate_covariance(np.zeros((3, 1)))):
@@ -98,8 +98,8 @@ def test_without_it_or_before_a_sample(make_artifact):
 
 
 @pytest.mark.parametrize("batch", [(), (4,)])
-def test_it_is_of_the_estimate_as_things_stand(make_artifact, batch, tmp_path):
-    """Whatever has happened since the last was asked for; and files keep it."""
+def test_the_covariance_is_that_of_the_current_estimate(make_artifact, batch, tmp_path):
+    """After every operation of an observer, whose artifact was saved and read."""
     plain, rng, before = make_artifact("van_der_pol", forward=True, **OPTIONS), np.random.default_rng(3), 0.0
     with_error_bars(plain).save(tmp_path / "map.safetensors")
     observer = KKLObserver(Artifact.read(tmp_path / "map.safetensors"), 0.1)
@@ -117,6 +117,6 @@ def test_it_is_of_the_estimate_as_things_stand(make_artifact, batch, tmp_path):
         given = observer.covariance
         assert not np.allclose(before, given, rtol=1e-3)
         before = given.copy()
-        given[:] = np.nan  # the caller's own
+        given[:] = np.nan  # a copy
         np.testing.assert_array_equal(observer.covariance, before)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(observer)).covariance, observer.covariance)

@@ -1,4 +1,4 @@
-"""Observers for ranges of parameters, and those that estimate them beside the state."""
+"""Observers for ranges of parameters, and observers that estimate parameters and states."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from observers import ArtifactError, KKLObserver
 def records(artifact, *batch, steps=30):
     rng = np.random.default_rng(3)
     u = rng.normal(size=(steps - 1, *batch, artifact.nu))
-    u[:10] = 0.0  # the map of free motion is asked first
+    u[:10] = 0.0  # the map of free motion gives the first estimates
     return rng.normal(size=(steps, *batch, artifact.ny)), u
 
 
@@ -43,7 +43,7 @@ def test_parameters_step_by_step(make_artifact, batch):
     assert (observer.parameters_hat != along[-1]).all()
 
 
-def test_who_estimates_no_parameters_says_so(make_artifact):
+def test_errors_of_observers_that_estimate_no_parameters(make_artifact):
     observer = KKLObserver(make_artifact())
     with pytest.raises(RuntimeError, match="reset"):
         _ = observer.parameters_hat
@@ -64,7 +64,7 @@ def test_an_observer_fits_every_plant_of_its_range(make_artifact):
         artifact.check("van_der_pol", {}, dt=0.01, ny=1, nu=1)
 
 
-def test_ranges_that_make_no_sense(make_artifact):
+def test_invalid_ranges_of_parameters(make_artifact):
     artifact = make_artifact(estimated=True)
     for ranges in ({"mu": (3.1, 3.3)}, {"nu": (3.1, 3.3)}, {"mu": (2.0, np.nan)}, {"mu": 3.0}, [3.0], {}):
         with pytest.raises(ArtifactError, match="parameter"):
@@ -77,7 +77,7 @@ def test_ranges_that_make_no_sense(make_artifact):
 
 def test_wrappers_show_parameters(saved):
     path = saved(system="rossler", estimated=True)
-    env = KKLObservation(gym.make("KKLRossler-v0", parameters={"c": 6.0}), path)  # another plant of its range
+    env = KKLObservation(gym.make("KKLRossler-v0", parameters={"c": 6.0}), path)  # another plant within the map's range
     obs, info = env.reset(seed=0)
     assert (obs.shape, info["parameters_hat"].shape) == ((3,), (3,))
     *_, info = env.step([0.1])

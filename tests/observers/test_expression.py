@@ -1,4 +1,4 @@
-"""Outputs as data: what they give, and what is none."""
+"""Outputs as expressions: their values, and errors for invalid expressions."""
 
 import json
 import math
@@ -67,7 +67,7 @@ trees = st.recursive(leaves, grown, max_leaves=8)
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(trees, st.integers(0, 1000))
-def test_expressions_give_what_numpy_gives(tree, seed):
+def test_expressions_agree_with_numpy(tree, seed):
     written, function = tree
     expression = Expression(json.loads(json.dumps([written, ["x", 0]])))
     x = np.random.default_rng(seed).normal(0.0, 3.0, (4, 5, 3))
@@ -90,7 +90,7 @@ def test_conditions_combine():
     assert Expression([["+", 1, 2, ["x", 0], 4], ["maximum", 1, ["x", 0], 3]])(np.array([5.0])).tolist() == [12, 5]
 
 
-def test_where_it_is_not_defined_there_are_no_warnings():
+def test_undefined_values_give_no_warnings():
     undefined = Expression([["sqrt", ["x", 0]], ["log", ["x", 1]], ["**", ["x", 1], -1], ["**", 10, ["**", 10, 10]]])
     first, *others = undefined(np.array([-1.0, 0.0])).tolist()
     assert math.isnan(first)
@@ -105,7 +105,7 @@ NONE = [
 ]  # fmt: skip
 
 
-def test_what_is_no_expression():
+def test_invalid_expressions_are_refused():
     for wrong in NONE:
         with pytest.raises(
             ValueError, match=r"output|expression|state|name and arg|must be one of|takes \D*\d arguments"

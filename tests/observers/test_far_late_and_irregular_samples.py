@@ -1,4 +1,4 @@
-"""Outputs far from what is expected, samples at times of their own, and samples that are late."""
+"""Outliers, irregular sampling times, and delayed samples."""
 
 import copy
 import warnings
@@ -27,7 +27,7 @@ def motions(name, steps, n=4, dt=0.01):
 def test_a_sample_that_is_far_off_hardly_moves_an_estimate_with_a_gate(name):
     x, y = motions(name, 300)
     far = y.copy()
-    far[150] += 50.0  # a hundred standard deviations of the noise
+    far[150] += 50.0  # 100 standard deviations of the noise
     observer, scale = load(name, 0.5, gate=5.0), x.std((0, 1))
     moved = np.abs(observer.estimate(far) - observer.estimate(y)) / scale
     assert moved.max() < 0.15
@@ -35,7 +35,7 @@ def test_a_sample_that_is_far_off_hardly_moves_an_estimate_with_a_gate(name):
     assert (np.abs(plain.estimate(far) - plain.estimate(y)) / scale).max() > 1.0
 
 
-def test_a_jump_that_stays_is_believed():
+def test_the_gate_accepts_a_jump_that_stays():
     x, y = motions("lorenz", 1200)
     x[600:], y[600:] = np.roll(x, 1, axis=1)[600:], np.roll(y, 1, axis=1)[600:]
     observer = load("lorenz", 0.5, gate=5.0)
@@ -101,8 +101,8 @@ def test_filters_at_other_intervals_are_those_made_for_them():
 
 
 @pytest.mark.parametrize("tracking", [None, False])
-def test_times_of_samples_that_are_irregular(tracking):
-    """They cost nothing much, where they are known."""
+def test_irregular_sampling_times(tracking):
+    """Irregular sampling times hardly increase the error if the observer gets them."""
     rng, dt = np.random.default_rng(1), 0.001
     x, y = motions("lorenz", 6000, n=20, dt=dt)
     regular = np.arange(0, 6000, 10)
@@ -134,7 +134,7 @@ def test_steps_and_records_at_other_intervals_agree_in_numpy_and_numba():
 
 
 @pytest.mark.parametrize("by", ["flow", "discrete"])
-def test_motions_that_know_whole_samples_alone(by):
+def test_flows_and_discrete_motions_need_whole_sampling_intervals(by):
     artifact = tracking(by)
     observer, dt = KKLObserver(artifact, 0.1), artifact.filter.dt
     observer.reset(np.zeros(1))
@@ -145,7 +145,7 @@ def test_motions_that_know_whole_samples_alone(by):
     found = artifact.motion.step(observer.decode(), u, dt, 2.0)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
     y, t = np.linspace(0.0, 0.3, 9)[:, None], dt * np.arange(9)
-    rounded = observer.estimate(y, t=1.7e9 + t)  # the seconds since 1970 have 2e-7 s as their last digit
+    rounded = observer.estimate(y, t=1.7e9 + t)  # seconds since 1970 have a resolution of 2e-7 s
     np.testing.assert_allclose(rounded, observer.estimate(y, t=t), atol=1e-4)
     slow = KKLObserver(artifact, 0.1, compiled=False)
     slow.reset(np.zeros(1))
@@ -153,7 +153,7 @@ def test_motions_that_know_whole_samples_alone(by):
 
 
 @pytest.mark.parametrize("compiled", [None, False])
-def test_late_samples_are_those_of_then_predicted_to_now(compiled):
+def test_estimates_from_delayed_samples_are_predicted_to_the_present(compiled):
     artifact, late = tracking(forward=True), 3
     y, u = signals(artifact, 40, (2,))
     observer, then = (KKLObserver(artifact, 0.1, compiled=compiled, delay=d) for d in (late, 0))
@@ -181,7 +181,7 @@ def test_late_samples_are_those_of_then_predicted_to_now(compiled):
     np.testing.assert_allclose(observer.decode()[1:], fresh.step(y[0, 1:], u[0, 1:]), **EXACT)
 
 
-def test_a_copy_is_a_snapshot_from_which_late_samples_are_taken_in():
+def test_late_samples_are_applied_to_a_copied_observer():
     artifact = tracking()
     y, u = signals(artifact, 30)
     observer, whole = KKLObserver(artifact, 0.1), KKLObserver(artifact, 0.1).estimate(y, u)
@@ -190,7 +190,7 @@ def test_a_copy_is_a_snapshot_from_which_late_samples_are_taken_in():
         if k == 15:
             snapshot = copy.copy(observer)
         observer.step(y[k] if k < 15 else None, u[k - 1])
-    for k in range(15, 30):  # all that was missing has come
+    for k in range(15, 30):  # the late samples have arrived
         x_hat = snapshot.step(y[k], u[k - 1])
     np.testing.assert_array_equal(x_hat, whole[-1])
 
@@ -219,7 +219,7 @@ def test_the_first_gap_that_no_map_fills_warns_once():
         KKLObserver(tracking(), 0.1).estimate([[0.0], [np.nan]])
 
 
-def test_what_is_wrong_is_named():
+def test_errors_of_gates_and_delays():
     artifact = tracking()
     for options in ({"gate": 5.0}, {"delay": 2}):
         with pytest.raises(ValueError, match="cannot track"):

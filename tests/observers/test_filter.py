@@ -32,7 +32,7 @@ def signals(linear, steps, *batch):
 @both
 @pytest.mark.parametrize(("nu", "dt"), [(0, 0.1), (2, 1e-3), (2, 2.0)])
 def test_one_interval_is_exact(A, nu, dt):
-    """Against the exponential of the system augmented with the ramp of y and the constant u."""
+    """Compare with the matrix exponential of the system augmented with the ramp of y and the constant u."""
     expm = pytest.importorskip("scipy.linalg").expm
     linear = random_filter(A, 2, nu, dt)
     nz = len(A)
@@ -94,7 +94,7 @@ def test_intervals_beyond_floats():
             LinearFilter(A, B, dt)
 
 
-def test_a_filter_keeps_what_it_was_made_of():
+def test_a_filter_copies_its_matrices_and_they_are_read_only():
     A, B = np.diag([-1.0, -2.0]), np.ones((2, 1))
     linear = LinearFilter(A, B, dt=0.1)
     A[0, 0] = 5.0

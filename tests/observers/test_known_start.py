@@ -1,4 +1,4 @@
-"""Starts at z_0 = T(x_0), and how far z is from T(x_hat)."""
+"""Known starts z_0 = T(x_0), and the mismatch between z and T(x_hat)."""
 
 import math
 
@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from observers import KKLObserver
 
 KINDS = [{"inputs": 0, "age": 0}, {"pair": True}]
-CLOSE = {"rtol": 1e-5, "atol": 1e-5}  # the networks work in float32
+CLOSE = {"rtol": 1e-5, "atol": 1e-5}  # rounding of the float32 networks
 
 
 def oscillations(steps, dt, n=6, seed=0):
@@ -29,14 +29,14 @@ def test_a_known_start_has_no_transient_on_a_linear_system():
     observer = KKLObserver(exact_observer(dt=0.01))
     x, y = oscillations(300, 0.01)
     known = [observer.reset(y[0], x[0])] + [observer.step(yk) for yk in y[1:]]
-    assert np.abs(known - x).max() < 5e-4  # of the first-order hold and of float32
+    assert np.abs(known - x).max() < 5e-4  # error of the first-order hold and of float32
     assert np.array_equal(observer.estimate(y, x0=x[0]), known)
     unknown = np.abs(observer.estimate(y) - x).max((1, 2))
     assert unknown[0] > 0.3
     assert unknown[100] > 0.05
 
 
-def test_what_is_left_of_a_known_start_is_of_second_order_in_dt():
+def test_the_transient_of_a_known_start_is_of_second_order_in_dt():
     def error(dt):
         artifact = exact_observer(dt)
         M, observer = sylvester(artifact.filter.A, artifact.filter.B), KKLObserver(artifact)
@@ -51,7 +51,7 @@ def test_what_is_left_of_a_known_start_is_of_second_order_in_dt():
     assert math.log2(error(0.2) / error(0.1)) == pytest.approx(2.0, abs=0.1)
 
 
-def test_mismatch_is_what_of_the_transient_lies_beside_the_image_of_T():
+def test_mismatch_is_the_part_of_the_transient_outside_the_image_of_T():
     dt, steps = 0.01, 150
     artifact = exact_observer(dt)
     A, M, observer = artifact.filter.A, sylvester(artifact.filter.A, artifact.filter.B), KKLObserver(artifact)
@@ -68,12 +68,12 @@ def test_mismatch_is_what_of_the_transient_lies_beside_the_image_of_T():
             assert (expected > 5e-3).all()
     observer.reset(y[0], x[0])
     assert (observer.mismatch < 1e-6).all()
-    observer.advance(y[0] + 5.0)  # a sensor that jumps
+    observer.advance(y[0] + 5.0)  # a jump of the sensor
     assert (observer.mismatch > 1e-3).all()
 
 
 @pytest.mark.parametrize("options", KINDS, ids=str)
-def test_z_is_T_of_the_start_and_the_map_is_told_that_no_transient_is_left(options, make_artifact):
+def test_z_is_T_of_the_start_and_the_map_gets_the_largest_age(options, make_artifact):
     observer = observer_with_T(make_artifact, **options)
     artifact = observer.artifact
     inverse, T = artifact.inverse, artifact.forward
@@ -82,8 +82,8 @@ def test_z_is_T_of_the_start_and_the_map_is_told_that_no_transient_is_left(optio
     z0 = np.concatenate([T(x0), np.zeros(artifact.filter.size - T.mlp.outputs)])
     assert np.array_equal(observer.z, z0)
     modes = inverse.gain(0.3) * (inverse.whiten @ (z0 - inverse.z_offset))
-    told = [*inverse.noise_features(0.3, 0.0), *([inverse.age_feature(2.0)] if options.get("age", True) else [])]
-    expected = inverse.x_offset + inverse.x_scale * inverse.mlp(np.array([*modes, *told]))
+    features = [*inverse.noise_features(0.3, 0.0), *([inverse.age_feature(2.0)] if options.get("age", True) else [])]
+    expected = inverse.x_offset + inverse.x_scale * inverse.mlp(np.array([*modes, *features]))
     assert np.allclose(x_hat, expected, **CLOSE)
     observer.step([0.5])
     z1 = artifact.filter.advance(z0, np.array([0.4]), np.zeros(artifact.nu), np.array([0.5]))
@@ -91,7 +91,7 @@ def test_z_is_T_of_the_start_and_the_map_is_told_that_no_transient_is_left(optio
 
 
 def test_rows_restart_with_known_and_unknown_starts(make_artifact):
-    """Row by row as observers of their own, whatever age the others have."""
+    """Each row equals a single observer, independently of the ages of other rows."""
     rng = np.random.default_rng(0)
     y, x0 = rng.normal(size=(6, 4, 1)), rng.normal(size=(4, 2))
     together = observer_with_T(make_artifact)

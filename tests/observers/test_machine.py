@@ -1,4 +1,4 @@
-"""Machine code is kept on disk between processes."""
+"""The on-disk cache of compiled code, shared between processes."""
 
 import os
 import subprocess
@@ -42,7 +42,7 @@ def test_kernels_of_several_processes_go_together(tmp_path):
     assert run("2.0") == [(12.0, 0)]
     assert run("1.0", "2.0", "3.0") == [(6.0, 1), (12.0, 1), (18.0, 0)]
 
-    for path in (tmp_path / "cache").rglob("*.nb[ic]"):  # cut off, as by a power failure
+    for path in (tmp_path / "cache").rglob("*.nb[ic]"):  # truncated files, as after a power failure
         path.write_bytes(path.read_bytes()[:20])
     assert run("1.0") == [(6.0, 0)]
     assert run("1.0") == [(6.0, 1)]

@@ -1,4 +1,4 @@
-"""Samples of which an output is missing: the observer coasts on that one."""
+"""Samples with missing outputs: the observer substitutes its own prediction."""
 
 import dataclasses
 import math
@@ -35,7 +35,7 @@ def test_outputs_at_different_rates(output):
     x = motions()
     y = TwoOutputs().output(x)
     slow = y.copy()
-    slow[np.arange(STEPS + 1) % 5 != 0, :, 1] = math.nan  # the second sensor is five times slower
+    slow[np.arange(STEPS + 1) % 5 != 0, :, 1] = math.nan  # the second sensor has a fifth of the rate
     held = slow.copy()
     for k in range(1, STEPS + 1):
         held[k] = np.where(np.isnan(slow[k]), held[k - 1], slow[k])
@@ -49,24 +49,24 @@ def test_outputs_at_different_rates(output):
     nothing = {"C": None, "h": None}
     assert np.array_equal(
         KKLObserver(exact(**nothing)).estimate(slow), KKLObserver(exact(**nothing)).estimate(held)
-    )  # who knows no h can but hold
+    )  # without h, the last value is held
 
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(
     batch=st.lists(st.integers(1, 3), max_size=2).map(tuple),
     share=st.sampled_from([0.1, 0.5, 0.9]),
-    knows=st.sampled_from(["C", "h", "nothing"]),
+    output=st.sampled_from(["C", "h", "nothing"]),
     seed=st.integers(0, 1000),
 )
-def test_records_agree_with_steps_and_batches_with_their_rows(batch, share, knows, seed):
-    artifact = exact(C=C if knows == "C" else None, h=H if knows == "h" else None)
+def test_records_agree_with_steps_and_batches_with_their_rows(batch, share, output, seed):
+    artifact = exact(C=C if output == "C" else None, h=H if output == "h" else None)
     rng = np.random.default_rng(seed)
     y = rng.normal(size=(12, *batch, 2))
     y[1:][rng.random((11, *batch, 2)) < share] = math.nan
     whole = y.copy()
     x_hat = KKLObserver(artifact).estimate(y)
-    np.testing.assert_array_equal(y, whole)  # the caller's array
+    np.testing.assert_array_equal(y, whole)  # the caller's array is unchanged
     assert np.isfinite(x_hat).all()
     np.testing.assert_allclose(x_hat, step_by_step(KKLObserver(artifact), y), atol=1e-5)
     for row in np.ndindex(batch):
@@ -75,7 +75,7 @@ def test_records_agree_with_steps_and_batches_with_their_rows(batch, share, know
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
-def test_where_all_outputs_are_missing_the_sample_is(batch):
+def test_a_sample_without_outputs_is_a_missing_sample(batch):
     y = np.random.default_rng(1).normal(size=(4, *batch, 2))
     one, other = (KKLObserver(exact()) for _ in range(2))
     for observer in (one, other):
@@ -86,7 +86,7 @@ def test_where_all_outputs_are_missing_the_sample_is(batch):
     assert np.array_equal(one.z, other.z)
 
 
-def test_what_is_neither_there_nor_missing():
+def test_invalid_samples_are_refused():
     observer, gap = KKLObserver(exact()), np.array([0.1, math.nan])
     for call in (observer.reset, lambda y: observer.estimate([y, [0.1, 0.2]])):
         with pytest.raises(ValueError, match="the first sample must be complete"):
@@ -105,7 +105,7 @@ def test_what_is_neither_there_nor_missing():
     assert np.array_equal(observer.z, z)
 
 
-def test_a_prediction_that_is_no_number_is_not_taken():
+def test_predictions_that_are_nan_are_not_used():
     undefined = Expression([["sqrt", ["+", ["x", 0], -1e3]], ["x", 1]])
     observer, holding = KKLObserver(exact(C=None, h=undefined)), KKLObserver(exact(C=None))
     for each in (observer, holding):
@@ -115,8 +115,8 @@ def test_a_prediction_that_is_no_number_is_not_taken():
     assert np.isfinite(observer.step(None)).all()
 
 
-def test_what_is_missing_is_not_judged():
-    """One output of two is never there: the score is that of a monitor of the other one alone."""
+def test_missing_outputs_do_not_change_the_score():
+    """If one output of two is always missing, the score is that of a monitor of the other output."""
     artifact, y = exact(limits=limits(2)), TwoOutputs().output(motions(1)[:, 0])
     watched, first = KKLObserver(artifact, 0.0, monitor=True), Monitor(limits(2), 0.0, DT)
     watched.reset(y[0])

@@ -1,4 +1,4 @@
-"""The residual against its limits."""
+"""The monitor: scores of residuals relative to their limits."""
 
 import copy
 import dataclasses
@@ -48,10 +48,10 @@ def test_a_monitor_changes_no_estimate():
     for k in range(1, 20):
         assert (plain.step(y[k]) == watched.step(y[k])).all()
         rows = rng.random(4) < 0.5
-        np.testing.assert_allclose(plain.decode(rows), watched.decode(rows), rtol=1e-5, atol=1e-5)  # of another batch
+        np.testing.assert_allclose(plain.decode(rows), watched.decode(rows), rtol=1e-5, atol=1e-5)  # rounding
     before = watched.score
     assert (plain.step(None) == watched.step(None)).all()
-    assert (watched.score == before).all()  # nothing was measured
+    assert (watched.score == before).all()  # a missing sample changes no score
     watched.decode()[:] = np.nan  # a copy
     assert np.isfinite(watched.decode()).all()
     for rows in (np.array([0, 2]), np.array([True, False])):
@@ -76,7 +76,7 @@ def test_no_score_without_a_monitor_or_limits():
         dataclasses.replace(artifact, limits=limits(ny=2))
 
 
-def test_another_noise_level_is_another_monitor():
+def test_a_new_noise_level_restarts_the_monitor():
     artifact = watched_artifact()
     plain, watched = KKLObserver(artifact, 0.3), KKLObserver(artifact, 0.3, monitor=True)
     y = np.random.default_rng(3).normal(size=(30, 2, 1))
@@ -85,7 +85,7 @@ def test_another_noise_level_is_another_monitor():
         for k in range(1, 15):
             observer.step(y[k])
         observer.measurement_noise = 0.9
-    assert (watched.score == 0).all()  # it begins anew
+    assert (watched.score == 0).all()  # a new level restarts the monitor
     assert (plain.decode() == watched.decode()).all()
     for k in range(15, 30):
         assert (plain.step(y[k]) == watched.step(y[k])).all()

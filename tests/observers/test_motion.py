@@ -1,4 +1,4 @@
-"""How states move: the order of the Runge-Kutta steps, discrete time, learned flows, and motions that do not fit."""
+"""Motions: the order of the Runge-Kutta steps, discrete time, learned flows, and errors of motions that do not fit."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Levels of measurement noise, of all outputs or each."""
+"""Levels of measurement noise, one for all outputs or one per output."""
 
 import dataclasses
 import math
@@ -16,13 +16,13 @@ def test_each_output_has_an_input_of_the_network_and_its_part_in_the_shrinkage(m
     inverse, levels = artifact.inverse, (0.3, 1.2)
     gain = 1 / (1 + sum((sigma * each) ** 2 for sigma, each in zip(levels, inverse.noise_gain, strict=True)))
     np.testing.assert_allclose(inverse.gain(levels), gain)
-    told = [*(math.log1p(sigma / 0.1) for sigma in levels), math.log1p(0.1 / 0.01)]
-    np.testing.assert_allclose(inverse.noise_features(levels, 0.1), told)
+    features = [*(math.log1p(sigma / 0.1) for sigma in levels), math.log1p(0.1 / 0.01)]
+    np.testing.assert_allclose(inverse.noise_features(levels, 0.1), features)
     np.testing.assert_array_equal(inverse.gain(0.3), inverse.gain((0.3, 0.3)))
     assert inverse.noise_features(0.3, 0.1) == inverse.noise_features((0.3, 0.3), 0.1)
     z = artifact.filter.start(np.ones(2))
     modes = gain * (inverse.whiten @ (z - inverse.z_offset))
-    expected = inverse.x_offset + inverse.x_scale * inverse.mlp(np.array([*modes, *told, 0.0]))
+    expected = inverse.x_offset + inverse.x_scale * inverse.mlp(np.array([*modes, *features, 0.0]))
     found = KKLObserver(artifact, levels, process_noise=0.1).reset(np.ones(2))
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
@@ -38,7 +38,7 @@ def test_levels_beyond_the_range_of_an_output(make_artifact):
             KKLObserver(artifact, wrong)
 
 
-def test_maps_of_several_outputs_that_are_told_one_level(make_artifact):
+def test_maps_of_several_outputs_that_take_one_level(make_artifact):
     now = make_artifact(outputs=2, noise=False)
     inverse = dataclasses.replace(
         now.inverse, noise_gain=now.inverse.noise_gain[0], measurement_noise_unit=0.1, measurement_noise_max=1.0
@@ -47,11 +47,11 @@ def test_maps_of_several_outputs_that_are_told_one_level(make_artifact):
     assert KKLObserver(artifact, 0.3).measurement_noise == KKLObserver(artifact, (0.3, 0.3)).measurement_noise == 0.3
     with pytest.raises(ValueError, match=r"takes one level of measurement noise for all outputs, got \(0\.1, 0\.3\)"):
         KKLObserver(artifact, (0.1, 0.3))
-    papers = exact_observer(C=np.eye(2))  # to which noise is nothing
+    papers = exact_observer(C=np.eye(2))  # a map without noise features
     assert KKLObserver(papers, (0.1, 7.0)).measurement_noise == (0.1, 7.0)
 
 
-def test_what_is_told_of_each_output_must_fit_the_outputs(make_artifact):
+def test_levels_per_output_must_fit_the_outputs(make_artifact):
     artifact = make_artifact(outputs=2, free_inverse=True)
     inverse = artifact.inverse
     for name in ("measurement_noise_unit", "measurement_noise_max"):
@@ -64,7 +64,7 @@ def test_what_is_told_of_each_output_must_fit_the_outputs(make_artifact):
         dataclasses.replace(artifact, free_inverse=make_artifact(free_inverse=True).free_inverse)
 
 
-def test_what_is_usual_is_assumed_where_nothing_is_said(make_artifact, tmp_path):
+def test_the_default_level_is_the_usual_one_within_the_maps_range(make_artifact, tmp_path):
     path = tmp_path / "a.safetensors"
     for options, usual, assumed in (
         ({}, 0.5, 0.5),
@@ -100,7 +100,7 @@ def test_limits_of_outputs_with_levels_of_their_own():
     for row, levels in enumerate(found.levels):
         for part, at in zip((found.mean, found.low, found.high), found.at(tuple(levels)), strict=True):
             np.testing.assert_allclose(at, part[row])
-    mean, low, high = found.at((0.1, 100.0))  # the second output's noise reaches the first one's residual
+    mean, low, high = found.at((0.1, 100.0))  # noise of output 2 raises the residual of output 1
     np.testing.assert_allclose(mean, found.mean[2])
     np.testing.assert_allclose(high, found.high[2])
     np.testing.assert_allclose(low, [found.low[1, 0], found.low[2, 1]])
@@ -108,9 +108,9 @@ def test_limits_of_outputs_with_levels_of_their_own():
         with pytest.raises(ValueError, match=r"no limits beyond noise \[1\.0, 100\.0\]"):
             found.at(wrong)
     monitor = Monitor(dataclasses.replace(found, warm_up=0.0), (0.1, 10.0), 0.01)
-    rows = monitor.update(monitor.start(1), np.zeros((1, 2)), np.ones((1, 2), bool))  # from squares of the noise
+    rows = monitor.update(monitor.start(1), np.zeros((1, 2)), np.ones((1, 2), bool))  # linear in noise^2
     assert monitor.score(rows) == pytest.approx(0.005 / (0.01 * np.exp(-0.1)))
-    old = limits_of_two(levels=np.array([0.0, 1.0, 100.0]))  # of all outputs
+    old = limits_of_two(levels=np.array([0.0, 1.0, 100.0]))  # one level for all outputs
     np.testing.assert_allclose(old.at(1.0)[0], found.mean[1])
     np.testing.assert_allclose(old.at((1.0, 100.0))[0], found.mean[2])
 
@@ -121,7 +121,7 @@ def test_impossible_levels_of_limits():
             limits_of_two(levels=np.array(wrong, dtype=float))
 
 
-def test_residuals_where_the_output_is_not_defined_count_as_none(make_artifact):
+def test_residuals_are_zero_where_the_output_is_undefined(make_artifact):
     artifact = dataclasses.replace(make_artifact(), h=Expression([["log", ["x", 0]]]))
     x_hat, y = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]), np.full((3, 1), 0.5)
     assert artifact.residual(y, x_hat).ravel().tolist() == [0.0, 0.0, 0.5]

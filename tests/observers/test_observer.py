@@ -14,7 +14,7 @@ KINDS = [{"inputs": inputs, "noise": noise, "age": age} for inputs in (0, 1) for
     {"free_inverse": True},
     {"process": True},
 ]
-CLOSE = {"rtol": 1e-5, "atol": 1e-4}  # the network works in float32
+CLOSE = {"rtol": 1e-5, "atol": 1e-4}  # rounding of the float32 network
 
 
 def record(observer, steps, *batch, seed=0):
@@ -30,7 +30,7 @@ def step_by_step(observer, y, u):
 
 
 def begun(artifact, **options):
-    """Two observers that have taken two samples in."""
+    """Two observers after the same two samples."""
     both = KKLObserver(artifact, **options), KKLObserver(artifact, **options)
     for observer in both:
         observer.reset([0.5])
@@ -40,7 +40,7 @@ def begun(artifact, **options):
 
 @pytest.mark.parametrize("options", KINDS, ids=str)
 def test_the_estimate_is_the_formula(options, make_artifact):
-    """All that is folded together, written out with plain arrays."""
+    """The operations that the observer merges, written out with plain arrays."""
     artifact = make_artifact(**options)
     inverse, observer = artifact.inverse, KKLObserver(artifact, 0.3, process_noise=0.1)
     y, u = record(observer, 5)
@@ -79,7 +79,7 @@ def test_batches_equal_their_rows_and_records_their_steps(make_artifact, batch, 
         assert np.allclose(z[index], observer.z, rtol=1e-12, atol=1e-13)
 
 
-def test_an_estimate_leaves_the_state_alone_and_takes_a_last_row_of_u_more_and_none(make_artifact):
+def test_estimate_keeps_the_observers_state_and_accepts_one_more_row_of_u_or_no_u(make_artifact):
     observer = KKLObserver(make_artifact())
     y, u = record(observer, 10)
     expected = observer.estimate(y, u)
@@ -89,7 +89,7 @@ def test_an_estimate_leaves_the_state_alone_and_takes_a_last_row_of_u_more_and_n
     z = observer.z
     observer.estimate(-y, u)
     assert np.array_equal(observer.z, z)
-    assert np.array_equal(step_by_step(observer, y, u), first)  # a reset forgets
+    assert np.array_equal(step_by_step(observer, y, u), first)  # a reset discards the past
     assert np.array_equal(observer.estimate(y, np.concatenate([u, [[99.0]]])), expected)
     assert np.array_equal(observer.estimate(y), observer.estimate(y, 0 * u))
     assert not np.allclose(observer.estimate(y), expected)
@@ -106,7 +106,7 @@ def test_until_an_input_acts_the_map_of_free_motion_is_in_use(make_artifact):
     observer, steps = KKLObserver(both), 12
     y, _ = record(observer, steps, 3)
     u = np.zeros((steps - 1, 3, 1))
-    u[4, 1] = 1e-9  # one row is driven, however little, from here on
+    u[4, 1] = 1e-9  # from here on, one row is driven, if weakly
     u[7, 2] = -2.0
     begins = np.array([steps, 5, 8])
     x_hat, always, never = step_by_step(observer, y, u), driven.estimate(y, u), free.estimate(y)
@@ -121,12 +121,12 @@ def test_until_an_input_acts_the_map_of_free_motion_is_in_use(make_artifact):
         assert np.allclose(step_by_step(alone, y[:, row], u[:, row]), expected[:, row], **CLOSE)
 
 
-def test_a_missing_sample_holds_the_last_where_the_output_is_not_known(make_artifact):
-    coasting, told = begun(make_artifact())
+def test_a_missing_sample_holds_the_last_if_the_output_map_is_unknown(make_artifact):
+    coasting, holding = begun(make_artifact())
     for _ in range(3):
-        assert np.array_equal(coasting.step(None, [0.1]), told.step([0.7], [0.1]))
-    assert np.array_equal(coasting.step([0.2]), told.step([0.2], [0.0]))  # no input is zero input
-    assert not np.array_equal(coasting.step([0.2]), told.step([0.2], [1.0]))
+        assert np.array_equal(coasting.step(None, [0.1]), holding.step([0.7], [0.1]))
+    assert np.array_equal(coasting.step([0.2]), holding.step([0.2], [0.0]))  # no input is zero input
+    assert not np.array_equal(coasting.step([0.2]), holding.step([0.2], [1.0]))
 
 
 def test_arrays_are_the_callers(make_artifact):
@@ -176,7 +176,7 @@ def test_every_kind_of_real_number_is_a_noise_level(level, make_artifact):
 
 
 @pytest.mark.parametrize("free", [False, True])
-def test_process_noise_told_changes_the_estimate_up_to_what_training_had(make_artifact, free):
+def test_process_noise_changes_the_estimate_up_to_the_level_in_training(make_artifact, free):
     artifact = make_artifact(process=True, free_inverse=free)
     estimates = [KKLObserver(artifact, process_noise=level).reset([1.0]) for level in (0.0, 0.1, 0.2, 5.0, None)]
     assert not np.allclose(estimates[0], estimates[1], atol=1e-6)
@@ -190,13 +190,13 @@ def test_process_noise_told_changes_the_estimate_up_to_what_training_had(make_ar
     assert np.array_equal(estimates[0], observer.decode())
     observer.process_noise = None
     assert np.array_equal(estimates[2], observer.decode())
-    plain = make_artifact()  # is told none
+    plain = make_artifact()  # without this feature
     assert np.array_equal(KKLObserver(plain, process_noise=0.1).reset([1.0]), KKLObserver(plain).reset([1.0]))
 
 
 def test_age_changes_the_estimate_until_age_max(make_artifact):
     observer = KKLObserver(make_artifact(age=True))
-    x_hat = observer.estimate(np.full((400, 1), 0.3))  # the filter stays at its equilibrium
+    x_hat = observer.estimate(np.full((400, 1), 0.3))  # the filter stays in equilibrium
     assert not np.allclose(x_hat[0], x_hat[1], rtol=1e-3)
     assert not np.allclose(x_hat[198], x_hat[200], rtol=1e-6, atol=0)
     assert np.allclose(x_hat[200:], x_hat[200], rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Maps that are replaced while the filter runs."""
+"""Replacement of maps while the filter runs."""
 
 import dataclasses
 
@@ -44,10 +44,10 @@ def changed_filter(artifact, **changes):
     )
 
 
-def test_what_cannot_replace_leaves_the_observer_as_it_was(artifact):
+def test_a_refused_replacement_leaves_the_observer_unchanged(artifact):
     observer, linear = KKLObserver(artifact, 0.9), artifact.filter
     quiet = dataclasses.replace(artifact.inverse, measurement_noise_max=0.5)
-    for other, told in (
+    for other, message in (
         (changed_filter(artifact, dt=0.02), "the filters differ in dt"),
         (changed_filter(artifact, A=2 * linear.A), "the filters differ in A"),
         (changed_filter(artifact, B=2 * linear.B), "the filters differ in B"),
@@ -55,7 +55,7 @@ def test_what_cannot_replace_leaves_the_observer_as_it_was(artifact):
         (dataclasses.replace(artifact, parameters={"mu": 7.0}), "has parameters"),
         ("van_der_pol", r"must be an observers\.Artifact, got 'van_der_pol'"),
     ):
-        with pytest.raises(ArtifactError, match=told):
+        with pytest.raises(ArtifactError, match=message):
             observer.replace(other)
     with pytest.raises(ValueError, match="beyond the map's range"):
         observer.replace(dataclasses.replace(artifact, inverse=quiet))
@@ -63,7 +63,7 @@ def test_what_cannot_replace_leaves_the_observer_as_it_was(artifact):
     assert observer.measurement_noise == 0.9
 
 
-def test_monitors_begin_anew(artifact):
+def test_monitors_restart(artifact):
     watched = dataclasses.replace(artifact, C=np.array([[1.0, 0.0]]), limits=limits())
     observer = KKLObserver(watched, monitor=True)
     observer.reset(np.full((2, 1), 3.0))

@@ -11,7 +11,7 @@ NAMES = sorted(SYSTEMS)
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("suffix", ["", "-spinn"])
-def test_shipped_maps_say_what_they_are(name, suffix):
+def test_metadata_of_shipped_maps(name, suffix):
     artifact = observers.load(name + suffix).artifact
     system = get_system(name)
     artifact.check(name, system.parameters, dt=0.01, ny=system.ny, nu=system.nu)
@@ -35,7 +35,7 @@ def test_spinn_maps_recover_settled_states_from_their_own_forward_map(name):
 def test_every_map_can_be_monitored(name):
     observer = observers.load(name, measurement_noise=0.5, monitor=True)
     assert observer.artifact.limits.false_alarms == 0.01
-    y = 0.5 * np.random.default_rng(0).standard_normal((600, 1, 1)) + 300.0  # far off scale
+    y = 0.5 * np.random.default_rng(0).standard_normal((600, 1, 1)) + 300.0  # far outside the range
     observer.reset(y[0])
     for k in range(1, 600):
         observer.step(y[k])
@@ -56,8 +56,8 @@ def test_the_worst_start_of_many_beyond_x_is_found_and_kept(name):
 
 
 @pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
-def test_a_few_false_samples_are_forgotten(name):
-    """Far off, so that a covariance grows far beyond the motions that the flow was fitted to."""
+def test_estimates_recover_from_a_few_outliers(name):
+    """Outliers inflate the covariance far beyond the motions to which the flow was fitted."""
     observer = observers.load(name)
     system = get_system(observer.artifact.system)
     x = simulate(system, system.draw_starts(np.random.default_rng(3), 40), 2000, 0.01)
@@ -66,11 +66,11 @@ def test_a_few_false_samples_are_forgotten(name):
         y = outputs.copy()
         y[500:505] = false * outputs.std() / 2
         apart = (observer.estimate(y) - x)[-200:] / system.scale
-        assert np.sum(np.sqrt((apart**2).mean((0, 2))) > 0.5) <= 1, "13 s later"  # one may just be at a turn
+        assert np.sum(np.sqrt((apart**2).mean((0, 2))) > 0.5) <= 1, "13 s later"  # one run may be in a fast turn
 
 
-def test_where_samples_are_missing_from_the_start_t_inv_is_no_surer_than_what_was_there_allows():
-    """Of the states' scale, after 3 s of one sample in ten; and error bars hold at all ages."""
+def test_error_bars_hold_if_samples_are_missing_from_the_start():
+    """Also for one sample in ten, after which the error at 3 s is small relative to the states' scale."""
     n, level, system, rng = 100, 0.5, get_system("van_der_pol"), np.random.default_rng(3)
     x = simulate(system, rng.uniform(*system.box(), (n, system.nx)), 300, 0.01)
     y = system.output(x) + level * rng.standard_normal((301, n, 1))
@@ -83,5 +83,5 @@ def test_where_samples_are_missing_from_the_start_t_inv_is_no_surer_than_what_wa
             if k in (29, 80, 100, 300):
                 error = x[k] - x_hat
                 squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(observer.covariance), error)
-                assert np.mean(squared < 4.605) > 0.6  # of 0.9: factors are those of runs without gaps
+                assert np.mean(squared < 4.605) > 0.6  # not 0.9: factors were fitted to runs without gaps
     assert np.sqrt(np.mean((error / system.scale) ** 2)) < 0.1

@@ -48,27 +48,27 @@ def path(tmp_path):
     return found
 
 
-def test_what_is_saved_is_read(path):
+def test_round_trip(path):
     tensors, described = read(path)
     assert described == DESCRIBED
     assert set(tensors) == set(ARRAYS)
-    os.truncate(path, 0)  # which would end the process if the arrays lay in the file
+    os.truncate(path, 0)  # would kill the process if the arrays were memory-mapped
     for name, array in ARRAYS.items():
         assert (tensors[name].dtype, tensors[name].shape) == (array.dtype, array.shape)
         assert np.array_equal(tensors[name], array)
-        tensors[name] += 1.0  # arrays of one's own
+        tensors[name] += 1.0  # writable copies
 
 
 def test_a_file_is_the_same_bytes_each_time_with_a_checksum_of_all_others(path):
     whole = path.read_bytes()
-    for _ in range(8):  # safetensors itself shuffles the entries of the metadata
+    for _ in range(8):  # safetensors alone writes metadata in random order
         save(path)
         assert path.read_bytes() == whole
     header = json.loads(whole[8 : 8 + int.from_bytes(whole[:8], "little")])
-    said = header["__metadata__"].pop("ours-sha256")
+    checksum = header["__metadata__"].pop("ours-sha256")
     assert header["__metadata__"] == {"ours": '{"format": 1, "text": "\\u00e4"}'}
     save_file({name: array.copy("C") for name, array in ARRAYS.items()}, path, metadata=header["__metadata__"])
-    assert storage.checksum(path, UnreadableError) == hashlib.sha256(path.read_bytes()).hexdigest() == said
+    assert storage.checksum(path, UnreadableError) == hashlib.sha256(path.read_bytes()).hexdigest() == checksum
     with named(path, "lacks its checksum, the metadata ours-sha256.*get the file again, or make it again"):
         read(path)
 
@@ -89,7 +89,7 @@ def nested(levels):
         ({"a": np.zeros(200)}, {}, ValueError, "file.safetensors would have"),
     ],
 )  # fmt: skip
-def test_what_could_not_be_read_is_not_saved(path, arrays, described, error, words, monkeypatch):
+def test_contents_that_read_would_refuse_are_not_saved(path, arrays, described, error, words, monkeypatch):
     before = path.read_bytes()
     monkeypatch.setattr(storage, "MOST_BYTES", 1000 if arrays else storage.MOST_BYTES)
     with pytest.raises(error, match=words):
@@ -99,7 +99,7 @@ def test_what_could_not_be_read_is_not_saved(path, arrays, described, error, wor
 
 
 def test_files_have_the_rights_that_the_umask_gives(tmp_path, monkeypatch):
-    """The umask is the whole process's: to change it would make other threads' files what everybody may write."""
+    """The umask belongs to the process: changing it could make other threads' files writable for all users."""
     for umask, rights in ((0o022, 0o644), (0o077, 0o600), (0o002, 0o664)):
         before = os.umask(umask)
         try:
@@ -111,7 +111,7 @@ def test_files_have_the_rights_that_the_umask_gives(tmp_path, monkeypatch):
         assert stat.S_IMODE((tmp_path / str(umask) / "b.txt").stat().st_mode) == rights
 
 
-def test_the_file_is_on_disk_before_it_takes_its_place_and_the_folder_after(tmp_path, monkeypatch):
+def test_the_file_is_synchronised_before_it_is_renamed_and_the_folder_after(tmp_path, monkeypatch):
     events, fsync, replace, opened = [], os.fsync, os.replace, os.open
 
     def recorded_fsync(descriptor):
@@ -131,7 +131,7 @@ def test_the_file_is_on_disk_before_it_takes_its_place_and_the_folder_after(tmp_
     monkeypatch.setattr(os, "replace", recorded_replace)
     save(tmp_path / "a")
     assert events == ["file", "replace", "folder"]
-    monkeypatch.setattr(os, "open", refuse)  # as on systems that open no folders
+    monkeypatch.setattr(os, "open", refuse)  # as on systems that cannot open folders
     save(tmp_path / "a", {"text": "other"})
     assert read(tmp_path / "a")[1] == {"text": "other"}
 
@@ -167,7 +167,7 @@ def test_missing_files_and_folders(tmp_path):
         read("a\0b")
 
 
-def test_damage_is_noticed_wherever_it_is(path):
+def test_damage_is_noticed_at_any_byte(path):
     whole = path.read_bytes()
     for length in range(len(whole)):
         path.write_bytes(whole[:length])
@@ -221,6 +221,6 @@ def test_files_that_are_too_large_are_not_looked_into(path, monkeypatch):
         read(path)
     monkeypatch.setattr(Path, "read_bytes", lambda self: pytest.fail("read"))
     for size in (2 * 2**30, storage.MOST_BYTES + 1):
-        os.truncate(path, size)  # a sparse file, which takes no room on disk
+        os.truncate(path, size)  # a sparse file takes no space on disk
         with named(path, f"has {size} bytes, more than the {storage.MOST_BYTES}"):
             read(path)

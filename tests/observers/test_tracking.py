@@ -1,4 +1,4 @@
-"""Observers that track: on a linear system they are a Kalman filter, which T_inv starts and starts again."""
+"""Tracking observers: on a linear system they equal a Kalman filter that T_inv initialises and re-initialises."""
 
 import functools
 import pickle
@@ -22,9 +22,9 @@ from tracking import (
 from observers import ArtifactError, Expression, Factors, KKLObserver, unscented
 from observers.tracker import INFLATION, Supervision
 
-LEVEL, WINDOW = 0.2, 10  # samples within which T_inv is asked
+LEVEL, WINDOW = 0.2, 10  # WINDOW: samples in which T_inv may take over
 EXACT = {"rtol": 1e-9, "atol": 1e-11}
-CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # T_inv's network works in float32
+CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # rounding of T_inv's float32 network
 
 
 @functools.cache
@@ -41,7 +41,7 @@ def runs(steps=400, n=3, outputs=1):
 
 
 def settled(**options):
-    """An observer far beyond the first window, and the states and samples that come next."""
+    """An observer long after the first window, and the next states and samples."""
     (x, y), observer = runs(), KKLObserver(tracking_observer(**options), LEVEL, process_noise=0.0)
     observer.reset(y[0])
     for sample in y[1:100]:
@@ -53,7 +53,7 @@ def settled(**options):
 @pytest.mark.parametrize("outputs", [1, 2])
 @pytest.mark.parametrize("by", ["equations", "flow"])
 def test_it_is_the_kalman_filter_of_a_linear_system(by, outputs, known):
-    """From the start on, where outputs or samples are missing, and where levels of noise change."""
+    """From the first sample on, with missing outputs and samples, and with changes of the noise levels."""
     H, (x, y) = np.eye(2)[:outputs], runs(outputs=outputs)
     y, artifact = y.copy(), of_t_inv(tracking_observer(H, by=by), 2.0)
     motion, observer = artifact.motion, KKLObserver(artifact, LEVEL, process_noise=0.0)
@@ -78,7 +78,7 @@ def test_it_is_the_kalman_filter_of_a_linear_system(by, outputs, known):
 
 
 def test_innovations_beyond_their_limits_inflate_the_covariance_or_let_t_inv_take_over():
-    """Of a sensor that drifts, sample by sample by hand."""
+    """A drifting sensor, with the tracker computed by hand."""
     artifact, (x, y) = tracking_observer(), runs()
     watch, plain = Supervision.of(artifact.motion, DT), KKLObserver(plain_observer(), LEVEL)
     observer = KKLObserver(artifact, LEVEL, process_noise=0.0)
@@ -117,8 +117,8 @@ def test_t_inv_takes_over_within_the_first_window_where_its_determinant_is_small
         assert np.allclose(observer.covariance, plain.covariance) == surer, k
 
 
-def test_an_output_that_is_undefined_where_it_is_expected_loses_the_tracker():
-    """x1 of the oscillator, written so that it is defined beyond -2 alone, after a start that is said to be there."""
+def test_an_output_that_is_undefined_at_the_prediction_re_initialises_the_tracker():
+    """The output x1, written so that h is undefined below -2, with a wrong known start below -2."""
     h = Expression([["+", ["**", ["sqrt", ["+", ["x", 0], 2.0]], 2.0], -2.0]])
     observer, (x, y) = KKLObserver(replace(tracking_observer(), C=None, h=h), LEVEL), runs()
     observer.reset(y[0], np.full((3, 2), [-3.0, 0.0]))
@@ -139,7 +139,7 @@ def test_batches_are_rows_and_records_are_steps():
             np.testing.assert_allclose(record[k, i // 2, i % 2], x_hat, **CLOSE)
             np.testing.assert_allclose(covariances[k, i], single.covariance, **CLOSE)
     with pytest.raises(RuntimeError, match="reset"):
-        batch.decode()  # its own state is as it was
+        batch.decode()  # a record does not change the observer's own state
     for shape in ((0,), (2, 0)):
         batch.reset(np.zeros((*shape, 1)))
         assert batch.step(None).shape == batch.step(np.zeros((*shape, 1))).shape == (*shape, 2)
@@ -147,7 +147,7 @@ def test_batches_are_rows_and_records_are_steps():
         assert batch.estimate(np.zeros((3, *shape, 1))).shape == (3, *shape, 2)
 
 
-def test_some_rows_move_and_some_begin_anew():
+def test_some_rows_advance_and_some_restart():
     observer, _, y = settled()
     rows = np.array([True, False, True])
     before, covariance = observer.decode(), observer.covariance
@@ -172,7 +172,7 @@ def test_some_rows_move_and_some_begin_anew():
 
 
 @pytest.mark.parametrize("t_is_there", [True, False])
-def test_a_known_start_is_begun_with(t_is_there):
+def test_known_starts(t_is_there):
     artifact = tracking_observer()
     observer = KKLObserver(artifact if t_is_there else replace(artifact, forward=None), LEVEL)
     (x, y), sure = runs(), np.tile(1e-3 * artifact.motion.x_scale, (3, 1))
@@ -182,12 +182,12 @@ def test_a_known_start_is_begun_with(t_is_there):
     observer.measurement_noise = 0.9 * LEVEL
     observer.restart(y[1][:1], [True, False, False])
     assert (observer.std[0] > 0.1).all()
-    np.testing.assert_allclose(observer.std[1:], sure[1:])  # T_inv, which is less sure, does not take over
+    np.testing.assert_allclose(observer.std[1:], sure[1:])  # T_inv has a larger covariance and does not take over
     with pytest.raises(ArtifactError, match="has no T, and the observer does not track"):
         KKLObserver(replace(artifact, forward=None), LEVEL, tracking=False).reset(y[0], x[0])
 
 
-def test_maps_are_replaced_while_it_runs():
+def test_maps_are_replaced_during_a_run():
     observer, x, y = settled()
     x_hat, P = observer.decode(), observer.covariance
     observer.replace(tracking_observer(by="flow", x_scale=(1.0, 3.0)))
@@ -197,7 +197,7 @@ def test_maps_are_replaced_while_it_runs():
     assert not observer.tracking
     plain = observer.decode()
     observer.replace(of_t_inv(tracking_observer(), 1e-3))
-    np.testing.assert_allclose(observer.decode(), plain)  # it begins with what T_inv says, where that is surer
+    np.testing.assert_allclose(observer.decode(), plain)  # T_inv, with the smaller covariance, initialises the tracker
     observer.replace(plain_observer())
     observer.replace(tracking_observer())
     for k in range(50):
@@ -206,7 +206,7 @@ def test_maps_are_replaced_while_it_runs():
 
 
 def test_covariances_are_multiplied_by_factors_of_level_and_age():
-    """In logarithms between the ages, of the largest level that the map was trained for, which is 1."""
+    """Factors are interpolated in logarithms between ages; levels are fractions of the map's largest level, 1."""
     ages, values = np.array([0.0, 2.0, 4.0]), np.array([[9.0, 3.0, 1.0], [4.0, 8.0, 2.0]])
     factors = Factors(np.array([0.0, 2 * LEVEL]), ages, values[None])
     (_, y), rows = runs(), np.array([True, False, False])
@@ -223,7 +223,7 @@ def test_covariances_are_multiplied_by_factors_of_level_and_age():
 
 
 @pytest.mark.parametrize("options", [{}, {"outputs": 2, "process": True, "free_inverse": True}], ids=str)
-def test_without_tracking_it_is_the_map_without_a_motion(options):
+def test_tracking_false_equals_the_map_without_a_motion(options):
     artifact = tracking(**options)
     bare, (y, u) = replace(artifact, motion=None), signals(artifact, 30, (3,))
     y[5:9, 1], y[12, :, 0] = np.nan, np.nan

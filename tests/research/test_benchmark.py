@@ -68,7 +68,7 @@ class Held:
 
 @pytest.fixture
 def toy(tmp_path):
-    """A script with methods of a user's, and the log of their trainings."""
+    """A user's script with methods, and the log of their trainings."""
     folder = tmp_path / "user"
     folder.mkdir()
     (folder / "toy.py").write_text(TOY)
@@ -76,7 +76,7 @@ def toy(tmp_path):
 
 
 def rows_of(page, title):
-    """The first table under a title of a Markdown page: the header, then rows of cells by their first one."""
+    """The first table under a title of a Markdown page: the header, and a dict of rows by their first cell."""
     lines = page.split(f"\n## {title}\n")[1].split("\n## ")[0].splitlines()
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith("|")]
     return cells[0][1:], {first: rest for first, *rest in cells[2:]}
@@ -88,8 +88,8 @@ def test_the_notebooks_measure_by_hand():
     assert component_smape(x, x_hat)[0] == pytest.approx((200 + 200 + 0 + 200 / 3) / 4)
 
 
-def test_a_quick_run_of_two_methods_stands_beside_an_earlier_one(toy, tmp_path):
-    """Also a narrower run, a report alone and a run of other settings."""
+def test_a_quick_run_with_the_option_beside_includes_an_earlier_run(toy, tmp_path):
+    """A second run adds a method, and fails with other settings."""
     (script, log), first, second = toy, tmp_path / "first", tmp_path / "second"
     quick = ("benchmark", "--quick", "--systems", "lorenz", "--jobs", "1", "--methods")
     research(*quick, "ekf", "--out", str(first))
@@ -101,7 +101,7 @@ def test_a_quick_run_of_two_methods_stands_beside_an_earlier_one(toy, tmp_path):
         ("lorenz", "ekf"): 30,
     }
     kept = (first / "results.csv").read_text().splitlines()
-    assert (second / "results.csv").read_text().splitlines()[: len(kept)] == kept  # digit by digit
+    assert (second / "results.csv").read_text().splitlines()[: len(kept)] == kept  # copied unchanged
     assert (methods.us_batch_1 > 0).all()
     page = (second / "table.md").read_text()
     assert imread(second / "heatmap.png").shape[1] > 300
@@ -120,7 +120,7 @@ def test_a_quick_run_of_two_methods_stands_beside_an_earlier_one(toy, tmp_path):
 
     trainings, before = log.read_text(), {path: path.read_bytes() for path in second.glob("*.[cm]*")}
     research(*options, "--beside", str(first))
-    assert log.read_text() == trainings  # nothing was trained again
+    assert log.read_text() == trainings  # a second call trains nothing
     assert {path: path.read_bytes() for path in before} == before
     with pytest.raises(SystemExit, match="holds results of another benchmark: protocol"):
         research(*options, "--seed", "1")
@@ -140,7 +140,7 @@ def test_the_configuration_with_the_least_validation_error_is_trained(toy, tmp_p
     assert info["configuration"] == {"shift": 0.0}
     assert info["validation"][1] == min(info["validation"])
     shifts = [line.split()[1] for line in toy[1].read_text().splitlines()]
-    assert shifts == ["1.0", "0.0", "2.0", "0.0"]  # three short trainings and the full one
+    assert shifts == ["1.0", "0.0", "2.0", "0.0"]  # three short trainings, then the full one
     run_job(one)
     assert len(toy[1].read_text().splitlines()) == 4
     with pytest.raises(ValueError, match="holds results of another benchmark: budget"):
@@ -164,7 +164,7 @@ def test_impossible_benchmarks(tmp_path):
 
 
 class Oracle(Method):
-    """Knows the trajectories of one case; some rows are wrong at will."""
+    """An observer that returns the true trajectories of one case, and given wrong values in some rows."""
 
     name, label = "oracle", "oracle"
 
@@ -226,7 +226,7 @@ def test_validation_trajectories_are_not_those_of_evaluation():
     particular = Oracle(exact)
     particular.tuned_for = (0.25,)
     validate(particular, None, **how)
-    assert [noise for noise, _ in particular.seen] == [0.125]  # of the 0.5 that are the system's own
+    assert [noise for noise, _ in particular.seen] == [0.125]  # 0.25 of the system's level, 0.5
 
 
 @pytest.mark.research
@@ -238,4 +238,4 @@ def test_committed_results_give_the_committed_table_and_figure(name, tmp_path):
     assert (tmp_path / "table.md").read_text() == (RESULTS / name / "table.md").read_text()
     drawn, committed = (imread(folder / "heatmap.png") for folder in (tmp_path, RESULTS / name))
     assert drawn.shape == committed.shape
-    assert np.abs(drawn[..., :3] - committed[..., :3]).mean() < 0.01  # which has fewer colours
+    assert np.abs(drawn[..., :3] - committed[..., :3]).mean() < 0.01  # the committed figure has fewer colours

@@ -39,7 +39,7 @@ def test_agents_on_a_system_are_compared_and_not_trained_again(tmp_path):
     shutil.rmtree(tmp_path / "jobs" / "lorenz-0.5" / "ekf")
     research(*common, "--episodes", "2", "--information", "ekf")
     again = pd.read_csv(tmp_path / "results.csv")
-    assert again.drop(columns="seconds").equals(results.drop(columns="seconds"))  # all is seeded
+    assert again.drop(columns="seconds").equals(results.drop(columns="seconds"))  # all randomness is seeded
     assert {path: path.stat().st_mtime_ns for path in files} == files
     with pytest.raises(SystemExit, match="of another comparison: episodes = 2 there, 3 here"):
         research(*common, "--episodes", "3", "--information", "ekf")
@@ -79,7 +79,7 @@ def test_the_published_tables_follow_from_the_published_results(name, tmp_path):
 
 def test_statistics_by_hand():
     assert normalised(np.array([-0.1, -0.3, -0.4]), -0.2, -0.6).tolist() == pytest.approx([1.25, 0.75, 0.5])
-    assert np.isnan(normalised(np.array([-0.1]), -0.6, -0.6)).all()  # the best is no better than idle
+    assert np.isnan(normalised(np.array([-0.1]), -0.6, -0.6)).all()  # the best agent is no better than zero input
     assert middle(np.array([0.0, 1.0, 2.0, 3.0, 100.0])) == 2.0
     best, values = np.zeros(4), np.array([-0.2, -0.3, -0.4, -0.5])
     score, low, high = interval(values, best, -1.0)
@@ -88,11 +88,11 @@ def test_statistics_by_hand():
     varied = np.array([-0.2, -0.1, 0.1, 0.2])
     assert interval(varied, varied, -1.0)[0] == 1.0
     wider = interval(values, varied, -1.0)
-    assert wider[2] - wider[1] > high - low  # the best are uncertain, too
+    assert wider[2] - wider[1] > high - low  # the scores of the best agents are uncertain too
     assert np.isnan(interval(values[:2], best, -1.0)[1:]).all()
 
 
-def test_kalman_filters_that_know_the_input_follow_a_driven_state():
+def test_kalman_filters_that_get_the_input_follow_a_driven_state():
     env = show_filtered(control_task("van_der_pol", 0.1, period=0.01, duration=5.0), "x_hat", 3)
     env.reset(seed=0)
     errors = []
@@ -100,7 +100,7 @@ def test_kalman_filters_that_know_the_input_follow_a_driven_state():
         *_, info = env.step(action)
         errors.append(np.abs(info["x_hat"] - info["x"]).max())
     assert max(errors[200:]) < 0.1 < errors[0]
-    y, unknown = np.ones((3, 1)), np.full((3, 2), np.nan)  # states, at which they are not to look
+    y, unknown = np.ones((3, 1)), np.full((3, 2), np.nan)  # NaN states: the filters must not use them
     filters, rows = kalman_filters(env.unwrapped), np.array([True, False, False])
     filters.reset(y, unknown)
     first = filters.report()["x_hat"]

@@ -1,4 +1,4 @@
-"""Examples, research and its tests use public names: none that begins with an underscore, of modules or of objects."""
+"""Examples, research and its tests use only public names: no module or attribute that begins with an underscore."""
 
 import ast
 from pathlib import Path
@@ -13,11 +13,11 @@ FILES = [*(ROOT / "examples").rglob("*.py"), *Path(__file__).parent.glob("*.py")
 def private(name):
     return (
         name.startswith("_") and not name.startswith("__") and name not in ("_exit", "_replace")
-    )  # of os, of named tuples
+    )  # os._exit, and named tuples
 
 
 def used(source):
-    """Private names that a file imports from this project, or takes from objects other than self and cls."""
+    """Private names that a file imports from this project, or uses as attributes of objects other than self and cls."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in OURS:
             yield from (part for name in node.names for part in (*node.module.split("."), name.name) if private(part))

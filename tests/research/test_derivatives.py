@@ -1,4 +1,4 @@
-"""What differentiating a system's equations gives."""
+"""Derivatives of a system's equations."""
 
 import numpy as np
 import pytest
@@ -37,11 +37,11 @@ def test_derivatives_of_kinked_equations(system):
 def test_derivatives_at_kinks_and_jumps(equation, at, slope):
     found = evaluate(jacobian(lambda x: (equation(x[0]),), 1), np.array(at)[:, None])
     np.testing.assert_allclose(found[:, 0, 0], slope, rtol=1e-14)
-    for one, expected in zip(at, slope, strict=True):  # and on single states
+    for one, expected in zip(at, slope, strict=True):  # single states
         assert evaluate(jacobian(lambda x: (equation(x[0]),), 1), np.array([one]))[0, 0] == pytest.approx(expected)
 
 
-def test_what_sympy_cannot_differentiate_is_named():
+def test_functions_that_sympy_cannot_differentiate_are_named():
     def rounded(x):
         return x[0], sympy.ceiling(x[0])
 

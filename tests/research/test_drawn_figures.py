@@ -1,4 +1,4 @@
-"""The figures of the pages: both themes are there, and their colours are those of the style."""
+"""The figures of the pages exist in both themes, and have the colours of the style."""
 
 import re
 from pathlib import Path
@@ -14,11 +14,11 @@ from training import figures as styles
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [*DOCS.rglob("*.md"), ROOT / "README.md"]
-LIGHT_ALONE = {"figures/qube.png"}  # examples/research/figures.py says why
+LIGHT_ALONE = {"figures/qube.png"}  # examples/research/figures.py gives the reason
 
 
 def pictures(pattern):
-    """Pictures that pages name, by their places under docs/."""
+    """Paths relative to docs/ of the pictures that pages link to by a pattern."""
     names = set()
     for page in PAGES:
         for name in re.findall(pattern, page.read_text(encoding="utf-8")):
@@ -34,7 +34,7 @@ def test_pages_show_pictures_that_are_there_in_both_themes():
     assert not [name for name in shown - LIGHT_ALONE if not (DOCS / in_theme(name, "dark")).exists()]
 
 
-def test_every_picture_is_shown_and_drawn():
+def test_every_picture_is_on_a_page_and_in_figures():
     there = {path.relative_to(DOCS).as_posix() for ending in ("png", "gif") for path in DOCS.rglob(f"*.{ending}")}
     assert there == {in_theme(name, theme) for name in FIGURES for theme in ("light", "dark")} | LIGHT_ALONE
     assert pictures(r"\]\(([^)\s]+\.(?:png|gif))\)") == set(FIGURES) | LIGHT_ALONE

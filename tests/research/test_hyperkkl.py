@@ -1,4 +1,4 @@
-"""HyperKKL's protocol: its inputs, its traffic, the command at toy size, and the table on its page."""
+"""HyperKKL's protocol: the inputs, the traffic model, the command at toy size, and the published table."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Kalman filters against filterpy's, and against the linear filter where that is exact."""
+"""Nonlinear Kalman filters against those of filterpy, and against the linear filter on linear systems."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -44,7 +44,7 @@ def test_nonlinear_filters_are_the_kalman_filter_on_a_linear_system(filters, dri
     y, u = rng.normal(size=(200, 3, 1)), rng.uniform(-0.5, 0.5, (200, 3, 1))
     found = [ours.reset(y[0])] + [ours.step(y[k], u[k] if driven else None) for k in range(1, 200)]
     Phi = expm(F * dt)
-    held = np.linalg.solve(F, Phi - np.eye(2)) @ [[0.0], [1.0]]  # what an input does that is held over a sample
+    held = np.linalg.solve(F, Phi - np.eye(2)) @ [[0.0], [1.0]]  # effect of an input that is constant over a sample
     for i in range(3):
         one = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
         one.F, one.B, one.H, one.Q, one.R = Phi, held, C, np.diag([0.01, 0.02]) * dt, np.array([[0.3]])
@@ -102,7 +102,7 @@ def test_ukf_is_filterpys_to_rounding(name):
         one = FilterpyUKF(system.nx, 1, dt, lambda x: np.array(system.h(x)), flow, points)
         one.x, one.P = unknown_start(system)
         one.Q, one.R = Q * dt, R
-        one.sigmas_f = points.sigma_points(one.x, one.P)  # what its prediction would have left
+        one.sigmas_f = points.sigma_points(one.x, one.P)  # filterpy sets these in predict, which comes later
         for k in range(31):
             if k:
                 one.predict(u=u[k, i])
@@ -143,7 +143,7 @@ def test_a_filter_that_leaves_the_bounds_restarts_without_the_others(filters):
 
 
 @pytest.mark.parametrize("P", [np.diag([1.0, -1e-3]), np.full((2, 2), np.nan)])
-def test_a_ukf_whose_covariance_is_invalid_restarts_without_the_others(P):
+def test_a_ukf_restarts_only_the_row_with_an_invalid_covariance(P):
     observer, untouched = (of_van_der_pol(UnscentedKalmanFilter) for _ in range(2))
     y = np.array([[0.7], [-0.4]])
     for one in (observer, untouched):
@@ -158,7 +158,7 @@ def test_a_ukf_whose_covariance_is_invalid_restarts_without_the_others(P):
 
 @dataclass(frozen=True)
 class Level(Autonomous):
-    """The oscillator, whose first state is seen through a root, which is undefined below -1.2."""
+    """The oscillator with the output sqrt(x1 + 1.2), which is undefined below -1.2."""
 
     name: ClassVar[str] = "level"
 
@@ -166,8 +166,8 @@ class Level(Autonomous):
         return (sqrt(x[0] + 1.2),)
 
 
-def test_samples_count_where_h_is_undefined_at_some_sigma_points(filters):
-    """Motions stay where h is defined; a start so wide that its points do not is no reason to leave a sample out."""
+def test_samples_are_used_where_h_is_undefined_at_some_sigma_points(filters):
+    """The states stay where h is defined, but some sigma points of the wide initial covariance do not."""
     system, dt, rng = Level(), 0.02, np.random.default_rng(0)
     x = simulate(system, rng.uniform(-0.7, 0.7, (20, 2)), 500, dt)
     y = system.output(x) + 0.01 * rng.normal(size=(501, 20, 1))
@@ -186,7 +186,7 @@ def test_a_sample_that_is_missing_begins_no_row(filters):
 
 
 def test_missing_outputs_correct_nothing(filters):
-    """With NaN in place of the second output it is the filter of the first alone, and with none it only predicts."""
+    """With NaN as the second output the filter equals that of the first output; without outputs it only predicts."""
     start, Q, dt = (np.array([0.2, -0.1]), np.array([[1.0, 0.3], [0.3, 0.5]])), np.diag([0.01, 0.02]), 0.02
     both = running(filters, TwoOutputs(), dt, Q=Q, R=np.diag([0.3, 0.4]), start=start)
     one = running(filters, Oscillator(), dt, Q=Q, R=np.array([[0.3]]), start=start)

@@ -1,4 +1,4 @@
-"""Agents in kinds of partial observability, at toy size."""
+"""Agents under several kinds of partial observability, at toy size."""
 
 import numpy as np
 import pandas as pd
@@ -75,7 +75,7 @@ def test_timed_agents_are_compared_and_not_trained_again(tmp_path):
     assert all(group.steps.is_monotonic_increasing for _, group in rows.groupby(["kind", "shown"]))
     table = (tmp_path / "table.md").read_text()
     value = f"{last['return']['masked', 'state']:.4g}, 1"
-    assert f"| `CartPole-v1`, delay | {value} |" in table  # the state is the same whatever the sensor does
+    assert f"| `CartPole-v1`, delay | {value} |" in table  # the sensor does not change the state
     files = {path: path.stat().st_mtime_ns for path in tmp_path.glob("jobs/**/curve.csv")}
     research(*common, "state", "lru")
     assert {path: path.stat().st_mtime_ns for path in files} == files
@@ -86,13 +86,13 @@ def test_timed_agents_are_compared_and_not_trained_again(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["parameters", "delay"])
-def test_an_agent_sees_estimates_of_the_state_as_it_is_now(tmp_path, monkeypatch, kind):
+def test_an_agent_sees_estimates_of_the_present_state(tmp_path, monkeypatch, kind):
     monkeypatch.setattr(kinds, "OBSERVER_STEPS", 2_000)
     monkeypatch.setattr(kinds, "LAST_EPISODES", 2)
     make_small(monkeypatch)
     agent = kinds.TimedAgent("Pendulum-v1", kind, "x_hat", 0, 0.1, tmp_path)
     agent.work()
-    assert (pd.read_csv(tmp_path / "curve.csv").steps > 2_000).all()  # with those of the observer
+    assert (pd.read_csv(tmp_path / "curve.csv").steps > 2_000).all()  # includes the steps of the observer's rollouts
     env = agent.make(3, tmp_path / "observer.safetensors")
     obs, _ = env.reset(seed=0)
     for _ in range(20):
@@ -103,4 +103,4 @@ def test_an_agent_sees_estimates_of_the_state_as_it_is_now(tmp_path, monkeypatch
     if kind == "parameters":
         np.testing.assert_allclose(obs[:, :2], info["y"], rtol=1e-5)
     z = [kinds.TimedAgent("Pendulum-v1", sensor, "z", 0, 0.1, tmp_path).make(1) for sensor in ("masked", "noise")]
-    assert z[0].observation_space.shape == (1, 8) > z[1].observation_space.shape  # under noise, what predicts
+    assert z[0].observation_space.shape == (1, 8) > z[1].observation_space.shape  # weights under noise

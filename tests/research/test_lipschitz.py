@@ -1,4 +1,4 @@
-"""Bounds of T_inv's Lipschitz constant, where it is known and on random networks."""
+"""Bounds of T_inv's Lipschitz constant, for networks with a known constant and for random networks."""
 
 from itertools import pairwise
 
@@ -17,14 +17,14 @@ from training.trajectories.motions import filter_states
 
 def test_constants_that_are_known():
     assert lipschitz_upper(MLP([np.diag([3.0, 2.0])], [np.zeros(2)], "tanh")) == pytest.approx(3.0)
-    # One neuron, at its steepest in zero: |w2| |w1|; and layers of orthonormal rows, at their steepest together.
+    # One neuron is steepest at zero, |w2| |w1|; layers with orthonormal rows are all steepest at the same point.
     neuron = MLP([np.array([[3.0, 4.0]]), np.array([[2.0]])], [np.zeros(1), np.zeros(1)], "tanh")
     assert lipschitz_upper(neuron) == pytest.approx(10.0, rel=1e-3)
     assert lipschitz_lower(neuron, np.zeros((1, 2))) == pytest.approx(10.0)
     turns = [np.linalg.qr(np.random.default_rng(i).normal(size=(6, 6)))[0] for i in range(3)]
     assert lipschitz_upper(MLP([turns[0], np.eye(6), turns[2]], [np.zeros(6)] * 3, "tanh")) == pytest.approx(1.0, 1e-3)
     silu = MLP([np.array([[3.0]]), np.array([[2.0]])], [np.zeros(1), np.zeros(1)], "silu")
-    lower = lipschitz_lower(silu, np.array([[2.39935728052 / 3.0]]))  # the steepest place of silu
+    lower = lipschitz_lower(silu, np.array([[2.39935728052 / 3.0]]))  # where silu is steepest
     assert lower == pytest.approx(6.0 * 1.0998393201, rel=1e-9)
     assert lower <= lipschitz_upper(silu) <= norm_product(silu) < 1.000001 * lower
 

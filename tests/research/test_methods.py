@@ -1,4 +1,4 @@
-"""The methods of the benchmark: each trains and observes, and each is right where the truth is known."""
+"""The methods of the benchmark: each method trains and estimates, and agrees with closed forms."""
 
 import math
 from dataclasses import replace
@@ -69,10 +69,10 @@ def test_each_learned_method_learns(name, steps, trajectories, tmp_path):
     assert np.sqrt((late**2).mean() / (x**2).mean()) < 0.2
 
 
-def test_the_observer_of_node_forgets_its_start_at_the_rate_that_it_learned(tmp_path):
+def test_transients_of_the_observer_of_node_decay_at_the_learned_rate(tmp_path):
     method, system, artifact, dt = trained_on_oscillator("node", tmp_path, configuration=1, steps=100)
     slowest = -artifact.filter.A.diagonal().max()
-    assert slowest != pytest.approx(1.0, abs=1e-4)  # where it began
+    assert slowest != pytest.approx(1.0, abs=1e-4)  # the initial rate
     y = system.output(oscillations(dt))
     misled = y.copy()
     misled[0] += 1e-3
@@ -96,17 +96,17 @@ def test_rollout_is_the_filter_sample_by_sample(ny):
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
-def test_kalman_filters_know_the_noise(name):
+def test_kalman_filters_get_the_noise_level(name):
     method, system = get_method(name), get_system("van_der_pol")
     trained, y0 = {"diffusion": np.array([0.01])}, np.array([[3.0]])
     first = [run(method.observer(trained, system, 0.01, noise), y0[None])[0, 0, 0] for noise in (0.0, 50.0)]
-    assert first[0] == pytest.approx(3.0, abs=0.01)  # from the centre of X, 0
+    assert first[0] == pytest.approx(3.0, abs=0.01)  # starting from the centre of X, 0
     assert first[1] == pytest.approx(3.0 * (25 / 3) / (25 / 3 + 2500), rel=1e-6)
 
 
 @pytest.mark.parametrize("cell", [GRUCell, LRUCell, TransformerCell])
-def test_a_sequence_at_once_is_the_observer_sample_by_sample(cell):
-    """In chunks too, each row on its own, longer than the transformer's window; a missing sample leaves it finite."""
+def test_a_sequence_model_agrees_with_its_observer_sample_by_sample(cell):
+    """Sequences longer than the transformer's window, in two chunks; rows are independent; a sample is missing."""
     torch.manual_seed(0)
     model, noise = Model(cell, 8, 1, 2), torch.tensor([0.3])
     y = torch.randn(250, 3, 1)

@@ -1,4 +1,4 @@
-"""Jobs in worker processes: failures, interruptions, and processes that are killed."""
+"""Jobs in worker processes: failures, interruptions and killed processes."""
 
 import os
 import signal
@@ -40,7 +40,7 @@ def test_a_worker_has_one_thread(monkeypatch, tmp_path):
 
 
 @needs_proc
-def test_what_a_dead_worker_was_at_is_begun_again(tmp_path):
+def test_the_job_of_a_killed_worker_runs_again(tmp_path):
     jobs = [Busy("victim", tmp_path, 2.0, kills=1), *(Busy(name, tmp_path) for name in "abc")]
     assert run(jobs) == dict.fromkeys(("victim", "a", "b", "c"))
     assert len(jobs[0].processes) == 2
@@ -75,7 +75,7 @@ def test_workers_do_not_outlive_their_parent(how, tmp_path):
     parent = subprocess.Popen([sys.executable, "-c", PARENT, tmp_path], **options)
     try:
         until(lambda: all(job.processes for job in jobs))
-        os.killpg(parent.pid, how) if how == signal.SIGINT else parent.send_signal(how)  # Ctrl-C reaches all of them
+        os.killpg(parent.pid, how) if how == signal.SIGINT else parent.send_signal(how)  # Ctrl-C reaches workers too
         _, errors = parent.communicate(timeout=120)
     finally:
         parent.kill()
@@ -84,7 +84,7 @@ def test_workers_do_not_outlive_their_parent(how, tmp_path):
 
 
 @needs_proc
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # joblib's, of jobs that were cancelled
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # joblib warns of cancelled jobs
 def test_workers_end_when_the_context_is_left(tmp_path):
     long = Busy("long", tmp_path, 600.0)
     with engine(2) as here:

@@ -30,7 +30,7 @@ def test_speed_of_a_shipped_system(observer, wrapped, observers, capsys):
     own = [name.removeprefix("van_der_pol").removeprefix("-large").removeprefix(", ") for name in names]
     assert {what: own.count(what) for what in of_tables} == {
         what: observers + (what == "KKL") for what in of_tables
-    }  # the last is of records
+    }  # one more row measures records
     assert {len(cells) for cells in lines} == {3}
     with pytest.raises(ValueError, match="turns must be positive"):
         Speed(turns=0).run(Console())

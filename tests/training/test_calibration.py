@@ -1,4 +1,4 @@
-"""Covariances, factors and limits where the truth is known: on a linear system with an exact T_inv."""
+"""Covariances, factors and limits against closed forms: a linear system with an exact T_inv."""
 
 import dataclasses
 
@@ -32,17 +32,17 @@ class Disturbed(Slow):
 
 
 def of_process_noise(artifact):
-    """The observer as a map that depends on process noise too, and does not use it."""
+    """Add the feature process noise to the observer, which ignores it."""
     inverse = artifact.inverse
     (weight,), biases = inverse.mlp.weights, inverse.mlp.biases
-    told = dataclasses.replace(
+    inverse = dataclasses.replace(
         inverse,
         mlp=MLP([np.insert(weight, 4, 0.0, axis=1)], biases, "tanh"),
         features=("z_y", "measurement_noise", "process_noise", "age"),
         process_noise_unit=0.1,
         process_noise_max=DISTURBED,
     )
-    return dataclasses.replace(artifact, inverse=told)
+    return dataclasses.replace(artifact, inverse=inverse)
 
 
 def calibrated(system, artifact):
@@ -58,22 +58,22 @@ def tracking():
 
 @pytest.fixture(scope="module")
 def quiet():
-    """The same without process noise."""
+    """The calibrated observer without process noise."""
     return calibrated(Slow(), plain_observer())
 
 
-def test_the_covariance_of_t_inv_is_that_of_noise_and_of_what_is_left_of_the_start(quiet):
+def test_the_covariance_of_t_inv_is_that_of_noise_and_of_the_transient(quiet):
     found = quiet.inverse.error_covariance
     linear, L = exact_observer(DT).filter, exact_observer(DT).inverse.mlp.weights[0]
     M, C = np.linalg.pinv(L), np.array([[1.0, 0.0]])
     ages = np.round(found.ages / DT).astype(int)
     noise = L @ noise_covariance(linear, ages)[:, 0] @ L.T
     moved = np.array([np.linalg.matrix_power(linear.transition, age) for age in ages])
-    left = L @ moved @ (linear.equilibrium @ C - M)  # of a start, of which a third lie in 2X: variances 2/3
+    left = L @ moved @ (linear.equilibrium @ C - M)  # transient of the start; start variances 2/3, as a third lie in 2X
     settled, expected = ages >= 60, noise + left @ left.mT * 2 / 3
     size = np.sqrt(np.einsum("tii,tjj->tij", expected, expected))[settled]
     np.testing.assert_allclose(found.covariance[-1, settled] / size, expected[settled] / size, atol=0.15)
-    first = (left @ left.mT)[:2].mean(0)  # about the first knot are ages 0 and 1
+    first = (left @ left.mT)[:2].mean(0)  # ages 0 and 1 belong to the first knot
     assert ages[:2].tolist() == [0, 1]
     table = found.covariance[0, 0]
     np.testing.assert_allclose(table / table.trace(), first / first.trace(), atol=0.05)
@@ -87,7 +87,7 @@ def test_factors_of_an_exact_kalman_filter_are_about_one(tracking):
 
 
 @pytest.mark.parametrize("alone", [False, True])
-def test_regions_hold_what_they_should_on_other_runs(tracking, quiet, alone):
+def test_confidence_regions_on_new_runs(tracking, quiet, alone):
     system, artifact = (Slow(), dataclasses.replace(quiet, motion=None)) if alone else (Disturbed(), tracking)
     noise = system.process_noise
     runs = unseen_trajectories(system, DT, n=600, duration=20.0, seed=7, process_noise=noise)
@@ -95,7 +95,7 @@ def test_regions_hold_what_they_should_on_other_runs(tracking, quiet, alone):
         spans = (slice(20, 22), slice(100, None))
         early, late = coverage(artifact, system, runs, measurement_noise=level, seed=7, spans=spans)
         assert late["90"] == pytest.approx(90, abs=5 if alone else 3)
-        # Of 600, three standard deviations are 0.037. Beyond X, where T_inv's covariance counts too, starts are worse.
+        # 3 standard deviations of 600 runs are 0.037. Starts beyond X, which use T_inv's covariance, are less accurate.
         assert 85 < early["90"] < (97 if alone else 95)
         assert all(late[name] == pytest.approx(100 * share, abs=10 if alone else 7) for name, share in REGIONS.items())
 
@@ -106,7 +106,7 @@ def test_a_second_calibration_finds_the_same_factors(tracking):
 
 
 def ever_above(artifact, system, level, fault=lambda y: y, n=400, duration=20.0):
-    """Which new runs raise an alarm."""
+    """A boolean for each of `n` new runs: whether its score raises an alarm."""
     rng = np.random.default_rng(11)
     runs = unseen_trajectories(system, DT, n=n, duration=duration, seed=3, process_noise=system.process_noise)
     y = fault(system.output(runs.x) + level * rng.standard_normal((*runs.x.shape[:2], system.ny)))
@@ -121,11 +121,11 @@ def ever_above(artifact, system, level, fault=lambda y: y, n=400, duration=20.0)
 
 def test_false_alarms_are_as_frequent_as_was_asked(tracking):
     limits = tracking.limits
-    assert (np.diff(limits.mean[1:, 0]) > 0).all()  # more noise, wider limits
+    assert (np.diff(limits.mean[1:, 0]) > 0).all()  # limits grow with the noise
     assert limits.low[0] == 0.0
-    assert limits.low[-1] < limits.levels[-1] == 1.0 < limits.high[-1]  # about the variance of the noise
+    assert limits.low[-1] < limits.levels[-1] == 1.0 < limits.high[-1]  # around the variance of the noise
     for level in (0.2, 1.0):
-        assert ever_above(tracking, Disturbed(), level).mean() < 0.03  # 0.01 was asked for
+        assert ever_above(tracking, Disturbed(), level).mean() < 0.03  # the nominal rate is 0.01
     often = calibrate(tracking, Disturbed(), false_alarms=0.3)
     assert 0.05 < ever_above(often, Disturbed(), 0.2).mean() < 0.4
 
@@ -139,14 +139,14 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_raise_the_score(fault, quiet):
-    """Of T_inv alone: a tracker may follow a sensor that is off."""
+    """For T_inv alone, since a tracker may follow a faulty sensor."""
     alone = calibrate(dataclasses.replace(quiet, motion=None), Slow())
 
     def happens(y, at=300):
         return np.concatenate([y[:at], FAULTS[fault](y[at:])])
 
     seen = ever_above(alone, Slow(), 0.1, happens, n=50, duration=22.0)
-    assert seen.mean() >= 0.9  # within 7 s of it
+    assert seen.mean() >= 0.9  # within 7 s after the fault
 
 
 def test_limits_of_outputs_with_levels_of_their_own():
@@ -161,7 +161,7 @@ def test_limits_of_outputs_with_levels_of_their_own():
     training = {"pipeline": "input-aware", "eigenvalues": [-1.0], "dt": DT, "measurement_noise_max": (0.2, 2.0)}
     artifact = dataclasses.replace(artifact, measurement_noise=(0.1, 1.0), training={**training, "inputs": False})
     found = calibrate(artifact, SimulatedSource(Quiet(), settings_of(artifact.training, runs=200)))
-    assert found.inverse.error_covariance is None  # the map does not depend on the level
+    assert found.inverse.error_covariance is None  # the map has no feature for the level
     limits = found.limits
     assert limits.mean.shape == (6, 2)
     np.testing.assert_allclose(limits.levels[[0, -1]], [[0.0, 0.0], [0.2, 2.0]])
@@ -169,10 +169,10 @@ def test_limits_of_outputs_with_levels_of_their_own():
     assert (limits.low[-1] < limits.levels[-1] ** 2).all()
     assert (limits.levels[-1] ** 2 < limits.high[-1]).all()
     for levels in ((0.1, 1.0), (0.02, 1.0), (0.2, 0.1)):
-        assert ever_above(found, Quiet(), levels, n=200).mean() < 0.04  # of 200, 8 are more than chance allows
+        assert ever_above(found, Quiet(), levels, n=200).mean() < 0.04  # 8 of 200 would be improbable
 
 
-def test_a_system_is_a_source_too_if_the_observer_says_how_it_was_trained():
+def test_a_system_is_a_source_too_if_the_observer_has_settings_of_its_training():
     artifact = plain_observer()
     artifact = dataclasses.replace(artifact, training={**artifact.training, "inputs": False, "runs": 100})
     assert calibrate(artifact, Slow(), false_alarms=0.5).limits.false_alarms == 0.5
@@ -206,7 +206,7 @@ def test_a_kalman_filter_is_consistent_on_a_linear_system():
             assert found[region] / 100 == pytest.approx(share, abs=limit)
     assert found["nees_low"] < found["nees"] < found["nees_high"]
     assert found["nees_low"] < 2.0 < found["nees_high"]
-    # One that takes the noise for half of what it is believes too much.
+    # A filter that assumes too little process noise is overconfident.
     half = dataclasses.replace(trajectories, process_noise=0.01)
     (wrong,) = coverage(None, system, half, **how)
     assert wrong["nees"] > found["nees_high"]

@@ -1,4 +1,4 @@
-"""Checkpoints: damage is noticed, and nothing in them runs."""
+"""Checkpoints: damaged files raise errors, and no code in them runs."""
 
 import pickle
 import re
@@ -33,7 +33,7 @@ def same(found):
     )
 
 
-def test_what_is_saved_is_loaded(path):
+def test_round_trip_of_checkpoints(path):
     assert same(run.load_checkpoint(path, fingerprint="mine"))
     assert same(run.load_checkpoint(path))
     with pytest.raises(ValueError, match="belongs to another configuration"):
@@ -41,13 +41,13 @@ def test_what_is_saved_is_loaded(path):
 
 
 def damaged(path):
-    """A single line that names the file."""
+    """Expect an error with a message of one line that names the file."""
     return pytest.raises(ValueError, match=rf"\Athe checkpoint {re.escape(str(path))} is damaged or of another.*: .+\Z")
 
 
 def test_a_flipped_bit_is_noticed_or_changes_nothing(path):
-    """The format has checksums of its parts; what lies between them says nothing."""
-    whole, rng, said = path.read_bytes(), np.random.default_rng(0), []
+    """The zip format has checksums of its parts; bytes between the parts have no meaning."""
+    whole, rng, messages = path.read_bytes(), np.random.default_rng(0), []
     with zipfile.ZipFile(path) as file:
         (weights,) = (part for part in file.infolist() if part.file_size == 2400)
     begin = whole.index(np.arange(600.0, dtype=np.float32).tobytes())
@@ -60,9 +60,9 @@ def test_a_flipped_bit_is_noticed_or_changes_nothing(path):
             assert same(run.load_checkpoint(path, fingerprint="mine"))
             assert i < 300
         except ValueError as error:
-            said.append(str(error))
-    assert len(said) > 200
-    assert all(str(path) in message and "\n" not in message for message in said)
+            messages.append(str(error))
+    assert len(messages) > 200
+    assert all(str(path) in message and "\n" not in message for message in messages)
 
 
 def test_truncated_and_empty_files(path):

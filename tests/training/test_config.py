@@ -1,4 +1,4 @@
-"""Settings that make no sense."""
+"""Invalid settings."""
 
 import json
 from dataclasses import replace

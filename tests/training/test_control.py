@@ -18,7 +18,7 @@ def nothing(obs):
     return np.zeros((len(obs), 1))
 
 
-def test_a_system_of_ones_own_has_the_defaults_and_no_controller_without_input(script):
+def test_a_user_system_has_the_defaults_and_no_controller_without_input(script):
     own = get_system(f"{script}:Pendulum")
     assert profile(own) == Profile()
     with pytest.raises(ValueError, match="pendulum has no inputs"):
@@ -56,7 +56,7 @@ class Diagonal(System):
 
 @pytest.mark.parametrize("dt", [0.001, 0.1])
 def test_the_regulator_of_fast_modes_has_the_closed_loop_in_closed_form(dt):
-    """For a mode a with input gain b, held over dt, and r = R / Q: z + 1 / z = a + (1 + b^2 / r) / a."""
+    """A mode a with input gain b over dt and r = R / Q has the closed-loop z with z + 1 / z = a + (1 + b^2 / r) / a."""
     rates, ratio = np.array([40.0, -200.0]), INPUT_WEIGHT / 100.0 * np.array([1.0, 4.0])
     a = np.exp(rates * dt)
     b = (a - 1.0) / rates
@@ -88,9 +88,9 @@ def test_the_linear_quadratic_regulator_saturates_away_from_the_target(name):
     assert np.abs(act(np.random.default_rng(0).uniform(*system.box(), (50, system.nx)))).max() == 1.0
 
 
-# Of the two others one succeeds in half of all episodes alone, and one is slow to simulate.
+# Of the two other systems, one succeeds in only half of all episodes, and one is slow to simulate.
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol"])
-def test_the_state_feedback_succeeds_where_nothing_fails(name):
+def test_state_feedback_succeeds_where_zero_input_fails(name):
     task, n, system = TASKS[name], 20, get_system(name)
     episodes = play(vector(task, n), controller(system, task.repeat * task.env_kwargs["dt"]), seed=0)
     idle = play(vector(task, n), nothing, seed=0)
@@ -121,14 +121,14 @@ def test_scores_and_successes_by_hand():
     x[:, 1] = [2.0, 1.5]  # one scale off in both states: c = 1
     assert scores(system, x) == pytest.approx([0.0, np.exp(-4.0) - 1.0])
     x[:] = 0.0
-    x[:8, 0] = 5.0  # before the last fifth
+    x[:8, 0] = 5.0  # only the last fifth counts
     x[9, 1] = [0.0, 1.01 * TOLERANCE * 1.5]
     assert successes(system, x).tolist() == [True, False]
     x[9, 1] = [0.0, 0.99 * TOLERANCE * 1.5]
     assert successes(system, x).tolist() == [True, True]
 
 
-def test_what_is_refused():
+def test_invalid_tasks_and_names_are_refused():
     for wrong in ({"dt": True}, {"dt": np.nan}, {"period": 0.015}, {"duration": 19.97}, {"duration": 1e9}):
         with pytest.raises(ValueError, match=r"task needs|whole multiple|max_episode_steps must be"):
             control_task("lorenz", **wrong)
@@ -138,7 +138,7 @@ def test_what_is_refused():
 
 
 def test_the_law_of_reverse_duffing_follows_its_parameters():
-    """Where x2 is on its way, -cbrt(a x1), the input replaces the drift by one that stays there."""
+    """On the manifold x2 = -cbrt(a x1), the input keeps the state on the manifold."""
     act = controller(get_system("reverse_duffing", {"a": 8.0, "b": 0.5}), 0.01)
     assert act(np.array([[1e-3, -0.2]])) == pytest.approx(0.5e-3)
     assert act(np.array([[-0.5, 0.3]])) == pytest.approx(np.clip(-0.25 - 2.0 * (0.3 - 4.0 ** (1 / 3)), -1, 1))

@@ -1,4 +1,4 @@
-"""The style of figures: what follows the theme, what is left alone, and what is written."""
+"""The style of figures: colours of the themes, unchanged global settings, and saved files."""
 
 import matplotlib
 import numpy as np
@@ -39,14 +39,14 @@ def test_a_drawing_is_written_at_its_end(tmp_path, theme):
 
 @pytest.mark.parametrize("theme", THEMES)
 def test_moving_pictures_keep_ground_and_colours(tmp_path, theme):
-    """A line of one pixel is too little for a palette to notice, and blends with the ground are many."""
+    """A palette might drop the colour of a thin line in favour of the many blends with the background."""
     ground = np.round(255 * np.array(to_rgb(GROUNDS[theme]))).astype(np.uint8)
     rng = np.random.default_rng(0)
     frames = np.tile(ground, (5, 60, 80, 1))
-    frames[:, 30:, 10:70] ^= rng.integers(0, 8, (5, 30, 60, 3), dtype=np.uint8)  # nearly the ground
+    frames[:, 30:, 10:70] ^= rng.integers(0, 8, (5, 30, 60, 3), dtype=np.uint8)  # close to the background
     own = np.round(255 * np.array([to_rgb(colour) for colour in CYCLES[theme]])).astype(np.uint8)
     frames[:, 10, 10 : 10 + len(own)] = own
-    for k, frame in enumerate(frames):  # one moves
+    for k, frame in enumerate(frames):  # one pixel moves
         frame[20, 10 + k] = own[0]
     path = tmp_path / "moving.gif"
     with style(theme):

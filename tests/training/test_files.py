@@ -1,4 +1,4 @@
-"""Files that appear whole, tables, and the folders of runs and jobs."""
+"""Atomic writing of files, tables, and the folders of runs and jobs."""
 
 import errno
 import json
@@ -53,7 +53,7 @@ with storage.replacing(sys.argv[1]) as temporary:
 """
 
 
-def test_what_killed_processes_leave_is_cleared_away(tmp_path):
+def test_unfinished_files_of_killed_processes_are_removed(tmp_path):
     path = tmp_path / "new" / "a.txt"
     write(path, "whole")
     before = path.read_bytes()
@@ -63,7 +63,7 @@ def test_what_killed_processes_leave_is_cleared_away(tmp_path):
     assert path.read_bytes() == before
     (left,) = {*path.parent.iterdir()} - {path}
     clear_unfinished(path.parent)
-    assert left.exists()  # somebody may be at work on it
+    assert left.exists()  # a running process may be writing this file
     for file in (left, path):
         os.utime(file, (time.time() - 3700.0,) * 2)
     with claimed_run(path.parent, {}, resume=False):
@@ -71,7 +71,7 @@ def test_what_killed_processes_leave_is_cleared_away(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "symlink"), reason="this system has no links")
-def test_what_is_linked_to_stays(tmp_path):
+def test_targets_of_links_are_not_removed(tmp_path):
     kept = tmp_path / "kept" / "file"
     kept.parent.mkdir()
     kept.touch()
@@ -115,7 +115,7 @@ def test_two_trainings_do_not_share_a_folder(tmp_path):
             with pytest.raises(ValueError, match="another process is at work in"), claimed_run(tmp_path, other, resume):
                 raise AssertionError
         assert json.loads((tmp_path / "config.json").read_text()) == {"width": 8}
-    with claimed_run(tmp_path, other, resume=False):  # it left no checkpoints
+    with claimed_run(tmp_path, other, resume=False):  # the other process left no checkpoints
         assert json.loads((tmp_path / "config.json").read_text()) == other
 
 
@@ -153,7 +153,7 @@ def test_identities_that_are_damaged(text, tmp_path):
         check_identity(path, {"seed": 0}, "another job")
 
 
-def test_a_system_is_told_from_another():
+def test_descriptions_of_systems_differ():
     lorenz = get_system("lorenz")
     assert describe(lorenz) == describe(get_system("lorenz"))
     other = describe(lorenz.replace({"rho": 30.0}))
@@ -174,5 +174,5 @@ class Tiny(System):
         return (x[0],)
 
 
-def test_equations_of_small_numbers_are_told_apart():
+def test_descriptions_of_small_systems_differ():
     assert describe(Tiny())["equations"] != describe(Tiny(0.06))["equations"]

@@ -1,4 +1,4 @@
-"""From a system to an observer that tracks, at toy size."""
+"""Training of tracking observers from systems, at toy size."""
 
 import io
 import json
@@ -22,7 +22,7 @@ from training.evaluation.report import write_report
 
 
 class Slow(Oscillator):
-    """Twenty samples in a second: calibration takes a fifth of its time."""
+    """The oscillator with 20 samples per second, for a fast calibration."""
 
     name = "oscillator"
     dt = 0.05
@@ -30,7 +30,7 @@ class Slow(Oscillator):
 
 
 class Table(Slow):
-    """Its restoring force is a table, which NumPy looks up."""
+    """The restoring force is a table, interpolated by NumPy, which no expression represents."""
 
     name = "table"
 
@@ -39,10 +39,10 @@ class Table(Slow):
 
 
 def trained(system, folder=None, *, resume=False, **changes):
-    """The result, and what was said on the way."""
-    said = Console(file=io.StringIO(), width=300)
-    found = train(system, toy(system, **changes), folder, resume=resume, device=CPU, console=said)
-    return found, said.file.getvalue()
+    """Train an observer of a system; return the result and the printed text."""
+    printed = Console(file=io.StringIO(), width=300)
+    found = train(system, toy(system, **changes), folder, resume=resume, device=CPU, console=printed)
+    return found, printed.file.getvalue()
 
 
 LONG = {"duration": 20.0, "inverse_steps": 200}
@@ -55,7 +55,7 @@ KINDS = {
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Of each kind the folder of an uninterrupted run, its result, and what it said."""
+    """For each of KINDS, the folder of an uninterrupted run, the result, and the printed text."""
     found = {}
     for kind, (system, _, changes) in KINDS.items():
         folder = tmp_path_factory.mktemp(kind)
@@ -64,8 +64,8 @@ def whole(tmp_path_factory):
 
 
 def test_an_observer_tracks_by_its_equations(whole, tmp_path):
-    _, result, said = whole["equations"]
-    assert "track" not in said
+    _, result, printed = whole["equations"]
+    assert "track" not in printed
     result.artifact.save(tmp_path / "a.safetensors")
     artifact = Artifact.read(tmp_path / "a.safetensors")
     assert list(result.losses) == ["free", "inverse"]
@@ -74,7 +74,7 @@ def test_an_observer_tracks_by_its_equations(whole, tmp_path):
     later = simulate(Slow(), x, 1, 0.05, u=u[None, :, :1])[-1]
     np.testing.assert_allclose(artifact.motion.step(x, u[:, :1], 0.05), later, atol=1e-5)
     ages = artifact.motion.factors.ages
-    assert artifact.motion.factors.factors.shape == (2, 6, len(ages))  # without process noise and with it
+    assert artifact.motion.factors.factors.shape == (2, 6, len(ages))  # first axis: without and with process noise
     for inverse in (artifact.inverse, artifact.free_inverse):
         assert inverse.error_covariance.covariance.shape == (6, len(ages), 2, 2)
     assert artifact.limits.duration == 20.0
@@ -87,8 +87,8 @@ def test_an_observer_tracks_by_its_equations(whole, tmp_path):
 
 
 def test_equations_that_no_expression_holds_give_way_to_a_flow(whole):
-    _, result, said = whole["flow"]
-    assert "by a learned flow: an observer of 'table' cannot hold f(x) + g(x) u as an expression" in said
+    _, result, printed = whole["flow"]
+    assert "by a learned flow: an observer of 'table' cannot hold f(x) + g(x) u as an expression" in printed
     motion = result.artifact.motion
     assert motion.equations is None
     assert list(result.losses) == ["inverse", "flow"]
@@ -101,7 +101,7 @@ def test_equations_that_no_expression_holds_give_way_to_a_flow(whole):
 
 
 def parts(artifact):
-    """All numbers that training and calibration find."""
+    """Yield all arrays that training and calibration determine."""
     for inverse in (artifact.inverse, artifact.free_inverse):
         if inverse is not None:
             yield from (*inverse.mlp.weights, inverse.error_covariance.covariance)
@@ -160,9 +160,9 @@ def test_another_run_is_not_resumed(whole):
 
 
 def test_an_artifact_of_spinn_has_a_forward_map_and_no_motion(whole):
-    folder, result, said = whole["spinn"]
+    folder, result, printed = whole["spinn"]
     artifact = result.artifact
-    assert "track" not in said  # which nobody asked for
+    assert "track" not in printed  # no message, since spinn maps never track
     assert (artifact.motion, artifact.nu, artifact.forward.mlp.inputs) == (None, 0, 2)
     assert artifact.inverse.error_covariance is not None
     assert (artifact.training["pipeline"], artifact.training["seed"]) == ("spinn", 0)
@@ -187,9 +187,9 @@ def test_outputs_that_no_expression_holds_cannot_be_tracked():
         def h(self, x):
             return (np.sin(x[0]),)
 
-    result, said = trained(Sine(), duration=1.0, inverse_steps=2, inputs=False)
+    result, printed = trained(Sine(), duration=1.0, inverse_steps=2, inputs=False)
     artifact = result.artifact
-    assert "does not track: an observer of 'sine' cannot hold h(x) as an expression" in said
+    assert "does not track: an observer of 'sine' cannot hold h(x) as an expression" in printed
     assert (artifact.knows_output, artifact.motion, artifact.limits) == (False, None, None)
     assert artifact.inverse.error_covariance is not None
 
@@ -233,10 +233,10 @@ def test_the_papers_own_way_takes_neither_noise_nor_age(monkeypatch):
     result, _ = trained(Slow(), duration=20.0, inverse_steps=5, forward_steps=5, solved_output_layer=False, **papers)
     artifact = result.artifact
     assert artifact.inverse.features == ("z_y",)
-    np.testing.assert_allclose(artifact.forward.x_scale, 1.0, atol=0.01)  # the box, not the motions beyond it
+    np.testing.assert_allclose(artifact.forward.x_scale, 1.0, atol=0.01)  # the scale of the box X
     np.testing.assert_allclose(artifact.inverse.x_scale, 1.0, atol=0.01)
     assert artifact.inverse.error_covariance is None
-    np.testing.assert_allclose(artifact.limits.levels[-1], 0.2)  # of the training
+    np.testing.assert_allclose(artifact.limits.levels[-1], 0.2)  # the largest level in training
     monkeypatch.delattr(SimulatedSource, "pairs")
     with pytest.raises(ValueError, match="make them longer"):
         trained(Slow(), pipeline="spinn")
@@ -273,7 +273,7 @@ def test_two_outputs_have_noise_of_their_own(tmp_path):
 
 @dataclass(frozen=True)
 class Still(Slow):
-    """Units of a million and of a millionth, and a state that never moves; starts lie on a circle."""
+    """States in units of 1e6 and 1e-6, and a constant state; starts lie on a circle."""
 
     name: ClassVar[str] = "still"
     X: ClassVar = ((-1e-6, 1e-6), (-1e6, 1e6), (200.0, 400.0))
@@ -291,9 +291,9 @@ class Still(Slow):
 
 
 def test_states_in_odd_units_and_states_that_stand_still():
-    result, said = trained(Still(), duration=20.0, inverse_steps=400, width=24)
+    result, printed = trained(Still(), duration=20.0, inverse_steps=400, width=24)
     artifact = result.artifact
-    assert "track" not in said
+    assert "track" not in printed
     assert artifact.motion.factors.factors.shape[0] == 1
     runs = unseen_trajectories(Still(), 0.05, n=20, duration=20.0, seed=0)
     x_hat = KKLObserver(artifact).estimate(runs.x[..., :1] + 5e-8 * np.random.default_rng(0).normal(size=(401, 20, 1)))

@@ -1,4 +1,4 @@
-"""Plants of Gymnasium's classic control: an unstable one, and one on a circle."""
+"""The cart pole and the pendulum on a circle in examples/ against those of Gymnasium."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def test_cart_pole_is_gymnasiums():
     rng = np.random.default_rng(0)
     for action in (0, 1) * 10:
         x = rng.uniform([-2, -2, -0.2, -2], [2, 2, 0.2, 2])
-        env.state = tuple(x)  # whose steps are Euler's
+        env.state = tuple(x)  # Gymnasium's cart pole takes Euler steps
         env.steps_beyond_terminated = None
         env.step(action)
         slope = (np.array(env.state) - x) / env.tau
@@ -62,7 +62,7 @@ def test_starts_beyond_x_are_on_the_circle_too(pendulum):
     assert (np.abs(x[:, 2]) > 8).all()
 
 
-def test_what_is_known_of_a_start_on_the_circle(pendulum):
+def test_mean_and_covariance_of_unknown_starts_on_the_circle(pendulum):
     mean, covariance = unknown_start(pendulum)
     np.testing.assert_allclose(mean, 0.0, atol=0.2)
     np.testing.assert_allclose(covariance, np.diag([0.5, 0.5, 64 / 3]), atol=0.5)

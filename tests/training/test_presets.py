@@ -21,7 +21,7 @@ def test_paper_preset_has_the_papers_table():
     assert all(value < 0 for value in presets.eigenvalues(Oscillator(), 0.01))
 
 
-def test_spinn_of_a_system_of_ones_own_forgets_its_start_and_looks_for_no_spectrum_that_is_given(monkeypatch):
+def test_spinn_of_a_user_system_has_fast_modes_and_keeps_a_given_spectrum(monkeypatch):
     for duration in (50.0, 200.0):
         config = preset(Oscillator(), "spinn", "fast", changes={"duration": duration, "width": None})
         assert -max(config.eigenvalues) * duration >= 30
@@ -33,7 +33,7 @@ def test_spinn_of_a_system_of_ones_own_forgets_its_start_and_looks_for_no_spectr
     assert config.box_factor == 2.0
 
 
-def test_maps_are_trained_for_twice_what_is_usual_on_each_output():
+def test_maps_are_trained_up_to_twice_the_usual_level_of_each_output():
     for system, levels in (
         (VanDerPol(), 1.0),
         (TwoOutputs(), (0.2, 0.6)),
@@ -46,7 +46,7 @@ def test_maps_are_trained_for_twice_what_is_usual_on_each_output():
     assert preset(Lorenz(), "input-aware", "fast").measurement_noise_max == 3.0
 
     class Exact(TwoOutputs):
-        """Its sensors are said to be without noise, which no map need believe."""
+        """One sensor has no noise; maps are trained for noise all the same."""
 
         name = "exact"
         measurement_noise = (0.0, 0.3)
@@ -55,7 +55,7 @@ def test_maps_are_trained_for_twice_what_is_usual_on_each_output():
 
 
 @pytest.mark.parametrize("name", ["fast", "paper"])
-def test_uncertain_parameters_add_what_the_systems_profile_says(name):
+def test_uncertain_parameters_add_settings_of_the_systems_profile(name):
     def of(**changes):
         return preset(Rossler(), "input-aware", name, changes=changes)
 
@@ -73,7 +73,7 @@ def test_uncertain_parameters_add_what_the_systems_profile_says(name):
     )
 
 
-def test_large_is_a_t_inv_that_stands_alone():
+def test_large_is_for_a_t_inv_without_a_tracker():
     small, large = (preset(VanDerPol(), size=size) for size in ("default", "large"))
     assert (small.width, large.width) == (20, 128)
     assert (small.pairs, len(large.pairs)) == ((), 4)

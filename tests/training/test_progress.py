@@ -1,4 +1,4 @@
-"""Progress bars, and the lines that stand for them where none are drawn."""
+"""Progress bars, and the log lines in their place without a terminal."""
 
 import io
 import re
@@ -21,7 +21,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch):
-    monkeypatch.setattr(training.progress, "BEAT", 1e6)  # which goes by another clock
+    monkeypatch.setattr(training.progress, "BEAT", 1e6)  # the heartbeat uses another clock
     return Clock()
 
 
@@ -47,12 +47,12 @@ def written(clock, log=None, **how):
     return console.file.getvalue().splitlines()
 
 
-def test_what_is_no_terminal_gets_a_line_now_and_then(clock):
+def test_without_a_terminal_lines_are_printed_now_and_then(clock):
     assert written(clock, steps=80) == [
         "simulating [lorenz]: 60 of 80, 0:01:00 passed, 0:00:20 left",
         "simulating [lorenz]: 80 of 80, 0:01:20 passed",
     ]
-    assert written(clock, steps=50) == []  # not worth a line
+    assert written(clock, steps=50) == []  # too fast for a line
     assert "simulating [lorenz]: 2 of 4, 2:00:00 passed, 2:00:00 left" in written(clock, steps=4, seconds=3600.0)
 
 
@@ -66,12 +66,12 @@ def test_a_phase_that_has_ended_keeps_its_duration(clock):
     assert console.file.getvalue() == "80 s: 1 of 1, 0:01:20 passed\n"
 
 
-def test_what_went_before_an_interruption_does_not_count_as_speed(clock):
+def test_steps_before_an_interruption_do_not_count_as_speed(clock):
     lines = written(clock, steps=200, completed=80)
     assert lines[0] == "simulating [lorenz]: 140 of 200, 0:01:00 passed, 0:01:00 left"
 
 
-def test_a_phase_that_says_nothing_of_itself_is_not_silent(monkeypatch):
+def test_a_phase_without_progress_prints_lines(monkeypatch):
     monkeypatch.setattr(training.progress, "FIRST_LINE", 0.0)
     monkeypatch.setattr(training.progress, "BEAT", 0.01)
     console = console_of(terminal=False)
@@ -83,14 +83,14 @@ def test_a_phase_that_says_nothing_of_itself_is_not_silent(monkeypatch):
         assert console.file.getvalue() == "bounding T_inv: 0 of 1, 0:00:00 passed\n"
 
 
-def test_what_is_refused_leaves_no_log(tmp_path):
+def test_a_refused_training_leaves_no_log(tmp_path):
     with suppress(ValueError), progress_bars(None, tmp_path / "run" / "log.txt"):
         raise ValueError("x")
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("console", [None, console_of(terminal=True)])
-def test_a_log_has_lines_whatever_is_drawn(console, clock, tmp_path):
+def test_a_log_has_lines_with_and_without_bars(console, clock, tmp_path):
     log = tmp_path / "run" / "log.txt"
     work(ProgressBars(console, log, get_time=clock), clock, steps=100)
     with suppress(ValueError), progress_bars(console, log) as progress:

@@ -15,7 +15,7 @@ def line_of(folder, **settings):
 
 
 class Clock:
-    """CPU time that goes on by 20 ms at each look."""
+    """A CPU clock that advances by 20 ms per call."""
 
     def __init__(self):
         self.now = 100.0
@@ -25,7 +25,7 @@ class Clock:
         return self.now
 
 
-def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypatch):
+def test_a_time_limit_ends_a_stage_and_includes_time_before_resuming(tmp_path, monkeypatch):
     monkeypatch.setattr(training.run.time, "process_time", Clock())
     rates = []
 
@@ -47,15 +47,15 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
 
     monkeypatch.setattr(training.run, "CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(KeyboardInterrupt):
-        fit(stop_after=150)  # the checkpoint is of step 100
+        fit(stop_after=150)  # the last checkpoint is at step 100
     spent = seconds_spent(tmp_path)
     assert 1.5 < spent < 3.0
     rest = fit()
     assert 4.0 <= seconds_spent(tmp_path) < 4.1
     assert rest == pytest.approx(100 * (4.0 - spent) / spent, rel=0.1)
-    assert rates[-1] < 1e-4  # the learning rate has followed the clock to zero
+    assert rates[-1] < 1e-4  # the schedule follows the clock to zero
     assert fit() == 0
-    (tmp_path / f"{UNFINISHED}1234-line{training.run.CHECKPOINT}").write_bytes(b"half")  # of a process that was killed
+    (tmp_path / f"{UNFINISHED}1234-line{training.run.CHECKPOINT}").write_bytes(b"half")  # left by a killed process
     assert 4.0 <= seconds_spent(tmp_path) < 4.1
     (tmp_path / f"other{training.run.CHECKPOINT}").write_bytes(b"half")
     with pytest.raises(ValueError, match="is damaged or of another version; remove it"):

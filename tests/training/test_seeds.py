@@ -16,8 +16,8 @@ def test_no_two_streams_meet():
 
 
 @pytest.mark.parametrize("seed", [(-1,), (2**32,), (2**32 + 5,), (0, -1), (0, 2**32)])
-def test_seeds_that_would_meet_others_are_refused(seed):
-    """Of [1, 2**32 + 5] NumPy makes the words of [1, 5, 1], part 1 of seed 5."""
+def test_seeds_that_would_collide_are_refused(seed):
+    """NumPy converts [1, 2**32 + 5] to the words [1, 5, 1], which belong to part 1 of seed 5."""
     with pytest.raises(ValueError, match=rf"seed = {seed[-1]} must be a whole number from 0 to 2\*\*32 - 1"):
         generator(Stream.TRAINING, *seed)
 

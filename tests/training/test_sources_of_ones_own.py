@@ -1,4 +1,4 @@
-"""A source that is none of ours: a mass on a spring, known in closed form."""
+"""A user-defined source: a mass on a spring in closed form."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ PHI = np.array([[np.cos(DT), np.sin(DT)], [-np.sin(DT), np.cos(DT)]])
 
 
 class Spring:
-    """Positions are measured; states are turned by PHI in each sample."""
+    """The position is measured; PHI is the transition of the state per sample."""
 
     name, nx, ny, nu, dt, pace, process_noise = "spring", 2, 1, 0, DT, 1.0, 0.0
 
@@ -53,7 +53,7 @@ class Spring:
 
     def equations(self):
         if not self.known:
-            raise ValueError("nobody knows them")
+            raise ValueError("no equations")
         return exact_equations()
 
     def increments(self, *, report):
@@ -73,7 +73,7 @@ class Spring:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_source_of_ones_own_is_enough(known):
+def test_a_user_defined_source_suffices(known):
     source = Spring(known)
     artifact = train(source, device=CPU).artifact
     assert (artifact.motion.equations is not None, artifact.training["judged"]) == (known, "spring")

@@ -1,4 +1,4 @@
-"""The eigenvalues of A, the filter that they make, and how smooth T is, judged by the z of neighbouring states."""
+"""The eigenvalues of A, the filter with them, and the smoothness of T, measured by the z of neighbouring states."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ def test_complex_modes_filter_a_linear_system_to_its_sylvester_solution():
     )
     motions = Motions(system, linear.dt, 2500)
     data = motions.beside(linear, np.array([2400, 2500]), 20, np.random.default_rng(0))
-    np.testing.assert_allclose(data.z, data.x @ sylvester(linear.A, linear.B).T, atol=1e-4)  # as holding y is exact
+    np.testing.assert_allclose(data.z, data.x @ sylvester(linear.A, linear.B).T, atol=1e-4)  # holding y adds no error
 
 
 @pytest.mark.parametrize(("ny", "nu"), [(1, 0), (2, 1)])
@@ -71,7 +71,7 @@ def test_slow_modes_of_a_chaotic_system_are_rough():
     assert (fast > SMOOTH).all()
 
 
-def test_intervals_follow_the_rate_up_to_what_dt_resolves():
+def test_intervals_follow_the_rate_as_far_as_dt_resolves():
     system = Oscillator()
     found = intervals(system, 0.01)
     rate = system.typical_rate
@@ -97,7 +97,7 @@ def test_the_slowest_smooth_spectrum_is_chosen_and_always_the_same():
 
 @dataclass(frozen=True)
 class Resting(Oscillator):
-    """All motions end in a point, at once."""
+    """All motions converge to a point at once."""
 
     name = "resting"
 
@@ -107,7 +107,7 @@ class Resting(Oscillator):
 
 @dataclass(frozen=True)
 class Saddle(Oscillator):
-    """All motions leave; fast filters forget their start before."""
+    """All motions leave the bounds; transients of fast filters end earlier."""
 
     name = "saddle"
     bounds = ((-3, 3), (-3, 3))

@@ -1,4 +1,4 @@
-"""Trainings for plants whose parameters are known roughly."""
+"""Training for plants with uncertain parameters."""
 
 import io
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from training.trajectories.parameters import with_parameters
 
 @dataclass(frozen=True)
 class Undamped(Spring):
-    """Its frequency is the root of the stiffness."""
+    """A spring without damping; its frequency is the root of the stiffness."""
 
     damping: float = 0.0
 
@@ -30,7 +30,7 @@ class Undamped(Spring):
 
 @cache
 def trained(**uncertain):
-    """An observer of free motion, for one plant or many."""
+    """An observer of free motion, for one plant or for a range of plants."""
     system = Undamped()
     own = {"inputs": False, "trajectories": 200, "duration": 15.0, "inverse_steps": 1200, "width": 24}
     own |= {"uncertain": uncertain, "estimate_parameters": True} if uncertain else {}
@@ -48,21 +48,21 @@ def test_an_observer_for_uncertain_plants_holds_on_another():
             runs = unseen_trajectories(moving, 0.05, n=20, duration=15.0, seed=3)
             late[name, what] = np.median(errors(artifact, moving, runs, measurement_noise=0.02, seed=3).late)
     assert late["many", "plant"] < 0.6 * late["one", "plant"]
-    assert late["many", "model"] < 2.5 * late["one", "model"]  # at this toy size
+    assert late["many", "model"] < 2.5 * late["one", "model"]  # loose, at this toy size
 
 
-def test_it_identifies_the_plant_while_it_runs():
+def test_the_observer_estimates_the_plants_parameter():
     system, artifact = Undamped(), trained(stiffness=0.3)
     assert artifact.estimated_parameters == ("stiffness",)
     assert artifact.parameter_ranges == {"stiffness": (2.8, 5.2)}
-    drawn = 30.0 / np.sqrt(3)  # in percent, of who only knows the range
+    drawn = 30.0 / np.sqrt(3)  # error in % of a constant estimate at the centre of the range
     many = with_parameters(system, artifact.parameter_ranges)
     runs = unseen_trajectories(many, artifact.filter.dt, n=30, duration=15.0, seed=5)
     clean, noisy = (parameter_errors(artifact, many, runs, measurement_noise=level, seed=5)[0] for level in (0.0, 0.02))
     assert clean < noisy < 0.5 * drawn
 
 
-def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate():
+def test_pairs_hold_only_the_signals_that_the_map_estimates():
     config = toy(VanDerPol(), uncertain={"mu": 0.1}, trajectories=60, duration=1.0)
     for estimated in (False, True):
         source = SimulatedSource(VanDerPol(), replace(config, estimate_parameters=estimated))
@@ -78,11 +78,11 @@ def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate():
     assert 2.7 <= mu.min() < 2.8 < 3.2 < mu.max() <= 3.3
 
 
-def test_it_does_not_track_and_says_why():
-    said = Console(file=io.StringIO(), width=200)
+def test_maps_for_uncertain_parameters_do_not_track_and_print_the_reason():
+    console = Console(file=io.StringIO(), width=200)
     config = toy(Undamped(), uncertain={"stiffness": 0.3}, duration=1.0, inverse_steps=2, inputs=False)
-    artifact = train(Undamped(), config, device=CPU, console=said).artifact
-    assert "a tracker needs exact parameters, but these are uncertain: stiffness" in said.file.getvalue()
+    artifact = train(Undamped(), config, device=CPU, console=console).artifact
+    assert "a tracker needs exact parameters, but these are uncertain: stiffness" in console.file.getvalue()
     assert artifact.motion is None
     assert artifact.inverse.error_covariance.nx == 2
 

@@ -4,5 +4,5 @@ from small_agents import make_small
 
 @pytest.fixture
 def small(monkeypatch):
-    """Agents in any environment, and their observers, are learned in no time."""
+    """Tiny settings for agents in any environment and for their observers."""
     make_small(monkeypatch)

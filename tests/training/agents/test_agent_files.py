@@ -1,4 +1,4 @@
-"""Files of agents: playing them as they were trained, and refusing what does not fit."""
+"""Files of agents: agents play as trained, and invalid files and arguments are refused."""
 
 import os
 import re
@@ -54,7 +54,7 @@ def test_a_file_holds_the_agent(changes, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"head": "softmax"}, "head"),
         ({"mean": np.zeros(2)}, "belong together"),
@@ -63,8 +63,8 @@ def test_a_file_holds_the_agent(changes, tmp_path):
         ({"training": {"seed": "x/../../out"}}, "seed must be a whole number"),
     ],
 )
-def test_an_agent_that_makes_no_sense_is_refused(changes, says):
-    with pytest.raises(AgentError, match=says):
+def test_invalid_agents_are_refused(changes, message):
+    with pytest.raises(AgentError, match=message):
         agent(**changes)
 
 
@@ -83,11 +83,11 @@ def test_mismatches_are_errors(saved, tmp_path):
         on_map.make(1)
     with pytest.raises(AgentError, match="trained with target = "):
         replace(agent(task=task, information="state"), rules={**rules(task), "target": [1.0, 1.0]}).make(1)
-    for wrong, says in (
+    for wrong, message in (
         ({"task": TASKS["lorenz"], "information": "state"}, "1 outputs, but the environment needs 3 and 1"),
         ({"head": "argmax"}, "head is argmax"),
     ):
-        with pytest.raises(AgentError, match=says):
+        with pytest.raises(AgentError, match=message):
             agent(**wrong).make()
 
 
@@ -105,24 +105,24 @@ def test_damaged_and_foreign_files(saved, tmp_path):
         find("nothing")
 
 
-@pytest.mark.parametrize(("change", "says"), [
+@pytest.mark.parametrize(("change", "message"), [
     (lambda t, d: t.update({"0.bias": np.full_like(t["0.bias"], np.nan)}), ""),
     (lambda t, d: d.update(format=9), "has format 9"),
     (lambda t, d: d.pop("activation"), "incomplete"),
     (lambda t, d: d.update(invented=1), "unknown metadata keys: invented"),
     (lambda t, d: d["task"].update(env_id=3), "env_id must be a string"),
 ])  # fmt: skip
-def test_contents_that_make_no_agent(change, says, tmp_path):
+def test_contents_that_make_no_agent(change, message, tmp_path):
     tensors, described = storage.read(find("lorenz"), key=KEY, error=AgentError, what="an agent")
     path = tmp_path / "agent.safetensors"
     change(tensors, described)
     storage.save(path, tensors, key=KEY, described=described)
-    with pytest.raises(AgentError, match=f"{re.escape(str(path))}.*{says}"):
+    with pytest.raises(AgentError, match=f"{re.escape(str(path))}.*{message}"):
         Agent.read(path)
 
 
 @pytest.mark.parametrize("kind", ["script", "module"])
-def test_what_an_agents_file_names_is_imported_only_if_the_caller_names_it(kind, tmp_path):
+def test_scripts_named_in_an_agents_file_are_imported_only_if_the_caller_trusts_them(kind, tmp_path):
     evil = tmp_path / "evil.py"
     evil.write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()\nclass Evil: pass\n")
     named = f"{evil}:Evil" if kind == "script" else "no_such_module:Evil-v0"
@@ -141,7 +141,7 @@ def test_what_an_agents_file_names_is_imported_only_if_the_caller_names_it(kind,
 
 
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol-y"])
-def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
+def test_shipped_agents_are_read_and_written_without_a_change(name, tmp_path):
     Agent.read(find(name)).save(tmp_path / "new" / "agent.safetensors")
     assert (tmp_path / "new" / "agent.safetensors").read_bytes() == find(name).read_bytes()
     assert os.listdir(tmp_path / "new") == ["agent.safetensors"]
@@ -155,7 +155,7 @@ def test_shipped_agents_act_on_estimates(name, least):
     assert (one.information, one.task) == ("x_hat", TASKS[name])
     assert resolve(one.observer) == resolve(observer_of(system))
     episodes = played(one)
-    assert scores(system, episodes.x).mean() > least  # zero input: about -0.6
+    assert scores(system, episodes.x).mean() > least  # zero input scores about -0.6
     assert not episodes.escaped.any()
     assert (episodes.lengths == one.task.steps).all()
     assert (episodes.returns > 0).all()
@@ -164,8 +164,8 @@ def test_shipped_agents_act_on_estimates(name, least):
     assert np.std(noise) == pytest.approx(one.task.measurement_noise, rel=0.05)
 
 
-def test_what_ends_early_stays_at_its_end():
-    """A still cart falls, each row in its own time."""
+def test_rows_that_end_early_are_not_played_further():
+    """With a constant action, the poles of the rows fall at different times."""
     env = agent(task=CART, outputs=2, head="argmax").make(5)
     episodes = play(env, lambda obs: np.zeros(5, dtype=int), seed=0)
     np.testing.assert_array_equal(episodes.returns, episodes.lengths)

@@ -1,4 +1,4 @@
-"""Tasks of agents, and what they are shown of them."""
+"""Tasks of agents, and their observations."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ CASES += [(CART, information) for information in INFORMATION if not information.
 
 @pytest.mark.parametrize(("task", "information"), CASES)
 def test_last_observations_of_episodes_and_first_ones_of_the_next(task, information):
-    """Against the same environment whose episodes are longer; sizes are about one."""
+    """Compare with the same environment with longer episodes; observations are scaled to about one."""
     steps = 10
     longer = replace(task, env_kwargs={**task.env_kwargs, "max_episode_steps": 400 if task.system else 50})
     short = replace(task, env_kwargs={**task.env_kwargs, "max_episode_steps": steps * task.repeat})
@@ -45,7 +45,7 @@ def test_last_observations_of_episodes_and_first_ones_of_the_next(task, informat
     assert (first == other.reset(seed=1)[0]).all()
     calm = np.zeros((N, 1), np.float32) if task.system else np.array([0, 1, 0])
     for k in range(steps):
-        action = calm if task.system else (calm + k) % 2  # by which the pole stands for so long
+        action = calm if task.system else (calm + k) % 2  # keeps the pole upright for these steps
         obs, reward, terminated, truncated, info = ours.step(action)
         expected, expected_reward, *_ = other.step(action)
         assert (reward == expected_reward).all()
@@ -57,7 +57,7 @@ def test_last_observations_of_episodes_and_first_ones_of_the_next(task, informat
     assert not terminated.any()
     assert all((info["final_obs"][row] == expected[row]).all() for row in range(N))
     assert obs.shape == first.shape
-    if information == "stacked":  # all are the first
+    if information == "stacked":  # all frames are the first observation
         assert np.ptp(obs.reshape(N, task.frames, -1), axis=1).max() == 0
     assert 0.01 < np.sqrt(np.square(first).mean()) < 5
 
@@ -74,7 +74,7 @@ def test_states_and_outputs_are_taken_from_the_target_over_the_scale():
     assert output_deviation(system)({"y": np.array([[system.target[1]]])}).tolist() == [[0.0]]
 
 
-def test_error_bars_are_shown_by_their_size():
+def test_error_bars_are_shown_as_logarithms():
     env = make(VAN_DER_POL, "x_hat_std", N, observer="van_der_pol")
     env.reset(seed=0)
     obs, *_, info = env.step(np.zeros((N, 1)))
@@ -82,7 +82,7 @@ def test_error_bars_are_shown_by_their_size():
     np.testing.assert_allclose(obs[:, 2:], np.log10(np.maximum(sigma, 1e-6)), rtol=1e-5)
 
 
-def test_z_is_what_the_network_sees_from_its_value_at_the_target():
+def test_z_is_the_whitened_filter_state_relative_to_the_target():
     env = make(VAN_DER_POL, "z", N, observer="van_der_pol")
     env.reset(seed=0)
     for action in actions(env, 5):
@@ -106,7 +106,7 @@ def test_stacks_and_traces_by_hand(task):
     for k, action in enumerate([None, *actions(plain, 8)]):
         if k:
             (y, *_), (shown, *_), (traced, *_) = (env.step(action) for env in (plain, stacked, traces))
-        u = action / 2 if k and nu else np.zeros((2, nu))  # of torques within ±2
+        u = action / 2 if k and nu else np.zeros((2, nu))  # torques are within ±2
         seen.append(np.concatenate([y, u], axis=1))
         trace = decay * trace + (1 - decay) * seen[-1] if k else trace
         rows = [*[seen[0]] * (4 - len(seen)), *seen[-4:]]
@@ -114,7 +114,7 @@ def test_stacks_and_traces_by_hand(task):
         np.testing.assert_allclose(traced, np.concatenate([*trace, seen[-1]], axis=1), rtol=1e-5, atol=1e-6)
 
 
-def test_noise_lies_on_what_is_measured_and_leaves_episodes_as_they_are():
+def test_noise_is_added_to_measured_entries_and_does_not_change_episodes():
     clean, noisy = single(PENDULUM), single(NOISY)
     apart = []
     for seed in range(3):
@@ -131,8 +131,8 @@ def test_noise_lies_on_what_is_measured_and_leaves_episodes_as_they_are():
     np.testing.assert_array_equal(make(NOISY, "state", 1).reset(seed=1)[0][0], single(PENDULUM).reset(seed=1)[0])
 
 
-def test_pay_is_minus_the_cost_and_escaping_never_pays():
-    """An action has five samples, whose rewards are 1 / (1 + 4 c); the second one of the third action escapes."""
+def test_rewards_are_minus_the_cost_and_escaping_has_no_advantage():
+    """An action has five samples with rewards 1 / (1 + 4 c); the state escapes in the second of the third action."""
     task, cost = control_task("rossler", period=0.05, duration=20.0), np.array([0.0, 0.3, 2 * MAX_COST])
     total = task.repeat / (1 + 4 * cost)
     np.testing.assert_allclose(paid(task, total, 15, False), [0.0, -0.3, -MAX_COST], atol=1e-12)
@@ -150,7 +150,7 @@ def test_a_system_is_named_in_three_ways():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         ({"measured": ()}, "measured must name"),
         ({"measured": (0, 0)}, "each once"),
@@ -161,12 +161,12 @@ def test_a_system_is_named_in_three_ways():
         ({"env_kwargs": {"g": PENDULUM}}, "env_kwargs must be JSON"),
     ],
 )
-def test_a_task_that_makes_no_sense_is_refused(arguments, says):
-    with pytest.raises(ValueError, match=says):
+def test_invalid_tasks_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
         Task(**{"env_id": "Pendulum-v1", "measured": (0,), **arguments})
 
 
-def test_what_is_not_there_is_named():
+def test_errors_name_missing_entries_and_observers():
     with pytest.raises(ValueError, match=r"no entry 7 .* 0 to 2"):
         single(Task("Pendulum-v1", (7,)))
     with pytest.raises(ValueError, match="needs an observer"):

@@ -73,7 +73,7 @@ def test_escapes_are_no_time_limits():
     info = infos[int(done.argmax())]
     assert info["TimeLimit.truncated"] is False
     assert info["escaped"]
-    assert (np.abs(env.reset()) < 25).all()  # options are used once
+    assert (np.abs(env.reset()) < 25).all()  # options apply to one reset only
 
 
 def test_any_vector_environment():
@@ -114,7 +114,7 @@ def test_attributes_of_batched_environments(saved):
     env.close()
 
 
-def test_what_is_refused():
+def test_invalid_environments_and_options_are_refused():
     with pytest.raises(ValueError, match='autoreset_mode="SameStep"'):
         SB3VecEnv(KKLVectorEnv("lorenz", 2, autoreset_mode="NextStep"))
     with pytest.raises(ValueError, match="the action space is empty"):
@@ -123,13 +123,13 @@ def test_what_is_refused():
     env.set_options([{"x0": [1.0, 1.0]}, {}, {}])
     with pytest.raises(ValueError, match="the same options for all rows"):
         env.reset()
-    env.set_options({"x0": np.array([1.0, 1.5])})  # the wrong ones are forgotten
+    env.set_options({"x0": np.array([1.0, 1.5])})  # replaces the invalid options
     assert env.reset().tolist() == [[1.0, 1.5]] * N
 
 
 @pytest.mark.parametrize("inside", [True, False])
 def test_nested_infos_arrive_as_stable_baselines3_expects_them(inside):
-    """Monitors report a dictionary where an episode ends."""
+    """Monitors report a dictionary at the end of an episode."""
     env = SyncVectorEnv([partial(cart, inside)] * N, autoreset_mode="SameStep")
     env, seen = SB3VecEnv(env if inside else RecordEpisodeStatistics(env)), 0
     env.seed(0)

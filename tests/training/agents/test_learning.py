@@ -1,4 +1,4 @@
-"""Agents learn in systems and in any environment, and observers for them."""
+"""Training of agents in systems and in any environment, and of their observers."""
 
 from dataclasses import replace
 
@@ -36,10 +36,10 @@ def test_all_settings_are_ones_of_their_algorithm(script):
             found = hyperparameters(name, task)
             assert found["n_timesteps"] > 0
             assert set(found) <= set(algorithm.__init__.__annotations__) | of_the_run, (name, task)
-    for task in HIDDEN_VELOCITIES.values():  # as many steps as those compared with it
+    for task in HIDDEN_VELOCITIES.values():  # as many steps as the agents in the comparison
         other = "sac" if task.env_id in settings_of("sac") else "ppo"
         assert hyperparameters("ppo_lstm", task)["n_timesteps"] == hyperparameters(other, task)["n_timesteps"]
-    hyperparameters("sac", PENDULUM)["policy_kwargs"]["net_arch"] = None  # of a copy
+    hyperparameters("sac", PENDULUM)["policy_kwargs"]["net_arch"] = None  # changes a copy only
     assert hyperparameters("sac", PENDULUM)["policy_kwargs"]["net_arch"] == [64, 64]
     assert hyperparameters("sac", tasks[-1]) == hyperparameters("sac", TASKS["lorenz"])
 
@@ -84,7 +84,7 @@ def test_a_file_acts_as_the_agent_that_was_trained(tmp_path, small, monkeypatch,
 
 
 def test_seeds_make_agents_and_never_the_episodes_of_the_evaluation(tmp_path, small, monkeypatch):
-    """stable-baselines3 seeds environments when a model is made; each agent has seeds of its own all the same."""
+    """Each agent has its own seeds, although stable-baselines3 seeds environments when it makes a model."""
     seeds, reset = [], KKLVectorEnv.reset
 
     def noted(self, *, seed=None, options=None):
@@ -109,7 +109,7 @@ def test_an_agent_on_estimates_sees_hidden_signals_until_there_are_estimates(tmp
     assert curve.steps.min() < 200 < curve.steps.max()
 
 
-def test_z_under_noise_shows_what_predicts(tmp_path, small):
+def test_z_under_noise_has_only_predictive_features(tmp_path, small):
     task = replace(PENDULUM, measurement_noise=0.1, angles=((0, 1),))
     agent = learn(task, "z", tmp_path, algorithm="ppo", timesteps=3_000, observer_steps=300, seed=1)
     again = Agent.read(tmp_path / "agent.safetensors")
@@ -122,13 +122,13 @@ def test_z_under_noise_shows_what_predicts(tmp_path, small):
 @pytest.mark.parametrize(
     ("task", "algorithm", "timesteps", "aggregate", "first"),
     [
-        (CART, "ppo", 320, 1, 288 + 2),  # it stops with the first step of what it would collect next
-        (CART, "ppo", 98, 0, 64 + 2),  # the third time is with estimates
+        (CART, "ppo", 320, 1, 288 + 2),  # stops at the first step of the next rollout
+        (CART, "ppo", 98, 0, 64 + 2),  # the third rollout has estimates
         (PENDULUM, "sac", 97, 1, 87 + 1),
         (NOISY_CART, "ppo", 320, 1, 32),
     ],
 )
-def test_from_how_many_steps_an_observer_is_learned(
+def test_number_of_steps_before_an_observer_is_learned(
     tmp_path, small, monkeypatch, task, algorithm, timesteps, aggregate, first
 ):
     fitted = []
@@ -144,7 +144,7 @@ def test_from_how_many_steps_an_observer_is_learned(
 
 
 @pytest.mark.parametrize("task", [CART, PENDULUM], ids=["no bounds", "bounds"])
-def test_hidden_signals_stand_where_estimates_will(tmp_path, small, task):
+def test_hidden_signals_take_the_place_of_later_estimates(tmp_path, small, task):
     privileged = Privileged(task, 1)
     env = privileged.make()
     env.reset(seed=0)
@@ -163,14 +163,14 @@ def test_hidden_signals_stand_where_estimates_will(tmp_path, small, task):
 
 @pytest.mark.parametrize("task", [CART, NOISY_CART])
 def test_short_episodes_are_no_error(tmp_path, small, task):
-    """Neither at the end nor where the longest one is held out, as of this seed."""
+    """Neither as the last episode nor if the longest episode is held out, as with this seed."""
     options = {"algorithm": "dqn", "timesteps": 600, "observer_steps": 300, "aggregate": 1, "seed": 11}
     agent = learn(task, "x_hat", tmp_path, **options)
     assert agent.observer == str(tmp_path / "observer.safetensors")
     assert agent.make().reset(seed=0)[0].shape == (1, 4)  # two positions, two estimates
 
 
-def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, monkeypatch):
+def test_an_observer_is_refitted_to_the_agents_own_episodes(tmp_path, small, monkeypatch):
     task, first = replace(PENDULUM, measurement_noise=0.1), []
 
     def noted(*arguments, **options):
@@ -183,7 +183,7 @@ def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, mon
     learn(task, "x_hat", tmp_path, **options)
     path = tmp_path / "observer.safetensors"
     artifact = Artifact.read(path)
-    assert artifact.training["held_out_errors"] != first[0].training["held_out_errors"]  # a refit was taken
+    assert artifact.training["held_out_errors"] != first[0].training["held_out_errors"]  # a refit replaced the observer
     assert artifact.signals["hidden"] == ["info[clean][0]", "info[clean][1]", "info[clean][2]"]
     assert artifact.signals["measured"] == ["obs[0]", "obs[1]"]
     obs, info = make(task, "x_hat", 2, observer=str(path)).reset(seed=0)
@@ -193,7 +193,7 @@ def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, mon
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         ({"information": "z", "aggregate": 2}, "aggregate needs x_hat in an environment"),
         ({"information": "recurrent", "algorithm": "ppo"}, "recurrent agents learn by ppo_lstm"),
@@ -204,15 +204,15 @@ def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, mon
         ({"task": replace(CART, measured=(0, 1, 2, 3)), "information": "x_hat"}, "nothing is left to estimate"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(tmp_path, small, options, says):
+def test_options_that_do_not_go_together_are_refused(tmp_path, small, options, message):
     task, information = options.pop("task", PENDULUM), options.pop("information")
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         learn(task, information, tmp_path, **options)
 
 
 @pytest.mark.slow
 def test_an_agent_learns(tmp_path):
-    """Half a minute of PPO on the full state of Van der Pol."""
+    """Half a minute of PPO on the full state of Van der Pol's oscillator."""
     agent = learn(get_task("van_der_pol"), "state", tmp_path, timesteps=200_000)
     env = agent.make(50)
     x = play(env, agent.policy(env.single_action_space), seed=0).x

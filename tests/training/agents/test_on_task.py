@@ -1,4 +1,4 @@
-"""The control tasks for programs that train on single environments, rl-zoo3 above all."""
+"""The control tasks for programs that train on single environments, such as rl-zoo3."""
 
 from dataclasses import replace
 from importlib.resources import files
@@ -24,7 +24,7 @@ def settings(algorithm, name):
 
 @pytest.mark.parametrize(("name", "x0"), [("van_der_pol", None), ("rossler", [-44.0, -17.0, 212.0])])
 def test_one_environment_is_a_row_of_the_task(name, x0):
-    """Of what an agent sees and is paid, with the environment made as rl-zoo3 makes it; from x0 it escapes."""
+    """Observations and rewards are equal, with the environment made as by rl-zoo3; the motion from x0 escapes."""
     one = OnTask(gym.make(ENV_IDS[name], **settings("ppo", name)["env_kwargs"]))
     rows = Cost(make(TASKS[name], "x_hat", 2, observer=name), TASKS[name])
     options = None if x0 is None else {"x0": x0}
@@ -42,7 +42,7 @@ def test_one_environment_is_a_row_of_the_task(name, x0):
         assert reward == pytest.approx(paid[0], rel=1e-5)
         assert (ended, truncated) == (terminated[0], truncated_rows[0])
     assert ended == (x0 is not None)
-    if ended:  # is paid for the rest of the episode
+    if ended:  # the reward covers the rest of the episode
         assert reward == -MAX_COST * (TASKS[name].steps - done + 1)
 
 
@@ -63,7 +63,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name != 
 
 @pytest.mark.parametrize("name", ["lorenz", *SLOW])
 def test_the_shipped_agent_reaches_the_reward_threshold(name):
-    """On the registered environment, acting as slowly as in its task; without acting the threshold is not reached."""
+    """On the registered environment, with the period of the agent's task; zero input stays below the threshold."""
     agent, spec = Agent.read(find(name)), gym.spec(ENV_IDS[name])
     options = {**agent.task.env_kwargs, "start_box": None, "max_episode_steps": spec.max_episode_steps}
     env = make(replace(agent.task, env_kwargs=options), "x_hat", 8, observer=agent.observer)
@@ -81,7 +81,7 @@ def test_refusals():
         OnTask(gym.make("KKLLorenz-v0", dt=0.02))
 
 
-def test_its_specification_makes_it_again(saved):
+def test_the_specification_recreates_the_wrapper(saved):
     env = OnTask(gym.make("KKLVanDerPol-v0"), observer=saved())
     again = gym.make(env.spec)
     assert isinstance(again, OnTask)

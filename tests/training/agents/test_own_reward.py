@@ -1,4 +1,4 @@
-"""Agents are paid by a system's own reward."""
+"""Agents learn from a reward that the system defines."""
 
 import csv
 from pathlib import Path
@@ -14,5 +14,5 @@ def test_agents_of_a_system_with_a_reward_are_paid_that(tmp_path, capsys):
     assert "holds the target" not in printed
     mean = float(printed.partition("return")[2].partition("±")[0].strip(" │"))
     trained_on = [float(row["return"]) for row in csv.DictReader((tmp_path / "curve.csv").read_text().splitlines())]
-    assert min([mean, *trained_on]) > 0.0  # minus the cost is below zero
+    assert min([mean, *trained_on]) > 0.0  # the default reward, minus the cost, is below zero
     assert mean < 2000.0

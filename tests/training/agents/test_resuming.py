@@ -1,4 +1,4 @@
-"""Trainings of agents that were cut off and go on."""
+"""Resuming of interrupted trainings of agents."""
 
 import shutil
 from dataclasses import replace
@@ -19,7 +19,7 @@ SHORT = control_task("van_der_pol", 0.2, duration=0.5)
 
 @pytest.fixture
 def saves(monkeypatch):
-    """Checkpoints of an agent, due at each rollout's beginning; ``saves.stop`` of them, and it is interrupted."""
+    """Collect an agent's checkpoints, one per rollout; after ``saves.stop`` checkpoints, interrupt the training."""
 
     class Saves(list):
         stop = None
@@ -28,7 +28,7 @@ def saves(monkeypatch):
 
     def noted(path, state, **options):
         save(path, state, **options)
-        if path.name != "agent.checkpoint.pt":  # an observer's
+        if path.name != "agent.checkpoint.pt":  # a checkpoint of the observer
             return
         saved.append(run.load_checkpoint(path))
         if len(saved) == saved.stop:
@@ -51,13 +51,13 @@ def same(one, other):
         (SHORT, "state", {"algorithm": "sac", "timesteps": 60}, 50),
         (CART, "y", {"algorithm": "dqn", "timesteps": 60}, 12),
         (CART, "recurrent", {"timesteps": 128}, 3),
-        (CART, "x_hat", {"timesteps": 600, "observer_steps": 400}, 8),  # which sees hidden signals
-        (CART, "x_hat", {"timesteps": 600, "observer_steps": 300, "aggregate": 1}, 14),  # which sees estimates
+        (CART, "x_hat", {"timesteps": 600, "observer_steps": 400}, 8),  # on hidden signals
+        (CART, "x_hat", {"timesteps": 600, "observer_steps": 300, "aggregate": 1}, 14),  # on estimates
         (replace(CART, measurement_noise=0.1), "x_hat", {"timesteps": 600, "observer_steps": 300}, 5),
-        (replace(CART, measurement_noise=0.1), "z", {"timesteps": 600, "observer_steps": 500}, 2),  # is normalised
+        (replace(CART, measurement_noise=0.1), "z", {"timesteps": 600, "observer_steps": 500}, 2),  # normalised
     ],
 )
-def test_all_but_the_episodes_goes_on(task, information, options, stop, tmp_path, small, saves):
+def test_all_but_unfinished_episodes_is_resumed(task, information, options, stop, tmp_path, small, saves):
     out = tmp_path / "run"
     saves.stop = stop
     with pytest.raises(KeyboardInterrupt):
@@ -65,24 +65,24 @@ def test_all_but_the_episodes_goes_on(task, information, options, stop, tmp_path
     assert not (out / "agent.safetensors").exists()
     shutil.copytree(out, tmp_path / "copy")
     agent = learn(task, information, out, resume=True, **options)
-    before, after = saves[stop - 1], saves[stop]  # the last before the end, and the first of what goes on
+    before, after = saves[stop - 1], saves[stop]  # the last before the interruption, and the first after
     assert before["counters"]["num_timesteps"] > 0
     assert (before.pop("resumed"), after.pop("resumed")) == (0, 1)
     assert before.pop("restarts") + 1 == after.pop("restarts")
     moments = [state.pop("moments").get("obs_rms", {"count": 0}) for state in (before, after)]
-    assert moments[1]["count"] - moments[0]["count"] in (0, 2)  # which have seen two more observations since
+    assert moments[1]["count"] - moments[0]["count"] in (0, 2)  # the reset adds two observations
     torch.testing.assert_close(after, before, rtol=0, atol=0)  # networks, optimisers, counters, replay buffer, steps
     assert agent.training["resumed"] == 1
-    assert agent.training["timesteps"] >= 0.95 * options["timesteps"]  # the rest is rehearsal
+    assert agent.training["timesteps"] >= 0.95 * options["timesteps"]  # the rest are rehearsal steps
     again = learn(task, information, tmp_path / "copy", resume=True, **options)
-    assert same(again, agent)  # random by seed and checkpoint alone
+    assert same(again, agent)  # seed and checkpoint determine the result
     assert pd.read_csv(out / "curve.csv").steps.is_monotonic_increasing
     whole = (out / "agent.safetensors").read_bytes()
-    assert same(learn(task, information, out, resume=True, **options), agent)  # nothing is left to do
+    assert same(learn(task, information, out, resume=True, **options), agent)  # a finished training is read
     assert (out / "agent.safetensors").read_bytes() == whole
 
 
-def test_what_is_resumed_must_be_the_same_training_and_whole(tmp_path, small):
+def test_resuming_needs_the_same_training_and_a_valid_checkpoint(tmp_path, small):
     agent = learn(CART, "y", tmp_path)
     assert "resumed" not in agent.training
     for changed in ({"seed": 1}, {"timesteps": 2}, {"algorithm": "dqn"}, {"information": "z"}):
@@ -104,5 +104,5 @@ def test_what_is_resumed_must_be_the_same_training_and_whole(tmp_path, small):
     path.write_bytes(flipped)
     with pytest.raises(ValueError, match=r"agent\.checkpoint\.pt is damaged"):
         learn(CART, "y", tmp_path, resume=True)
-    learn(CART, "y", tmp_path)  # from the beginning
+    learn(CART, "y", tmp_path)  # starts from the beginning
     assert same(Agent.read(tmp_path / "agent.safetensors"), agent)

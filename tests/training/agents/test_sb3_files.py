@@ -1,4 +1,4 @@
-"""Agents to stable-baselines3's files and back: the same actions, and nothing unpickled."""
+"""Export to and import from stable-baselines3: actions are the same, and nothing is unpickled."""
 
 import pickle
 import zipfile
@@ -24,7 +24,7 @@ def actions(agent, obs):
     return agent.policy(agent.make().single_action_space)(obs)
 
 
-@pytest.mark.parametrize("name", ["reverse_duffing", "lorenz"])  # SAC's and PPO's
+@pytest.mark.parametrize("name", ["reverse_duffing", "lorenz"])  # trained by SAC and PPO
 def test_there_and_back(name, tmp_path):
     agent, path = Agent.read(find(name)), tmp_path / "agent.zip"
     main(["agent", "export", name, "--out", str(path)])
@@ -55,7 +55,7 @@ def test_agents_in_any_environment_there_and_back(algorithm, task, information, 
     agent = learn(task, information, tmp_path, algorithm=algorithm, timesteps=40)
     to_sb3(agent).save(tmp_path / "agent.zip")
     again = from_sb3(tmp_path / "agent.zip", task, information)
-    assert again.mean is None  # its first layer scales
+    assert again.mean is None  # the first layer includes the scaling
     env = agent.make(5)
     policies = [one.policy(env.single_action_space) for one in (agent, again)]
     obs, _ = env.reset(seed=0)
@@ -73,7 +73,7 @@ class _Bomb:
 
 @pytest.fixture
 def trained(tmp_path):
-    """An untrained SAC agent on the task, in tmp_path, with the activation that SAC has by default."""
+    """The file of an untrained SAC agent with SAC's default activation."""
     env = OnTask(gym.make("KKLRossler-v0"))
     SAC("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, buffer_size=1, device="cpu").save(tmp_path / "agent.zip")
     return tmp_path / "agent.zip"
@@ -85,7 +85,7 @@ def trained(tmp_path):
     ({"data": b'{"policy_kwargs": {"activation_fn": "<class \'torch.nn.ELU\'>"}}'}, "activation .*ELU.* is unknown"),
     ({"data": b"{"}, "agent.zip"),
 ])  # fmt: skip
-def test_what_is_refused(parts, match, trained):
+def test_invalid_files_are_refused(parts, match, trained):
     with zipfile.ZipFile(trained) as files:
         held = {name: files.read(name) for name in files.namelist()}
     with zipfile.ZipFile(trained, "w") as files:
@@ -97,7 +97,7 @@ def test_what_is_refused(parts, match, trained):
 
 
 def test_files_that_are_something_else(tmp_path, trained):
-    assert from_sb3(trained, TASKS["rossler"]).network.activation == "relu"  # SAC's by default
+    assert from_sb3(trained, TASKS["rossler"]).network.activation == "relu"  # SAC's default
     with pytest.raises(AgentError, match=r"missing\.zip: it cannot be read: No such file"):
         from_sb3(tmp_path / "missing.zip", TASKS["rossler"])
     with pytest.raises(AgentError, match="the policy has 3 inputs and 1 outputs, but the environment"):

@@ -1,4 +1,4 @@
-"""``kkl-gym agent``: episodes, systems of one's own, any environment; tests/training/agents has the rest."""
+"""``kkl-gym agent``: episodes, user systems, any environment; tests/training/agents tests the functions behind it."""
 
 from functools import partial
 
@@ -25,7 +25,7 @@ CART = HIDDEN_VELOCITIES["CartPole-v1"]
 
 
 @pytest.fixture(autouse=True)
-def _nothing_is_compiled(monkeypatch):
+def _small_and_without_compilation(monkeypatch):
     monkeypatch.setattr("kkl_gym.vector.batch_step", lambda system: SamplingStep(partial(advance_batch, system)))
     make_small(monkeypatch)
 
@@ -36,13 +36,13 @@ def test_an_agent_is_played_on_the_episodes_of_a_seed(capsys):
     for seed in ("0", "0", "1"):
         main(["agent", "evaluate", "lorenz", "--episodes", "2", "--seed", seed])
         lines = capsys.readouterr().out.splitlines()
-        shown.append("\n".join(line for line in lines if " passed" not in line))  # progress, on a slow machine
+        shown.append("\n".join(line for line in lines if " passed" not in line))  # no progress lines of slow machines
     assert "±" in shown[0]
     assert "holds the target" in shown[0]
     assert shown[0] == shown[1] != shown[2]
 
 
-def test_an_agent_for_a_system_of_ones_own(saved, script):
+def test_an_agent_for_a_user_system(saved, script):
     main(["agent", "train", OWN, "--observer", saved(system=OWN), "--timesteps", "1"])
     path = "runs/agents/oscillator-x_hat-0/agent.safetensors"
     agent = Agent.read(path)

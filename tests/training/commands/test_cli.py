@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[3]
 PAGE = runpy.run_path(str(ROOT / "docs" / "site" / "commands.py"))
 RESUME = "; --resume continues from the last checkpoint, if there is one"
 
-# Help of everything, then of each command; what is not to be imported on the way, at first as it may be missing.
+# Print all help, then report slow imports; the first help must work without optional packages.
 HELP = """
 import sys
 from training.cli import COMMANDS, main
@@ -101,7 +101,7 @@ def test_a_script_with_one_system_needs_no_class(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ("demo lorenz --seed 1.5", "Error parsing --seed: invalid literal for int() with base 10: '1.5'"),
         ("train lorenz --set width",
@@ -111,20 +111,20 @@ def test_a_script_with_one_system_needs_no_class(tmp_path):
         ("agent", "Expected one of {train, evaluate, export, import}."),
     ],
 )  # fmt: skip
-def test_options_that_cannot_be_read_are_said_in_one_line(arguments, said, capsys):
+def test_invalid_options_give_a_message_of_one_line(arguments, message, capsys):
     with pytest.raises(SystemExit) as end:
         main(arguments.split())
     assert end.value.code == 2
-    assert capsys.readouterr().err == f"kkl-gym: {said}\n"
+    assert capsys.readouterr().err == f"kkl-gym: {message}\n"
 
 
-def test_a_reader_who_has_seen_enough_gets_no_error():
+def test_a_closed_pipe_gives_no_error():
     command = f"{sys.executable} -m training maps | head -n 1"
     assert subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True).stderr == ""
 
 
 def ends(arguments, instead, monkeypatch):
-    """The exit status of a command, or what is said, with a function in place of the import of its module."""
+    """The exit status or message of a command, with a function in place of the import of its module."""
     monkeypatch.setattr(training.cli, "import_module", instead)
     with pytest.raises(SystemExit) as end:
         main(arguments)
@@ -151,7 +151,7 @@ def test_the_extra_that_brings_a_missing_module_is_named(missing, hint, monkeypa
     assert ends(["maps"], raising(error), monkeypatch) == f"kkl-gym: No module named {missing!r}{hint}"
 
 
-def test_the_package_says_what_it_lacks(monkeypatch):
+def test_missing_extras_are_named(monkeypatch):
     assert all(callable(getattr(training, name)) for name in training.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         training.nothing  # noqa: B018
@@ -167,13 +167,13 @@ def test_extras_are_those_of_the_package():
     installed = packages_distributions()
     for extra, modules in EXTRAS.items():
         names = {text.partition(">")[0].lower().replace("_", "-") for text in declared[extra]}
-        for module in modules - {"PIL"}:  # which matplotlib brings, whatever else does
+        for module in modules - {"PIL"}:  # a dependency of matplotlib and of other packages
             assert {entry.lower().replace("_", "-") for entry in installed[module]} & names, module
     assert len(set().union(*EXTRAS.values())) == sum(map(len, EXTRAS.values()))
 
 
 def swallowing(becomes):
-    """Raise something else, as SciPy does if an interruption comes while its parts are imported."""
+    """Raise another exception, as SciPy does on an interruption during its imports."""
 
     def instead(name):
         try:
@@ -201,12 +201,12 @@ def test_interruptions_while_modules_are_imported(arguments, instead, hint, monk
 
 
 @pytest.mark.filterwarnings("error")
-def test_an_interruption_that_a_callback_swallows_comes_again(monkeypatch, capsys):
+def test_an_interruption_that_a_callback_swallows_is_raised_again(monkeypatch, capsys):
     callback = type("Callback", (), {"__del__": lambda self: signal.raise_signal(signal.SIGINT)})
 
     def interrupted(name):
         callback()
-        for _ in range(600):  # Python looks for interruptions between steps, not within one
+        for _ in range(600):  # Python handles interruptions between bytecodes only
             time.sleep(0.1)
 
     hook = sys.unraisablehook

@@ -28,7 +28,7 @@ def test_all_that_ship(tmp_path, capsys):
     assert (tmp_path / "estimates.png").stat().st_size > 10_000
 
 
-def test_a_system_of_ones_own(saved, tmp_path, capsys):
+def test_a_user_system(saved, tmp_path, capsys):
     system = f"{linear_system.__file__}:Autonomous"
     observer = saved(system=system, dt=0.02)
     main(["demo", system, "--observer", observer, "--out", ".", "--duration", "1", "--measurement-noise", "0.2"])
@@ -69,12 +69,12 @@ def test_a_moving_picture(tmp_path, monkeypatch, capsys):
 
 
 def push(x):
-    """Push as far as the input goes."""
+    """A policy with the largest input."""
     return np.ones((len(x), 1))
 
 
-def test_the_policy_of_its_training_acts(tmp_path):
-    """An oscillator without damping comes to rest under its regulator, about u = 0.5 when pushed, alone nowhere."""
+def test_the_demo_uses_the_policy_of_the_training(tmp_path):
+    """The undamped oscillator rests at 0 under its regulator, near u = 0.5 when pushed, and never without a policy."""
     artifact, pushed = random_artifact(system=OWN, dt=0.02), f"{__file__}:push"
     late = {}
     for policy in (None, "controller", pushed):

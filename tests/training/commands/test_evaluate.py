@@ -33,13 +33,13 @@ COLUMNS = "observer,starts,driven,process_noise,measurement_noise,trajectory,sma
 
 
 def evaluate(*observers, **options):
-    """The command, with the options of all groups."""
+    """An Evaluate command with options of all groups."""
     motions = {one.name: options.pop(one.name) for one in dataclasses.fields(Motions) if one.name in options}
     return Evaluate(observers, motions=Motions(**motions), **options)
 
 
 def printed(*observers, **options):
-    """The tables of the command, each a header and rows of cells, and all lines that are not of tables."""
+    """The printed tables, each a header and rows of cells, and all other printed lines."""
     console = Console(width=200, record=True, file=io.StringIO())
     evaluate(*observers, **options).run(console)
     headers, rows, below = [], [], []
@@ -84,12 +84,12 @@ def test_every_column_of_the_printed_tables_holds_one_thing(saved):
     cases = [["X", "no"], ["2X \\ X", "no"], ["X", "yes"]]
     who = [Path(saved()).stem, "exact EKF", "limit"]
     keys = [[each, *case, "0.1", noise] for case in cases for noise in ("0", "0.5") for each in who]
-    keys = [key for key in keys if key[:2] != ["limit", "2X \\ X"]]  # starts of unknown variance
+    keys = [key for key in keys if key[:2] != ["limit", "2X \\ X"]]  # starts with unknown variance have no limit
     assert [row[:5] for row in smape[1:]] == [row[:5] for row in nrmse[1:]] == keys
 
 
-def test_another_plant_moves_and_nothing_knows():
-    """The oscillator turns at rate 1 in the exact observer's model, and twice as fast as a plant."""
+def test_runs_of_another_plant_than_the_model():
+    """The oscillator has the rate 1 in the exact observer's model, and the rate 2 as the plant."""
     path = "map.safetensors"
     dataclasses.replace(linear_system.exact_observer(name="turning"), parameters={"omega": 1.0, "gain": 1.0}).save(path)
     options = {"trajectories": 4, "duration": 30.0, "measurement_noise": (0.0,)}
@@ -100,10 +100,10 @@ def test_another_plant_moves_and_nothing_knows():
     found = pd.read_csv("errors.csv")
     assert found.columns[:2].tolist() == ["observer", "plant"]
     assert set(found.plant) == {"omega=2 gain=1"}
-    assert float(right[1][-2].split()[0]) < 0.1  # from X
+    assert float(right[1][-2].split()[0]) < 0.1  # starts in X
     assert min(float(row[-2].split()[0]) for row in off[1:]) > 20.0
     _, titles = printed(path, **options, plant_error=1.0)
-    assert " ".join(titles).count("plant omega=2 gain=2, model omega=1 gain=1") == 2  # in the title of each table
+    assert " ".join(titles).count("plant omega=2 gain=2, model omega=1 gain=1") == 2  # in the titles of both tables
 
 
 def test_levels_of_each_output(capsys):
@@ -114,7 +114,7 @@ def test_levels_of_each_output(capsys):
     assert pd.read_csv("errors.csv").measurement_noise.unique().tolist() == ["0.0", "0.2, 0.1", "0.4"]
     assert "│ X      │ 0.2, 0.1 │" in capsys.readouterr().out
     main(command)
-    assert "│ X      │ 0.1, 0.3 │" in capsys.readouterr().out  # the system's own
+    assert "│ X      │ 0.1, 0.3 │" in capsys.readouterr().out  # the system's own levels
     with pytest.raises(SystemExit, match="one number, or one for each of 2 outputs"):
         main([*command, "--measurement-noise", "1,2,3"])
 
@@ -164,7 +164,7 @@ def test_calibration_is_judged(make_artifact, saved):
     with_error_bars(make_artifact(system, dt=0.1)).save("map.safetensors")
     options = {"trajectories": 2, "duration": 5.5, "calibration": True, "ekf": True, "csv": Path("coverage.csv")}
     found = evaluate("map.safetensors", system=system, **options).run(console := Console(width=200, record=True))
-    assert len(found) == 3 * 6 * 2 * 2  # cases, levels, spans, and both who estimate
+    assert len(found) == 3 * 6 * 2 * 2  # cases, levels, spans, estimators
     assert found["90"].between(0, 100).all()
     assert set(found.observer) == {"KKL", "EKF"}
     assert Path("coverage.csv").exists()

@@ -1,4 +1,4 @@
-"""``kkl-gym identify``; its refusals are among the others."""
+"""``kkl-gym identify``; test_refusals.py has its errors."""
 
 import json
 from dataclasses import replace
@@ -15,8 +15,8 @@ from training.cli import main
 SIZES = "--set trajectories=20 duration=5 samples=20 inverse_steps=20 width=8 depth=1 batch=64"
 
 
-def test_from_files_to_an_observer_and_to_another(tmp_path, capsys):
-    """Files of outputs of a plant with mu = 3.3."""
+def test_identify_from_files_and_adapt_an_observer(tmp_path, capsys):
+    """The files hold outputs of a plant with mu = 3.3."""
     plant, data = VanDerPol(3.3), [f"{i}.npz" for i in range(4)]
     x = simulate(plant, plant.draw_starts(np.random.default_rng(0), 4), 200, 0.02)
     for i, path in enumerate(data):

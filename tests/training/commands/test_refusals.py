@@ -1,4 +1,4 @@
-"""Options that make no sense are refused in one line that names them, before any work is done."""
+"""Invalid options give a message of one line that names them, before any work."""
 
 import re
 from pathlib import Path
@@ -75,10 +75,10 @@ def _records():
 def test_refused(arguments, message, capsys):
     with pytest.raises(SystemExit) as end:
         main(arguments.split())
-    said = f"{end.value}\n" if end.value.code != 2 else capsys.readouterr().err
-    assert said.startswith("kkl-gym: ")
-    assert said.count("\n") == 1
-    assert re.search(message, said), said
+    printed = f"{end.value}\n" if end.value.code != 2 else capsys.readouterr().err
+    assert printed.startswith("kkl-gym: ")
+    assert printed.count("\n") == 1
+    assert re.search(message, printed), printed
 
 
 @pytest.mark.parametrize(

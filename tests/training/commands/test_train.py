@@ -1,4 +1,4 @@
-"""``kkl-gym train``, and ``kkl-gym evaluate`` on what it wrote."""
+"""``kkl-gym train``, and ``kkl-gym evaluate`` on the trained files."""
 
 import re
 from pathlib import Path
@@ -28,12 +28,12 @@ class OnFloats(linear_system.Autonomous):
 
 
 def hold(x):
-    """Keep it from falling."""
+    """A policy that stabilises the plant."""
     return np.clip(-1.6 * x[:, :1] - 0.8 * x[:, 1:], -1, 1)
 
 
 def lines(capsys):
-    """What was printed, but for the progress of a slow machine."""
+    """Printed lines without progress lines, which slow machines print."""
     return [line for line in capsys.readouterr().out.splitlines() if " passed" not in line]
 
 
@@ -74,8 +74,8 @@ def test_other_kinds_have_names_of_their_own(options, name, capsys):
     main(["train", OSCILLATOR, *SIZES, *options])
     artifact = Artifact.read(f"runs/{name}/{name}.safetensors")
     assert (artifact.forward is None) == (artifact.motion is not None) == ("large" in name)
-    said = "the observer tracks by the system's equations" if "large" in name else "the observer is T_inv alone"
-    assert any(line.startswith(said) for line in lines(capsys))
+    begin = "the observer tracks by the system's equations" if "large" in name else "the observer is T_inv alone"
+    assert any(line.startswith(begin) for line in lines(capsys))
 
 
 def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(capsys):
@@ -90,7 +90,7 @@ def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(caps
             main(command)
         main([*command, "--policy", f"{__file__}:hold"])
     found = pd.read_csv("errors.csv")
-    assert (found.starts == "X").sum() == 8  # nothing escaped
+    assert (found.starts == "X").sum() == 8  # no run escaped
     assert set(found.driven) == {True, False}
 
 

@@ -8,8 +8,8 @@ from kkl_gym.simulate import advance_batch
 
 
 @pytest.fixture(autouse=True, scope="package")
-def _nothing_is_compiled():
-    """Small systems take less time in NumPy than to be compiled."""
+def _without_compilation():
+    """Simulate in NumPy: compiling small systems would take longer than simulating them."""
     in_numpy = functools.partial(functools.partial, advance_batch)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training.diagnosis.system, "batch_step", lambda system: SamplingStep(in_numpy(system)))

@@ -1,4 +1,4 @@
-"""Systems that are deliberately wrong, each with its finding; and systems without problems."""
+"""Checks of systems with deliberate faults, each with its finding, and of systems without problems."""
 
 import importlib.util
 import json
@@ -28,12 +28,12 @@ EXAMPLES = Path(__file__).parents[3] / "examples"
 
 
 def made(base=Oscillator, **changes):
-    """A system that differs from another in some of its attributes."""
+    """A system like `base` with some other attributes."""
     return type("Made", (base,), {"name": "made", **changes})()
 
 
 def findings(system, name=None, *, dt=None, duration=2.0, policy=None):
-    """Of one check alone, or of all."""
+    """Findings of one check, or of all checks."""
     if name is None:
         return list(check(system, dt=dt, duration=duration, policy=policy))
     return list(CHECKS[name](Subject(system, dt or system.dt, duration, policy, (system.measurement_noise,))))
@@ -123,7 +123,7 @@ def test_an_if_on_the_state_is_a_problem_and_ends_the_command_with_status_1(caps
     assert shown.splitlines()[-1] == "1 problem, 2 notes"
     found = json.loads((tmp_path / "found.json").read_text())
     (wrong,) = (one["found"] for one in found if one["verdict"] == "problem")
-    assert wrong in shown  # square brackets are no markup
+    assert wrong in shown  # square brackets are not parsed as markup
     assert "on arrays: f(x) of 'branching' failed in" in wrong
     assert "(`if x[0] > 0:`)" in wrong
     assert "kkl_gym.elementary.where" in wrong
@@ -177,7 +177,7 @@ BLIND = NO_INPUT | {
          "widen the bounds, shrink X, shorten the motions, reduce u_max, or give a policy"),
         ("sampling", "note", {}, {"dt": 0.7, "duration": 60.0}, "dt = 0.7 s", "samples are few: take dt = 0.1 s"),
         ("sampling", "problem", {}, {"dt": 1.5, "duration": 60.0}, "dt = 1.5 s",
-         "the motion between samples is lost: take dt = 0.1 s"),  # 2 pi / 0.1: some sixty samples a period
+         "the motion between samples is lost: take dt = 0.1 s"),  # about sixty samples per period, 2 pi
         ("output", "problem", {"h": lambda self, x: (x[0], 0.0 * x[0] + 2.5)}, {}, "y2 is 2.5 everywhere in X",
          "let h measure something that moves, or leave this output out"),
         ("observability", "problem", BLIND, {}, "y does not determine bias", "let h measure bias too, or"),
@@ -187,11 +187,11 @@ BLIND = NO_INPUT | {
          "let h measure bias too"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_found_and_how_to_change_it(name, verdict, changes, options, found, advice):
-    said = one(made(**changes), name, verdict, **options)
-    assert found in said.found
-    assert advice in said.advice
-    assert bool(said.advice) == (verdict != "ok")
+def test_findings_name_the_fault_and_the_fix(name, verdict, changes, options, found, advice):
+    finding = one(made(**changes), name, verdict, **options)
+    assert found in finding.found
+    assert advice in finding.advice
+    assert bool(finding.advice) == (verdict != "ok")
 
 
 def test_a_system_that_only_a_policy_holds():
@@ -221,7 +221,7 @@ def test_equations_that_divide_by_zero_in_the_middle_of_X():
 
 @dataclass(frozen=True)
 class ThroughThird(Lorenz):
-    """Seen through x3, which (x1, x2) -> (-x1, -x2) leaves as it is, as does the input on x3."""
+    """Lorenz with the output x3 and an input on x3: (x1, x2) -> (-x1, -x2) is a symmetry."""
 
     name: ClassVar[str] = "lorenz_through_x3"
     G: ClassVar = ((0.0,), (0.0,), (1.0,))
@@ -241,10 +241,10 @@ def test_a_symmetry_is_no_poor_observability():
     "changes",
     [
         {"f": lambda self, x: (-x[0], 0.0 * x[0]), "g": lambda self, x: ((x[1],), (0.0,))},  # x1' = -x1 + x2 u
-        {"h": lambda self, x: (x[0] ** 2,)},  # without input, x and -x have the same y
+        {"h": lambda self, x: (x[0] ** 2,)},  # without an input, x and -x have the same output
     ],
 )
-def test_what_only_an_input_makes_visible(changes):
+def test_states_that_only_an_input_makes_observable(changes):
     assert {one.verdict for one in findings(made(**changes), "observability", duration=10.0)} == {"ok"}
     if "h" in changes:
         found = one(made(**NO_INPUT | changes), "observability", duration=10.0).found

@@ -1,4 +1,4 @@
-"""The least error of any observer, against closed forms on linear systems and Riccati's recursion on Lorenz's."""
+"""The least error of any observer, against closed forms for linear systems and Riccati's recursion for Lorenz."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_chaotic_motions_are_followed_as_by_riccatis_recursion():
     np.testing.assert_allclose(found, expected, rtol=1e-2)
 
 
-def test_outputs_have_noise_of_their_own_and_one_that_does_not_move_says_nothing():
+def test_outputs_have_their_own_noise_and_constant_outputs_have_no_information():
     both, one, still = (
         of(made(h=h), level)[0]
         for h, level in (
@@ -62,7 +62,7 @@ def test_outputs_have_noise_of_their_own_and_one_that_does_not_move_says_nothing
 
 
 def test_least_errors_do_not_depend_on_the_units_of_states(oscillator):
-    """The oscillator with x2 in thousandths, about another point."""
+    """The oscillator with x2 in other units, around another point."""
     other = made(
         X=((4.0, 6.0), (6000.0, 8000.0)),
         bounds=((-25.0, 35.0), (-23000.0, 37000.0)),

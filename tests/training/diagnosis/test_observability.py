@@ -31,8 +31,8 @@ def test_pendulums_rate_is_determined_by_its_angle():
     assert rate.verdict == "determined"
     assert 1 <= rate.window <= 8
     assert found.errors[0, found.windows.index(8), 0] < 0.05
-    assert found.errors[0, 0, 0] > 0.9  # the angle alone says nothing of it
-    of_differences = 0.05 * np.sqrt(2) / 0.05 / 3  # of angles, over a rate of 3 rad/s or so
+    assert found.errors[0, 0, 0] > 0.9  # one angle alone does not determine the rate
+    of_differences = 0.05 * np.sqrt(2) / 0.05 / 3  # error of differences of angles, relative to 3 rad/s
     assert 2 * rate.errors[0] < rate.errors[1] < of_differences
 
 
@@ -50,9 +50,9 @@ def wandering(records=40, n=150, a=0.95):
     return [Record(f"{i}", t, each, x=each, source="wandering") for i, each in enumerate(x)]
 
 
-def test_what_no_output_sees_is_not_determined():
+def test_unobserved_signals_are_not_determined():
     rng, records = np.random.default_rng(0), wandering()
-    for i, record in enumerate(records):  # noise, a constant of each record, and one of all
+    for i, record in enumerate(records):  # hidden: noise, a constant per record, a common constant
         x = np.stack([rng.normal(size=len(record.t)), np.full(len(record.t), rng.normal()), np.ones(len(record.t))], 1)
         records[i] = replace(record, x=x, signals=Signals("t", ("y1",), (), ("noise", "weight", "one")))
     found = verdicts(of_records(records, measurement_noise=[]))
@@ -107,7 +107,7 @@ NONE = [np.nan] * 3
         ([0.9, 0.04, 0.01], [np.nan, 0.5, 0.5], "determined", 1),
         ([0.5, 0.3, 0.29], [np.nan, 0.5, 0.5], "partly (29 % left)", 1),
         ([0.9, 0.41, 0.4], [np.nan, 0.3, 0.03], "up to a constant", 2),
-        ([0.9, 0.07, 0.07], [np.nan, 0.02, 0.02], "partly (7 % left)", 1),  # its change is no better seen
+        ([0.9, 0.07, 0.07], [np.nan, 0.02, 0.02], "partly (7 % left)", 1),  # the change has no smaller error
         ([0.99, 0.95, 1.0], NONE, "not determined", None),
         (NONE, NONE, "never moves", None),
     ],
@@ -144,9 +144,9 @@ def samples(n, modes, seed):
     return np.random.default_rng(seed).uniform(-1, 1, (n, modes))
 
 
-def test_what_is_left_is_the_part_of_x_that_does_not_follow_from_z():
+def test_left_by_is_the_part_of_x_that_z_does_not_determine():
     z, others = samples(500, 3, 0), samples(6000, 3, 1)
-    noise, others_noise = (np.sqrt(3) * samples(n, 1, 2)[:, 0] for n in (500, 6000))  # of variance 1
+    noise, others_noise = (np.sqrt(3) * samples(n, 1, 2)[:, 0] for n in (500, 6000))  # variance 1
 
     def x(z, noise):
         bent = np.sin(2 * z[:, 0]) * z[:, 1]

@@ -1,4 +1,4 @@
-"""Shipped maps are what the preset makes; tests/guard holds how accurate they are."""
+"""Shipped maps have the settings of the preset; tests/guard tests their accuracy."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from training.presets import preset
 
 
 @pytest.mark.parametrize("name", observers.shipped())
-def test_shipped_maps_are_what_the_preset_makes(name):
+def test_shipped_maps_have_the_settings_of_the_preset(name):
     artifact = observers.load(name).artifact
     kind = name.removeprefix(artifact.system).removeprefix("-")
     pipeline, size = ("spinn", "default") if kind == "spinn" else ("input-aware", kind or "default")

@@ -1,4 +1,4 @@
-"""Errors on unseen trajectories, of the model and of other plants."""
+"""Errors on unseen trajectories of the model and of other plants."""
 
 import dataclasses
 
@@ -70,19 +70,19 @@ def test_starts_outside_lie_outside_and_escapes_are_counted():
 
 
 def test_an_error_of_the_small_state_shows_in_its_nrmse_and_nowhere_else():
-    """A temperature of 300 K off by 0.03, a concentration of 1e-3 mol/l 2 % off."""
+    """The temperature, about 300 K, is off by 0.03 K, the concentration, about 1e-3 mol/l, by 2 %."""
     system = Reactor()
     runs = unseen_trajectories(system, system.dt, n=20, duration=40 * np.pi, seed=0)
     found = errors(reactor_observer(offset=0.03, gain=1.02), system, runs, measurement_noise=0.0, seed=0)
     assert np.median(found.late) == pytest.approx(0.01, rel=0.01)
-    rms = np.sqrt(((runs.x - [300, 1e-3]) ** 2).mean(0))  # of whole periods, for any radius of the circle
+    rms = np.sqrt(((runs.x - [300, 1e-3]) ** 2).mean(0))  # over whole periods
     size = runs.x.std((0, 1))
     np.testing.assert_allclose(found.nrmse[:, 0], 100 * 0.03 / size[0], rtol=0.02)
     np.testing.assert_allclose(found.nrmse[:, 1], 2.0 * rms[:, 1] / size[1], rtol=0.02)
 
 
 def test_each_output_has_noise_of_its_level():
-    """In closed form: the exact observer's error is what its filter makes of the noise."""
+    """In closed form, the exact observer's error is the stationary noise of its filter state."""
     system, artifact, level = TwoOutputs(), exact_observer(C=np.eye(2), name="two-outputs"), (0.1, 0.3)
     runs = unseen_trajectories(system, 0.05, n=40, duration=100.0, seed=0)
     P = (np.reshape(level, (2, 1, 1)) ** 2 * stationary_covariance(artifact.filter)).sum(0)
@@ -102,7 +102,7 @@ def test_an_exact_kalman_filter_follows_the_same_runs():
         for noise, skip in ((0.1, None), (0.1, 15.0), (0.4, None))
     )
     assert found.nrmse.shape == (20, 2)
-    assert 0.5 < np.median(found.nrmse) < 10  # noise of some 15 % of the output, averaged
+    assert 0.5 < np.median(found.nrmse) < 10  # in %, after averaging noise of about 15 %
     assert np.median(found.late) < np.median(found.full)
     assert np.median(longer.nrmse) < np.median(found.nrmse)
     assert (louder.nrmse.mean(0) > 1.5 * found.nrmse.mean(0)).all()
@@ -110,7 +110,7 @@ def test_an_exact_kalman_filter_follows_the_same_runs():
 
 def test_the_limit_of_a_linear_system_is_the_error_of_its_kalman_filter():
     system, how = Oscillator(), {"measurement_noise": 0.3, "seed": 0, "skip": 2.0}
-    for process_noise in (0.0, 0.1):  # without any, the filter assumes a little
+    for process_noise in (0.0, 0.1):  # at 0, the filter assumes a small process noise
         runs = unseen_trajectories(system, 0.05, n=60, duration=10.0, seed=0, driven=True, process_noise=process_noise)
         limit, exact = noise_limit(system, runs, **how), errors(None, system, runs, **how)
         squares = [(one.nrmse**2).mean(0) for one in (limit, exact)]
@@ -123,7 +123,7 @@ def test_the_limit_of_a_linear_system_is_the_error_of_its_kalman_filter():
 
 
 def test_the_limit_follows_tichavskys_recursion_on_the_plant():
-    """J' = F^-T J F^-1 + H^T R^-1 H, where nothing disturbs the motion; and the figure of Lorenz's."""
+    """J' = F^-T J F^-1 + H^T R^-1 H, without process noise; and the published limit of the Lorenz system."""
     model, plant, how = Turning(), Turning(omega=2.0), {"measurement_noise": 0.3, "seed": 0}
     runs = unseen_trajectories(model, 0.05, n=3, duration=1.0, seed=0, plant=plant)
     filters = ExtendedKalmanFilter(plant, 0.05, Q=np.zeros((2, 2)), R=np.array([[0.09]]))

@@ -25,7 +25,7 @@ def test_the_command_and_its_report(tmp_path, capsys):
     sound, bias = found[found.fault == "none"], found[found.fault == "bias"]
     assert (sound.score > 0).all()
     assert (sound.score < 1).mean() > 0.8
-    assert (bias.score > 1).all()  # a fifth of Lorenz's range is nine
+    assert (bias.score > 1).all()  # the bias, a fifth of Lorenz's range, is 9
     assert (bias.delay < 0.5).all()
     for fault in FAULTS[1:]:
         here = found[found.fault == fault]

@@ -25,12 +25,12 @@ def trained_up_to(artifact, largest):
     return dataclasses.replace(artifact, inverse=dataclasses.replace(artifact.inverse, measurement_noise_max=largest))
 
 
-def test_the_systems_own_level_as_far_as_the_map_knows_it(make_artifact):
+def test_the_default_level_is_the_systems_own_within_the_maps_range(make_artifact):
     artifact = make_artifact()  # trained up to 1
     assert level_for(artifact, VanDerPol()) == 0.5
     assert level_for(trained_up_to(artifact, 0.1), VanDerPol()) == 0.1
     assert level_for(make_artifact(noise=False), VanDerPol()) == 0.5
-    assert level_for(artifact, TwoOutputs()) == 0.3  # the larger one: this map takes one for all outputs
+    assert level_for(artifact, TwoOutputs()) == 0.3  # this map takes one level for all outputs: the larger one
     two = make_artifact(system=f"{linear_system.__file__}:TwoOutputs", outputs=2)  # trained up to 1 and 2
     assert level_for(two, TwoOutputs()) == (0.1, 0.3)
     assert level_for(trained_up_to(two, (1.0, 0.2)), TwoOutputs()) == (0.1, 0.2)

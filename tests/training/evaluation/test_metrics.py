@@ -1,4 +1,4 @@
-"""Measures of error, by hand."""
+"""Measures of error, computed by hand."""
 
 import math
 
@@ -23,8 +23,8 @@ def test_smape_by_hand():
 
 def test_nrmse_by_hand():
     x = np.zeros((4, 2, 3))
-    x[..., 0] = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, 1.0], [-1.0, -1.0]])  # of standard deviation 1
-    x[..., 1] = 300.0 + np.array([0.0, 4.0])  # 2, though neither of the two moves by itself
+    x[..., 0] = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, 1.0], [-1.0, -1.0]])  # standard deviation 1
+    x[..., 1] = 300.0 + np.array([0.0, 4.0])  # standard deviation 2 over two constant trajectories
     x[..., 2] = 5.0
     x_hat = x + np.array([[0.1, 0.2, 1.0], [0.3, 0.0, 1.0]])
     x_hat[0] += 7.0
@@ -45,6 +45,6 @@ def test_nrmse_by_hand():
     arrays(float, (5, 3, 2), elements=st.floats(-1e3, 1e3)),
     st.tuples(st.floats(1e-6, 1e6), st.floats(1e-6, 1e6)),
 )
-def test_nrmse_knows_no_units(x, error, unit):
-    x[0], x[1] = -1e3, 1e3  # it moves
+def test_nrmse_does_not_depend_on_units(x, error, unit):
+    x[0], x[1] = -1e3, 1e3  # x must not be constant
     np.testing.assert_allclose(nrmse(x * unit, (x + error) * unit), nrmse(x, x + error), rtol=1e-6, atol=1e-9)

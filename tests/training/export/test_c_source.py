@@ -1,4 +1,4 @@
-"""The step in C99, compiled, against the same in Python."""
+"""The exported step in C99 against KKLObserver."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def test_every_kind_of_map(index, precision, tmp_path):
         *(pytest.param(name, each, 100_000, marks=pytest.mark.slow) for name in shipped() for each in TOLERANCES),
     ],
 )
-def test_many_steps_of_what_ships(name, precision, steps, tmp_path):
+def test_many_steps_of_shipped_maps(name, precision, steps, tmp_path):
     of_range, of_scale = apart_at_all_levels(
         name, precision, lambda exported, y, u: estimates(compiled(exported, tmp_path), y, u), steps, length=steps // 3
     )
@@ -54,7 +54,7 @@ def test_other_levels_of_noise(tracks, tmp_path):
 
 
 @needs_cc
-def test_names_of_others_end_no_comment(tmp_path):
+def test_names_of_signals_are_escaped_in_comments(tmp_path):
     names = ["*/ int x; /*", "a\\", "ends with ??/", "/*/"]
     artifact = replace(observer_of("Any-v0", names[:1], names[1:3], names[3:]), environment=None)
     exported = exported_of(artifact, tmp_path, name="2 weird-é names", precision="double")

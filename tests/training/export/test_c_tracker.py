@@ -1,4 +1,4 @@
-"""Maps that track in C99, compiled, against the same in Python."""
+"""Exported tracking observers in C99 against KKLObserver."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from compiled_c import compiled, estimates, fed, needs_cc
 from exported_steps import apart, doubles, operated, stepped, t_inv, tracked
 from random_tracking import KINDS
 
-# Breaks the covariance in the midst of a record.
+# A main program that makes the covariance invalid during a record.
 BROKEN = """
 #include <stdio.h>
 #include "made.h"
@@ -46,7 +46,7 @@ def test_equations_of_all_operations(tmp_path):
 
 
 @needs_cc
-def test_a_covariance_that_breaks_down_is_lost(tmp_path):
+def test_t_inv_replaces_an_invalid_covariance(tmp_path):
     exported, *_ = tracked(0)
     (tmp_path / "broken.c").write_text(BROKEN, encoding="utf-8")
     printed = fed(compiled(exported, tmp_path, main=tmp_path / "broken.c"), "").stdout

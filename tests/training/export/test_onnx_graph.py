@@ -1,4 +1,4 @@
-"""The step as an ONNX graph, run by ONNX Runtime. To export one takes seconds: these are few."""
+"""The exported step as an ONNX graph, run by ONNX Runtime; few cases, since an export takes seconds."""
 
 import json
 from dataclasses import replace
@@ -26,7 +26,7 @@ TYPES = {"tensor(float)": np.float32, "tensor(double)": float}
 
 
 class Runner:
-    """A graph, in a batch."""
+    """Runs a graph with a batch."""
 
     def __init__(self, model):
         options = onnxruntime.SessionOptions()
@@ -42,12 +42,12 @@ class Runner:
         return np.zeros((n, self.width))
 
     def step(self, state, **given):
-        """The outputs by their names."""
+        """Run one step; return the outputs by name."""
         inputs = {name: np.asarray((given | {"state": state})[name], TYPES[kind]) for name, kind in self.types.items()}
         return dict(zip(self.names, self.session.run(self.names, inputs), strict=True))
 
     def along(self, y, u, measurement_noise, process_noise):
-        """Estimates along a record of several rows."""
+        """Estimates along a batch of records."""
         n, x_hat = y.shape[1], []
         levels = {
             "measurement_noise": np.tile(measurement_noise, (n, 1)),
@@ -78,8 +78,8 @@ def test_maps_that_track(index):
     assert apart(exported, along(exported, y[:, None], u[:, None])[:, 0], expected) < 1e-9
 
 
-def test_what_ships():
-    """Restarts, gaps, levels and covariances as in Torch; and the metadata."""
+def test_shipped_maps():
+    """Restarts, gaps, noise levels and covariances agree with TorchObserver; the metadata name all signals."""
     exported = Exported.read("van_der_pol")
     model = onnx_model(exported)
     runner, module = Runner(model), TorchObserver(exported.artifact)

@@ -1,4 +1,4 @@
-"""The memory as a module of Torch, against that of the wrapper."""
+"""The memory as a PyTorch module, against the wrapper."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ CONSTANTS = {"time_constants": (1.0, 2.5, 8.0), "input_time_constants": (1.0, 4.
 
 
 @pytest.mark.parametrize("angles", [[], [(2, 0)]])
-def test_it_shows_what_the_wrapper_shows(angles):
+def test_features_equal_those_of_the_wrapper(angles):
     rng, n, again = np.random.default_rng(0), 3, np.array([True, False, False])
     memory = Memory(4, 2, angles, **CONSTANTS)
     module = TorchMemory(4, 2, angles=angles, **CONSTANTS)
@@ -19,7 +19,7 @@ def test_it_shows_what_the_wrapper_shows(angles):
     for k in range(250):
         y, u = y + 0.3 * rng.normal(size=(n, 4)), rng.normal(size=(n, 2))
         if k == 50:
-            y[1] = 0.0  # where no angle is known
+            y[1] = 0.0  # cosine and sine of zero give no angle
         expected = memory.advance(y, u) if k else memory.reset(y)
         if k == 120:
             state = state * ~torch.tensor(again)[:, None]

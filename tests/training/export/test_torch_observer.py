@@ -1,4 +1,4 @@
-"""The step as a module of Torch, against the same in Python."""
+"""The exported step as a PyTorch module, against KKLObserver."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def module_of(exported):
 
 
 def along(module, y, u, **levels):
-    """Estimates along a record of several rows."""
+    """Estimates along a batch of records."""
     levels = {name: torch.tensor(values, dtype=torch.float64) for name, values in levels.items()}
     with torch.no_grad():
         state, x_hat = module.start(y.shape[1]), []
@@ -66,7 +66,7 @@ def test_equations_of_all_operations():
 
 
 @pytest.mark.parametrize("name", [*kkl_gym.SYSTEMS, "lorenz-spinn"])
-def test_what_ships_with_gaps_restarts_and_covariances(name):
+def test_shipped_maps_with_gaps_restarts_and_covariances(name):
     artifact = observers.load(name).artifact
     y, u = (each.reshape(3, 200, -1).swapaxes(0, 1) for each in motion(artifact, 600, runs=3))
     rng, again = np.random.default_rng(0), np.array([False, True, False])
@@ -104,7 +104,7 @@ def test_gaps_of_maps_that_do_not_track(knows_output, tmp_path):
 def test_rows_have_levels_of_their_own(tracks):
     exported, y, u, _ = tracked(5) if tracks else mapped(1)
     y, u = (np.stack([each[:100]] * 2, 1) for each in ((y, u) if tracks else (y[:, 1], u[:, 1])))
-    levels = [((0.2, 0.7), 0.1), ((0.9, 7.0), 0.6)]  # T_inv knows up to 2 and 0.2, and the Kalman filter any
+    levels = [((0.2, 0.7), 0.1), ((0.9, 7.0), 0.6)]  # T_inv's largest levels are 2 and 0.2; the Kalman filter has none
     given = {"measurement_noise": [a for a, _ in levels], "process_noise": [[b] for _, b in levels]}
     x_hat = along(module_of(exported), y, u, **given)
     for row, (measurement, process) in enumerate(levels):
@@ -113,7 +113,7 @@ def test_rows_have_levels_of_their_own(tracks):
         np.testing.assert_allclose(x_hat[:, row], in_doubles(alone, y[:, row], u[:, row]), atol=1e-9)
 
 
-def test_a_row_whose_covariance_breaks_down_is_lost():
+def test_t_inv_re_initialises_a_row_with_an_invalid_covariance():
     exported, y, u, _ = tracked(0)
     y, u, module = y[10:71, None], u[10:71, None], module_of(exported)
     state, x_hat = module.start(1), []
@@ -132,7 +132,7 @@ def test_a_row_whose_covariance_breaks_down_is_lost():
 
 @pytest.mark.parametrize("kind", [{"by": "flow"}, {"outputs": 2, "nonlinear": True}])
 def test_gradients_are_those_of_finite_differences(kind):
-    """Through filter, T_inv, which is surer for a while, tracker, gaps and covariance, and to T_inv's weights."""
+    """Gradients through filter, T_inv, tracker, gaps and covariance, also with respect to T_inv's weights."""
     artifact, name = tracking(surer=1.0, **kind), "driven.network.layers.0.weight"
     module = TorchObserver(artifact, dtype=torch.float64)
     y, u = (torch.tensor(each) for each in signals(artifact, 5, (2,)))
@@ -152,8 +152,8 @@ def test_gradients_are_those_of_finite_differences(kind):
     assert all(each.grad.isfinite().all() and each.grad.abs().max() > 1e-3 for each in given)
 
 
-def test_an_observer_of_floats_throughout_tracks():
-    """For devices without doubles; T_inv is inaccurate then."""
+def test_an_observer_in_float32_tracks():
+    """In float32, for devices without double precision; T_inv is then inaccurate."""
     artifact = observers.load("van_der_pol").artifact
     y, u = (each[:, None] for each in motion(artifact, 300))
     exact, rough = along(TorchObserver(artifact), y, u), along(TorchObserver(artifact).float(), y, u)

@@ -18,7 +18,7 @@ from training.trajectories.motions import random_inputs
 
 
 class HiddenSigns(Lorenz):
-    """Lorenz seen through x3."""
+    """The Lorenz system with the output x3."""
 
     name: ClassVar[str] = "lorenz_x3"
 
@@ -27,7 +27,7 @@ class HiddenSigns(Lorenz):
 
 
 def records(system, n, *, seconds, noise=0.0, seed=0, driven=False):
-    """Outputs of motions from X."""
+    """Records of outputs along motions from X."""
     rng, steps = np.random.default_rng(seed), round(seconds / system.dt)
     u = random_inputs(system, n, steps, dt=system.dt, rng=rng, kinds=("steps",)) if driven else None
     x = simulate(system, system.draw_starts(rng, n), steps, system.dt, u=u)
@@ -70,7 +70,7 @@ def test_equal_seeds_find_equal_parameters():
     assert one.system == same.system
 
 
-def test_what_duffings_output_does_not_tell():
+def test_only_a_product_of_duffings_parameters_is_identifiable():
     class Duffing(ReverseDuffing):
         name: ClassVar[str] = "coarse_duffing"
         dt: ClassVar = 0.05
@@ -83,14 +83,14 @@ def test_what_duffings_output_does_not_tell():
     assert got.unscaled_states == ("x2",)
     assert "a b^3 = 1" in " ".join(got.summary())
     assert got.system.a * got.system.b**3 == pytest.approx(1.0, rel=1e-5)
-    assert got.system.a / got.system.b == pytest.approx(1.4 / 1.3, rel=0.01)  # nearest to what was given
+    assert got.system.a / got.system.b == pytest.approx(1.4 / 1.3, rel=0.01)  # nearest to the given values
 
 
-def test_signs_that_outputs_do_not_tell():
+def test_signs_that_are_not_identifiable():
     assert sign_symmetries(HiddenSigns(), ["sigma", "rho", "beta"]) == [("x1", "x2")]
     assert sign_symmetries(Lorenz(), ["sigma", "rho", "beta"]) == []
     assert sign_symmetries(ReverseDuffing(), ["a", "b"]) == [("x2", "a", "b")]
-    assert sign_symmetries(ReverseDuffing(), ["a", "b"], driven=True) == []  # the input stays as it is
+    assert sign_symmetries(ReverseDuffing(), ["a", "b"], driven=True) == []  # the symmetry does not hold with an input
     assert sign_symmetries(Spring(), ["gain"]) == [("gain",)]
     assert sign_symmetries(Spring(), ["gain"], driven=True) == []
 
@@ -105,7 +105,7 @@ def test_products_of_powers():
 
 def test_the_nearest_parameters_keep_their_ratios():
     hidden = np.array([[3.0, -1.0]]).T / 10**0.5
-    # A plant that is 10 % faster, found anywhere along a b^3 = 1.1^4.
+    # The plant is 10 % faster; any parameters with a b^3 = 1.1^4 fit.
     anywhere = np.array([1.1 * 2.0**3, 1.1 / 2.0])
     assert nearest(anywhere, np.ones(2), hidden) == pytest.approx([1.1, 1.1], rel=1e-2)
 
@@ -114,7 +114,7 @@ def test_the_noise_of_records():
     assert noise_level(records(VanDerPol(), 4, seconds=10, noise=0.2)) == pytest.approx(0.2, rel=0.1)
 
 
-def test_what_makes_no_sense():
+def test_invalid_arguments():
     (free,), (driven,) = records(Spring(), 1, seconds=3), records(Spring(), 1, seconds=3, driven=True)
     doubled = Record("doubled", free.t, np.hstack([free.y, free.y]))
     stiffness = {"stiffness": (1.0, 9.0)}
@@ -131,7 +131,7 @@ def test_what_makes_no_sense():
             estimate_parameters(Spring(), unknown, given, progress=progress)
 
 
-def test_a_parameter_at_its_limit_is_told():
+def test_a_parameter_at_its_limit_is_reported():
     measured, limits = records(Spring(), 2, seconds=8, noise=0.05), {"stiffness": (3.0, 3.7)}
     with progress_bars(None) as progress:
         got = estimate_parameters(Spring(3.5), limits, measured, progress=progress)

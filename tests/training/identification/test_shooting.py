@@ -1,4 +1,4 @@
-"""Windows of records: standard errors, and first guesses that explain nothing."""
+"""Multiple shooting: weights of windows, standard errors, and initial guesses that fit no window."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -41,7 +41,7 @@ SWING = Spring(damping=0.0)
 
 
 def windows(system, n, steps, *, noise, process_noise, seed):
-    """Windows of motions from X, with true starts."""
+    """Windows of motions from X, with their true initial states."""
     rng = np.random.default_rng(seed)
     x0 = system.draw_starts(rng, n)
     x = simulate(system, x0, steps, system.dt, w=process_noise * rng.standard_normal((steps, n, system.nx)))
@@ -50,13 +50,13 @@ def windows(system, n, steps, *, noise, process_noise, seed):
 
 
 def fitted(measured):
-    """A fit of the rate, from a guess of 1.1."""
+    """Fit the rate, from an initial guess of 1.1."""
     shooting = Shooting(Decay(1.1), Decay.dt, {"rate_constant": (0.11, 11.0)}, np.array([1.1]))
     return shoot(shooting, np.array([1.1]), measured)
 
 
-def test_windows_count_less_the_worse_they_are_explained():
-    """Against the best rate of a search in one dimension, with the best starts in closed form."""
+def test_windows_with_large_residuals_have_small_weights():
+    """Compare with a one-dimensional search for the rate, with the optimal initial states in closed form."""
     good = windows(Decay(), 20, 20, noise=0.01, process_noise=0.0, seed=0)
     rough = windows(Decay(rate_constant=1.3), 15, 20, noise=0.01, process_noise=0.0, seed=1)
     both = Windows(*(np.concatenate([getattr(w, each) for w in (good, rough)], axis) for each, axis in AXES.items()))
@@ -77,12 +77,12 @@ def test_windows_count_less_the_worse_they_are_explained():
     assert abs(fit.parameters["rate_constant"] - 1.0) < abs(alike - 1.0) / 2
 
 
-AXES = {"y": 1, "u": 1, "x0": 0}  # along which windows follow each other
+AXES = {"y": 1, "u": 1, "x0": 0}  # the axes of windows
 
 
 @pytest.mark.parametrize(("process_noise", "coloured"), [(0.0, False), (0.3, True)])
 def test_standard_errors_cover_the_truth_under_process_noise(process_noise, coloured):
-    """Normalised errors are standard normal: where noise is white, and where windows alone show what it does."""
+    """Normalised errors are standard normal, also for coloured residuals, where the spread of windows is used."""
     off, white = [], []
     for seed in range(12):
         measured = windows(Decay(), 40, 20, noise=0.01, process_noise=process_noise, seed=seed)
@@ -109,7 +109,7 @@ def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypat
     assert abs(fit.parameters["stiffness"] - 4.0) < 3 * fit.standard_errors[0] < 0.3
 
 
-def test_guesses_that_explain_nothing():
+def test_guesses_that_fit_no_window():
     measured = windows(Decay(), 5, 20, noise=0.01, process_noise=0.0, seed=0)
     shooting = Shooting(Decay(-40.0), 0.02, {"rate_constant": (-50.0, -30.0)}, np.array([40.0]))
     with pytest.raises(UnexplainedError, match=r"windows of 20 samples: all motions leave the bounds of decay.*-40"):
@@ -117,7 +117,7 @@ def test_guesses_that_explain_nothing():
 
 
 def test_derivatives_are_those_of_closed_form():
-    """x = x0 exp(-a t) and y = b x, and their derivatives."""
+    """For x = x0 exp(-a t) and y = b x."""
     system = Decay(1.3, 0.7)
     shooting = Shooting(system, system.dt, {"rate_constant": (0.1, 9.0), "gain": (0.1, 9.0)}, np.array([1.3, 0.7]))
     x0, u, t = np.array([[0.5], [1.2]]), np.zeros((100, 2, 0)), np.arange(101)[:, None] * system.dt
@@ -130,7 +130,7 @@ def test_derivatives_are_those_of_closed_form():
 
 
 def test_random_starts_lead_to_the_state():
-    """Squares of a second and a half of a chaotic motion have minima that trap a start three units away."""
+    """Over 1.5 s of a chaotic motion, local minima trap an initial state that is off by three units."""
     plant, rng = get_system("lorenz"), np.random.default_rng(2)
     x0 = simulate(plant, plant.draw_starts(rng, 8), 500, plant.dt)[-1]
     y = plant.output(simulate(plant, x0, 150, plant.dt))
@@ -145,8 +145,8 @@ def test_random_starts_lead_to_the_state():
     assert abs(fit.parameters["rho"] - 28) < 4 * fit.standard_errors[0]
 
 
-def test_few_windows_may_tell_all_there_is():
-    """Windows at rest tell no stiffness; those that move are believed, however much more they claim."""
+def test_few_informative_windows_suffice():
+    """Windows at rest do not determine the stiffness; the moving windows are used despite their larger information."""
     n, rng = 30, np.random.default_rng(0)
     phase = rng.uniform(0, 2 * np.pi, n)
     x0 = np.stack([np.cos(phase), 2 * np.sin(phase)], 1) * (np.arange(n) < 5)[:, None]

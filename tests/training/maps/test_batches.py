@@ -1,4 +1,4 @@
-"""Batches: what they hold, and that the observer shows its network the same."""
+"""Batches: noise levels, weights, and inputs of the network that equal those of the observer."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -23,7 +23,7 @@ def batches_of(data, linear, measurement_noise=0.5, **settings):
 
 
 @pytest.mark.parametrize(("noise_free_share", "high_noise_emphasis"), [(0.2, 2.0), (1.0, 2.0), (0.0, 1e-3)])
-def test_how_often_batches_hold_each_noise_level(noise_free_share, high_noise_emphasis):
+def test_distribution_of_noise_levels_in_batches(noise_free_share, high_noise_emphasis):
     _, data, linear = open_loop()
     how = {"noise_free_share": noise_free_share, "high_noise_emphasis": high_noise_emphasis}
     batches = batches_of(data, linear, measurement_noise_max=0.5, batch=32_768, **how)
@@ -35,15 +35,15 @@ def test_how_often_batches_hold_each_noise_level(noise_free_share, high_noise_em
     assert ((cell % 7 == 0).numpy() == (level == 0)).all()
     assert cell.max() < batches.cells
     assert (level == 0).mean() == pytest.approx(noise_free_share, abs=0.01)
-    for below in (0.05, 0.2):  # of which a part of the two decades below 0.5 is left out
+    for below in (0.05, 0.2):  # levels cover two decades below 0.5
         expected = noise_free_share + (1 - noise_free_share) * (1 + np.log10(below / 0.5) / 2) ** high_noise_emphasis
         assert (level <= below).mean() == pytest.approx(expected, abs=0.01)
 
 
-def test_motions_of_the_systems_own_parameters_are_in_cells_apart():
+def test_motions_with_nominal_parameters_have_their_own_cells():
     _, data, linear = open_loop()
     nominal = np.arange(data.x.shape[1]) % 3 == 0
-    size = np.where(nominal, 0.0, 1e6)  # by which the states are marked
+    size = np.where(nominal, 0.0, 1e6)  # marks the states
     marked = replace(data, x=data.x * 0 + size[:, None] + 1, nominal=nominal)
     alike, apart = (batches_of(each, linear, batch=1024) for each in (replace(marked, nominal=None), marked))
     assert apart.cells == 2 * alike.cells
@@ -56,7 +56,7 @@ def test_motions_of_the_systems_own_parameters_are_in_cells_apart():
 
 @cache
 def of_two_outputs():
-    """Batches along trajectories of a system whose outputs have units of their own, and what they are made of."""
+    """Batches for a system whose outputs have different units, the trajectories, and the filter."""
     system = TwoUnits()
     linear = Spectrum((-0.5, -2.0, -8.0)).filter(2, 0.01, 1)
     motions = Motions(system, linear.dt, 300, KINDS)
@@ -65,7 +65,7 @@ def of_two_outputs():
     return sampler, data, linear
 
 
-def test_each_of_several_outputs_has_a_level_of_its_own():
+def test_each_output_has_its_own_noise_level():
     sampler, _, linear = of_two_outputs()
     inverse = untrained(sampler, linear)[1].inverse
     inputs, _, _, cell = sampler(torch.Generator().manual_seed(0))
@@ -84,14 +84,14 @@ def test_each_of_several_outputs_has_a_level_of_its_own():
 
 
 @pytest.mark.parametrize(("made", "largest"), [(open_loop, 1.0), (of_two_outputs, (200.0, 0.2))])
-def test_batches_hold_the_noise_that_the_filter_would_pass_on(made, largest):
+def test_batches_hold_the_noise_of_the_filter_state(made, largest):
     sampler, data, linear = made()
     usual = TwoUnits().measurement_noise if made is of_two_outputs else 0.5
     quiet = batches_of(data, linear, usual, measurement_noise_max=largest, noise_free_share=1.0)
     inverse, ny = untrained(sampler, linear)[1].inverse, np.size(largest)
     whiten, gain = inverse.whiten, np.atleast_2d(inverse.noise_gain)
     covariance = whiten @ noise_covariance(linear, data.ages) @ whiten.T  # (ages, outputs, modes, modes)
-    heard = gain.max(0) > 1e-3 * gain.max()  # modes that are about inputs hold no noise
+    heard = gain.max(0) > 1e-3 * gain.max()  # modes of the inputs have no noise
     measured, expected, count = 0.0, 0.0, 0
     for seed in range(30):
         inputs, without = (
@@ -103,7 +103,7 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(made, largest):
         shrink = 1 + ((level[..., None] * gain) ** 2).sum(1)
         noise = (inputs[:, : len(whiten)] * shrink - without[:, : len(whiten)])[:, heard]
         assert np.abs(noise[(level == 0).all(1)]).max() < 1e-5
-        some = (level == 0).sum(1) == (seed % 2 if ny > 1 else 0)  # one of two outputs is exact, or none is
+        some = (level == 0).sum(1) == (seed % 2 if ny > 1 else 0)  # rows with one exact output of two, or with none
         predicted = np.einsum("nj,njab->nab", level[some] ** 2, covariance[slot[some]])[:, heard][..., heard]
         size = np.sqrt(np.einsum("naa->na", predicted))
         measured += np.einsum("na,nb->ab", noise[some] / size, noise[some] / size)
@@ -113,7 +113,7 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(made, largest):
 
 
 def assert_shown(batch, row, artifact, data):
-    """A row without measurement noise holds what the observer gives its network; returns its trajectory."""
+    """Assert that a noiseless row equals the observer's input of its network; return the row's trajectory."""
     inverse = artifact.inverse
     state = batch.x[row].numpy() * inverse.x_scale + inverse.x_offset
     slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
@@ -127,7 +127,7 @@ def assert_shown(batch, row, artifact, data):
 
 
 @pytest.mark.parametrize("made", [open_loop, partial(open_loop, 0.5), of_two_outputs])
-def test_batches_are_what_the_observer_shows_its_network(made):
+def test_batches_equal_the_observers_inputs_of_its_network(made):
     sampler, data, linear = made()
     _, artifact = untrained(sampler, linear)
     batch = sampler(torch.Generator().manual_seed(0))

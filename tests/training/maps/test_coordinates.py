@@ -1,4 +1,4 @@
-"""What networks read and give, and what the filter passes on of the noise on y."""
+"""Coordinates of the networks' inputs and outputs, and the covariance of noise in the filter state."""
 
 import numpy as np
 
@@ -24,10 +24,10 @@ def test_coordinates_make_the_signal_white_and_the_noise_diagonal():
     np.testing.assert_allclose(found.whiten @ noise @ found.whiten.T, np.diag(found.noise_gain**2), atol=1e-3)
     assert (np.diff(found.noise_gain) >= 0).all()
     flat = coordinates(z[:, [0, 0, 0]], noise)
-    assert len(flat.noise_gain) == 1  # two modes hold nothing but rounding
+    assert len(flat.noise_gain) == 1  # two modes hold only rounding
 
 
-def test_spread_is_in_any_units_and_takes_rounding_for_rest():
+def test_spread_has_the_units_of_z_and_ignores_rounding():
     z = np.random.default_rng(0).normal(size=(1000, 3)) * [1e-20, 1.0, 1e-15] + [0.0, 1e6, 1.0]
     np.testing.assert_allclose(spread(z), [1e-20, 1.0, 1.0], rtol=0.1)
     assert (spread(np.zeros((10, 2))) == 1.0).all()
@@ -51,7 +51,7 @@ def test_noise_covariance_tends_to_the_lyapunov_solution():
     linear = LinearFilter(np.diag([-0.5, -4.0]), np.ones((2, 1)), 0.01, 1)
     late = noise_covariance(linear, np.array([5000]))[0, 0]
     np.testing.assert_allclose(late, stationary_covariance(linear)[0], rtol=1e-9, atol=1e-15)
-    assert not late[2:].any()  # the input is known exactly
+    assert not late[2:].any()  # inputs have no noise
     np.testing.assert_allclose(root(late) @ root(late).T, late, atol=1e-15)
 
 
@@ -64,7 +64,7 @@ def test_relative_scale_is_by_standard_deviation_and_weighs_small_states_more():
     np.testing.assert_allclose(scale.weight(scale.scale * [3.0, 1.0]), 1 / (5.0 + LEAST))
 
 
-def test_range_scale_reaches_from_minus_one_to_one_and_weighs_all_alike():
+def test_range_scale_maps_to_minus_one_to_one_with_equal_weights():
     x = np.random.default_rng(0).uniform((1.0, -3.0), (2.0, 7.0), (1000, 2))
     scale = StateScale.of(x, "range")
     np.testing.assert_allclose(scale(x).min(0), -1.0)

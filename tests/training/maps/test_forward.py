@@ -80,14 +80,14 @@ def test_solved_output_layer_minimises_the_risk_over_it(unit):
             last.weight -= step
 
 
-def test_filter_state_from_T_and_what_is_left_of_its_start():
+def test_filter_state_is_T_plus_the_transient_of_the_start():
     system, linear = Autonomous(), Spectrum((-1.0,), ((-0.5, 2.0),)).filter(1, 0.001)
     ages = np.array([0, 1, 100, 1000])
     x = simulate(system, np.random.default_rng(0).uniform(-1, 1, (5, 2)), 1000, 0.001)
     simulated = filter_states(linear, system.output(x), np.zeros((1000, 5, 0)), ages)
     T = x[ages] @ sylvester(linear.A, linear.B).T
     found = transients(T, simulated[0], linear=linear, ages=ages)
-    assert np.abs(T[1] - simulated[1]).max() > 0.1  # the start is far from T
+    assert np.abs(T[1] - simulated[1]).max() > 0.1  # the transient is large
     np.testing.assert_allclose(found, simulated, atol=1e-6)
 
 

@@ -26,7 +26,7 @@ def csv(path, header="time,theta,alpha,note", rows=None):
 
 def test_arrays(tmp_path):
     u, x = np.cos(T), np.stack([Y, np.cos(T)], -1)
-    for given in (u, u[:-1]):  # there may be no input after the last sample
+    for given in (u, u[:-1]):  # the input after the last sample may be missing
         path = npz(tmp_path / "a.npz", u=given, x=x, notes=np.array("today"), more=np.array({}, dtype=object))
         (record,) = read_records([path], warn=quiet)
         assert record.signals == Signals("t", ("y",), ("u",), ("x1", "x2"))
@@ -50,7 +50,7 @@ def test_csv_by_names(tmp_path, separator):
     "text",
     [
         '"time, in s";"y, in mm"\n0;1\n1;3\n',
-        '"time, in s", "y, in mm"\n"0", "1"\n"1", "3"\n',  # with spaces before quotes
+        '"time, in s", "y, in mm"\n"0", "1"\n"1", "3"\n',  # spaces before quotes
         '"time, in s"\t"y, in mm"\t; x\r\r0\t1\t7\r1\t3\t7\r',
         '"time, in s","y, in mm"\n2024-05-01T23:59:59.5Z,1\n2024-05-02T00:00:00.5Z,3\n',
     ],
@@ -88,7 +88,7 @@ def test_missing_samples_are_nan(tmp_path):
 
 BAD_CSV = {
     "short row": (["0,1,2,a", "1,2,a"], "row 2 has 3 cells, the header 4"),
-    "no number": (["0,1,2,a", "1,x7,2,a"], "column theta, row 2: 'x7' is not a number"),
+    "not a number": (["0,1,2,a", "1,x7,2,a"], "column theta, row 2: 'x7' is not a number"),
     "time stands": (["0,1,2,a", "0,2,2,a"], "column time, row 2: time must increase"),
     "no time": (["0,1,2,a", ",2,2,a"], "column time, row 2: a number is missing"),
     "all missing": (["0,,2,a", "1,nan,2,a"], "column theta, row 1: no row holds a number"),

@@ -15,7 +15,7 @@ def jittery(seed=0, share=0.2):
     return T + np.random.default_rng(seed).uniform(-share, share, len(T)) * DT
 
 
-def test_a_uniform_record_stays_as_it_is():
+def test_a_uniform_record_is_unchanged():
     u = np.random.default_rng(0).normal(size=(500, 2))
     before = record(T, u=u, x=np.cos(T)[:, None])
     after = resampled(before)

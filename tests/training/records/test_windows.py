@@ -23,7 +23,7 @@ def test_a_filter_may_start_at_any_sample(age):
     records = [record(50), record(30, x=x), record(9, x=None)]
     windows = Windows(records, LINEAR, 1)
     rows = windows.rows(age)
-    assert len(rows) == (50 - age) + (30 - age) - (age <= 3)  # every sample with a state that is old enough
+    assert len(rows) == (50 - age) + (30 - age) - (age <= 3)  # samples with a state, from `age` on
     for z, state in zip(windows.restarted(rows, age), windows.x[rows, 0]):
         owner, sample = records[int(state >= 1000)], int(state) % 1000
         y, u = owner.y[sample - age : sample + 1, None], owner.u[sample - age : sample + 1, None]

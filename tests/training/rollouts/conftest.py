@@ -1,4 +1,4 @@
-"""An environment whose observations say what acted on it, and an observer for it."""
+"""An environment whose observations contain the last action, and an observer for it."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from rollout_observers import observer_of
 
 
 class Spy(gym.Env):
-    """It shows what acted on it. Episodes end after seven steps."""
+    """Observations contain the last action; episodes end after seven steps."""
 
     observation_space = spaces.Box(-99.0, 99.0, (2,))
     action_space = spaces.Box(np.float32([-1.0]), np.float32([3.0]))
@@ -27,7 +27,7 @@ class Spy(gym.Env):
 
 @pytest.fixture
 def register():
-    """Registers environments, as long as a test takes."""
+    """Register environments for the duration of a test."""
     names = []
 
     def registered(env_id, entry_point, **options):
@@ -45,7 +45,7 @@ def spy(tmp_path, register):
     """Path of an observer for Spy-v0."""
     register("Spy-v0", Spy)
     training = {"pipeline": "input-aware", "eigenvalues": [-1.2, -2.4, -4.8], "dt": 1.0, "held_out": 0.5}
-    rates = (1.2, 2.4, 4.8)  # with which the filter settles within an episode
+    rates = (1.2, 2.4, 4.8)  # the filter settles within an episode
     artifact = observer_of("Spy-v0", ["obs[0]"], ["obs[1]"], ["action[0]"], rates=rates)
     dataclasses.replace(artifact, training=training).save(tmp_path / "spy.safetensors")
     return tmp_path / "spy.safetensors"

@@ -1,4 +1,4 @@
-"""Observers that are refitted on an agent's own episodes."""
+"""Refits of observers to an agent's own episodes."""
 
 import dataclasses
 from contextlib import nullcontext
@@ -29,7 +29,7 @@ NET = {"net_arch": [8]}
 
 @pytest.fixture(scope="module")
 def pendulum(tmp_path_factory):
-    """An observer from few random steps and batches."""
+    """An observer trained with few random steps and few batches."""
     folder, few = tmp_path_factory.mktemp("observer"), {"steps": 400, "members": 1, "inverse_steps": 20}
     training.learn("Pendulum-v1", measured=[0, 1], hidden=[2], out=folder, **few, **TINY)
     return folder / "Pendulum-v1.safetensors"
@@ -54,20 +54,20 @@ def in_use(env):
 
 
 def test_a_refit_lowers_the_error(pendulum, tmp_path, capsys):
-    told, path = [], tmp_path / "newer.safetensors"
+    results, path = [], tmp_path / "newer.safetensors"
     env = vector("Pendulum-v1", pendulum)
     first = in_use(env)[0]
-    options = {"path": path, "on_refit": told.append, "verbose": 1}
+    options = {"path": path, "on_refit": results.append, "verbose": 1}
     refits = KKLTrainingCallback(1000, **options, inverse_steps=200, width=32)
     refits.init_callback(model := ppo(VecNormalize(env, norm_reward=False)))
     assert refits.artifact is first
     model.learn(2100, refits)
     assert in_use(env) == [refits.artifact] * 4
-    assert [refit.steps for refit in told] == [1024, 2048]
-    assert told[0].taken
-    last = [refit for refit in told if refit.taken][-1]  # a second refit may be no better, and is then left alone
-    assert last.error < 0.4 * told[0].before
-    assert told[-1].artifact is last.artifact is refits.artifact
+    assert [refit.steps for refit in results] == [1024, 2048]
+    assert results[0].taken
+    last = [refit for refit in results if refit.taken][-1]  # a second refit may be worse, and is then dropped
+    assert last.error < 0.4 * results[0].before
+    assert results[-1].artifact is last.artifact is refits.artifact
     assert refits.artifact.training["held_out_errors"]["obs[2]"] == pytest.approx(last.error)
     assert refits.artifact.training["eigenvalues"] == tuple(first.training["eigenvalues"])
     assert Artifact.read(path).training["held_out_errors"] == refits.artifact.training["held_out_errors"]
@@ -77,16 +77,16 @@ def test_a_refit_lowers_the_error(pendulum, tmp_path, capsys):
 
 
 def test_pieces_are_longer_than_the_settling_time_of_a_slow_filter(tmp_path):
-    """It settles after 345 steps; where episodes are shorter, a warning gives the reason why there is no refit."""
-    few, told = {"steps": 1000, "members": 1, "inverse_steps": 20}, []
+    """The filter settles after 345 steps; if episodes are shorter, a warning gives the reason for a missing refit."""
+    few, results = {"steps": 1000, "members": 1, "inverse_steps": 20}, []
     long = {"eigenvalues": (-0.4, -4.0, -20.0), "env_kwargs": {"max_episode_steps": 500}}
     training.learn("Pendulum-v1", measured=[0, 1], hidden=[2], out=tmp_path, **long, **few, **TINY)
-    path, options = tmp_path / "Pendulum-v1.safetensors", {"inverse_steps": 20, "on_refit": told.append}
+    path, options = tmp_path / "Pendulum-v1.safetensors", {"inverse_steps": 20, "on_refit": results.append}
     with pytest.warns(UserWarning, match=r"lasts 17\.3 s, the settling time .* make episodes longer, or .*eigenvalues"):
         ppo(vector("Pendulum-v1", path), 100).learn(900, KKLTrainingCallback(800, **options))
-    assert told == []
+    assert results == []
     ppo(vector("Pendulum-v1", path, max_episode_steps=500), 100).learn(2000, KKLTrainingCallback(1600, **options))
-    assert [refit.steps for refit in told] == [1600]
+    assert [refit.steps for refit in results] == [1600]
 
 
 def test_environments_in_processes_of_their_own(pendulum, asked):
@@ -97,12 +97,12 @@ def test_environments_in_processes_of_their_own(pendulum, asked):
         assert in_use(env)[0].versions == {"of": "the refit"}
     finally:
         env.close()
-    assert [len(record.t) for record in asked.found[0]] == [200]  # the second is held out
+    assert [len(record.t) for record in asked.found[0]] == [200]  # the second record is held out
 
 
 @pytest.fixture
 def asked(monkeypatch):
-    """Records that observers would be fitted to, by the refit; none is fitted."""
+    """Collects the records of each refit; the refit itself is replaced."""
     found = []
 
     def train(source):
@@ -118,7 +118,7 @@ def asked(monkeypatch):
 
 @pytest.fixture
 def spied(spy, asked):
-    """Makes environments; a refit brings the observer back that is in use there."""
+    """Makes environments of Spy; a refit returns the observer in use unchanged."""
 
     def make(n=1):
         env = vector("Spy-v0", spy, n)
@@ -129,7 +129,7 @@ def spied(spy, asked):
 
 
 def check_spied(records):
-    """Inputs lead from sample to sample: what acted is what the next sample shows."""
+    """Assert that each input equals the action that the next sample shows."""
     for record in records:
         np.testing.assert_allclose(record.u[:-1, 0], (record.x[1:, 0] - 1.0) / 2.0, atol=1e-6)
         assert (record.y[0, 0] >= 50) == (record.x[0, 0] == -50)
@@ -150,11 +150,11 @@ def test_actions_are_those_that_acted(spied, asked, algorithm):
     records = asked.found[-1]
     check_spied(records)
     assert len(records) == pytest.approx(0.5 * 200 / 7, abs=4)
-    assert sum(record.y[0, 0] >= 50 for record in records) >= len(records) - 3  # they begin with their resets
+    assert sum(record.y[0, 0] >= 50 for record in records) >= len(records) - 3  # records begin at resets
     u = np.concatenate([record.u for record in records])
     assert u.min() < -0.5
     assert u.max() > 0.5
-    if algorithm == "ppo":  # cut at the bounds
+    if algorithm == "ppo":  # actions are clipped
         assert abs(u).max() == 1.0
 
 
@@ -180,17 +180,17 @@ def test_a_training_that_goes_on(spied, asked):
     env, after = spied(), []
     refits = KKLTrainingCallback(100, on_refit=lambda refit: after.append(torch.get_rng_state()))
     model = ppo(env, 50)
-    for _ in range(5):  # in the middle of an episode
+    for _ in range(5):  # each call continues the episode
         model.learn(50, refits, reset_num_timesteps=False)
     check_spied(asked.found[-1])
     assert len(asked.found) == 2
-    assert torch.equal(asked.random, after[-1])  # the agent's random numbers are its own
+    assert torch.equal(asked.random, after[-1])  # refits do not use the agent's random numbers
 
 
 def test_a_rehearsal_is_played_as_the_agent_will_act(spied, asked, monkeypatch):
-    env, told = VecNormalize(spied(2)), []
+    env, results = VecNormalize(spied(2)), []
     model = ppo(env, 50, log_std_init=1.5)
-    refits = KKLTrainingCallback(100, keep=30, rehearsal=30, on_refit=told.append)
+    refits = KKLTrainingCallback(100, keep=30, rehearsal=30, on_refit=results.append)
     predict, acted = model.predict, []
 
     def noted(*given, **options):
@@ -199,22 +199,22 @@ def test_a_rehearsal_is_played_as_the_agent_will_act(spied, asked, monkeypatch):
         return actions, state
 
     monkeypatch.setattr(model, "predict", noted)
-    for _ in range(2):  # the second begins in new episodes
+    for _ in range(2):  # the second call begins new episodes
         seen = env.obs_rms.count
         model.learn(200, refits, reset_num_timesteps=False)
-        assert env.obs_rms.count == seen + 202  # with those of the reset, and none of the rehearsal
+        assert env.obs_rms.count == seen + 202  # includes the reset, excludes the rehearsal
         assert env.training
         records = [record for record in asked.found[-1] if record.y[0, 0] >= 50]
         check_spied(records)
         played = [round(float(u), 5) for u in np.ravel(acted)]
         assert {round(float(u), 5) for record in records for u in record.u[:-1, 0] * 2 + 1} <= {*played}
-    assert [refit.steps for refit in told] == [100, 230, 330, 460]
+    assert [refit.steps for refit in results] == [100, 230, 330, 460]
     assert len(acted) == 60
 
 
 @pytest.mark.parametrize(("memory", "before", "times"), [(7.0, True, 2), (8.0, True, 0), (8.0, False, 0)])
 def test_a_refit_is_judged_by_the_agents_own_episodes(spied, asked, monkeypatch, memory, before, times):
-    """While none that is held out is long enough, records from before are no reason for a refit: a warning instead."""
+    """If no held-out episode is long enough, earlier records cause a warning instead of a refit."""
     env = spied()
     signals, column = Signals("t", ("obs[0]",), ("action[0]",), ("obs[1]",)), np.zeros((100, 1))
     long = Record("long", np.arange(100.0), *[column] * 3, signals, environment=asked.artifact.environment)
@@ -228,12 +228,12 @@ def test_episodes_from_before_must_be_of_the_plant(spied, asked):
     env = spied()
     ppo(env, 50).learn(100, KKLTrainingCallback(50, held_out=0.0))
     record = asked.found[0][0]
-    for change, says in (
+    for change, message in (
         ({"x": None}, "no hidden states"),
         ({"environment": {**record.environment, "id": "Other-v0"}}, "Other-v0"),
         ({"t": 1e-3 * record.t}, "do not fit dt = 1 s"),
     ):
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             ppo(env, 50).learn(100, KKLTrainingCallback(50, records=[dataclasses.replace(record, **change)]))
 
 
@@ -258,7 +258,7 @@ def test_environments_that_are_refused(pendulum, tmp_path):
     other.save(tmp_path / "other.safetensors")
     two = DummyVecEnv([partial(wrapped, "Pendulum-v1", pendulum)] * 2)
     two.envs[1] = wrapped("Pendulum-v1", tmp_path / "other.safetensors")
-    for env, settings, told in (
+    for env, settings, message in (
         (gym.make("Pendulum-v1"), {}, r"the environment has none: wrap each environment"),
         (wrapped("Pendulum-v1", tmp_path / "plain.safetensors"), {}, "holds no settings of its training"),
         (hiding, {}, r"environment 0 has no 'x': KKLObservation gives the true obs\[2\] as 'x'"),
@@ -268,11 +268,11 @@ def test_environments_that_are_refused(pendulum, tmp_path):
         (two, {}, "has signals"),
         (wrapped("Pendulum-v1", pendulum), {"width": -1}, "width"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             ppo(env, 10).learn(20, KKLTrainingCallback(100, **settings))
 
 
-def test_arguments_that_make_no_sense():
+def test_invalid_arguments_of_the_callback():
     for arguments, message in (
         ({"every": 10.5}, "every must be"),
         ({"records": ["a"]}, r"records must be a list of training\.records\.Record, got"),

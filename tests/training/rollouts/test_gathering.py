@@ -1,4 +1,4 @@
-"""Pieces of episodes that refits are made of."""
+"""Pieces of episodes for refits."""
 
 import numpy as np
 import pytest
@@ -13,22 +13,22 @@ def sample(k):
     return {"y": np.array([float(k)]), "u": np.array([0.1 * k]), "x": np.array([-float(k)]), "sample": k}
 
 
-def test_episodes_are_cut_and_the_oldest_are_forgotten(spy):
+def test_episodes_are_cut_and_the_oldest_are_dropped(spy):
     gathering = Gathering(Artifact.read(spy), keep=2 * LONGEST, held_out=0.0)
     gathering.begin(0, {"y": np.zeros(1)})
     for k in range(1, 3 * LONGEST + 3):
         gathering.add(0, sample(k))
     records, held_out = gathering.records()
     assert (gathering.steps, held_out) == (3 * LONGEST + 2, [])
-    assert [len(record.t) - 1 for record in records] == [LONGEST, 2]  # a third would be more than are kept
-    assert records[0].y[0, 0] == 2 * LONGEST  # the next piece begins with the last sample
+    assert [len(record.t) - 1 for record in records] == [LONGEST, 2]  # a third piece would exceed the limit
+    assert records[0].y[0, 0] == 2 * LONGEST  # a piece begins with the last sample of the one before
     assert records[1].y[0, 0] == 3 * LONGEST == records[0].y[-1, 0]
     np.testing.assert_allclose(records[0].u[:-1, 0], 0.1 * records[0].y[1:, 0])
     gathering.add(0, sample(3 * LONGEST + 3))
     assert len(gathering.records()[0][-1].t) == 4
 
 
-def test_an_unfinished_episode_is_not_forgotten(spy):
+def test_an_unfinished_episode_is_not_dropped(spy):
     gathering = Gathering(Artifact.read(spy), keep=10, held_out=0.0)
     for row, steps in ((0, 5), (1, 10)):
         gathering.begin(row, sample(0))
@@ -55,7 +55,7 @@ def test_pieces_have_their_role_for_good(spy, share):
     assert roles["Spy-v0, piece 1"] == 1
 
 
-def test_what_comes_from_before_is_brought_to_the_observers_form(spy):
+def test_earlier_records_are_converted_for_the_observer(spy):
     artifact, count = Artifact.read(spy), np.arange(400.0)
     signals = Signals("seconds", ("obs[0]",), ("action[0]",), ("obs[1]",))
     column = count[:, None]

@@ -1,4 +1,4 @@
-"""Minari data sets: written whole, and read again."""
+"""Minari data sets: a round trip, and data sets of other programs."""
 
 import json
 
@@ -31,25 +31,25 @@ def rollouts(name=NAME, env_id="CartPole-v1", **changes):
 
 
 def rewrite(folder, change):
-    """Lets ``change`` alter the metadata of a data set."""
+    """Change the metadata of a data set in place by ``change``."""
     path = folder / "data" / "metadata.json"
     metadata = json.loads(path.read_text())
     change(metadata)
     path.write_text(json.dumps(metadata))
 
 
-def test_what_is_written_is_read(datasets):
-    told, found = [], rollouts()
+def test_round_trip_of_data_sets(datasets):
+    warnings, found = [], rollouts()
     folder = write_dataset(found, policy="random")
     assert folder == datasets / "cart" / "random-v0"
     assert [path.name for path in folder.parent.iterdir() if path.name.startswith(".")] == []
     expected = [record.fingerprint for record in found.records()]
     for name in ("minari:cart/random-v0", folder):
         assert is_dataset(name)
-        records = read_records([name], warn=told.append)
+        records = read_records([name], warn=warnings.append)
         assert [record.fingerprint for record in records] == expected
         assert records[0].environment == {"id": "CartPole-v1", "kwargs": {}}
-    assert told == []
+    assert warnings == []
     other = read_records([folder], signals=Signals(measured=("obs[2]",), hidden=("3",)))
     assert other[0].signals.hidden == ("obs[3]",)
     dataset = minari.load_dataset("cart/random-v0")
@@ -78,7 +78,7 @@ def test_dicts_and_infos_are_kept(register):
     assert [record.fingerprint for record in read] == [record.fingerprint for record in found.records()]
 
 
-def test_what_is_no_data_set():
+def test_invalid_data_sets_are_refused():
     with pytest.raises(ValueError, match="minari:none/none-v0 cannot be read"):
         read_records(["minari:none/none-v0"])
     folder = write_dataset(rollouts(), policy="random")
@@ -94,11 +94,11 @@ def test_what_is_no_data_set():
     with pytest.raises(ValueError, match="cannot be read as a Minari data set"):
         read_records([folder])
     rewrite(folder, lambda metadata: metadata.pop("action_space"))
-    with pytest.raises(ValueError, match="its spaces are missing"):  # nothing is made of what the file names
+    with pytest.raises(ValueError, match="its spaces are missing"):  # the file's environment is not created
         read_records([folder])
 
 
-def test_data_sets_of_others():
+def test_data_sets_of_other_programs():
     folder, heard = write_dataset(rollouts(), policy="random"), []
     rewrite(folder, lambda metadata: [metadata.pop(key) for key in ("kkl_gym", "env_spec")])
     read = read_dataset(folder, heard.append)
@@ -113,9 +113,9 @@ def test_data_sets_of_others():
 def test_record_and_train(tmp_path, capsys):
     record = ["record", "Pendulum-v1", "--measured", "0,1", "--hidden", "2", "--episodes", "6", "--env-kwargs", "g=9"]
     main(record)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "6 episodes of 200 to 200 steps of 0.05 s" in said
-    assert "kkl-gym train NAME --data minari:pendulum-v1/random-v0" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "6 episodes of 200 to 200 steps of 0.05 s" in printed
+    assert "kkl-gym train NAME --data minari:pendulum-v1/random-v0" in printed
     for wrong, message in ((record, "there is a data set"), ([*record, "--env-kwargs", "g"], None)):
         with pytest.raises(SystemExit, match=message):
             main(wrong)

@@ -17,7 +17,7 @@ TINY = {"inverse_steps": 20, "members": 1, "width": 8, "samples": 5, "windows": 
 
 
 class Drift(gym.Env):
-    """A position that the input drives; a Dict says it, info its speed, but not at reset. It ends beyond 3."""
+    """A position in a Dict, driven by the input; info has the speed except at resets. Episodes end beyond 3."""
 
     observation_space = spaces.Dict({"place": spaces.Box(-9.0, 9.0, (1,)), "goal": spaces.Discrete(2)})
     action_space = spaces.Discrete(3, start=-1)
@@ -54,13 +54,13 @@ def test_inputs_lead_from_each_sample_to_the_next(drift):
     rollouts = played(make(drift))
     records = rollouts.records()
     assert sum(len(episode.rewards) for episode in rollouts.episodes) == 100
-    assert len({len(record.t) for record in records}) > 1  # of different lengths
+    assert len({len(record.t) for record in records}) > 1  # episodes of different lengths
     for record, episode in zip(records, rollouts.episodes):
         assert record.signals == Signals("t", ("place",), ("action[0]", "action[1]", "action[2]"), ("info[speed]",))
         push = record.u @ [-0.5, 0.0, 0.5]
         np.testing.assert_allclose(np.diff(record.y[:, 0]), push[:-1], atol=1e-6)
         np.testing.assert_array_equal(record.u[-1], record.u[-2])
-        assert np.isnan(record.x[0, 0])  # a reset says no speed
+        assert np.isnan(record.x[0, 0])  # the info of a reset has no speed
         np.testing.assert_allclose(record.x[1:, 0], push[:-1])
         np.testing.assert_allclose(np.diff(record.t), 0.1)
         assert episode.terminated == (abs(record.y[-1, 0]) > 3)
@@ -72,13 +72,13 @@ def test_the_same_seed_plays_the_same_until_episodes_or_steps_are_played(drift):
     one, same, other = (played(make(drift), seed=seed).records() for seed in (1, 1, 2))
     assert [record.fingerprint for record in one] == [record.fingerprint for record in same]
     assert one[0].fingerprint != other[0].fingerprint
-    told = []
-    rollouts = played(make(drift), hidden=[], episodes=4, steps=None, report=told.append)
-    assert told == [1, 2, 3, 4] == list(range(1, len(rollouts.episodes) + 1))
+    counts = []
+    rollouts = played(make(drift), hidden=[], episodes=4, steps=None, report=counts.append)
+    assert counts == [1, 2, 3, 4] == list(range(1, len(rollouts.episodes) + 1))
     assert rollouts.records()[0].x is None
 
 
-def test_what_cannot_be_recorded(drift):
+def test_invalid_signals_and_amounts_are_refused(drift):
     for changes, message in (
         ({"measured": ["far"]}, r"contains 'far', but an observation of Drift-v0 holds goal\[0\], goal\[1\], place;"),
         ({"measured": []}, "name the measured entries of the observation"),
@@ -180,7 +180,7 @@ def test_an_interval_that_is_not_the_environments():
         training.learn("CartPole-v1", measured=[0], hidden=[1], steps=60, dt=0.5)
 
 
-def test_what_is_wrong_is_said_before_anything_is_played(tmp_path, monkeypatch):
+def test_invalid_arguments_are_refused_before_any_step(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "inverse-1.checkpoint.safetensors").touch()
@@ -197,7 +197,7 @@ def test_what_is_wrong_is_said_before_anything_is_played(tmp_path, monkeypatch):
 
 def test_rollouts_that_were_handed_out_stay_as_they_are():
     recorder = Recorder(gym.make("CartPole-v1"), measured=["0"], hidden=["1"])
-    for _ in range(2):  # a reset alone is no episode
+    for _ in range(2):  # a reset alone is not an episode
         recorder.reset(seed=0)
     recorder.step(0)
     found = recorder.rollouts()

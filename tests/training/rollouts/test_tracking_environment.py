@@ -1,4 +1,4 @@
-"""Observers of an environment that track: learned in one call, started at a known state, and refitted."""
+"""Tracking observers of an environment: training in one call, known starts, and refits."""
 
 import gymnasium as gym
 import numpy as np
@@ -28,7 +28,7 @@ def agent(path, n, steps):
     return PPO("MlpPolicy", env, seed=0, n_steps=steps, batch_size=n * steps, n_epochs=1, device="cpu")
 
 
-def test_it_tracks_where_what_is_measured_is_hidden_too(path, tmp_path, monkeypatch):
+def test_observers_track_if_all_measured_signals_are_hidden_signals_too(path, tmp_path, monkeypatch):
     np.testing.assert_allclose(Artifact.read(path).C, np.eye(2, 3), atol=1e-6)
     env = KKLObservation(gym.make("Pendulum-v1"), path, measurement_noise=0.05, uncertainty=True)
     obs, info = env.reset(seed=0)
@@ -42,7 +42,7 @@ def test_it_tracks_where_what_is_measured_is_hidden_too(path, tmp_path, monkeypa
     assert not list(tmp_path.iterdir())  # nothing is written without a folder
 
 
-def test_a_start_that_is_known(path):
+def test_known_starts_in_environments(path):
     env = gym.make("Pendulum-v1")
     rows = gym.make_vec("Pendulum-v1", 3, vectorization_mode="sync")
     for known in (KKLObservation(env, path, known_start=True), KKLVectorObservation(rows, path, known_start=True)):
@@ -54,13 +54,13 @@ def test_a_start_that_is_known(path):
 
 
 def test_a_refit_without_enough_held_out_is_left_out(path):
-    model = agent(path, 1, 240)  # an episode of 200 steps is kept, and 40 steps of the next are held out
+    model = agent(path, 1, 240)  # 200 steps for training, 40 held out
     with pytest.warns(UserWarning, match="the observer in use stays: too few steps are held out"):
         model.learn(480, KKLTrainingCallback(240))
 
 
 def test_a_refit_learns_the_flow_again(path, monkeypatch):
-    first, refits, errors = Artifact.read(path), [], iter([1.0, 0.5])  # of the old one, and of the new one
+    first, refits, errors = Artifact.read(path), [], iter([1.0, 0.5])  # of the old and the new observer
     monkeypatch.setattr(callback, "recorded_errors", lambda *_, **__: {"x": next(errors)})
     model = agent(path, 4, 64)
     model.learn(1300, KKLTrainingCallback(1200, on_refit=refits.append))
@@ -68,6 +68,6 @@ def test_a_refit_learns_the_flow_again(path, monkeypatch):
     assert refit.taken
     assert (refit.before, refit.error) == (1.0, 0.5)
     assert refit.artifact.inverse.error_covariance is not None
-    assert refit.artifact.motion.x_offset[2] != first.motion.x_offset[2]  # from other rollouts
+    assert refit.artifact.motion.x_offset[2] != first.motion.x_offset[2]  # fitted to other rollouts
     in_use = [observer.artifact.motion.x_offset[2] for observer in model.get_env().get_attr("observer")]
     assert in_use == [refit.artifact.motion.x_offset[2]] * 4

@@ -1,4 +1,4 @@
-"""Observers from records of a plant whose best observer is known: a mass on a spring."""
+"""Observers from records of a mass on a spring, for which the optimal observer is known."""
 
 import io
 from dataclasses import replace
@@ -24,25 +24,25 @@ A = np.array([[np.cos(DT), np.sin(DT)], [-np.sin(DT), np.cos(DT)]])
 
 
 def both(seed, n=600):
-    """A run of which the position is both measured and among what is to be estimated."""
+    """A run with the position as both a measured and a hidden signal."""
     run = swing(seed, n=n)
     return replace(run, x=np.hstack([run.y, run.x]), signals=replace(run.signals, hidden=("position", "speed")))
 
 
 def trained(records, folder=None, *, resume=False, **changes):
-    """The result, and what was said on the way."""
-    said = Console(file=io.StringIO(), width=400)
+    """Train an observer from records; return the result and the printed text."""
+    printed = Console(file=io.StringIO(), width=400)
     source = RecordedSource(records, recorded_preset(records, {**SMALL, "flow_steps": 300, **changes}), "spring")
-    return train(source, folder=folder, resume=resume, device=CPU, console=said), said.file.getvalue()
+    return train(source, folder=folder, resume=resume, device=CPU, console=printed), printed.file.getvalue()
 
 
 @pytest.fixture(scope="module")
 def tracking(tmp_path_factory):
-    """An observer that tracks, as read from a file."""
+    """A tracking observer, saved and read."""
     path = tmp_path_factory.mktemp("spring") / "spring.safetensors"
-    result, said = trained([both(seed) for seed in range(10)], measurement_noise_max=2 * NOISE)
-    assert "the tracker predicts by a learned flow: records have no equations" in said
-    assert "does not track" not in said
+    result, printed = trained([both(seed) for seed in range(10)], measurement_noise_max=2 * NOISE)
+    assert "the tracker predicts by a learned flow: records have no equations" in printed
+    assert "does not track" not in printed
     assert list(result.losses) == ["inverse", "flow"]
     result.artifact.save(path)
     return Artifact.read(path)
@@ -62,7 +62,7 @@ def estimated(artifact, *, n=40, level=NOISE):
 
 
 def test_it_tracks_nearly_as_well_as_the_kalman_filter(tracking):
-    """The plant is linear, and what the flow is off by is small: the Kalman filter with its noise is the best."""
+    """The plant is linear and the flow's error small, so a Kalman filter with this error as noise is optimal."""
     C = np.array([[1.0, 0.0]])
     np.testing.assert_allclose(tracking.C, C, atol=1e-5)
     before, after = (
@@ -77,7 +77,7 @@ def test_it_tracks_nearly_as_well_as_the_kalman_filter(tracking):
 
 
 @pytest.mark.parametrize("level", [NOISE, 2 * NOISE])
-def test_regions_hold_what_they_should_on_new_records(tracking, level):
+def test_confidence_regions_on_new_records(tracking, level):
     for artifact in (tracking, replace(tracking, motion=None)):
         errors, covariances = estimated(artifact, level=level)
         assert 0.83 < np.mean(squared_distance(errors[:200], covariances[:200]) < chi_square(0.9, 2)) < 0.97
@@ -85,12 +85,12 @@ def test_regions_hold_what_they_should_on_new_records(tracking, level):
 
 def test_signals_that_are_not_among_the_hidden_ones_cannot_be_tracked(tmp_path):
     records = [swing(seed, jitter=0.1) for seed in range(6)]
-    result, said = trained(records)
-    assert "does not track: position is not a weighted sum of speed" in said
+    result, printed = trained(records)
+    assert "does not track: position is not a weighted sum of speed" in printed
     artifact = result.artifact
     assert (artifact.motion, artifact.limits, list(result.losses)) == (None, None, ["inverse"])
     assert artifact.inverse.error_covariance is not None
-    assert artifact.training["held_out_errors"]["speed"] < 0.2  # the derivative of a driven position
+    assert artifact.training["held_out_errors"]["speed"] < 0.2  # estimated as the derivative of a driven position
     artifact.save(tmp_path / "spring.safetensors")
     read = Artifact.read(tmp_path / "spring.safetensors")
     assert read.signals == {"measured": ["position"], "inputs": ["force"], "hidden": ["speed"]}
@@ -101,25 +101,25 @@ def test_signals_that_are_not_among_the_hidden_ones_cannot_be_tracked(tmp_path):
         read.check("spring", {}, dt=0.05, ny=1, nu=1)
 
 
-def test_without_enough_that_is_held_out_there_are_no_covariances(tmp_path):
+def test_without_enough_held_out_samples_there_are_no_covariances(tmp_path):
     records = [both(seed, n=300) for seed in range(3)]
     for share, reason in (
         (0.0, "held_out must be positive, got 0"),
         (0.03, "the held-out records have 24 samples"),
     ):
-        result, said = trained(records, held_out=share, inverse_steps=20, flow_steps=20)
-        assert "does not track: " in said
-        assert reason in said
+        result, printed = trained(records, held_out=share, inverse_steps=20, flow_steps=20)
+        assert "does not track: " in printed
+        assert reason in printed
         artifact = result.artifact
         assert (artifact.motion, artifact.inverse.error_covariance) == (None, None)
         assert artifact.C is not None
         source = RecordedSource(records, recorded_preset(records, {"held_out": share}), "speed")
-        write_report(tmp_path / "report.png", result, source)  # of the losses alone, where nothing is held out
+        write_report(tmp_path / "report.png", result, source)  # shows only losses if nothing is held out
 
 
 @pytest.mark.parametrize("lengths", [[600] * 3, [600, 900]], ids=["alike", "one-longest"])
 def test_the_report_draws_no_motion_twice(tracking, monkeypatch, tmp_path, lengths):
-    """The longest held-out motions are drawn: two, or one if the others are shorter."""
+    """The report shows the longest held-out motions: two, or one if the others are shorter."""
     drawn, records = [], [both(seed, n=n) for seed, n in enumerate(lengths)]
     monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.append(figure))
     source = RecordedSource(records, recorded_preset(records, SMALL), "spring")
@@ -145,27 +145,27 @@ def test_resuming_makes_the_same_observer(tmp_path):
         trained([*records[:2], both(7)], tmp_path, resume=True, **options)
 
 
-def test_estimates_do_not_hang_on_an_arbitrary_zero():
+def test_estimates_do_not_depend_on_an_arbitrary_zero():
     records, new = [both(seed) for seed in range(3)], resampled(swing(100), DT)
-    result, said = trained(records, inverse_steps=20, arbitrary_zero=("position",))
-    assert "does not track: a tracker compares position with its prediction" in said
+    result, printed = trained(records, inverse_steps=20, arbitrary_zero=("position",))
+    assert "does not track: a tracker compares position with its prediction" in printed
     here, there = (KKLObserver(result.artifact).estimate(new.y + offset, new.u) for offset in (0.0, 100.0))
     np.testing.assert_allclose(here, there, atol=1e-3 * new.x.std())
-    assert here[-1] != pytest.approx(here[-50])  # it does move
+    assert here[-1] != pytest.approx(here[-50])  # the estimate is not constant
     with pytest.raises(ValueError, match=r"arbitrary_zero names 'angle', but measured are position"):
         trained(records, arbitrary_zero=("angle",))
 
 
-def test_increments_are_between_samples_that_are_known():
+def test_increments_are_between_complete_samples():
     run = both(3)
     x, y = run.x.copy(), run.y.copy()
     x[100:200], y[300:400] = np.nan, np.nan
     records = [replace(run, x=x, y=y), both(4)]
     finer = replace(swing(9, n=1200, dt=DT / 2), x=np.zeros((1200, 2)), signals=run.signals)
     source = RecordedSource(records, recorded_preset(records), "a", held_out=[finer])
-    assert np.diff(source.held_out[0].t) == pytest.approx(DT)  # on the same grid
+    assert np.diff(source.held_out[0].t) == pytest.approx(DT)  # resampled to the training's dt
     found, _ = source.increments()
-    known = [k for k in range(599) if not (99 <= k < 200 or 299 <= k < 400)]  # a gap of outputs cuts a record
+    known = [k for k in range(599) if not (99 <= k < 200 or 299 <= k < 400)]  # a gap in the outputs splits a record
     np.testing.assert_allclose(found.x[: len(known)], run.x[known], atol=1e-9)
     np.testing.assert_allclose(found.change[: len(known)], np.diff(run.x, axis=0)[known], atol=1e-9)
     np.testing.assert_allclose(found.u[: len(known)], run.u[known], atol=1e-9)
@@ -178,7 +178,7 @@ def test_outputs_are_sums_of_states_or_an_error():
     rng, run = np.random.default_rng(0), both(0)
     for noise, off in ((0.01, 2e-3), (0.3, 0.05)):
         noisy = replace(run, y=run.y + noise * rng.standard_normal(run.y.shape))
-        noisy.y[5] = 1e3 if noise == 0.3 else noisy.y[5]  # one sample is wrong
+        noisy.y[5] = 1e3 if noise == 0.3 else noisy.y[5]  # one outlier
         C, least = linear_output([noisy])
         np.testing.assert_allclose(C, [[1.0, 0.0]], atol=off)
         assert least == pytest.approx(noise, rel=0.1)
@@ -199,7 +199,7 @@ def test_records_that_no_observer_can_be_learned_from():
         trained([swing(0, n=40)])
 
 
-def test_what_is_held_out():
+def test_split_into_training_and_held_out_records():
     records = [resampled(swing(seed, n=100)) for seed in range(10)]
     kept, held_out = split(records, 0.3, 0)
     assert (len(kept), {record.name for record in kept + held_out}) == (7, {record.name for record in records})
@@ -226,7 +226,7 @@ def test_the_rate_of_signals_is_their_angular_frequency():
 
 
 def test_signals_that_stand_still_in_each_record():
-    """They do not slow the filter down, and have no relative error."""
+    """Constant signals do not change the filter's eigenvalues, and have no relative error."""
     signals = replace(SIGNALS, measured=("position", "target"), hidden=("speed", "mass"))
     records = []
     for seed in range(6):

@@ -1,4 +1,4 @@
-"""Motions that a source simulates, and the equations that it hands to a tracker."""
+"""Simulated sources: motions for training and calibration, and equations for a tracker."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ class Stiff(VanDerPol):
 
 
 class Rubbing(Autonomous):
-    """Dry friction: a jump where the speed changes its sign."""
+    """The oscillator with dry friction, a jump where the speed changes sign."""
 
     name = "rubbing"
 
@@ -54,7 +54,7 @@ def test_increments_are_those_of_the_system():
     assert len(judged.x) == pytest.approx(len(learned.x) / 19, rel=0.01)
     later = simulate(system, judged.x[:500], 1, system.dt, u=judged.u[None, :500])[-1]
     np.testing.assert_allclose(judged.change[:500], later - judged.x[:500], atol=1e-12)
-    assert (judged.u == 0).all(-1).mean() == pytest.approx(0.75, abs=0.1)  # half of them, and half of the others
+    assert (judged.u == 0).all(-1).mean() == pytest.approx(0.75, abs=0.1)  # 1/2 + 1/2 * 1/2
 
 
 def test_motions_for_calibration_are_with_and_without_process_noise():

@@ -1,4 +1,4 @@
-"""Training trajectories, and a filter beside them."""
+"""Training trajectories."""
 
 import numpy as np
 import pytest
@@ -39,13 +39,13 @@ def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
     (w,) = seen
     assert np.array_equal(x, simulate(system, x[0], 50, 0.01, u=u, w=w))
     relative, level = w / (system.process_noise * np.array(system.scale)), level / system.process_noise
-    largest = np.abs(relative).max((0, 2))  # of 100 numbers, all but the level of a run
+    largest = np.abs(relative).max((0, 2))  # the largest of 100 uniform samples is close to the run's level
     assert (largest > 0).mean() == pytest.approx(0.25, abs=0.06)
     assert np.allclose(largest, level, atol=0.12)
     quantiles = np.quantile(level[largest > 0], [0.1, 0.5, 0.9])
     assert quantiles == pytest.approx(np.sqrt([0.1, 0.5, 0.9]), abs=0.12)
     assert np.abs(relative.mean((0, 1))).max() < 0.01
-    assert relative.std((0, 1)) == pytest.approx(relative.std(), rel=0.03)  # each component by its own scale
+    assert relative.std((0, 1)) == pytest.approx(relative.std(), rel=0.03)  # relative to the scale of each component
 
 
 def test_recording_ages_cover_start_transient_and_end():
@@ -67,7 +67,7 @@ def test_most_motions_start_in_a_larger_box_where_one_is_asked_for():
 
 
 class Integrator(System):
-    """x' = u: free motion stays where it is, and most driven motion escapes."""
+    """x' = u: without input the state is constant, and most driven motions escape."""
 
     name, X, bounds, u_max, G = "integrator", ((-0.5, 0.5),), ((-0.6, 0.6),), (1.0,), ((1.0,),)
 
@@ -78,7 +78,7 @@ class Integrator(System):
         return (x[0],)
 
 
-def test_what_escapes_is_replaced_by_its_like(monkeypatch):
+def test_escaped_motions_are_replaced_by_motions_of_the_same_kind(monkeypatch):
     n = 57
     monkeypatch.setattr(training.trajectories.motions, "CHUNK", 24)
     tried = []
@@ -90,7 +90,7 @@ def test_what_escapes_is_replaced_by_its_like(monkeypatch):
     monkeypatch.setattr(training.trajectories.motions, "simulate", spy)
     x, u, level, _ = Motions(Integrator(), 0.01, 200, KINDS).drawn(n, np.random.default_rng(0))
     u = u.swapaxes(0, 1)
-    assert sum(tried) > 1.2 * n  # so many escaped that the kinds of those that stayed are others
+    assert sum(tried) > 1.2 * n  # many motions escaped, most of them driven
     assert x.shape == (201, n, 1)
     assert (np.abs(x) <= 0.6).all()
     assert not level.any()

@@ -1,4 +1,4 @@
-"""Outputs as data that say what the system says."""
+"""Outputs of systems as expressions with the same values."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from training.trajectories.equations import field_expression, output_expression,
 
 @dataclass(frozen=True)
 class Everything(System):
-    """Every elementary function once."""
+    """A system whose output uses every elementary function."""
 
     length: float = 1.5
 

@@ -1,4 +1,4 @@
-"""A system whose parameters are states."""
+"""Systems with parameters as additional states."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from training.trajectories.parameters import NOMINAL_SHARE, relative_ranges, wit
 
 @dataclass(frozen=True)
 class Motor(System):
-    """One whose input matrix and output hold parameters."""
+    """A system with parameters in the input matrix and in the output."""
 
     gain: float = 2.0
     offset: float = 0.5
@@ -58,7 +58,7 @@ def test_ranges_about_the_values():
     assert with_parameters(lorenz, {}) is lorenz
 
 
-def test_ranges_that_make_no_sense():
+def test_invalid_ranges_are_refused():
     for system, widths, message in (
         (Lorenz(), {"nu": 0.1}, "no parameter 'nu' to be uncertain; it has sigma, rho, beta"),
         (Lorenz(beta=0.0), {"all": 0.1}, "beta of lorenz is 0, which has no relative range: exclude it by beta=0"),
@@ -80,15 +80,15 @@ def test_trainings_have_the_nominal_parameters_or_some_towards_the_ends():
     own = [system.sigma, system.beta]
     nominal = (drawn == own).all(-1)
     assert nominal.mean() == pytest.approx(NOMINAL_SHARE**2, abs=0.02)
-    assert (nominal == (drawn == own).any(-1)).all()  # both or neither
+    assert (nominal == (drawn == own).any(-1)).all()  # both parameters are nominal, or neither
     share = (drawn[~nominal] / own - 1) / [0.1, 0.3]
     assert np.abs(share).max() <= 1 + 1e-12
-    for part in (0.5, 0.9):  # of the half-width; the sine of an even angle stays below it so often
+    for part in (0.5, 0.9):  # shares of the half-width: sines of uniform angles
         assert (np.abs(share) < part).mean(0) == pytest.approx(2 * np.arcsin(part) / np.pi, abs=0.02)
     assert np.corrcoef(share.T)[0, 1] == pytest.approx(0, abs=0.03)
 
 
-def test_a_bias_of_an_output_is_a_state_that_stands_still():
+def test_a_bias_of_an_output_is_a_constant_state():
     system = with_bias(Motor(gain=3.0, offset=0.25), 0.5)
     assert (system.nx, system.state_names[1:], system.X[1]) == (2, ("y1_bias",), (-0.5, 0.5))
     x0 = np.array([[0.4, -0.3]])

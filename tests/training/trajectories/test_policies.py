@@ -1,4 +1,4 @@
-"""Motions under a policy."""
+"""Motions under a policy, and errors of policies."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ SYSTEM = Falling()
 
 
 def exact(x):
-    """What the policy does on the true states."""
+    """The inputs of the policy at the true states."""
     return controller(SYSTEM, SYSTEM.dt)(x[:-1].reshape(-1, 2)).reshape(len(x) - 1, -1, 1) * SYSTEM.u_max
 
 
@@ -37,7 +37,7 @@ def test_actions_that_are_no_numbers_are_an_error():
                      dt=SYSTEM.dt, rng=rng, own=own)  # fmt: skip
 
 
-def test_a_policy_that_fails_on_the_way_says_where(tmp_path):
+def test_errors_of_a_policy_name_the_place(tmp_path):
     script = tmp_path / "mine.py"
     script.write_text("def hold(x):\n    return x[:, :1] if len(x) < 30 else x.gain if len(x) == 30 else x\n")
     policy = named_policy(SYSTEM, f"{script}:hold", SYSTEM.dt)
@@ -58,7 +58,7 @@ def test_an_unstable_plant_is_held_by_a_policy_alone():
     assert level.any()
 
 
-def test_what_is_no_policy(tmp_path):
+def test_invalid_policies_are_refused(tmp_path):
     (tmp_path / "bad.py").write_text(
         "def loud(x):\n    return 3.0 * (x[:, :1] > 0)\n\ndef wrong(x):\n    return x.nothing\n"
     )
@@ -75,7 +75,7 @@ def test_what_is_no_policy(tmp_path):
             named_policy(system, name, None)
 
 
-def test_a_system_that_no_regulator_holds():
+def test_a_system_that_no_regulator_stabilises():
     sizes = {
         "X": ((-0.3, 0.3), (-0.5, 0.5), (-1, 1)),
         "bounds": ((-2, 2), (-5, 5), (-3, 3)),
