@@ -83,7 +83,8 @@ class Train:
 
     def result(self, out):
         artifact = Artifact.read(out / "van_der_pol.safetensors")
-        history = {key: value for key, value in artifact.training.items() if key not in ("seconds", "resumed")}
+        spent = ("seconds", "cpu_seconds_spent", "resumed")
+        history = {key: value for key, value in artifact.training.items() if key not in spent}
         maps = (artifact.inverse, artifact.free_inverse)
         weights = [array.tobytes() for found in maps for array in (*found.mlp.weights, *found.mlp.biases, found.whiten)]
         return history, weights, (out / "report.png").stat().st_size > 10_000
