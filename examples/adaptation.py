@@ -1,6 +1,6 @@
-"""Adapt a shipped observer to a plant that differs from its model, from outputs only, and test it on the plant.
+"""Adapt a shipped observer, by outputs alone, to a plant that differs from the observer's model, and test the result.
 
-Every parameter of the plant is 10 % larger than in the observer's model. The records hold only t and y::
+Every parameter of the plant is 10 % larger than in the model. The plant's records hold only t and y. Usage::
 
     python examples/adaptation.py lorenz --noise 0.5
 

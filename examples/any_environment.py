@@ -121,7 +121,7 @@ def main(
         batches: training batches of each network.
         members: number of networks, whose outputs are averaged.
         noise: standard deviation of the measurement noise. With noise the observer estimates all signals and
-            tracks them. The policy then acts on these estimates, on those of T_inv alone, and on the true signals.
+            tracks them. The policy is run three times: on these estimates, on those of T_inv alone, and on the truth.
         seed: seed of all random numbers.
     """
     measured, hidden, policy = CASES[env_id]

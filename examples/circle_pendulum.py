@@ -1,6 +1,6 @@
 """An angle on a circle: a pendulum that can turn over. The state holds the cosine and sine of its angle.
 
-The same from the command line::
+To train such an observer from the command line, with the default settings::
 
     kkl-gym train examples/circle_pendulum.py:CirclePendulum
 

@@ -1,4 +1,4 @@
-"""Identify parameters and train an observer from outputs only, and compare them with the simulated plant.
+"""Identify a simulated plant from its outputs only, train an observer on the result, and print the errors of both.
 
 The records hold only t and y. First guesses of the parameters are 25 to 50 % off::
 
@@ -10,6 +10,7 @@ docs/guides/identification.md explains the method, and docs/results/identificati
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -52,7 +53,7 @@ class Found:
 
 
 def main(
-    system: tyro.conf.Positional[str],
+    system: tyro.conf.Positional[Literal["reverse_duffing", "van_der_pol", "rossler", "lorenz"]],
     noise: float = 0.0,
     process_noise: float = 0.0,
     records: int = 60,
@@ -64,7 +65,7 @@ def main(
     """Simulate records of a plant, identify it from its outputs, and print all errors.
 
     Args:
-        system: reverse_duffing, van_der_pol, rossler or lorenz.
+        system: the plant.
         noise: standard deviation of the measurement noise.
         process_noise: level of process noise in the records; environments have 0.05.
         records: number of records.

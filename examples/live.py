@@ -1,4 +1,4 @@
-"""Show an environment and its observer in a window, with sliders for noise and input, sensor faults, and keys.
+"""Show an environment and its observer in a window; sliders set noise and input, buttons choose a sensor fault.
 
 For your own system: ``python examples/live.py --system script.py --observer runs/NAME/NAME.safetensors``.
 """

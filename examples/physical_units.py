@@ -1,6 +1,6 @@
 """Three plants in physical units: minutes and seconds, kelvin and mol/l, volts and amperes.
 
-Scales, sampling and noise have their defaults, which follow from the equations and the training box::
+Scales, sampling and noise have defaults that follow from the equations and the training box. Try::
 
     kkl-gym diagnose examples/physical_units.py:StirredTank
     kkl-gym train examples/physical_units.py:StirredTank
@@ -36,7 +36,6 @@ class StirredTank(System):
     X: ClassVar = ((0.1, 1.0), (310.0, 390.0))
     bounds: ClassVar = ((0.0, 2.0), (200.0, 600.0))
     u_max: ClassVar = (5.0,)  # K
-    G: ClassVar = ((0.0,), (2.092,))
 
     @property
     def target(self):
@@ -49,6 +48,10 @@ class StirredTank(System):
         reaction = self.k0 * exp(-self.E / T) * c
         warming = self.q * (self.T_feed - T) + self.heat * reaction + self.cooling * (self.T_jacket - T)
         return self.q * (self.c_feed - c) - reaction, warming
+
+    def g(self, x):
+        """Input gain."""
+        return (0.0,), (self.cooling,)
 
     def h(self, x):
         """Output."""
@@ -109,13 +112,16 @@ class Motor(System):
     X: ClassVar = ((-10.0, 10.0), (-300.0, 300.0))
     bounds: ClassVar = ((-60.0, 60.0), (-1000.0, 1000.0))
     u_max: ClassVar = (24.0,)  # V
-    G: ClassVar = ((1 / 2e-3,), (0.0,))
 
     def f(self, x):
         """Drift."""
         i, w = x
         torque = self.flux * i - self.drag * w * abs(w)
         return (-self.resistance * i - self.flux * w) / self.inductance, torque / self.inertia
+
+    def g(self, x):
+        """Input gain."""
+        return (1 / self.inductance,), (0.0,)
 
     def h(self, x):
         """Output."""

@@ -122,7 +122,7 @@ def main(
     path
         Folder with run01.csv to run12.csv.
     out
-        Folder of the runs, which resume from their checkpoints; receives qube.safetensors, table.md and estimates.png.
+        Folder of the trainings, which resume from checkpoints; receives qube.safetensors, table.md and estimates.png.
     cross_validate
         Evaluate the settings on the training runs instead: hold out each half of them once; the test runs are not read.
     inverse_steps
@@ -322,7 +322,7 @@ def errors(x_hat: Sequence[np.ndarray], records: Sequence[Record]) -> np.ndarray
 def draw(
     path: Path, estimators: Mapping[str, Sequence[np.ndarray]], records: Sequence[Record], titles: Sequence[str]
 ) -> None:
-    """Draw the first seconds of the runs, one in each column: a recorded signal, and the errors of two signals."""
+    """Draw the first seconds of each run in its own column: a recorded signal, and the errors of two signals."""
     names, shown, smooth = ("sin(alpha)", "alpha_dot"), slice(0, round(SHOWN / DT)), np.ones(AVERAGED) / AVERAGED
     of = [SIGNALS.hidden.index(name) for name in names]
     # Finite differences give no estimates of alpha.

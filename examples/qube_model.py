@@ -18,8 +18,8 @@ class Qube(kkl_gym.System):
     The defaults are the published model, without dry friction and without the spring of the arm's cable.
 
     Lengths, masses and inertias are those of Quanser's script qube2_rotpen_param.m; the arm's inertia is that of a rod,
-    mass length^2 / 12. The script's damping is much larger than in these runs, so both damping coefficients are those
-    of BlueRiverTech's quanser-openai-driver, file qube_simulator.py. The motor's terminals are open.
+    mass length^2 / 12. The script's damping is much larger than in the runs of qube.py, so both damping coefficients
+    are those of BlueRiverTech's quanser-openai-driver, file qube_simulator.py. The motor's terminals are open.
     """
 
     gravity: float = 9.81  # m/s^2

@@ -122,7 +122,8 @@ def _read(
     least: float = -math.inf,
 ) -> None:
     """Check the shape and the limits of a class variable, and convert it to tuples."""
-    if isinstance(getattr(cls, name), property):  # the value is computed from other attributes
+    # The value may be computed from other attributes, except where the sizes follow from it.
+    if isinstance(getattr(cls, name), property) and name not in ("X", "bounds", "u_max"):
         return
     try:
         numbers = _numbers(getattr(cls, name), shape)

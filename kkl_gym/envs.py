@@ -150,7 +150,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
-        # The last observation. An observer wrapper outside compares it with the observation that it receives.
+        # The last observation. An outer observer wrapper raises an error if it receives another one.
         self.emitted = b""
         # Number of observer wrappers outside. The outermost draws the window; 0: the environment draws it.
         self.drawn_by = 0

@@ -32,7 +32,7 @@ class EquationError(ValueError):
     """A user's equations failed, or returned an invalid value.
 
     The message names the system, the equation, its file and line and, where known, the argument and a fix. If the
-    equations raised an exception, it is the cause.
+    equations raised an exception, ``__cause__`` holds it.
     """
 
 

@@ -23,12 +23,12 @@ def source_of(env: Any) -> str:
 
 
 def check_autoreset(env: Any) -> None:
-    """Raise ValueError for an Autoreset wrapper, whose step may start the next episode, except inside Async vectors."""
+    """Raise ValueError for an Autoreset wrapper, whose step may start an episode; Async vectors are not searched."""
     base = env.unwrapped
     for one in base.envs if isinstance(base, gym.vector.SyncVectorEnv) else [env]:
         while isinstance(one, gym.Wrapper):
             if isinstance(one, gym.wrappers.Autoreset):
-                raise ValueError("the wrapper Autoreset inside hides where episodes begin: put it outside")
+                raise ValueError("the wrapper Autoreset hides where episodes begin: put it outside")
             one = one.env
 
 

@@ -20,7 +20,8 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
     where, _, class_name = name.rpartition(":") if ":" in name else (name, "", "")
     failure = f"cannot load the {base.__name__.lower()} {name!r}"
     module = _imported(where, failure)
-    own = [key for key, value in vars(module).items() if _is_own(value, base, module.__name__)]
+    named = {value: key for key, value in vars(module).items() if _is_own(value, base, module.__name__)}
+    own = list(named.values())
     if not class_name and len(own) == 1:
         (class_name,) = own
     found = getattr(module, class_name, None)
@@ -97,4 +98,5 @@ def _importing_from(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        sys.path.remove(str(folder))
+        with contextlib.suppress(ValueError):  # the script may have removed it
+            sys.path.remove(str(folder))

@@ -26,8 +26,8 @@ class Outputs:
     """The measured outputs in an environment's observations.
 
     The order is that of :func:`gymnasium.spaces.flatten`: boxes row by row, the parts of a Dict or Tuple one after the
-    other, and Discrete values one-hot. Keys of a Dict that are not measured are not read, nor are images among its
-    measured keys.
+    other, and Discrete values one-hot. If ``measured`` is None or holds keys, only measured keys of a Dict are read,
+    and of these no images.
     """
 
     def __init__(

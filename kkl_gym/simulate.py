@@ -17,8 +17,8 @@ from kkl_gym.system import Components, System, dot, rate_under
 from observers.checks import check_dt
 
 # Largest rate * substep where a system has a formula for its rate. It is half of the largest value at which every
-# shipped system, from anywhere in twice its training box, keeps the error after 10 s below 1e-5 of the motion's size
-# (tests/kkl_gym/test_simulate.py).
+# shipped system, from anywhere in twice its training box, keeps the error after 10 s (Lorenz: 2 s) below 1e-5 of the
+# motion's size (tests/kkl_gym/test_simulate.py).
 RATE_STEP = 0.4
 # This is a millionth less than 1 / RATE_STEP. Without this margin, two rates that differ only by rounding could get
 # different numbers of substeps where rate * dt / RATE_STEP is a power of two.
@@ -350,9 +350,10 @@ def check_interval(system: System, dt: float) -> None:
     if not system.discrete:
         rate = float(rate_under(system, tuple(np.mean(system.X, axis=1).tolist()), system.u_max))
         if rate * dt * PER_RATE > MAX_SUBSTEPS:
+            longest = 0.95 * MAX_SUBSTEPS / PER_RATE / rate  # the two digits below may be rounded up by 5 %
             raise SubstepsError(
                 f"{system.name} changes at a rate of {rate:.4g}/s in the middle of X, for which dt = {dt:g} s would "
-                f"need more than {MAX_SUBSTEPS} substeps: take dt <= {MAX_SUBSTEPS / PER_RATE / rate:.2g} s"
+                f"need more than {MAX_SUBSTEPS} substeps: take dt <= {longest:.2g} s"
             )
     elif not math.isclose(dt, system.dt, rel_tol=1e-9):
         raise ValueError(f"{system.name} makes only steps of dt = {system.dt} s: got dt = {dt}")

@@ -58,8 +58,8 @@ class ReverseDuffing(System):
 class VanDerPol(System):
     """Van der Pol oscillator (paper, sec. 8, eq. vdp), y = x1, input on x2.
 
-    x1' = x2, x2' = mu (1 - x1^2) x2 - x1 + u. Dimensionless; the origin is unstable and every other motion tends
-    to the limit cycle. Far from the limit cycle the system is stiff: d(x2')/d(x2) = -297 at x1 = 10.
+    x1' = x2, x2' = mu (1 - x1^2) x2 - x1 + u. Dimensionless; the origin is unstable, and motions from all other
+    states tend to the limit cycle. Far from the limit cycle the system is stiff: d(x2')/d(x2) = -297 at x1 = 10.
 
     Parameters
     ----------

@@ -33,10 +33,10 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     and states agree to rounding. ``info`` holds the same keys, as arrays with a row for each environment. For each key
     a mask ``_key`` marks the rows that reported it, as in Gymnasium's own vector environments.
 
-    **Autoreset modes.** ``NEXT_STEP``: the step after a row's episode ends ignores the row's action and resets the row.
-    ``SAME_STEP``: the row is reset at once; ``info["final_obs"]`` and ``info["final_info"]`` hold the episode's last
-    observation and info. ``DISABLED``: a row stays at its episode's end, with reward 0 and its flags still set, until
-    ``reset(options={"reset_mask": mask})``. While a row stays there, its ``u`` and ``escaped`` are not reported.
+    **Autoreset modes.** ``"NextStep"``: the step after a row's episode ends ignores the row's action and resets the
+    row. ``"SameStep"``: the row is reset at once; ``info["final_obs"]`` and ``info["final_info"]`` hold the episode's
+    last observation and info. ``"Disabled"``: a row stays at its episode's end, with reward 0 and its flags still set,
+    until ``reset(options={"reset_mask": mask})``. While a row stays there, its ``u`` and ``escaped`` are not reported.
 
     Parameters
     ----------
@@ -394,7 +394,7 @@ def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any]
 
 
 def autoreset_mode_of(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's autoreset mode, given as such or by its name, or raise ValueError."""
+    """Return Gymnasium's autoreset mode, given as such or as a text like "NextStep", or raise ValueError."""
     if isinstance(mode, AutoresetMode):
         return mode
     return AutoresetMode(choice("autoreset_mode", mode, [known.value for known in AutoresetMode]))

@@ -100,7 +100,7 @@ class Decoder:
         given = modes + len(self._conditions)
         bias = bias + self._offset @ weight[:modes] + np.array(self._conditions, dtype=float) @ weight[modes:given]
         of_age = weight[given] if self._needs_age else np.zeros_like(bias)
-        first = np.vstack([bias, of_age, self._whiten @ weight[:modes]])  # (2 + size, outputs)
+        first = np.vstack([bias, of_age, self._whiten @ weight[:modes]])  # (2 + size, width of the layer)
         units = np.array([inverse.x_offset, inverse.x_scale], dtype=float)
         ages = np.array([inverse.age_unit, inverse.age_max if self._needs_age else 0.0], dtype=float)
         return first, units, ages, *inverse.mlp.packed(1)

@@ -72,9 +72,8 @@ class KKLObserver(RecordEstimates):
     ImportError
         If ``compiled`` is True and Numba is not installed.
     ValueError
-        If an argument has the wrong type, a noise level is negative or beyond 1e12, the measurement noise is beyond
-        the map's range, it differs between outputs but the map takes one level for all, or the artifact lacks the
-        motion or the limits that an argument needs.
+        If an argument has the wrong type or is out of range, the levels of measurement noise differ between outputs
+        but the map takes one level for all, or the artifact lacks the motion or the limits that an argument needs.
     """
 
     def __init__(
@@ -204,8 +203,8 @@ class KKLObserver(RecordEstimates):
         y0 : array_like, shape (..., ny)
             The sample; its shape sets the batch.
         x0 : array_like, shape (..., nx), optional
-            The state, if it is known. With T, the filter then starts at z_y = T(x0) and z_u = 0, as if it had always
-            followed a motion without input, so without transient. An observer that tracks starts at x0 itself, limited
+            The state, if it is known. With T, the filter then starts without transient: at z_y = T(x0) and z_u = 0, as
+            if it had always followed a motion without input. An observer that tracks starts at x0 itself, limited
             to the states' bounds, with or without T. If x0 is known in some rows only, pass it to :meth:`restart`.
 
         Returns
@@ -315,8 +314,8 @@ class KKLObserver(RecordEstimates):
         ------
         ValueError
             If a shape is wrong, an entry is not a finite real number (apart from NaN in ``y``), a nonzero input is
-            given to a map without inputs, ``dt`` does not suit the motion model, or ``dt`` and a delay are both given.
-            The observer is then unchanged.
+            given to a map without inputs, ``dt`` is not as described above, or ``dt`` and a delay are both given. The
+            observer is then unchanged.
         RuntimeError
             Before :meth:`reset`.
         """

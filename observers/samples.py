@@ -64,8 +64,8 @@ def check_replacement(artifact: Artifact, other: Artifact) -> None:
     for what, here in _shared(artifact).items():
         if here != there[what]:
             raise ArtifactError(
-                f"the observer in use has {what} {shown(here)}, the replacement {shown(there[what])}: only their maps "
-                "may differ; make a new observer or wrapper instead"
+                f"the observer in use has {what} {shown(here)}, the replacement {shown(there[what])}: both must "
+                "agree; make a new observer or wrapper instead"
             )
     for name in ("A", "B", "dt"):
         mine, others = (np.asarray(getattr(each.filter, name)) for each in (artifact, other))

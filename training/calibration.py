@@ -22,7 +22,7 @@ from training.trajectories.motions import filter_states
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # measurement noise, in multiples of the largest level in training
 # Times since reset, in units of the source's ``pace``.
 AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)
-# Samples of each run around each age (four times as many at the last), as all motions may be in phase at one age.
+# Samples of each run around each age (four times as many at the last), because motions may be in phase at one age.
 PER_AGE = 6
 FEWEST = 50  # least number of errors for a covariance or a quantile
 LEAST_VARIANCE = 1e-6  # added to the variance of each state's error, as a fraction of the state's squared range

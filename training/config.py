@@ -95,7 +95,7 @@ class Config:
     (n, nu) in [-1, 1], as script.py:function or module:function. It sees states with errors and explores, except in one
     trajectory in twelve. With a policy, no motions without inputs are simulated."""
     free_inverse: bool = True
-    """Whether an input-aware map has a second inverse of z_y alone, used until an input acts; never with a policy."""
+    """Whether an input-aware map has a second inverse of z_y alone, used until an input acts; none with a policy."""
     lead_in_input: NotNegative = 0.0
     """Before some trajectories without inputs, inputs lead the start out of X: constant inputs, up to this multiple of
     their bounds, for 20 of the system's time units (pace); with 0, random inputs within bounds for 10 units."""
@@ -109,7 +109,7 @@ class Config:
     """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
     measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
     windows: Count = 8000
-    """Number of recorded states for each time since the filter's start; it starts that long before each."""
+    """Number of recorded states for each time since reset; the filter starts that long before each state (records)."""
     members: Count = 1
     """Number of networks with different seeds, averaged into one wide network, as they extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()
@@ -124,7 +124,7 @@ class Config:
     runs: Annotated[int, Field(ge=100)] = 400
     """Number of simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability of an alarm in a fault-free motion of the calibration's length (systems: 20 times the pace)."""
+    """Probability of an alarm in a fault-free motion as long as a calibration motion (systems: 20 times the pace)."""
     truncation: Positive = 1e-6
     """epsilon: the forward map's data begins once the filter's start adds at most this to z (spinn, paper sec. 5.2)."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)

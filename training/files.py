@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a run's folder and write its configuration; raise ValueError if checkpoints there must not be resumed."""
+    """Lock a run's folder and write its configuration; ValueError if its checkpoints are another run's or unwanted."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)

@@ -1,4 +1,4 @@
-"""Extended Kalman filters that know the equations of motion, as a baseline, and the Cramér-Rao bound."""
+"""The Cramér-Rao bound, and a baseline: extended Kalman filters that know the equations of motion."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -30,7 +30,7 @@ from training.spectrum import Spectrum, check_continuous
 
 # Size and training of the flow's network.
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
-LEAST = 0.01  # the loss divides errors by the scaled residual's mean square plus this, lest tiny residuals dominate
+LEAST = 0.01  # the loss divides squared errors by the residual's mean square plus this, lest tiny residuals dominate
 LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, as a fraction of the increments' rms
 
 

@@ -95,7 +95,7 @@ PROFILES: dict[str, Profile] = {
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
         # Under noise, real modes hardly distinguish the parameters, but slow pairs at frequencies of y do: the first
-        # two reduce the best T_inv's error from 2.3 to 1.9 % (parameters 10 % off). More training cut T_inv's by 3 %.
+        # two cut the best T_inv's error from 2.3 to 1.9 % (parameters 10 % off). More training cut the error by 3 %.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,

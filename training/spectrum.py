@@ -72,7 +72,7 @@ def smoothness(system: System, spectra: Iterable[Spectrum], dt: float) -> Iterat
     """Yield for each spectrum the exponents (ny * modes,) of z between neighbouring states, as ``SMOOTH`` defines them.
 
     Motions without input are simulated once, half of them from X and half from 1.5 X, and all filters run along them.
-    Only states count at which at most a millionth of a filter's start is left; exponents are NaN if there are too few.
+    A state counts only after a filter's start has decayed to a millionth; exponents are NaN if too few states count.
     """
     check_continuous(system)
     rate = system.typical_rate

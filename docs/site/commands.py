@@ -71,7 +71,7 @@ def parsers(prog: str, commands: Commands) -> Iterator[tuple[str, argparse.Argum
         with warnings.catch_warnings():  # only this function of tyro lists the options
             warnings.simplefilter("ignore", DeprecationWarning)
             parser = tyro.extras.get_parser(command, config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff))
-        # without numpydoc's sections, which are for readers of the code
+        # numpydoc's sections are left out; they are for readers of the code
         yield f"{prog} {name}", parser, re.split(r"\n\n(?=\w+\n---)", inspect.getdoc(command) or "")[0]
         for action in parser._actions:
             if isinstance(action.choices, dict):
@@ -108,7 +108,7 @@ def text(written: str, between: str = " ") -> str:
 
 @dataclass(frozen=True)
 class Other(System):
-    """An oscillator of 1e5 rad/s and a size of 1e-5; settings that it shares with a shipped system are general."""
+    """An oscillator of frequency 1e5 rad/s and size 1e-5; defaults that it shares with a shipped system are general."""
 
     name = "other"
     X = ((-1e-5, 1e-5), (-1e-5, 1e-5))

@@ -19,7 +19,7 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).resolve().parents[2]
 BRANCH = "main"
 NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
-EXECUTED = ROOT / "runs" / "notebooks"  # make docs writes executed notebooks here
+EXECUTED = ROOT / "runs" / "notebooks"  # ``make docs`` writes executed notebooks here
 # Files outside docs/ that are pages of the site, each with its place under docs/.
 SHOWN: Mapping[str, str] = {
     "CONTRIBUTING.md": "development/contributing.md",
@@ -29,9 +29,9 @@ SHOWN: Mapping[str, str] = {
 WIDE = 1.5  # ratio of width to height above which pictures scroll on phones
 ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>~?")  # Sphinx roles in docstrings
 FETCHED = re.compile(r'<(?:script|link|img)[^>]+(?:src|href)="?(https?://[^" >]+)')
-# Blocks and spans of code, which contain no links; then the target of a link or an image.
+# A block or span of code, to be left as it is, or the target of a link or an image.
 LINK = re.compile(r"^```.*?^```|`[^`\n]*`|\]\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
-# The same code, then an image and its file.
+# A block or span of code, to be left as it is, or an image and its file.
 IMAGE = re.compile(r"^```.*?^```|`[^`\n]*`|(!\[[^\]]*\])\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
 
 # The HTML of pymdownx.arithmatex for $inline$ and $$displayed$$ formulas.
@@ -63,7 +63,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Show Sphinx's roles of docstrings as code, because Markdown has no roles, and formulas as MathML."""
+    """Show formulas as MathML, and Sphinx's roles in docstrings as code, because Markdown has no roles."""
     return typeset(ROLE.sub("<code>", html))
 
 

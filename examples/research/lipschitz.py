@@ -1,4 +1,4 @@
-"""``python -m examples.research lipschitz``: a rigorous bound on the change of an estimate by an error of z."""
+"""``python -m examples.research lipschitz``: a rigorous bound on how much an error of z changes an estimate."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,8 +98,8 @@ def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
         return norm_product(mlp)
     low, high = SLOPES[mlp.activation]
     weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in mlp.weights]
-    # The certificate holds for every diagonal matrix D > M. Here D = diag(M) e^shape, times the least factor
-    # that gives D >= M, times 1 + e^margin. The start, zeros, gives D = 2 M for diagonal M, which is optimal for tanh.
+    # The certificate holds for every diagonal matrix D > M. Here D = diag(M) e^shape, times the least factor that
+    # gives D >= M, times 1 + e^margin. Both exponents start at 0, where a diagonal M gives D = 2 M, optimal for tanh.
     shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
     margins = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in weights[:-1]]
 

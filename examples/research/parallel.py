@@ -31,17 +31,18 @@ class Engine:
         workers = min(self.workers, len(todo))
         attempt = delayed(partial(_attempt, run, Path.cwd()))
         while todo:
-            suspects = {index: job for index, job in todo.items() if lost[index]}
             # Each worker has one job at a time, so the job of a dead worker is among the first ones that are not done.
-            # Each of these suspects then runs by itself.
+            # Each of these suspects then runs by itself, since joblib may drop results of jobs beside a dead worker.
+            suspects = [index for index in todo if lost[index]]
             handed = 1 if suspects else workers
+            begun = suspects[:1] or list(todo)
             # With one worker, joblib would run jobs in this process, and a job could kill it.
             parallel = Parallel(max(2, workers), return_as="generator_unordered", batch_size=1, pre_dispatch=handed)
             try:
-                for index, failure in parallel([attempt(*item) for item in (suspects or todo).items()]):
+                for index, failure in parallel([attempt(index, todo[index]) for index in begun]):
                     yield todo.pop(index), failure
             except Exception as error:  # a worker died; errors of jobs are returned as text
-                for index in [index for index in suspects or todo if index in todo][:handed]:
+                for index in [index for index in begun if index in todo][:handed]:
                     lost[index] += 1
                     if lost[index] == TRIES:
                         yield todo.pop(index), f"was lost {TRIES} times with its worker: {error}"

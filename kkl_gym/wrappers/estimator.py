@@ -17,7 +17,7 @@ from observers.names import resolve
 
 
 class Estimates:
-    """Adapts any state estimator to the calls of :class:`VectorEstimate`; it ignores true starts ``x0``."""
+    """Adapts any state estimator to the calls of :class:`VectorEstimate`; the true starts ``x0`` are ignored."""
 
     def __init__(self, estimator: Estimator[Any], space: gym.spaces.Box) -> None:
         self._running, self.space = Running(estimator), space

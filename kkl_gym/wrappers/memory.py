@@ -293,7 +293,7 @@ class KKLVectorMemory(VectorWrapper):
         u = of.inputs(actions, batch)
         obs, reward, terminated, truncated, info = self.env.step(actions)
         ended, same = terminated | truncated, self.autoreset_mode is AutoresetMode.SAME_STEP
-        resting = self.autoreset_mode is AutoresetMode.DISABLED  # rows that have ended then wait for a reset
+        resting = self.autoreset_mode is AutoresetMode.DISABLED  # ended rows wait for a reset
         fresh = ended if same else before & (not resting)
         last, flat = self._flat, of.read(obs, batch, np.where(fresh[:, None], np.nan, self._flat))
         self._flat, self._ended = flat, ended & (not same)

@@ -113,7 +113,7 @@ class Samples:
         return y, x.get("x", self._nothing)
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return outputs after a step and the inputs that led to them; sets ``u``, ``sample`` and ``x`` in ``info``."""
+        """Return outputs after a step and the inputs that led to them; sets ``u``, ``sample`` and, if shown, ``x``."""
         y, u = self.outputs(observation, info), self.inputs(action)
         x = self.states(observation, info)
         info.pop("x", None)

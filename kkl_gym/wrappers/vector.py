@@ -57,7 +57,7 @@ class VectorEstimate(VectorWrapper):
         options, mask = with_mask(options, self.num_envs)
         inner, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self._check_untouched(inner, at_reset=True)
-        if not isinstance(info, dict) or not isinstance(info["y"], np.ndarray):
+        if not isinstance(info, dict) or not isinstance(info.get("y"), np.ndarray):
             raise ValueError(
                 f"the observer reads info['y'] as an array, and {shown(self.env)} changes info: put wrappers such as "
                 "DictInfoToList and NumpyToTorch outside"

@@ -65,6 +65,7 @@ def test_lists_arrays_and_numbers_of_numpy_become_tuples_of_numbers():
         ({"name": LEFT_OUT}, "Tank must set the class variables name, X and bounds; it lacks name"),
         ({"name": "a/b"}, "name = 'a/b' must be a text without slash"),
         ({"X": ((math.nan, 1), (-1, 1))}, "X = ((nan, 1), (-1, 1)) must be (low, high) for each state"),
+        ({"X": property(lambda self: ((-1, 1), (-1, 1)))}, "must be (low, high) for each state, as in"),
         ({"X": ((-1, 1), (1, 1))}, "X[1] = (1, 1) must be (low, high) with low < high"),
         ({"X": ((-1, 1), (-3, 1))}, "X[1] = (-3, 1) must be within bounds[1] = (-2, 2)"),
         ({"bounds": ((-2, 2),)}, "Tank: X has 2 states and bounds has 1"),

@@ -275,5 +275,5 @@ def test_arrays_that_an_environment_uses_again_are_copied(mode):
 @pytest.mark.parametrize("kind", [KKLMemory, KKLVectorMemory])
 def test_autoreset_inside_is_refused(kind):
     env = gym.wrappers.Autoreset(gym.make("Pendulum-v1"))
-    with pytest.raises(ValueError, match="Autoreset inside hides where episodes begin"):
+    with pytest.raises(ValueError, match="Autoreset hides where episodes begin"):
         kind(env if kind is KKLMemory else SyncVectorEnv([lambda: env]))

@@ -216,7 +216,7 @@ class Export:
 
 @dataclass(frozen=True)
 class Import:
-    """Convert an agent of stable-baselines3 or rl-zoo3; for a system it must have learned in training.agents.OnTask.
+    """Convert an agent of stable-baselines3 or rl-zoo3. Agents of systems must have learned in training.agents.OnTask.
 
     Writes agent.safetensors for kkl-gym agent evaluate. Nothing is unpickled.
     """

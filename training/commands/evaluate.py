@@ -401,5 +401,5 @@ def spread(values: np.ndarray) -> str:
 
 
 def percent(value: float) -> str:
-    """Return an NRMSE, which is NaN for a constant state, as text."""
+    """Return an error in percent as text; the NRMSE of a constant state is NaN."""
     return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.2f}"

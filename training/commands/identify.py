@@ -34,12 +34,12 @@ FARTHEST = 10.0  # largest factor between a parameter without limits and its fir
 class Identify:
     """Learn a plant's unknown parameters, and an observer for it, from records of its outputs and inputs.
 
-    No recorded state is needed. Multiple shooting fits the parameters, with standard errors, and the initial state of
-    each window of the records, searched from random states in the training box. The observer is then trained on
+    No recorded state is needed. Multiple shooting fits the parameters (with standard errors) and the initial state of
+    each window of the records; the search begins at random states in the training box. The observer is then trained on
     simulated motions of the identified plant. --observer adapts an observer to a plant that differs from the
     observer's model, with the settings of the observer's training.
 
-    The folder, runs/NAME-identified or with --observer runs/NAME-adapted, receives parameters.json, identification.png
+    The folder (runs/NAME-identified, or runs/NAME-adapted with --observer) receives parameters.json, identification.png
     (residuals, and predictions of held-out records), NAME.safetensors, report.png, checkpoints and log.txt. Parameters
     that the outputs do not identify are listed, and are null in parameters.json.
     """

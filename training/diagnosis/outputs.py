@@ -22,7 +22,7 @@ INVOLVED = 0.3  # a finding names the states with larger components in the direc
 VAGUE, NOTHING = 0.3, 1.0  # larger errors, without and with noise, in standard deviations of the state, are notes
 # Under a symmetry a state's least error is <= LOCALLY, but predicting it from motions of similar y errs by >= GLOBALLY.
 LOCALLY, GLOBALLY = 0.1, 0.3
-WINDOWS, MAX_SAMPLES = 7, 100  # numbers of windows, each half as long as the one before, and of samples of y in each
+WINDOWS, MAX_SAMPLES = 7, 100  # number of windows, each half as long as the one before; most samples in a window
 
 
 def observability(subject: Subject) -> Iterator[Finding]:
@@ -42,7 +42,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
             continue
         exact = errors[0, :, i]
         first = int((exact <= max(DETERMINED, AS_GOOD * exact.min())).argmax())
-        shares = [f"{error(least[0, i])} without noise (reached after {first * subject.dt:.3g} s)"]
+        shares = [f"{error(least[0, i])} without noise ({error(exact[first])} after {first * subject.dt:.3g} s)"]
         shares += [f"{error(one[i])} at noise {show_level(level)}" for level, one in zip(subject.noise, least[1:])]
         text = f"{name}: at best an error of {'; '.join(shares)}, in its standard deviations"
         blind = [show_level(level) for level, one in zip(subject.noise, least[1:, i]) if one >= NOTHING]

@@ -162,7 +162,7 @@ def errors(
     seed: int,
     skip: float | None = None,
 ) -> Errors:
-    """Return an observer's errors on test trajectories. The observer knows the noise levels, but no model errors.
+    """Return an observer's errors on test trajectories. The observer knows the noise levels, and assumes ``system``.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Return rms parameter errors after the transient, in percent of the plant's parameters or of x's last states."""
+    """Return rms errors after the transient in percent of the plant's parameters (without plant: x's last states)."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
         raise ValueError(f"all {trajectories.escaped} runs left bounds = {system.bounds}")

@@ -6,6 +6,7 @@ from typing import Literal, get_args
 import numpy as np
 import pandas as pd
 
+from kkl_gym.simulate import check_duration
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.evaluation.levels import Level
@@ -31,13 +32,14 @@ def simulate_faults(
     report: Callable[[int], object] = lambda done: None,
 ) -> pd.DataFrame:
     """Simulate sensors that fail in the middle of a trajectory; return the scores and delays of the monitor."""
+    check_duration(duration, dt := artifact.filter.dt)
+    if trajectories < 2:
+        raise ValueError(f"trajectories must be at least 2, with and without inputs, got {trajectories}")
     deadline = profile(system).fault_deadline or duration / 5
     if not deadline <= duration / 2:
-        late = f"a fault in the middle of {duration} s leaves less than the deadline of {deadline:g} s to detect it"
-        raise ValueError(f"{late}; take a longer duration")
-    dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
-    steps = round(duration / dt)
-    motions = Motions(system, dt, steps, **SOUND, levels=(system.process_noise,), policy=policy)
+        raise ValueError(f"duration must be at least {2 * deadline:g} s, twice a fault's deadline, got {duration:g} s")
+    rng, noise = generator(Stream.FAULTS, seed), (system.process_noise,)
+    motions = Motions(system, dt, round(duration / dt), **SOUND, levels=noise, policy=policy)
     x, u, *_ = motions.with_inputs(artifact.nu).drawn(trajectories, rng)
     clean = system.output(x)
     y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)

@@ -38,7 +38,7 @@ def multiple(system: System, factor: float) -> Level:
 
 
 def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
-    """Return ``given`` or, cut to the map's range, the system's level (the noisiest output's if the map takes one)."""
+    """Return ``given``, or the system's level cut to the map's range; a one-level map gets the noisiest output's."""
     if given is not None:
         return noise_levels("measurement_noise", given, system.ny)
     own = multiple(system, 1.0)

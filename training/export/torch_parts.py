@@ -68,7 +68,7 @@ class TorchExpression(Expression):
 
 
 def between(at: Tensor, points: Tensor, values: Tensor) -> Tensor:
-    """Return values (n, m) at ``at`` (n, 1): linear between values (k, m) at rising points (k,), constant beyond."""
+    """Return values (n, m) at ``at`` (n, 1): linear between points (k,) with values ([n,] k, m), constant beyond."""
     if len(points) == 1:
         return values[..., 0, :]
     passed = ((at - points[:-1]) / (points[1:] - points[:-1])).clamp(0.0, 1.0)

@@ -132,7 +132,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return V, white, expected outputs and V's validity; mean + V white and P - V V^T are corrected."""
+        """Return V, white, expected outputs and V's validity; corrected moments are mean + V white and P - V V^T."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)

@@ -134,7 +134,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     """Return the parameters nearest to ``given`` among all that explain the outputs as well as ``values`` do.
 
     Parameters without influence on the outputs become ``given``; those of another sign than ``given`` keep ``values``.
-    The other parameters' distance weighs ratios heavily, a common factor lightly: a faster plant may scale them alike.
+    Among the others, changed ratios count heavily, a common factor lightly: a faster plant may scale all parameters.
 
     Shapes: ``values`` (p,), ``given`` (p,), unidentifiable directions ``hidden`` (p, k); returns (p,).
     """

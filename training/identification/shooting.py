@@ -17,7 +17,7 @@ EXACT = 1e-16  # a smaller mean square of residuals, relative to the outputs' va
 ROUNDING = 1e-14  # lower bound of the noise, relative to an output's standard deviation
 MOST_DAMPING = 1e9
 CLUSTERS = 20  # least number of windows whose scatter gives standard errors
-COLOURED = 1.5  # residuals are coloured if scatter multiplies a standard error by more, as chance hardly does
+COLOURED = 1.5  # residuals are coloured if scatter raises a standard error by a larger factor, which chance hardly does
 OUTLIER = 9.0  # a window is left out if its mean square is so many median absolute deviations above the median
 
 
@@ -147,8 +147,8 @@ def shoot(
 
     Windows that the model explains much worse than most are left out. If the model is accurate for some motions and
     rough for others, as models of friction are, pass the standard deviations of the ``noise``. A window then has
-    the weight 1 / (1 + c), with c its residuals' mean square in units of the noise. No step leaves a window out then;
-    the standard errors of the Fit still leave out outliers (``Fit.used``).
+    the weight 1 / (1 + c), with c its residuals' mean square in units of the noise. Steps then leave out only
+    windows whose motions leave the bounds; the standard errors of the Fit still leave out outliers (``Fit.used``).
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):

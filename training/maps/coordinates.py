@@ -17,7 +17,7 @@ LEAST = 0.1  # the loss divides square errors by the mean square of x / scale pl
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Coordinates of z in which the signal has unit covariance and stationary noise a diagonal one.
+    """Coordinates of z in which the signal's covariance is the identity, and that of stationary noise is diagonal.
 
     A network in float32 cannot read z itself: components of z are nearly collinear, and their variances spread over ten
     orders of magnitude.

@@ -146,7 +146,7 @@ def _numbers(values: Any, column: str) -> np.ndarray:
 
     values = pd.Series(values)
     numbers = pd.to_numeric(values, errors="coerce")
-    if len(wrong := np.flatnonzero(numbers.isna() & values.notna())) or numbers.dtype.kind not in "fiu":
+    if len(wrong := np.flatnonzero(numbers.isna() & values.notna())) or numbers.dtype.kind not in "fiub":
         value = values.iloc[wrong[0]] if len(wrong) else values.dtype
         hint = "; write decimals with a point" if "," in str(value) else ""
         raise ValueError(f"column {column}, row {wrong[:1].sum() + 1}: {shown(value)} is not a number{hint}")

@@ -16,7 +16,7 @@ ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # field of Record: fiel
 MAX_SAMPLE = 1e100  # largest valid sample, so that sums of squares stay finite
 LONGEST_GAP = 3.0  # longest gap, in steps of the grid, in which samples are interpolated
 ROUNDING = 1e-6  # tolerance of times, in steps of the grid
-MOST_STEPS = 1000  # largest number of steps of a grid for each sample; a jump of the time is longer than any gap
+MOST_STEPS = 1000  # largest number of grid steps for each sample; a record with more has a jump in its times
 
 
 @dataclass(frozen=True)

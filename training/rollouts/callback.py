@@ -27,7 +27,7 @@ from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a shorter training than the first, as there are many refits
-LONGEST = 250  # steps of a piece, or two settling times; longer episodes are cut, so that parts can be held out
+LONGEST = 250  # steps of a piece, or two settling times if that is more; episodes are cut so that parts can be held out
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class KKLTrainingCallback(BaseCallback):
 
     An observer is accurate where its rollouts have been, but an agent in training goes elsewhere. A refit learns T_inv,
     the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
-    replaces the old one unless the new one's error on that share is larger. Filters keep their states. A refit takes
-    place only after a rehearsal, or as an algorithm begins to collect a rollout, lest an on-policy batch mix observers.
-    It needs a kept and a held-out episode as long as the filter's settling time; otherwise the callback warns.
+    replaces the old one unless the new one's error on that share is larger. Filters keep their states. So that no
+    on-policy batch mixes observers, a refit takes place only before a rollout is collected, or after the ``rehearsal``.
+    A refit needs a kept and a held-out episode as long as the filter's settling time; otherwise the callback warns.
 
     The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square, divided by
     standard deviations), and ``kkl/error_before``, that of the observer before the refit.
@@ -275,8 +275,8 @@ class Gathering:
         self._signals = Signals("t", *(tuple(names[role]) for role in ROLES.values()))
         self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
         self._longest = longest = max(LONGEST, 2 * math.ceil(settling_time(artifact.filter) / self._dt))
-        self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
-        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; the open one by row
+        self._keep, self._share = keep, held_out
+        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; each row's open piece
         self._made = self.steps = 0
         check_dt(before, self._dt)
         for record in before:
@@ -320,7 +320,7 @@ class Gathering:
         self.steps += 1
 
     def records(self) -> tuple[list[Record], list[Record]]:
-        """Drop the oldest closed pieces beyond ``keep`` steps; return kept and held-out records, also unfinished."""
+        """Drop the oldest closed pieces beyond ``keep`` steps; return kept and held-out records, open ones included."""
         total, first = 0, len(self._pieces)
         while first and (not total or total + len(self._pieces[first - 1].u) <= self._keep):
             first -= 1
@@ -333,7 +333,7 @@ class Gathering:
     def _new(self, row: int, y: Sequence[np.ndarray] = (), x: Sequence[np.ndarray] = ()) -> _Piece:
         """Begin a piece, or restart the open one if it has no step yet."""
         if row not in self._open or self._open[row].u:
-            held_out = bool(self._every) and self._made % self._every == 1
+            held_out = math.ceil(self._made * self._share) > math.ceil((self._made - 1) * self._share)
             self._open[row] = _Piece(f"{self._environment['id']}, piece {self._made}", held_out)
             self._pieces.append(self._open[row])
             self._made += 1

@@ -27,10 +27,9 @@ FEWEST = 50  # calibration needs at least this many samples at which a stretch m
 BEYOND = 0.5  # estimates may leave the range of the states by this fraction of it
 INCREMENTS = 400_000  # largest number of increments that a flow is learned from
 WINDOW = 10  # least number of samples over which a tracker averages innovations
-# The residual of y = C x counts as noise unless it exceeds UNEXPLAINED times the output's standard deviation, or a fit
-# with products of states reduces it below SQUARES times itself.
-UNEXPLAINED, SQUARES = 0.7, 0.8
-LITTLE = 0.1  # a residual below this share of the output's standard deviation always counts as noise
+# The residual of y = C x counts as noise unless it exceeds UNEXPLAINED times the output's standard deviation, or its
+# change from sample to sample is smaller than itself: noise is white. Below LITTLE times, it always counts as noise.
+UNEXPLAINED, LITTLE = 0.7, 0.1
 ROUNDING, OUTLIER = 1e-6, 6.0  # largest rounding, relative to an output; least outlier, in residual standard deviations
 LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
 MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # records: modes per output; slowest and fastest, relative to the signal rate
@@ -188,7 +187,7 @@ class RecordedSource:
         }
 
     def tracking(self) -> dict[str, Any]:
-        """Return the arguments of observers.Motion that records fix; ValueError if tracking is impossible."""
+        """Return the arguments of observers.Motion that records determine; ValueError if tracking is impossible."""
         if self.config.arbitrary_zero:
             raise ValueError(
                 f"a tracker compares {', '.join(self.config.arbitrary_zero)} with its prediction, so the zero matters: "
@@ -345,9 +344,7 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
     least = np.maximum(left, LEAST_NOISE * np.where(moves > ROUNDING * size, moves, np.where(size > 0, size, 1.0)))
     if known is not None:
         return C, least
-    i, j = np.triu_indices(x.shape[1])
-    _, unexplained = _fitted(np.column_stack([x, x[:, i] * x[:, j], np.ones(len(x))]), y, size)
-    wrong = (left > UNEXPLAINED * moves) | (unexplained < SQUARES * left)
+    wrong = (left > UNEXPLAINED * moves) | (_usual(np.diff(y - x @ C.T, axis=0)) < left)
     wrong &= left > np.maximum(LITTLE * moves, ROUNDING * size)
     signals = records[0].signals
     if other := [name for name, bad in zip(signals.measured, wrong) if bad]:

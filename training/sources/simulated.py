@@ -21,7 +21,7 @@ from training.trajectories.parameters import blind, nominal_share, relative_rang
 
 LEAD_IN_SHARE = 0.4  # in this share of the motions without inputs, earlier inputs have moved the start
 BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and some of a flow's training motions
-# Random inputs drive every other calibration run. A policy, if any, drives all, every other one with errors.
+# Random inputs drive every second calibration run. A policy, if any, drives all, with errors in every second run.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
 LEAST_PROCESS_NOISE = 0.005  # least level of process noise for a tracker, in ``scale`` per pace; a tenth of the default
@@ -73,7 +73,7 @@ class SimulatedSource:
         self.ages = recording_ages(self.steps, config.samples)
 
     def identity(self) -> dict[str, Any]:
-        """Return all that motions depend on apart from the settings, such as equations, noise and policy."""
+        """Return the equations, noise, policy and all else that motions depend on, except the settings."""
         system = self.system
         noise = {"process_noise": float(system.process_noise), "scale": list(map(float, system.scale))}
         identity = describe(system) | noise
@@ -146,7 +146,7 @@ class SimulatedSource:
             off = np.quantile(apart.max(-1), 0.99)
             if off <= INTEGRATION_ERROR:
                 break
-        if off > TOO_FAR_OFF:
+        if not off <= TOO_FAR_OFF:
             raise ValueError(
                 f"{SUBSTEPS} Runge-Kutta steps per {self.dt:g} s err by {off:.2g} > {TOO_FAR_OFF:g} standard deviations"
             )

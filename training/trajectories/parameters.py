@@ -133,7 +133,7 @@ def _with_constants(
             return outputs(x)
 
         def rate(self, x: Components) -> Any:
-            return system.rate(x[:nx])  # approximately, as a formula for the rate may need parameters as numbers
+            return system.rate(x[:nx])  # with the system's own parameters: a formula for the rate may need numbers
 
         if system.discrete:
 

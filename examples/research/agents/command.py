@@ -102,7 +102,7 @@ class Compare:
             write(out / "curves.csv", learned.to_csv(index=False))
             write_table(out / "table.md", results, partial, comparison.unusual_settings(tasks))
             draw_scores(out / "scores.png", results, partial)
-            draw_curves(out / "curves.png", learned, partial)
+            draw_curves(out / "curves.png", learned, partial, systems=on_systems)
             progress.say(f"wrote results.csv, curves.csv, table.md, scores.png and curves.png in {out}")
 
         run_and_report(agents, out, console, workers=self.workers, what="agents", report=report)

@@ -17,7 +17,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "parameters": {"vary": True},
 }
 MEASURED = {"Pendulum-v1": [0, 1], "CartPole-v1": [0, 2], "InvertedDoublePendulum-v5": [0, 1, 2, 3, 4]}
-ANGLES = {"Pendulum-v1": ((0, 1),), "InvertedDoublePendulum-v5": ((3, 1), (4, 2))}  # cosine and sine, in y
+ANGLES = {"Pendulum-v1": ((0, 1),), "InvertedDoublePendulum-v5": ((3, 1), (4, 2))}  # indices in y of (cosine, sine)
 # Each episode multiplies a parameter by a log-uniform number between 1/factor and factor.
 FACTORS: dict[str, dict[str, float]] = {
     "Pendulum-v1": {"m": 1.3, "l": 1.3},

@@ -11,7 +11,7 @@ from torch import nn
 class LinearRecurrence(BaseFeaturesExtractor):
     """The latest frame of a stack, and the state of a linear recurrent unit after all frames of the stack.
 
-    h' = lambda h + B x with complex lambda inside the unit circle, all learned (Orvieto et al., arXiv:2303.06349).
+    h_k = lambda h_k-1 + B x_k, complex lambda inside the unit circle, all learned (Orvieto et al., arXiv:2303.06349).
     Because the unit is linear, h is one matrix times the stacked frames.
     """
 

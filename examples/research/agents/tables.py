@@ -185,8 +185,8 @@ def _table_of_environments(
         "# Agents in any environment",
         "",
         "Return: interquartile mean over agents. In brackets the normalised return, where 0 is random actions and 1 "
-        "agents that see the full state without noise, with a bootstrap 95 % interval; then the number of agents. The "
-        f"steps from which an observer was learned count.{partial}",
+        "agents that see the full state without noise, with a bootstrap 95 % interval; then the number of agents. "
+        f"Steps that trained an observer count as training steps.{partial}",
         "",
         *files.table([*heads, "random"], rows),
         "",
@@ -250,7 +250,7 @@ def curves(agents: Sequence[ComparedAgent]) -> "pd.DataFrame":
     return pd.DataFrame(rows, columns=COLUMNS["curves.csv"])
 
 
-def draw_curves(path: Path, learned: "pd.DataFrame", partial: str = "") -> None:
+def draw_curves(path: Path, learned: "pd.DataFrame", partial: str = "", *, systems: bool = False) -> None:
     """Draw learning curves by steps and by CPU seconds."""
     tasks = tasks_in(learned)
     rows = max(1, math.ceil(len(tasks) / 2))
@@ -259,7 +259,7 @@ def draw_curves(path: Path, learned: "pd.DataFrame", partial: str = "") -> None:
         lines = dict[str, Any]()
         for pair, (environment, noise) in zip(axes.reshape(-1, 2), tasks):
             own = learned[learned.environment == environment]
-            for i, (kind, label) in enumerate(LABELS_IN_ENVIRONMENTS.items()):
+            for i, (kind, label) in enumerate((LABELS if systems else LABELS_IN_ENVIRONMENTS).items()):
                 one = own[(own.noise == noise) & (own.shown == kind)]
                 if kind == "state" and one.empty:
                     one = own[(own.noise == 0.0) & (own.shown == kind)]

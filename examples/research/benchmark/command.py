@@ -32,15 +32,15 @@ class Benchmark:
     budget: Literal["short", "cpu"] = "cpu"
     """cpu: 400,000 points and 300 CPU seconds for each training. short: half of the points, 40 s."""
     quick: bool = False
-    """Instead of the budget: trainings of 300 batches of the first configuration, few and short test trajectories.
-    Takes minutes, with the same results each time."""
+    """Instead of the budget: train only each method's first configuration, on 300 batches, and test on few and short
+    trajectories. This takes minutes, and gives the same results each time."""
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Shipped systems, or your own as script.py:Class or module:Class."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: the first nine)")] = None
-    """default, spinn, node, node-noise, gru, lru, transformer, ekf, ukf; for the maps that ship, shipped,
+    """default, spinn, node, node-noise, gru, lru, transformer, ekf, ukf; the maps that ship: shipped,
     shipped-spinn, shipped-large; or your own classes as script.py:Class or module:Class."""
     measurement_noise: NoiseLevels = None
-    """Standard deviations of the noise on each sample of y. 0.1,0.3 is one for each output."""
+    """Standard deviations of the noise on y. Each is one number for all outputs, or one for each as in 0.1,0.3."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
     """Folder of results."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)

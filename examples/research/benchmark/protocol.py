@@ -18,7 +18,6 @@ from training.seeds import Stream, generator
 
 UNTIMED, TIMED = 100, 400  # samples of a round of step_time; observers converge in the untimed ones
 LOST = 50.0  # a trajectory with a larger SMAPE in % after the transient counts as lost
-SETTLED = 0.1  # limit of settled errors, as a share of a trajectory's root mean square
 
 
 @dataclass(frozen=True)
@@ -50,20 +49,6 @@ def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarr
     return np.mean([smape(x[..., [i]], x_hat[..., [i]], skip) for i in range(x.shape[-1])], axis=0)
 
 
-def rmse(x: np.ndarray, x_hat: np.ndarray) -> np.ndarray:
-    """Return the root of the mean of |x - x_hat|^2 over the steps, (n,)."""
-    error = np.where(np.isfinite(x_hat), x - x_hat, np.inf)
-    return np.asarray(np.sqrt((error**2).sum(-1).mean(0)))
-
-
-def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
-    """Return times (n,) in s after which |x - x_hat| stays below a tenth of the rms of |x|; infinity if it does not."""
-    limit = SETTLED * np.sqrt((x**2).sum(-1).mean(0))
-    outside = ~(np.linalg.norm(x - x_hat, axis=-1) <= limit)
-    last = len(x) - 1 - outside[::-1].argmax(0)
-    return np.where(outside.any(0), np.where(last == len(x) - 1, np.inf, (last + 1) * dt), 0.0)
-
-
 def measure(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> pd.DataFrame:
     """Evaluate an observer on test trajectories. Returns a row for each domain, noise level and trajectory."""
     n, frames = protocol.trajectories, []
@@ -81,9 +66,6 @@ def measure(method: Method[Any], trained: Any, system: System, *, dt: float, pro
                     "smape": smape(runs.x, x_hat),
                     "smape_late": late,
                     "component_late": component_smape(runs.x, x_hat, skip),
-                    "rmse": rmse(runs.x, x_hat),
-                    "rmse_late": rmse(runs.x[skip:], x_hat[skip:]),
-                    "settling": settling_time(runs.x, x_hat, dt),
                     "lost": ((late > LOST) | ~np.isfinite(x_hat).all((0, 2))).astype(float),
                     **by_state(nrmse(runs.x, x_hat, skip)),
                 }

@@ -120,7 +120,7 @@ class ShippedLarge(Shipped):
 
 
 class SPINN(KKLMethod):
-    """The paper's method: a physics-informed T, then T_inv on z' = T(x') (``kkl-gym train --pipeline spinn``).
+    """The paper's pipeline: a physics-informed T, then T_inv fitted to z from T (``kkl-gym train --pipeline spinn``).
 
     It simulates as many trajectories as every method has, with the same distribution of starts in X.
     """

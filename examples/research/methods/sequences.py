@@ -1,4 +1,4 @@
-"""Neural networks on sequences of outputs: several cells share one training and one observer.
+"""Neural networks on sequences of outputs. Each has a cell of its own; all share the code of training and observer.
 
 From its state and the features of new samples, a cell computes a hidden vector for each sample, and its next state.
 """
@@ -22,7 +22,7 @@ WIDTH = 64  # width of features and hidden vectors
 LEARNING_RATE = 3e-3
 READOUT = 128  # neurons of the layer between the hidden vector and the estimate
 FAINT_NOISE = 0.01  # levels below this share of the system's own enter linearly, higher levels logarithmically
-ROUNDING = 1e-3  # errors shorter than this share of a state's standard deviation are smoothed
+ROUNDING = 1e-3  # the loss is quadratic in errors below this length, in standard deviations of the states
 
 
 class Cell(nn.Module):

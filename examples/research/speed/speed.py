@@ -36,7 +36,7 @@ class Speed:
     ratio is the median over turns of the ratio to the reference in the same turn. An observer for your own system
     is timed if you name its file. The references are also timed with the memory of `kkl_gym.KKLMemory`.
 
-    Times are CPU times of this process, which other processes hardly affect: run it with one thread. Further tables
+    Times are CPU times, which other processes hardly affect. They add up over threads: use one thread. Further tables
     compare observers alone, without an environment, to extended Kalman filters on the same samples.
     """
 

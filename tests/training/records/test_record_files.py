@@ -66,13 +66,13 @@ def test_parquet(tmp_path):
     pytest.importorskip("pyarrow", reason="needs the extra parquet")
     import pandas as pd
 
-    path, table = tmp_path / "a.parquet", pd.DataFrame({"t": T, "y": Y, "note": "text"})
+    path, table = tmp_path / "a.parquet", pd.DataFrame({"t": T, "y": Y, "u": T > 1, "note": "text"})
     dates = table.drop(columns="t").set_index(pd.Timestamp("2024-05-01") + pd.to_timedelta(T, unit="s"))
     for frame in (table, dates):
         frame.to_parquet(path)
         (record,) = read_records([path], warn=quiet)
         np.testing.assert_allclose(record.t, T, atol=1e-9)
-        np.testing.assert_array_equal(record.y[:, 0], Y)
+        np.testing.assert_array_equal((record.y[:, 0], record.u[:, 0]), (Y, T > 1))
     path.write_bytes(b"PAR1")
     with pytest.raises(ValueError, match=r"a.parquet: .*Parquet file size is 4 bytes"):
         read_records([path])

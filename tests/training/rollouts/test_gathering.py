@@ -1,6 +1,7 @@
 """Pieces of episodes that refits are made of."""
 
 import numpy as np
+import pytest
 from rollout_observers import observer_of
 
 from observers import Artifact
@@ -38,8 +39,9 @@ def test_an_unfinished_episode_is_not_forgotten(spy):
     assert [len(record.t) for record in gathering.records()[0]] == [7, 11]
 
 
-def test_pieces_have_their_role_for_good(spy):
-    gathering = Gathering(Artifact.read(spy), keep=10_000, held_out=0.2)
+@pytest.mark.parametrize("share", [0.2, 0.6])
+def test_pieces_have_their_role_for_good(spy, share):
+    gathering = Gathering(Artifact.read(spy), keep=10_000, held_out=share)
     roles = {}
     for episode in range(20):
         gathering.begin(0, sample(0))
@@ -49,7 +51,7 @@ def test_pieces_have_their_role_for_good(spy):
             for record in records:
                 assert roles.setdefault(record.name, held) == held
         assert len(roles) == episode + 1
-    assert sum(roles.values()) == 4
+    assert sum(roles.values()) == 20 * share
     assert roles["Spy-v0, piece 1"] == 1
 
 

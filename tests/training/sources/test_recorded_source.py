@@ -182,7 +182,8 @@ def test_outputs_are_sums_of_states_or_an_error():
         C, least = linear_output([noisy])
         np.testing.assert_allclose(C, [[1.0, 0.0]], atol=off)
         assert least == pytest.approx(noise, rel=0.1)
-    for other in (run.y**2, run.y + 3.0, rng.standard_normal(run.y.shape)):
+    drift = 0.4 * np.sin(np.arange(600)[:, None] / 15)
+    for other in (run.y**2, run.y + 3.0, run.y + drift, rng.standard_normal(run.y.shape)):
         with pytest.raises(ValueError, match=r"position is not a weighted sum of position, speed"):
             linear_output([replace(run, y=other)])
     early = np.arange(600)[:, None] < 300
