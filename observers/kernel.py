@@ -138,8 +138,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 total = q[i] + linear[i, 0]
                 for j in range(nx + nu):
                     total += linear[i, 1 + j] * q[j]
-                total += scaling[2, i] * moved[i]
-                at[i * wide + p] = scaling[0, i] + scaling[1, i] * total
+                at[i * wide + p] = scaling[0, i] + scaling[1, i] * (total + scaling[2, i] * moved[i])
 
     @_inlined
     def clipped(states: Any, s: Any, i: int) -> Any:
@@ -173,6 +172,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
             call(address, doubles(at), doubles(at), substeps, h)
         for _ in range(-substeps):
             flow_step(doubles(at), flow, scratch)
+        within(states, at)
         moments(at, nx, mean, moved)
         together(L, at, nx, across)
         for i in range(nx):

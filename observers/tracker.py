@@ -156,7 +156,7 @@ class Tracker:
         self, rows: np.ndarray, y: np.ndarray, u: np.ndarray, samples: float
     ) -> tuple[np.ndarray, np.ndarray]:
         def move(x: np.ndarray) -> np.ndarray:
-            return self.motion.step(self._within(x), u, self._dt, samples)
+            return self._within(self.motion.step(self._within(x), u, self._dt, samples))
 
         def predict(x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             mean, moved, across = transformed(x, P, move)

@@ -192,7 +192,7 @@ class Tracker {
     const s = this.#within(at);
     if (this.network) {
       const q = [...s, ...this.u_scale.map((scale, j) => u[j] / scale)], h = this.network(q);
-      return s.map((value, i) => value + dot(this.linear[i], [1, ...q]) + this.gain[i] * h[i]);
+      return this.#within(s.map((value, i) => value + dot(this.linear[i], [1, ...q]) + this.gain[i] * h[i]));
     }
     const f = (x) => this.field.map((part) => part(x, u));
     let x = this.substeps ? this.state(s) : f(this.state(s));
@@ -201,7 +201,7 @@ class Tracker {
       const a = f(x), b = ahead(h / 2, a), c = ahead(h / 2, b), d = ahead(h, c);
       x = x.map((value, i) => value + (h / 6) * (a[i] + 2 * (b[i] + c[i]) + d[i]));
     }
-    return x.map((value, i) => (value - this.x_offset[i]) / this.x_scale[i]);
+    return this.#within(x.map((value, i) => (value - this.x_offset[i]) / this.x_scale[i]));
   }
 
   /** What a function and noise make of a Gaussian, by sigma points: mean, covariance, and that with the states by columns. */

@@ -164,9 +164,9 @@ class TorchTracker(Module):
         s = self._within(s)
         if hasattr(self, "flow"):
             q = torch.cat([s, u / self.u_scale])
-            return s + self.affine + self.linear @ q + self.gain * self.flow(q.T).T
+            return self._within(s + self.affine + self.linear @ q + self.gain * self.flow(q.T).T)
         moved: Tensor = self.equations(self.states(s), u, self.dt)
-        return (moved - self.x_offset) / self.x_scale
+        return self._within((moved - self.x_offset) / self.x_scale)
 
     def _output(self, s: Tensor, _: Tensor) -> Tensor:
         """Return outputs of scaled states (nx, n) or, where h is undefined, of the states limited to their bounds."""

@@ -107,6 +107,7 @@ static void move(const double at[NX], const real *u, double next[NX])
         next[i] = s[i] + flow_linear[i][0] + flow_gain[i] * (double)MOVED[i];
         for (int j = 0; j < NX + NU; j++)
             next[i] += flow_linear[i][1 + j] * s[j];
+        next[i] = within(next[i], i);
     }
     (void)u;
 // end flow
@@ -131,7 +132,7 @@ static void move(const double at[NX], const real *u, double next[NX])
     }
 // end continuous
     for (int i = 0; i < NX; i++)
-        next[i] = (next[i] - x_offset[i]) / x_scale[i];
+        next[i] = within((next[i] - x_offset[i]) / x_scale[i], i);
 // end equations
 }
 
