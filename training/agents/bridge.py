@@ -85,7 +85,7 @@ class SB3VecEnv(VecEnv):
         return [None] * self.num_envs if frames is None else list(frames)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute for each row, from the wrapper that has it, else from the environment inside."""
+        """Return an attribute for each row, from the wrapper that stores it, else from the environment inside."""
         rows = list(self._get_indices(indices))
         owner = self._owner(attr_name)
         if owner is not None:
@@ -110,7 +110,7 @@ class SB3VecEnv(VecEnv):
         return list(self._rows_of("call", method_name)(method_name, *args, **options))
 
     def _owner(self, name: str) -> Any:
-        """Return the wrapper that has an attribute, else the vector environment, or None if that is Sync or Async."""
+        """Return the wrapper that stores an attribute, else the vector environment, or None for Sync and Async."""
         env: Any = self.env
         while hasattr(env, "env"):
             if name in vars(env):

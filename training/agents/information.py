@@ -124,7 +124,7 @@ def estimates(task: Task, information: Information, num_envs: int, observer: str
     system = None if task.system is None else get_system(task.system)
     if information == "z":
         return _modes(env, artifact, system)
-    # Without a system, x_hat comes after y; under noise, the observer estimates y too, and agents do not see y itself.
+    # Without a system, observations are [y, x_hat]; under noise, agents see only x_hat, which then estimates y too.
     first = len(task.measured) if task.measurement_noise else 0
     last = len(task.measured) + artifact.nx
     if system is not None and artifact.nx > system.nx:
@@ -162,7 +162,7 @@ def output_deviation(system: System) -> Feature:
 
 
 def _modes(env: VectorEnv, artifact: Artifact, system: System | None) -> VectorEnv:
-    """Show y if there is no system, z in T_inv's scale (minus z at a system's target), and age if T_inv takes it."""
+    """Show z in T_inv's scale (minus z at a system's target), also y without a system, and age if T_inv takes it."""
     inverse, linear, inside = artifact.inverse, artifact.filter, env
     while not isinstance(inside, KKLVectorObservation):
         inside = inside.env  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Conversion of agents to and from the files of stable-baselines3 (AGENT.zip), without unpickling."""
+"""Conversion of agents to and from the files of stable-baselines3 (AGENT.zip), whose code is never run."""
 
 import io
 import json
@@ -36,8 +36,8 @@ _MAX_BYTES = 1 << 28  # largest size of an unpacked file in the zip
 def to_sb3(agent: Agent, *, trusted: str | None = None) -> BaseAlgorithm:
     """Make a model of stable-baselines3 that acts like ``agent``; the model's ``save`` writes the zip.
 
-    The model's value functions are untrained, so that it can play but not continue to learn. Its first layer includes
-    the normalisation of observations, without the clip at ±10.
+    The model can play but not continue to learn: its critics, or DQN's target network, are untrained. Its first layer
+    includes the normalisation of observations, without the clip at ±10.
     """
     network = agent.network
     hidden = [len(bias) for bias in network.biases[:-1]]
@@ -79,7 +79,7 @@ def from_sb3(
 ) -> Agent:
     """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task without VecNormalize.
 
-    Only the tensors and the text of the file are read; nothing is unpickled.
+    Only the tensors and the text of the file are read (by torch with ``weights_only``), so none of its code runs.
     """
     if task.system is not None and information in OBSERVED and observer is None:
         observer = observer_of(get_system(task.system))

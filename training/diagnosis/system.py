@@ -184,9 +184,10 @@ def sampling(subject: Subject) -> Iterator[Finding]:
     if y.size and np.any(moving := (spread := np.sqrt(y.var(0).mean(0))) > 0):
         change = (np.sqrt((np.diff(y, axis=0) ** 2).mean((0, 1)))[moving] / spread[moving]).max()
         text += f"; y changes by {percent(change)} of its standard deviation from sample to sample"
-    verdict: Verdict = "problem" if change > COARSE else "note" if change > JERKY else "ok"
+    limits = (np.inf, np.inf) if subject.system.discrete else (COARSE, JERKY)  # a map has no motion between its steps
+    verdict: Verdict = "problem" if change > limits[0] else "note" if change > limits[1] else "ok"
     advice = {"problem": "the motion between samples is lost", "note": "samples are few", "ok": ""}[verdict]
-    if advice and not subject.system.discrete:
+    if advice:
         advice += f": take dt = {dt * SMOOTH / change:.1g} s"
     yield Finding("sampling", verdict, text, advice)
 

@@ -37,12 +37,12 @@ def write_report(path: Path, found: Identified) -> None:
 
 
 def _draw_residuals(ax: Any, found: Identified) -> None:
-    """Draw the autocorrelation of each output's residuals, and the 95 % band of white residuals."""
+    """Draw the autocorrelation of the residuals in the fit's windows, and the 95 % band of white residuals."""
     fit = found.fit
     for j, noise in enumerate(fit.noise):
         values = autocorrelation(fit.residuals[:, fit.used, j], LAGS)
         ax.plot(range(1, len(values) + 1), values, ".-", label=f"output {j + 1}, residuals' deviation {noise:.3g}")
     limit = 1.96 / np.sqrt(max(np.isfinite(fit.residuals[:, fit.used, 0]).sum(), 1))
     ax.axhspan(-limit, limit, color=MEASURED, alpha=0.3, lw=0, zorder=0)
-    ax.set(xlabel="lag in samples", ylabel="autocorrelation", title=f"{found.system.name}, residuals of the windows")
+    ax.set(xlabel="lag in samples", ylabel="autocorrelation", title=f"{found.system.name}, residuals of the fit")
     ax.legend()

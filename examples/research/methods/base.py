@@ -120,7 +120,7 @@ class Method(ABC, Generic[Trained]):
 
     @abstractmethod
     def train(self, task: Task, configuration: Configuration) -> Trained:
-        """Train for a task; the result is the argument ``trained`` of the other methods."""
+        """Train for a task; the result is passed to :meth:`observer` and :meth:`save` as ``trained``."""
 
     @abstractmethod
     def observer(self, trained: Trained, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
