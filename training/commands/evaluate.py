@@ -402,4 +402,4 @@ def spread(values: np.ndarray) -> str:
 
 def percent(value: float) -> str:
     """Return an error in percent as text; the NRMSE of a constant state is NaN."""
-    return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.2f}"
+    return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:{'.2f' if value >= 0.005 else '.1g'}}"
