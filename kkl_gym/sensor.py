@@ -149,7 +149,7 @@ class Readings:
 
     @np.errstate(over="ignore", invalid="ignore")  # outputs of states that escaped may overflow
     def read(self, h: np.ndarray, v: np.ndarray, rows: np.ndarray | None = None, *, start: bool) -> np.ndarray:
-        """Return the samples (ny, m) of ``rows`` (m,) at an episode's start or its next step, NaN where missing.
+        """Return samples (ny, m) of environments ``rows`` (m,) at an episode's start or next step, NaN where missing.
 
         Shapes: ``h`` (ny, m), ``v`` (ny, m) or, for a random sensor, (3 ny, m): white noise and the sensor's draws.
         """

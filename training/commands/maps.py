@@ -41,7 +41,7 @@ class Maps:
 
 
 def tracks_by(artifact: Artifact) -> str:
-    """Return the motion by which an observer tracks: "equations", "flow", or "" if it does not track."""
+    """Return the kind of model by which a tracker predicts, "equations" or (learned) "flow"; "" without a tracker."""
     if artifact.motion is None:
         return ""
     return "flow" if artifact.motion.equations is None else "equations"

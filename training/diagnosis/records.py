@@ -26,14 +26,15 @@ STEPS = 10_000  # number of steps played in an environment by default
 MAX_QUERIES, MAX_OTHERS = 500, 40_000  # largest numbers of samples to predict, and of their possible neighbours
 QUERY_SHARE = 0.2  # share of the records (of each if they are few) to predict; neighbours come from the rest
 MIN_QUERIES = 50  # least number of samples to predict
-MIN_OTHERS = 5  # least number of possible neighbours for each coordinate of z
+MIN_OTHERS = 5  # for each coordinate of z there must be more possible neighbours than this
 NOISE_SHARES = 0.01, 0.1  # default noise levels, in standard deviations of the output
 MIN_NEIGHBOURS = 32  # least number of neighbours; a z of many coordinates needs more, to determine a plane
 ROUNDING = 1e-9  # ridge of the linear regression on z, about the relative rounding error of z
 # Largest error of a determined signal and least error of an undetermined one, in the signal's standard deviations.
 DETERMINED, UNDETERMINED = 0.05, 0.8
 AS_GOOD = 1.1  # a window whose error is at most this multiple of the least error is as good as the best
-SEEN = 0.1  # a signal is known up to a constant if the error of its changes is at most this share of its value's error
+# A signal is known up to a constant if its changes are determined, with errors of at most this share of its own.
+SEEN = 0.1
 
 # Severity and advice by the first word of the verdict on a signal.
 VERDICTS: dict[str, tuple[Verdict, str]] = {
@@ -219,7 +220,7 @@ def of_records(
         raise ValueError(f"{total} samples are too few to judge {', '.join(signals.hidden)}: record more")
     warnings = list[str]()
     if len(records) < FEW:
-        text = "samples are compared within a record, where a constant of the record looks determined; record more"
+        text = "as samples are compared within records, a signal that is constant in each looks determined; record more"
         warnings.append(f"there are fewer than {FEW} records: {text}")
     if len(errors) < len(windows):
         warnings.append(f"too few samples for windows of {windows[len(errors)]} steps or more; record longer episodes")

@@ -33,9 +33,8 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
     for name, value in known.items():
         if width := half_widths.get(name, half_widths.get(EVERY, 0.0)):
             if not value:
-                raise ValueError(
-                    f"the parameter {name} of {system.name} is 0, which has no relative range: exclude it by {name}=0"
-                )
+                text = f"{name} of {system.name} is 0 and has no relative range"
+                raise ValueError(f"{text}: exclude it, with the half-width 0 ({name}=0)")
             ranges[name] = (value - width * abs(value), value + width * abs(value))
     return ranges
 
