@@ -1,7 +1,7 @@
 """The observer's step as machine code, for a batch with one observer in each row. It needs Numba.
 
 One compilation serves all observers with equal numbers of states, outputs and inputs, and is stored on disk for later
-processes. A system's motion and nonlinear output are compiled separately, and the kernel calls them by their address.
+processes. A system's equations and nonlinear output are compiled separately, and the kernel calls them by address.
 """
 
 import functools
@@ -26,7 +26,7 @@ _kernel, _part, _inlined = kernel(**OPTIONS), part(**OPTIONS), part(forceinline=
 
 @_intrinsic
 def call(typing: Any, address: Any, points: Any, other: Any, count: Any, h: Any) -> Any:
-    """Call a compiled motion or output by its address."""
+    """Call compiled equations of motion, or a compiled output, by their address."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         double = ir.DoubleType()
@@ -211,7 +211,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
-        """Set outputs whose innovations are beyond the gate to NaN, unless the gate is open."""
+        """Set outputs beyond the gate to NaN, unless a start, a divergence or a window of rejections has opened it."""
         for k in range(ny):
             innovation, count = y[k] - expected[k], now[rejections + k]
             far = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)

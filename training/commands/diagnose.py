@@ -63,7 +63,7 @@ class Diagnose:
         ),
     ] = None
     measurement_noise: Annotated[NoiseLevels, hint("the system's; else 1 % and 10 % of y's standard deviation")] = None
-    """Standard deviations of noise on each sample of y, besides 0; one for all outputs, or one for each: 0.1,0.3."""
+    """Noise levels to check besides 0: standard deviations on each sample of y. 0.1,0.3 has a level for each output."""
     dt: Annotated[float | None, hint("the system's")] = None
     """Sampling interval of a system in seconds."""
     duration: Annotated[float | None, hint("the system's")] = None

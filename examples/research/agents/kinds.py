@@ -49,10 +49,10 @@ PPO: dict[str, Any] = {
 CONTINUOUS = {"use_sde": True, "sde_sample_freq": 4}  # smooth exploration where actions are continuous
 LEARNING_RATE = 0.001  # at the start; it falls linearly to zero
 FRAMES = 32  # length of the linear recurrent unit's history
-EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluation intervals; episodes per evaluation, and in the last
+EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluations after the first; episodes in each, and in the last
 OBSERVER_STEPS = 40_000  # steps from which an observer, or the weights of z under noise, are learned
 TRUTH = 0.15  # share of the time, at the start, in which agents on x_hat see the true state
-FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and agents on x_hat see only estimates
+FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and agents on x_hat do not see y
 OF_STATE = ("masked", "parameters")  # kinds in which agents on the full state train; sensor faults do not affect them
 STEPS = 200_000  # number of steps after which returns are compared, too
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return")
@@ -101,7 +101,7 @@ class TimedAgent(Job):
         return float(KINDS[self.kind].get("noise", 0.0))
 
     def _states(self, size: int) -> tuple[int, ...]:
-        """Indices of the state in an observation; without faults, agents on x_hat read its measured entries from y."""
+        """Indices of the state in an observation, without the measured entries if agents on x_hat read these from y."""
         known = MEASURED[self.env_id] if self.shown == "x_hat" and self.kind not in FAULTY else ()
         return tuple(place for place in range(self._ny, size) if place - self._ny not in known)
 
