@@ -67,7 +67,7 @@ class Plant:
     def draw_noise(
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw w (NOISE_BLOCK, nx) and v (NOISE_BLOCK, nv), which :meth:`noise` scales."""
+        """Draw w (NOISE_BLOCK, nx) and v (NOISE_BLOCK, nv), into given arrays if any; :meth:`noise` scales them."""
         # A sensor draws from its own generator: a seed gives the same motions and noise with and without a sensor.
         n, ny = NOISE_BLOCK, self.ny
         w = rng.random((n, len(self._w_range)), out=w)

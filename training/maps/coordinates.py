@@ -93,7 +93,7 @@ def root(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StateScale:
-    """Scales states by an offset and a scale, (n,) each; the first ``nx`` states, or all, determine errors' weights."""
+    """Scales states by an offset and a scale, (n,) each; the first ``nx`` (None: all) determine errors' weights."""
 
     offset: np.ndarray
     scale: np.ndarray

@@ -52,7 +52,7 @@ class KKLTrainingCallback(BaseCallback):
     An observer is accurate where its rollouts have been, but an agent in training goes elsewhere. A refit learns T_inv,
     the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
     replaces the old one unless the new one's error on that share is larger. Filters keep their states. So that no
-    on-policy batch mixes observers, a refit takes place only before a rollout is collected, or after the ``rehearsal``.
+    on-policy batch mixes observers, a refit takes place only before a rollout is collected, or at the end of ``learn``.
     A refit needs a kept and a held-out episode as long as the filter's settling time; otherwise the callback warns.
 
     The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square, divided by

@@ -62,7 +62,7 @@ class Source(Protocol):
     pace : float
         Time scale of the signals in seconds.
     process_noise : float
-        Usual level of process noise, which T_inv takes as an input; 0 without process noise.
+        Largest level of process noise in training; 0 if T_inv takes no level of process noise.
     """
 
     name: str

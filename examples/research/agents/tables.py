@@ -44,9 +44,9 @@ WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 
 @dataclass(frozen=True)
 class Cell:
-    """Agents of one kind in one task.
+    """Agents of one kind in one task: their returns ``values`` (n,) and normalised ``scores`` (n,).
 
-    Shapes: ``values``, ``scores`` (n,). Without idle or full-state agents, ``scores`` and ``interval`` are NaN.
+    ``interval``: mean score and its ends. ``scores`` and ``interval`` are NaN without idle or full-state agents.
     """
 
     values: np.ndarray
@@ -90,7 +90,7 @@ def _task_name(environment: str, noise: float | str) -> str:
 
 
 def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
-    """Return rows with columns task and idle; in environments, agents on the state count for all noise levels."""
+    """Add columns task and idle (idle agent's return); environments' full-state agents recur at each noise level."""
     import pandas as pd
 
     tasks = []
