@@ -1,6 +1,6 @@
 """An angle on a circle: a pendulum that can turn over. The state holds the cosine and sine of its angle.
 
-To train such an observer from the command line, with the default settings::
+To train an observer for it from the command line, with the default settings::
 
     kkl-gym train examples/circle_pendulum.py:CirclePendulum
 
@@ -56,7 +56,7 @@ class CirclePendulum(kkl_gym.System):
 
 
 def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/circle_pendulum")) -> np.ndarray:
-    """Train, wrap and swing up; returns the estimate's rms errors in multiples of X's half-widths.
+    """Train an observer, swing up by its estimate; returns the estimate's rms errors in half-widths of X.
 
     Args:
         inverse_steps: batches of training.

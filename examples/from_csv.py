@@ -1,6 +1,6 @@
 """From CSV files to an observer in a control loop, without recorded states and with an unknown parameter.
 
-This command does the identification and the training; its options name the columns of your own files::
+This command does the identification and the training; further options name the columns of your own files::
 
     kkl-gym identify van_der_pol --data runs/from_csv/record-*.csv --unknown mu=2 --out runs/from_csv
 """

@@ -26,8 +26,8 @@ class Outputs:
     """The measured outputs in an environment's observations.
 
     The order is that of :func:`gymnasium.spaces.flatten`: boxes row by row, the parts of a Dict or Tuple one after the
-    other, and Discrete values one-hot. If ``measured`` is None or holds keys, only measured keys of a Dict are read,
-    and of these no images.
+    other, and Discrete values one-hot. If ``measured`` holds keys, only those keys of a Dict are read. If it holds keys
+    or is None (all), images in a Dict are left out.
     """
 
     def __init__(

@@ -401,7 +401,7 @@ def autoreset_mode_of(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def last_of_episodes(obs: np.ndarray, info: Infos, ended: np.ndarray) -> Infos:
-    """Return ``final_obs`` and ``final_info`` of the rows ``ended`` (n,), with masks, as Gymnasium's vectors do."""
+    """Return ``final_obs`` and ``final_info`` of the rows ``ended`` (n,), with masks, as in Gymnasium."""
     final_obs = np.full(len(ended), None, dtype=object)
     for row in np.flatnonzero(ended):
         final_obs[row] = obs[row].copy()

@@ -189,7 +189,7 @@ def test_the_guide_to_speed_has_the_errors_and_times_of_each_width():
         ("Lorenz, median SMAPE in %, no noise", "smape_without_noise", 2),
         ("Lorenz, median SMAPE in %, noise 0.5", "smape_under_noise", 2),
         ("Lorenz, µs a sample, single", "us_single", 1),
-        ("Lorenz, µs a sample, each of 1,024 rows", "us_a_row", 2),
+        ("Lorenz, µs a sample, each of 1,024 in a batch", "us_a_row", 2),
     ):
         cells = [f"{value:.{digits}f}" for value in results("sizes/lorenz")[column]]
         assert row(title, cells) in page("docs/guides/speed.md")

@@ -56,7 +56,7 @@ def page() -> str:
 
 
 def sections(prog: str, commands: Commands) -> Iterator[str]:
-    """A section for each command of a table, and for each of its subcommands."""
+    """A section for each of ``commands``, and for each of their subcommands."""
     for name, parser, description in parsers(prog, commands):
         rows = [row(action) for action in options(parser)]
         lines = table(["option and value", "meaning", "default"], rows) if rows else []
@@ -65,7 +65,7 @@ def sections(prog: str, commands: Commands) -> Iterator[str]:
 
 
 def parsers(prog: str, commands: Commands) -> Iterator[tuple[str, argparse.ArgumentParser, str]]:
-    """The words, parser and description of each command, and of its subcommands."""
+    """The full name (such as ``kkl-gym train``), parser and description of each command and subcommand."""
     for name, behind in commands.items():
         command = load(*behind)
         with warnings.catch_warnings():  # only this function of tyro lists the options
@@ -108,7 +108,7 @@ def text(written: str, between: str = " ") -> str:
 
 @dataclass(frozen=True)
 class Other(System):
-    """An oscillator of frequency 1e5 rad/s and size 1e-5; defaults that it shares with a shipped system are general."""
+    """An oscillator unlike any that ships (1e5 rad/s, size 1e-5): a default that a shipped system shares is general."""
 
     name = "other"
     X = ((-1e-5, 1e-5), (-1e-5, 1e-5))

@@ -43,8 +43,8 @@ def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
 class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
-    ``motions`` are states (steps + 1, MOTIONS, nx) and inputs. States are NaN after they leave the bounds. Each of the
-    ``kinds`` has an equal share. The mask ``stay`` (MOTIONS,) selects motions within bounds; ``y`` are their outputs.
+    ``motions`` are states (steps + 1, MOTIONS, nx) and inputs. States are NaN after they leave the bounds. The
+    ``kinds``, such as free, have equal shares. ``stay`` (MOTIONS,) marks motions within bounds; ``y`` is their output.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ def sampling(subject: Subject) -> Iterator[Finding]:
     if y.size and np.any(moving := (spread := np.sqrt(y.var(0).mean(0))) > 0):
         change = (np.sqrt((np.diff(y, axis=0) ** 2).mean((0, 1)))[moving] / spread[moving]).max()
         text += f"; y changes by {percent(change)} of its standard deviation from sample to sample"
-    limits = (np.inf, np.inf) if subject.system.discrete else (COARSE, JERKY)  # a map has no motion between its steps
+    limits = (np.inf, np.inf) if subject.system.discrete else (COARSE, JERKY)  # discrete: no motion between steps
     verdict: Verdict = "problem" if change > limits[0] else "note" if change > limits[1] else "ok"
     advice = {"problem": "the motion between samples is lost", "note": "samples are few", "ok": ""}[verdict]
     if advice:

@@ -55,7 +55,7 @@ def _system(task: Task) -> System:
 
 
 def _numbered(symbol: str, number: int) -> list[str]:
-    """Return the names of signals: the symbol alone if there is one, else numbered symbols such as y1, y2."""
+    """Return names for a number of signals: the symbol alone for a single signal, else y1, y2, ..."""
     return [symbol] if number == 1 else [f"{symbol}{i + 1}" for i in range(number)]
 
 
