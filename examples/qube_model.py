@@ -33,7 +33,7 @@ class Qube(kkl_gym.System):
     pendulum_inertia: float = 0.024 * 0.129**2 / 3  # kg m^2, about its joint
     pendulum_damping: float = 0.00005  # N m s
     pendulum_friction: float = 0.0  # N m
-    arm_slip: float = 0.1  # rad/s, the range of rates in which dry friction changes its sign
+    arm_slip: float = 0.1  # rad/s, dry friction changes its sign between minus and plus this rate
     pendulum_slip: float = 0.8  # rad/s
 
     name: ClassVar[str] = "qube"
@@ -86,7 +86,7 @@ class Sticking(BothAngles):
     name: ClassVar[str] = "qube-sticking"
 
     def rate(self, x):
-        """A rate that gives two substeps for each sample, which keep the integration stable while the arm sticks."""
+        """A rate of change that gives each sample two substeps: they keep integration stable while the arm sticks."""
         return 150.0 + 0.0 * x[0]
 
 

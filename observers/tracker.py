@@ -36,7 +36,7 @@ class Supervision:
 
     @classmethod
     def of(cls, motion: Motion, dt: float) -> Self:
-        """Return the supervision of a motion with samples every ``dt`` seconds."""
+        """Return the supervision for a model of the motion, with samples every ``dt`` seconds."""
         window, ny = max(1, round(motion.window / dt)), len(motion.least_measurement_noise)
         share, trend_share, long_share = (-math.expm1(-1 / (each * window)) for each in (1.0, _TREND, _LONG))
         memory = (1 - trend_share) ** 2 * (1 - long_share)  # squares of successive trends are correlated
@@ -81,7 +81,7 @@ class Tracker:
     missing. The gate is open in the first window. It also opens for an output that it has rejected for a whole window,
     and after a divergence, until the output fits again. So a lasting jump is accepted.
 
-    A row of the state, which the caller keeps, holds the estimate x (nx), its covariance P (nx^2), the NIS, the mean
+    Each row, which the caller keeps, holds the estimate x (nx), its covariance P (nx^2), the NIS, the mean
     square of the innovations' running mean, the number of samples seen, the number of outputs rejected, the number of
     successive samples beyond the gate (ny), and the running mean of the innovations (ny).
     """
@@ -131,7 +131,7 @@ class Tracker:
         return self._packed(x, P, np.concatenate([np.ones((n, 2)), seen, np.zeros((n, 1 + 2 * y.shape[1]))], 1))
 
     def take_over(self, rows: np.ndarray) -> np.ndarray:
-        """Return another tracker's rows, with their estimates limited to the bounds of this tracker's motion."""
+        """Return another tracker's rows, with their estimates limited to this tracker's bounds of the states."""
         rows = rows.copy()
         rows[:, self.x] = self._within(rows[:, self.x])
         return rows

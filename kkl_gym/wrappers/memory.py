@@ -298,7 +298,7 @@ class KKLVectorMemory(VectorWrapper):
         last, flat = self._flat, of.read(obs, batch, np.where(fresh[:, None], np.nan, self._flat))
         self._flat, self._ended = flat, ended & (not same)
         y = of.outputs.of_flat(flat)
-        # The memory takes the last outputs of these episodes, and then restarts with the first outputs of the next.
+        # The memory takes the last outputs of ended episodes, and then restarts with the first outputs of the next.
         if same and ended.any():
             rows, final, ends = np.flatnonzero(ended), np.full(self.num_envs, None, dtype=object), flat.copy()
             for row in rows:

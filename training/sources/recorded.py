@@ -286,7 +286,7 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
         chosen = generator(Stream.VALIDATION, seed).permutation(len(records))[:count]
         return [r for i, r in enumerate(records) if i not in chosen], [records[i] for i in sorted(chosen)]
     ends = [min(max(2, round((1 - share) * len(record.t))), len(record.t) - 2) for record in records]
-    return (  # fewer than four samples are kept whole
+    return (  # a record of fewer than four samples is kept whole
         [record.part(slice(None, end)) if end > 1 else record for record, end in zip(records, ends)],
         [record.part(slice(end, None)) for record, end in zip(records, ends) if end > 1],
     )

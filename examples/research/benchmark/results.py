@@ -18,7 +18,7 @@ FILES = ("results.csv", "methods.csv")  # a row for each trajectory; a row for e
 
 
 def collect(out: Path, beside: Path | None = None) -> None:
-    """Write results.csv and methods.csv of all jobs in the folder, joined with other observers' rows in ``beside``."""
+    """Write results.csv and methods.csv of all jobs in ``out``; add other observers' rows from folder ``beside``."""
     errors, costs = [], []
     for folder in sorted(path.parent for path in (out / "jobs").glob("*/*/errors.csv")):
         with explained(folder, ValueError):

@@ -102,7 +102,7 @@ class Speed:
         counts: Mapping[int, int],
         progress: ProgressBars,
     ) -> None:
-        """Time observers and Kalman filters without environments; ``counts`` are samples by number of rows."""
+        """Time observers and Kalman filters without environments; ``counts`` maps numbers of rows to sample counts."""
         lines = []
         for name, system in systems.items():
             artifact = Artifact.read(resolve(name))
