@@ -210,7 +210,7 @@ def rare(extremes: np.ndarray, share: float) -> np.ndarray:
     """Estimate the values (ny,) that ``extremes`` (n, ny) of motions exceed with probability ``share``.
 
     A Gumbel distribution is fitted to the logarithms by the median and the 90 % quantile, which a few huge extremes do
-    not change. The values are at most ten times the largest extreme: if y rarely moves, the fit may lie far above it.
+    not change. The values are at most ten times the largest extreme: if y rarely moves, the fit may lie far higher.
     """
     logs = np.log(np.maximum(extremes, np.finfo(float).tiny))
     middle, upper = np.quantile(logs, (0.5, 0.9), axis=0)

@@ -98,8 +98,8 @@ def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
         return norm_product(mlp)
     low, high = SLOPES[mlp.activation]
     weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in mlp.weights]
-    # The certificate holds for every diagonal matrix D > M. Here D = diag(M) e^shape, times the least factor that
-    # gives D >= M, times 1 + e^margin. Both exponents start at 0, where a diagonal M gives D = 2 M, optimal for tanh.
+    # d^T M d bounds the squared effect of a layer's change d. Any diagonal D > M is valid: here diag(M) e^shape times
+    # the least factor with D >= M, times 1 + e^margin. Exponents start at 0; diagonal M gives D = 2 M, best for tanh.
     shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
     margins = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in weights[:-1]]
 

@@ -49,7 +49,7 @@ _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes
 
 
 def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:
-    """Return ppo_lstm for recurrent agents, a system's ``PREFERRED``, sac for environments in sac.yml, or else ppo."""
+    """Return ppo_lstm for recurrent agents, else a system's ``PREFERRED``, sac for environments in sac.yml, or ppo."""
     if information == "recurrent":
         return RECURRENT
     if task.system is not None:

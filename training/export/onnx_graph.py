@@ -1,4 +1,4 @@
-"""The step as an ONNX graph, which Torch exports from :class:`TorchObserver`."""
+"""An observer's step as an ONNX graph, which Torch exports from :class:`TorchObserver`."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""Multiple shooting on windows whose length grows as long as longer windows improve the parameters."""
+"""Multiple shooting on windows: their length is doubled while this improves the parameters."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +15,7 @@ FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows; all lengths are
 MORE_NOISE = 1.5  # largest standard deviation of the first windows' residuals, in multiples of the noise level
 SMALL = 0.01  # limit of these residuals in multiples of the output's standard deviation; the larger limit counts
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
-GAIN = 0.7  # if a doubling of the length leaves a larger share of every standard error, it is the last
+GAIN = 0.7  # a doubling of the length is the last if it leaves more than this share of every standard error
 MORE_COST = 2.0  # largest factor by which a doubling may increase the residuals' mean square
 LEFT = 0.4  # in standard errors: longest Gauss-Newton step that may remain after a fit
 APART = 0.5  # in standard errors: largest distance between the two fits of longer windows

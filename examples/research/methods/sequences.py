@@ -232,7 +232,7 @@ class _Problem(nn.Module):
         self._y = tensor(data.y, cpu)
         self._x = (tensor(data.x, cpu) - self.model.x_offset) / self.model.x_scale
         self._noise = tensor(np.broadcast_to(task.system.measurement_noise, data.y.shape[-1:]), cpu)
-        self._number = torch.full((len(data.y),), -1)  # index of each sample among the recorded samples, or -1
+        self._number = torch.full((len(data.y),), -1)  # index of each sample among those with known x, or -1
         self._number[torch.as_tensor(data.ages)] = torch.arange(len(data.ages))
         self._steps = torch.arange(min(CHUNK, len(data.y)))[:, None]
         self.register_buffer("places", torch.zeros(3, ROWS, dtype=torch.long))  # trajectory, age, and age at the end
@@ -243,7 +243,7 @@ class _Problem(nn.Module):
         self.state: torch.Tensor
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Return the mean error at the recorded samples of the next chunk."""
+        """Return the mean error at those samples of the next chunk whose x is known."""
         (length, trajectories, _), (_, age, end) = self._y.shape, self.places
         fresh = (age >= end) | (age + len(self._steps) > length)
         zero = torch.zeros(ROWS, dtype=torch.long)
