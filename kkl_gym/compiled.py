@@ -42,7 +42,7 @@ Advance = Callable[[Values, Values, Values, float], Values]
 MAX_OPERATIONS = 500
 _TRIALS = 200  # number of trial states of each kind, at which machine code is compared with Python
 _MAX_TRIAL_SUBSTEPS = 64  # trial states that need more substeps are skipped, because Python is slow there
-_LANES = 32  # rows that are stepped together; they fill a few of the processor's vector registers
+_LANES = 32  # number of a batch's states that are stepped together; they fill a few of the processor's vector registers
 # Largest number of entries in the cache. An entry is a kernel, or the reason why a program was not compiled.
 _KEPT = 64
 _kept: dict[Any, Any] = {}
@@ -206,10 +206,10 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
 
 
 def batch_kernel(system: System, motion: Motion) -> Any:
-    """Compile the step of a batch: rows are sorted by the substeps that they need, and stepped in groups."""
+    """Compile the step of a batch: its states are sorted by the substeps that they need, and stepped in groups."""
     import numba
 
-    # Each row of a group is a lane. All components of all lanes lie in one array, at offsets that the compiler knows.
+    # Each state of a group is a lane. All components of all lanes lie in one array, at offsets that the compiler knows.
     # The compiler can then use the processor's vector registers.
     nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
     lanes = [f"s[{i * _LANES} + j]" for i in range(size + nx + 3)]
@@ -256,7 +256,7 @@ def batch_kernel(system: System, motion: Motion) -> Any:
         "    return left > 0",
     ]
     jit: Any = functools.partial(numba.njit, error_model="numpy")  # a division by zero gives infinity
-    inlined = functools.partial(jit, forceinline=True)  # a function call would prevent vectorisation over rows
+    inlined = functools.partial(jit, forceinline=True)  # a function call would prevent vectorisation over lanes
     kernel = jit(_assembled(motion, lines, inlined))
     u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None] / system.pace
     rounding = 1e-9 * np.ptp(system.X, axis=1)[:, None]
@@ -276,7 +276,7 @@ def _batch(system: System, kernel: Any) -> Advance[np.ndarray]:
     def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
         out = np.empty(x.shape)
         lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
-        # Rows that became NaN in this step need substeps whose length follows the error.
+        # States that became NaN in this step need substeps whose length follows the error.
         if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):
             out[:, rows] = advance_batch(system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out

@@ -289,7 +289,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     def _exchanged(self) -> None:
         self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
-        # The next reset adds _sample, which then includes samples of the old system; they do not count towards SOON.
+        # Subtracted in advance, as the next reset adds _sample: samples of the old system do not count towards SOON.
         self._samples = -self._sample
 
     def _input(self, action: np.ndarray) -> list[float]:

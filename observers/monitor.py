@@ -135,7 +135,7 @@ class Monitor:
         return np.tile(np.concatenate([np.zeros(ny), self._sound, [0.0]]), (n, 1))
 
     def update(self, rows: np.ndarray, residual: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """Return rows after residuals y - h(x_hat), (n, ny), of the outputs that are ``seen``, (n, ny)."""
+        """Return the state ``rows`` after residuals y - h(x_hat) (n, ny) of the outputs that are ``seen`` (n, ny)."""
         mean, square, samples = self._parts(rows)
         share = self._share * seen
         mean, square = mean + share * (residual - mean), square + share * (residual**2 - square)

@@ -154,7 +154,7 @@ class VectorEstimate(VectorWrapper):
             check_untouched(obs, b"".join(base.get_attr("emitted")), self.env, base)
 
     def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
-        """Add the observers' report to ``info`` for ``rows``. Returns the observations of all rows."""
+        """Add the observers' report to ``info``, with the mask ``rows`` of environments. Returns all observations."""
         report = self._estimator.report()
         for key, values in report.items():
             info |= {key: values, f"_{key}": rows.copy()}
@@ -230,7 +230,7 @@ class _SignalsInInfo(VectorWrapper):
 
 
 def _states(info: Infos, rows: np.ndarray) -> np.ndarray:
-    """Return true states in some rows, or an array without columns if ``info`` does not hold them."""
+    """Return true states of the environments in the mask ``rows``; without columns if ``info`` does not hold them."""
     return info["x"][rows] if "x" in info else np.full((int(rows.sum()), 0), np.nan)
 
 
@@ -374,7 +374,7 @@ class VectorActionRepeat(VectorWrapper):
 
     def step(self, actions: np.ndarray) -> Step:
         """Hold actions for ``repeat`` steps. Returns each row's sum of rewards, and all else from its last step."""
-        waiting = self._ended  # these rows ended in an earlier step, and stay unchanged in this one
+        waiting = self._ended  # rows that ended in an earlier step; env.step leaves them unchanged
         total, info = np.zeros(self.num_envs), Infos()
         for _ in range(self.repeat):
             obs, reward, terminated, truncated, new = self.env.step(actions)

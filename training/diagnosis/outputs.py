@@ -16,13 +16,13 @@ from training.trajectories.motions import how_to_stay
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
 MIN_STEPS = 10  # least number of samples of a motion
-# A direction of x is a problem or a note if this share of its initial standard deviation is left at a motion's end.
+# Shares of a direction's initial standard deviation at a motion's end, above which the verdict is "problem" or "note".
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in the direction
-VAGUE, NOTHING = 0.3, 1.0  # larger errors, without and with noise, in standard deviations of the state, are notes
+VAGUE, NOTHING = 0.3, 1.0  # errors in standard deviations of the state, without and with noise, that get a "note"
 # Under a symmetry a state's least error is <= LOCALLY, but predicting it from motions of similar y errs by >= GLOBALLY.
 LOCALLY, GLOBALLY = 0.1, 0.3
-WINDOWS, MAX_SAMPLES = 7, 100  # number of windows, each half as long as the one before; most samples in a window
+WINDOWS, MAX_SAMPLES = 7, 100  # number of windows, each half as long as the one before; upper bound of samples in each
 
 
 def observability(subject: Subject) -> Iterator[Finding]:

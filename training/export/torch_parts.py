@@ -81,7 +81,7 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def eliminated(P: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the Cholesky factors L of covariances P = L L^T (m, m, n), stacked on B L^-T for matrices B (k, m, n).
+    """Return the Cholesky factors L of covariances P = L L^T (m, m, n), stacked on B L^-T for B = ``rows`` (k, m, n).
 
     Also returns a mask (n,) of the P that are positive definite. LEAST_PIVOT replaces smaller pivots, so that gradients
     stay finite. Entries of L above the diagonal are rounding errors.

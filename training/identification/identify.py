@@ -15,8 +15,8 @@ from training.identification.windows import LEAST_USED, MORE_COST, Prediction, f
 from training.progress import ProgressBars
 from training.records import Record, check_signals, pieces
 
-HELD_OUT = 10  # of the pieces of records without a gap, the 6th, 16th, 26th, ... are held out of the fit
-KEPT_RATIOS = 100.0  # prior variance of log c over that of log f_i, where parameter i is given[i] * c * f_i
+HELD_OUT = 10  # of the pieces of records between gaps, the 6th, 16th, 26th, ... are held out of the fit
+KEPT_RATIOS = 100.0  # parameter i is given[i] * c * f_i: prior variance of log c, divided by that of log f_i
 BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(), tried in turn until one leaves the fit about as good
 UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change exceeds this share of the parameters' change
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
@@ -78,7 +78,7 @@ class Identified:
             used = ", ".join(f"{name} = {values[name]:.6g}" for name in hidden)
             lines.append(f"the observer uses {used}: other values fit too, but these are near the first guesses")
             if self.unscaled_states:
-                lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: these values fix it")
+                lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: these values set it")
         lines += [
             f"the outputs stay the same if {', '.join(names)} change sign: the signs are not identifiable"
             for names in self.symmetries
@@ -134,7 +134,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     """Return the parameters nearest to ``given`` among all that explain the outputs as well as ``values`` do.
 
     Parameters without influence on the outputs become ``given``; those of another sign than ``given`` keep ``values``.
-    Among the others, changed ratios count heavily, a common factor lightly: a faster plant may scale all parameters.
+    The distance counts changed ratios of all others heavily, their common factor lightly: a faster plant may scale all.
 
     Shapes: ``values`` (p,), ``given`` (p,), unidentifiable directions ``hidden`` (p, k); returns (p,).
     """

@@ -18,7 +18,7 @@ from training.lessons import train
 from training.presets import preset
 from training.spectrum import evenly_spaced
 
-# Candidate intervals of real eigenvalues of A in 1/s; the first is the paper's.
+# Candidate intervals of real eigenvalues of A, in 1 / System.pace; the first is the paper's.
 SPECTRA = ((-3.0, -1.5), (-8.0, -1.0), (-20.0, -2.0))
 # Candidates of SPINN, which needs a smooth T: the paper's, and two so fast that z depends on little of the past.
 SMOOTH_SPECTRA = ((-3.0, -1.5), (-20.0, -2.0), (-40.0, -6.0))
@@ -72,9 +72,9 @@ def trained(task: Task, config: Config) -> Artifact:
 class Default(KKLMethod):
     """The package's method: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
 
-    For each of its two inverses it simulates as many trajectories as every other method has: driven motions for one,
-    free motions for the other. Some free motions start at states that inputs have reached from X. Each inverse has half
-    of the time, although the benchmark uses only the inverse of free motion. The only configuration is
+    For each of its two T_inv it simulates as many trajectories as every other method has: driven motions for one,
+    free motions for the other. Some free motions start at states that inputs have reached from X. Each T_inv has half
+    of the time, although the benchmark uses only the one for free motions. The only configuration is
     the preset, which was chosen during the package's development.
     """
 
