@@ -30,7 +30,7 @@ class PredictiveMemory(Memory):
         self._targets = np.r_[self._plain, ny : ny + len(angles)]  # indices of the predicted signals
         features = (ny + len(angles)) * (1 + len(self.decay)) + nu * len(self.input_decay) + 1
         given = real_array("weights", weights)
-        self.weights = given if given.size else np.zeros((features, len(self._targets)))
+        self.weights = given if given.shape != (0,) else np.zeros((features, len(self._targets)))
         if self.weights.ndim != 2 or len(self.weights) != features or self.weights.shape[1] < len(self._targets):
             raise ValueError(
                 f"weights must be {features} rows of {len(self._targets)} numbers or more, got the shape "

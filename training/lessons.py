@@ -5,6 +5,7 @@ import platform
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ from training.spectrum import Spectrum, check_continuous
 # Size and training of the flow's network.
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
 LEAST = 0.01  # the loss divides squared errors by the residual's mean square plus this, lest tiny residuals dominate
+WORSE = 2.0  # a tracker whose held-out error is more than this multiple of T_inv's is dropped
 LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, as a fraction of the increments' rms
 
 
@@ -107,19 +109,10 @@ def train(
     with Run.begin(config, folder, identity=identity, console=console, device=device, resume=resume) as run:
         maps = learn_map(source, run)
         motion = _motion(source, run) if config.tracking and config.pipeline != "spinn" else None
-        training = {
-            **dataclasses.asdict(config),
-            **run.samples,
-            "device": run.device.type,
-            "threads": torch.get_num_threads(),
-            "resumed": resume,
-        }
-        versions = {
-            "kkl-gym": kkl_gym.__version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-        }
+        training = dataclasses.asdict(config) | run.samples
+        training |= {"device": run.device.type, "threads": torch.get_num_threads(), "resumed": resume}
+        versions = {"kkl-gym": kkl_gym.__version__, "python": platform.python_version()}
+        versions |= {"torch": torch.__version__, "numpy": np.__version__}
         facts = source.facts() | ({} if maps.filter.nu else {"u_max": None})
         artifact = Artifact(**vars(maps), **facts, training=training, versions=versions)
         with run.timed("calibrating"):
@@ -127,8 +120,23 @@ def train(
                 artifact = calibrate(artifact, source, motion=motion, console=run.progress)
             except TooFewRunsError as reason:
                 run.progress.say(f"the observer has no covariances and does not track: {reason}")
-        training |= source.judged(artifact) | {"cpu_seconds_spent": round(time.process_time() - began, 1)}
+        artifact, errors = _judged(artifact, source, run)
+        training |= errors | {"cpu_seconds_spent": round(time.process_time() - began, 1)}
         return Result(dataclasses.replace(artifact, training=training), run.losses, dict(run.seconds))
+
+
+def _judged(artifact: Artifact, source: Source, run: Run) -> tuple[Artifact, dict[str, Any]]:
+    """Return the artifact and the errors of its observer; a tracker that makes them much larger is dropped."""
+    errors = source.judged(artifact)
+    if artifact.motion is None or not errors.get("held_out_errors"):
+        return artifact, errors
+    of_alone = source.judged(alone := dataclasses.replace(artifact, motion=None, C=None))
+    total, of_T_inv = (sum(each["held_out_errors"].values()) for each in (errors, of_alone))
+    if total <= WORSE * of_T_inv:
+        return artifact, errors
+    text = f"its error on held-out records would be {total / of_T_inv:.2g} times that of T_inv alone"
+    run.progress.say(f"the observer does not track, as {text}: list the measured signals as hidden ones, too")
+    return alone, of_alone
 
 
 def _motion(source: Source, run: Run) -> Motion | None:

@@ -33,8 +33,8 @@ def simulate_faults(
 ) -> pd.DataFrame:
     """Simulate sensors that fail in the middle of a trajectory; return the scores and delays of the monitor."""
     check_duration(duration, dt := artifact.filter.dt)
-    if trajectories < 2:
-        raise ValueError(f"trajectories must be at least 2, with and without inputs, got {trajectories}")
+    if trajectories < (least := 1 + bool(artifact.nu and not policy)):
+        raise ValueError(f"trajectories must be at least {least}, one without inputs, got {trajectories}")
     deadline = profile(system).fault_deadline or duration / 5
     if not deadline <= duration / 2:
         raise ValueError(f"duration must be at least {2 * deadline:g} s, twice a fault's deadline, got {duration:g} s")

@@ -27,9 +27,7 @@ FEWEST = 50  # calibration needs at least this many samples at which a stretch m
 BEYOND = 0.5  # estimates may leave the range of the states by this fraction of it
 INCREMENTS = 400_000  # largest number of increments that a flow is learned from
 WINDOW = 10  # least number of samples over which a tracker averages innovations
-# The residual of y = C x counts as noise unless it exceeds UNEXPLAINED times the output's standard deviation, or its
-# change from sample to sample is smaller than itself: noise is white. Below LITTLE times, it always counts as noise.
-UNEXPLAINED, LITTLE = 0.7, 0.1
+UNEXPLAINED = 0.7  # a larger residual of y = C x, in standard deviations of the output, is no noise
 ROUNDING, OUTLIER = 1e-6, 6.0  # largest rounding, relative to an output; least outlier, in residual standard deviations
 LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
 MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # records: modes per output; slowest and fastest, relative to the signal rate
@@ -342,12 +340,8 @@ def linear_output(records: Sequence[Record], known: np.ndarray | None = None) ->
     size, moves = np.sqrt(np.mean(y**2, 0)), y.std(0)
     C, left = _fitted(x, y, size) if known is None else (known, _usual(y - x @ known.T))
     least = np.maximum(left, LEAST_NOISE * np.where(moves > ROUNDING * size, moves, np.where(size > 0, size, 1.0)))
-    if known is not None:
-        return C, least
-    wrong = (left > UNEXPLAINED * moves) | (_usual(np.diff(y - x @ C.T, axis=0)) < left)
-    wrong &= left > np.maximum(LITTLE * moves, ROUNDING * size)
-    signals = records[0].signals
-    if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
+    signals, wrong = records[0].signals, left > np.maximum(UNEXPLAINED * moves, ROUNDING * size)
+    if known is None and (other := [name for name, bad in zip(signals.measured, wrong) if bad]):
         raise ValueError(
             f"{', '.join(other)} is not a weighted sum of {', '.join(signals.hidden)} (without an offset), and a "
             "tracker predicts only such sums: list the measured signals, in the same units, as hidden ones too"
