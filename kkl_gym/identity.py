@@ -28,7 +28,7 @@ def check_autoreset(env: Any) -> None:
     for one in base.envs if isinstance(base, gym.vector.SyncVectorEnv) else [env]:
         while isinstance(one, gym.Wrapper):
             if isinstance(one, gym.wrappers.Autoreset):
-                raise ValueError("the wrapper Autoreset hides where episodes begin: put it outside")
+                raise ValueError("the wrapper Autoreset hides where episodes begin: remove it, or make it outermost")
             one = one.env
 
 

@@ -169,7 +169,7 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
-    """Return the state after an interval by substeps whose length follows the error; ``end`` if x escapes or is NaN."""
+    """Return the next state by substeps whose length follows the error, or the given ``end`` if x escapes or is NaN."""
     # Motions that accelerate, as at an ignition, need such substeps. The substeps also verify an escape: equal substeps
     # that were too long at the end of the interval may have left the bounds only by their error.
     if system.discrete:
@@ -251,7 +251,7 @@ def _powers(need: np.ndarray) -> np.ndarray:
 def _substeps(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: np.ndarray, n: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the states (nx, m) after n (m,) >= 1 substeps of length h (m,), and each row's largest squared error."""
+    """Return the states (nx, m) after n (m,) >= 1 substeps of length h (m,), and the largest squared errors (m,)."""
     out, error = _step_batch(system, x, u, w, h)
     for k in range(2, n.max(initial=1) + 1):
         rows = np.flatnonzero(n >= k)
@@ -263,7 +263,7 @@ def _substeps(
 def followed_rows(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, *, dt: float, end: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """Return ``end`` (nx, n), in which :func:`followed` has replaced the ``rows`` (m,) that start within bounds."""
+    """Return states ``end`` (nx, n); :func:`followed` replaces those of indices ``rows`` (m,) if x is within bounds."""
     if len(rows):
         low, high = np.array(system.bounds, dtype=float).T[..., None]
         # Equations may use NumPy even on the floats of a single state, and NumPy would warn.

@@ -166,13 +166,13 @@ class Artifact:
         sizes, ny = (motion.nx, len(motion.least_measurement_noise)), self.ny
         if sizes != (self.nx, ny) or not motion.fits_inputs(self.nu):
             raise ArtifactError(
-                f"a motion of {sizes[0]} states and {sizes[1]} outputs does not fit an observer of {self.nx} states "
-                f"and {ny} outputs, or the motion's inputs do not fit the observer's {self.nu} inputs"
+                f"a model of {sizes[0]} states and {sizes[1]} outputs does not fit an observer of {self.nx} states "
+                f"and {ny} outputs, or the model's inputs do not fit the observer's {self.nu} inputs"
             )
         if self.inverse.error_covariance is None or not self.knows_output:
-            raise ArtifactError("an artifact with a motion needs T_inv's covariance and the output h(x), too")
+            raise ArtifactError("a model of the motion needs T_inv's covariance and the output h(x), too")
         if self.parameter_ranges:
-            raise ArtifactError(f"a motion needs fixed parameters, not ranges of {', '.join(self.parameter_ranges)}")
+            raise ArtifactError(f"a model must have fixed parameters, not ranges of {', '.join(self.parameter_ranges)}")
 
     def _check_signals(self, signals: Mapping[str, Sequence[str]]) -> None:
         counts = {"measured": self.ny, "inputs": self.nu, "hidden": self.nx}
@@ -272,8 +272,8 @@ class Artifact:
             self._lacks("holds no covariance; kkl-gym train makes a map that does")
 
     def require_motion(self) -> Motion:
-        """Return the motion by which the observer tracks, or raise ArtifactError if it has no motion."""
-        return self.motion or self._lacks("cannot track: it holds no motion; kkl-gym train makes a map that does")
+        """Return the model by which the observer predicts when it tracks, or raise ArtifactError without a model."""
+        return self.motion or self._lacks("cannot track: it holds no model; kkl-gym train makes a map that tracks")
 
     def _lacks(self, text: str) -> NoReturn:
         raise ArtifactError(f"this map for {self.system!r} {text}")

@@ -1,4 +1,4 @@
-"""Networks, motions and outputs as machine code for the kernel. They need Numba."""
+"""Networks, equations of motion and outputs h(x) as machine code for the kernel. They need Numba."""
 
 import functools
 import math

@@ -191,7 +191,7 @@ def test_wrappers_that_change_the_meaning_of_actions(saved):
 
 
 def test_autoreset_inside_is_refused(saved):
-    with pytest.raises(ValueError, match="Autoreset hides where episodes begin: put it outside"):
+    with pytest.raises(ValueError, match="Autoreset hides where episodes begin: remove it, or make it outermost"):
         KKLObservation(Autoreset(gym.make("Pendulum-v1")), saved(PENDULUM()))
 
 

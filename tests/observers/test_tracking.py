@@ -239,7 +239,7 @@ def test_tracking_false_equals_the_map_without_a_motion(options):
         np.testing.assert_array_equal(one.covariance, other.covariance)
     for name in ("estimate", "estimate_covariance"):
         np.testing.assert_array_equal(*(getattr(each, name)(y, u) for each in (one, other)))
-    with pytest.raises(ArtifactError, match="cannot track: it holds no motion; kkl-gym train"):
+    with pytest.raises(ArtifactError, match="cannot track: it holds no model; kkl-gym train"):
         KKLObserver(bare, tracking=True)
 
 
@@ -251,9 +251,9 @@ def test_artifacts_with_a_motion_that_does_not_fit(make_artifact):
     for lacking in ({"inverse": replace(plain.inverse, error_covariance=None)}, {"C": None}):
         with pytest.raises(ArtifactError, match="needs T_inv's covariance and the output"):
             replace(plain, motion=motion, **lacking)
-    with pytest.raises(ArtifactError, match="needs fixed parameters, not ranges of k"):
+    with pytest.raises(ArtifactError, match="model must have fixed parameters, not ranges of k"):
         replace(plain, motion=motion, parameters={"k": 1.0}, parameter_ranges={"k": (0.9, 1.1)})
-    with pytest.raises(ArtifactError, match="cannot track: it holds no motion; kkl-gym train"):
+    with pytest.raises(ArtifactError, match="cannot track: it holds no model; kkl-gym train"):
         plain.require_motion()
 
 

@@ -1,4 +1,4 @@
-"""The step as C99 with only the C library. The tracker uses doubles: floats would not keep P positive definite."""
+"""An observer's step as C99, with only the C library. The tracker uses doubles, as floats could make P indefinite."""
 
 import math
 import re

@@ -13,7 +13,7 @@ from training.trajectories.parameters import with_parameters
 
 STEP = 1e-8  # step of numerical derivatives, in half-widths of states or units of parameters
 SETTLING = 12  # largest number of Levenberg-Marquardt steps that fit a start
-CONVERGED = 1e-3  # a start has converged if a step lowers the window's mean square by a smaller share
+CONVERGED = 1e-3  # a start has converged if a step lowers its mean squared residual by less than this share
 FIRST_DAMPING = 1e-3
 BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # shares of a window to which its start is fitted first
 DRAWS, KEPT = 64, 4  # random starts for each window, and the number of best ones that are fitted
@@ -64,7 +64,7 @@ class Shooting:
     def derivatives(
         self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
     ) -> np.ndarray:
-        """Return derivatives (steps + 1, n, ny, d) by starts (X's half-widths) and, if asked, parameters (``unit``)."""
+        """Return derivatives (steps + 1, n, ny, d) of ``y`` by starts in half-widths and, if asked, theta in units."""
         n, nx = x0.shape
         size = np.concatenate([self.half, self.unit]) * STEP
         moved = len(size) if parameters else nx
@@ -90,7 +90,7 @@ class Motions:
     each: np.ndarray
 
     def take(self, others: "Motions", rows: np.ndarray, of: np.ndarray) -> None:
-        """Replace the motions ``rows`` by the motions ``of`` from ``others``."""
+        """Replace the motions of indices ``rows`` by those of ``others`` at the indices ``of``."""
         self.x0[rows], self.each[rows] = others.x0[of], others.each[of]
         self.y[:, rows], self.r[:, rows] = others.y[:, of], others.r[:, of]
 
