@@ -143,28 +143,28 @@ class Motion:
     def __post_init__(self) -> None:
         nx = len(self.x_offset) if self.x_offset.ndim == 1 else 0
         if (self.equations is None) == (self.flow is None):
-            raise ArtifactError("a motion needs either equations or a flow")
+            raise ArtifactError("a Motion needs either equations or a flow")
         field = None if self.equations is None else self.equations.field
         fits = self.flow is not None if field is None else len(field.components) == nx and field.states <= nx
         if not nx or not fits or (self.flow is not None and self.flow.mlp.outputs != nx):
-            raise ArtifactError(f"a motion of {nx} states does not fit its equations or its flow")
+            raise ArtifactError(f"a Motion of {nx} states does not fit its equations or its flow")
         check_shapes(self, dict.fromkeys(("x_scale", "low", "high", "mean", "error", "process_noise"), (nx,)))
         check_shapes(self, {"covariance": (nx, nx)})
         if self.least_measurement_noise.ndim != 1:
             raise ArtifactError(f"least_measurement_noise must be (ny,), got {self.least_measurement_noise.shape}")
         for name in ("x_scale", "least_measurement_noise"):
             if not (getattr(self, name) > 0).all():
-                raise ArtifactError(f"{name} of a motion must be positive, got {getattr(self, name)}")
+                raise ArtifactError(f"{name} of a Motion must be positive, got {getattr(self, name)}")
         for name in ("error", "process_noise"):
             if not (getattr(self, name) >= 0).all():
-                raise ArtifactError(f"{name} of a motion must not be negative, got {getattr(self, name)}")
+                raise ArtifactError(f"{name} of a Motion must not be negative, got {getattr(self, name)}")
         check_positive_definite(self.covariance)
         if not (self.low < self.high).all():
-            raise ArtifactError(f"bounds of a motion must go from low to high, got {self.low} and {self.high}")
+            raise ArtifactError(f"bounds of a Motion must go from low to high, got {self.low} and {self.high}")
         for name in ("least_process_noise", "window"):
             value = getattr(self, name)
             if not is_finite(value) or not 0 < value <= _MAX_LEVEL:
-                raise ArtifactError(f"{name} of a motion must be positive and at most {_MAX_LEVEL:g}, got {value!r}")
+                raise ArtifactError(f"{name} of a Motion must be positive and at most {_MAX_LEVEL:g}, got {value!r}")
 
     @property
     def nx(self) -> int:
@@ -193,7 +193,7 @@ class Motion:
         continuous = self.equations is not None and self.equations.substeps
         # A tolerance, because clocks jitter and floats resolve seconds since 1970 only to 2e-7 s.
         if not continuous and abs(samples - max(1, round(samples))) > 1e-3:
-            what = "a learned flow" if self.flow is not None else "a motion in discrete time"
+            what = "a learned flow" if self.flow is not None else "a Motion in discrete time"
             raise ValueError(
                 f"{what} predicts over whole sampling intervals, got a dt of {samples:g} intervals; pass a whole "
                 "multiple of the interval, or tracking=False"

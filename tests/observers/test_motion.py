@@ -62,16 +62,16 @@ def test_variances_have_floors():
 @pytest.mark.parametrize(("changes", "words"), [
     ({"flow": exact_flow()}, "either equations or a flow"),
     ({"equations": None}, "either equations or a flow"),
-    ({"equations": None, "flow": tracking("flow", system="lorenz").motion.flow}, "a motion of 2 states does not fit"),
-    ({"equations": Equations(Expression([["x", 0], ["x", 2]]))}, "a motion of 2 states does not fit"),
+    ({"equations": None, "flow": tracking("flow", system="lorenz").motion.flow}, "a Motion of 2 states does not fit"),
+    ({"equations": Equations(Expression([["x", 0], ["x", 2]]))}, "a Motion of 2 states does not fit"),
     *(({name: np.zeros(3)}, name) for name in ("x_scale", "low", "high", "mean", "error", "process_noise")),
-    *(({name: np.zeros(size)}, f"{name} of a motion must be positive, got")
+    *(({name: np.zeros(size)}, f"{name} of a Motion must be positive, got")
       for name, size in (("x_scale", 2), ("least_measurement_noise", 1))),
-    *(({name: -np.ones(2)}, f"{name} of a motion must not be negative") for name in ("error", "process_noise")),
+    *(({name: -np.ones(2)}, f"{name} of a Motion must not be negative") for name in ("error", "process_noise")),
     *(({"covariance": np.array(wrong)}, "a covariance must be positive definite, got")
       for wrong in ([[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]])),
-    ({"low": np.full(2, 50.0)}, "bounds of a motion must go from low to high"),
-    *(({name: wrong}, f"{name} of a motion must be positive and at most")
+    ({"low": np.full(2, 50.0)}, "bounds of a Motion must go from low to high"),
+    *(({name: wrong}, f"{name} of a Motion must be positive and at most")
       for name in ("least_process_noise", "window") for wrong in (0.0, np.nan, 1e200, "1", None, True)),
 ])  # fmt: skip
 def test_motions_that_do_not_fit(changes, words):

@@ -397,7 +397,7 @@ def show_parameters(system: System) -> str:
 def spread(values: np.ndarray) -> str:
     """Return the median and interquartile range as text."""
     low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
-    return f"{median:.2f} ({low:.2f} – {high:.2f})"
+    return f"{percent(median)} ({percent(low)} – {percent(high)})"
 
 
 def percent(value: float) -> str:

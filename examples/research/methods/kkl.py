@@ -88,7 +88,7 @@ class Default(KKLMethod):
 
 
 class Shipped(KKLMethod):
-    """The shipped default maps, trained at a larger budget: ``--methods shipped``."""
+    """The shipped default maps, trained on fewer trajectories: ``--methods shipped``."""
 
     name: ClassVar[str] = "shipped"
     label: ClassVar[str] = "default maps, as shipped"
