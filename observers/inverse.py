@@ -53,7 +53,7 @@ class InverseMap:
     - ``z_y``, ``z_u``: together the modes ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2, with
       sigma_v the standard deviation of the measurement noise. Each mode has unit variance over noise-free training
       data, so the division shrinks a noisy mode to its conditional mean;
-    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), one value for each sigma_v;
+    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), one input for each sigma_v (see below);
     - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), with the level in multiples of the
       system's scale per second, as in environments;
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.

@@ -1,4 +1,4 @@
-"""Checkpoints of an agent's training, which need no pickle, unlike the files of stable-baselines3."""
+"""Checkpoints of an agent's training: unlike the files of stable-baselines3, they are read without running code."""
 
 import csv
 import time
@@ -26,7 +26,7 @@ class Checkpoint(BaseCallback):
     """Writes a checkpoint and the learning curve at the end of a training and, at intervals, between two rollouts.
 
     A checkpoint holds networks, optimisers, counters, the scaling of observations and returns, the replay buffer, the
-    learning curve, the memory's weights and the recorded samples that train an observer. It holds neither environments
+    learning curve, KKLMemory's weights and the recorded samples that train an observer. It holds neither environments
     nor random generators: a resumed training begins new episodes with other random numbers. The learning curve has a
     row for each episode: steps, CPU seconds and return.
     """
@@ -42,7 +42,7 @@ class Checkpoint(BaseCallback):
         if not resume:
             path.unlink(missing_ok=True)
         self.saved = run.load_checkpoint(path, fingerprint=fingerprint) if path.exists() else None
-        self.weights = (self.saved or {}).get("weights")  # the memory's weights
+        self.weights = (self.saved or {}).get("weights")  # of KKLMemory
 
     def restore(self, model: BaseAlgorithm, steps: int) -> None:
         """Restore the saved training, if there is one; ``steps`` is the number of steps at which learning ends."""

@@ -42,7 +42,7 @@ RECURRENT = "ppo_lstm"
 # all steps, and the agent learns from true hidden signals: its policy also suits the later, very accurate estimates.
 PRIVILEGED = 0.9
 WANDERED = 0.1  # share of all steps that the first phase takes under noise; its actions are random
-REHEARSAL = 0.05  # share of all steps: the end of a training with refits, without exploration or learning
+REHEARSAL = 0.05  # a training that refits its observer ends with this share of all steps, without learning
 FILE = "agent.safetensors"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings that no algorithm takes
 _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes a system's task
@@ -102,7 +102,7 @@ def learn(
     and afterwards their estimates. Under noise the estimates are less accurate, and a policy for true signals does not
     suit them. The first steps are then fewer, their actions are random, and only the observer learns.
 
-    If an agent sees z under noise and ``observer_steps`` is given, z's weights are learned from that many random steps.
+    If ``observer_steps`` is given for z under noise, KKLMemory's weights are learned from that many random steps.
     All these first steps count as steps of the training. The observer is refitted ``aggregate`` times to the agent's
     own steps and, if this number is not 0, once more at the end.
 
@@ -200,7 +200,7 @@ def learn(
 
 
 def _first_steps(task: Task, steps: int, rehearsal: int, given: int | None) -> int:
-    """Return the number of first steps, from which an observer or the memory's weights are learned."""
+    """Return the number of first steps, from which an observer or KKLMemory's weights are learned."""
     first = round((WANDERED if task.measurement_noise else PRIVILEGED) * steps) if given is None else given
     if 0 < first < steps - rehearsal:
         return first

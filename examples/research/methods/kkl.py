@@ -46,7 +46,7 @@ class KKLMethod(Method[Artifact]):
 
 
 def within(config: Config, budget: Budget, seed: int) -> Config:
-    """Return a configuration with the benchmark's data, networks and limit of CPU time, and without tracking."""
+    """Return a configuration with the benchmark's data, networks and limit of CPU time, for T_inv without a tracker."""
     return replace(
         config,
         tracking=False,
@@ -88,7 +88,7 @@ class Default(KKLMethod):
 
 
 class Shipped(KKLMethod):
-    """The shipped default maps, trained on fewer trajectories: ``--methods shipped``."""
+    """The shipped default maps, trained on 500 trajectories whatever the budget: ``--methods shipped``."""
 
     name: ClassVar[str] = "shipped"
     label: ClassVar[str] = "default maps, as shipped"
