@@ -122,7 +122,7 @@ def _read(
     least: float = -math.inf,
 ) -> None:
     """Check the shape and the limits of a class variable, and convert it to tuples."""
-    # The value may be computed from other attributes, except where the sizes follow from it.
+    # Properties are not checked. X, bounds and u_max, which set numbers of states and inputs, must not be properties.
     if isinstance(getattr(cls, name), property) and name not in ("X", "bounds", "u_max"):
         return
     try:

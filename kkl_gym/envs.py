@@ -289,7 +289,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     def _exchanged(self) -> None:
         self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
-        # Subtracted in advance, as the next reset adds _sample: samples of the old system do not count towards SOON.
+        # The next reset adds _sample and thus begins with 0: samples of the old system do not count towards SOON.
         self._samples = -self._sample
 
     def _input(self, action: np.ndarray) -> list[float]:

@@ -11,7 +11,7 @@ from observers.machine import available
 
 
 class Decoders:
-    """T_inv for a slice of its outputs. Rows without input since reset use the artifact's ``free_inverse``, if any."""
+    """T_inv for some entries of the estimate. Rows without input since reset use the ``free_inverse``, if any."""
 
     def __init__(self, artifact: Artifact, outputs: slice, **options: Any) -> None:
         free = artifact.free_inverse

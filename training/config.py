@@ -34,7 +34,7 @@ Biases = Annotated[
     frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 )
 class Config:
-    """The settings of a training; the input-aware preset "fast" has the defaults except where it depends on the system.
+    """The settings of a training. The input-aware preset "fast" changes only settings that depend on the system.
 
     Raises
     ------
@@ -95,7 +95,7 @@ class Config:
     (n, nu) in [-1, 1], as script.py:function or module:function. It sees states with errors and explores, except in one
     trajectory in twelve. With a policy, no motions without inputs are simulated."""
     free_inverse: bool = True
-    """Whether an input-aware map has a second inverse of z_y alone, used until an input acts; none with a policy."""
+    """Whether an input-aware map has a second inverse T_inv(z_y), used until an input acts; none with a policy."""
     lead_in_input: NotNegative = 0.0
     """Before some trajectories without inputs, inputs lead the start out of X: constant inputs, up to this multiple of
     their bounds, for 20 of the system's time units (pace); with 0, random inputs within bounds for 10 units."""
@@ -109,7 +109,7 @@ class Config:
     """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
     measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
     windows: Count = 8000
-    """Number of recorded states for each time since reset; the filter starts that long before each state (records)."""
+    """Number of recorded states for each time t since reset; the filter starts t before each of them (records)."""
     members: Count = 1
     """Number of networks with different seeds, averaged into one wide network, as they extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()

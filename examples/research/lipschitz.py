@@ -28,8 +28,8 @@ CHUNK = 4096  # points whose Jacobians are computed together
 class Lipschitz:
     """Bound the Lipschitz constant of T_inv: |x_hat(z + d) - x_hat(z)| <= constant |d| for all z and d.
 
-    T_inv is the map for motion without input, long after the reset. The lower bound is the largest norm of a Jacobian
-    along unseen motions.
+    T_inv is the one that an observer uses long after a reset if no input has acted. The lower bound is the largest norm
+    of its Jacobians along unseen motions.
     """
 
     observers: Observers
@@ -98,8 +98,8 @@ def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
         return norm_product(mlp)
     low, high = SLOPES[mlp.activation]
     weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in mlp.weights]
-    # d^T M d bounds the squared effect of a layer's change d. Any diagonal D > M is valid: here diag(M) e^shape times
-    # the least factor with D >= M, times 1 + e^margin. Exponents start at 0; diagonal M gives D = 2 M, best for tanh.
+    # A change d of a layer changes the output by at most sqrt(d^T M d). Any diagonal D > M gives M of the layer before.
+    # D is diag(M) e^shape, scaled to the least D >= M, times 1 + e^margin. At first D = 2 M if M is diagonal.
     shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
     margins = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in weights[:-1]]
 

@@ -85,7 +85,7 @@ class VectorEstimate(VectorWrapper):
         disabled = self.autoreset_mode is AutoresetMode.DISABLED
         expected = self._sample + 1
         over = bool(before.any())
-        if over:  # the rows ``before`` were reset in this step, or stay at their end
+        if over:  # the step before ended these rows; this one reset them or, if DISABLED, left them
             expected[before] = self._sample[before] if disabled else 0
         self._check(expected, info["sample"], before)
         if over and disabled:

@@ -21,7 +21,7 @@ from training.trajectories.parameters import blind, nominal_share, relative_rang
 
 LEAD_IN_SHARE = 0.4  # in this share of the motions without inputs, earlier inputs have moved the start
 BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and some of a flow's training motions
-# Random inputs drive every second calibration run. A policy, if any, drives all, but sees wrong states in every second.
+# Random inputs drive every second calibration run. A policy, if any, drives all; it explores in every second.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
 LEAST_PROCESS_NOISE = 0.005  # least level of process noise for a tracker, in ``scale`` per pace; a tenth of the default
@@ -30,7 +30,7 @@ SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
 INTEGRATION_ERROR = 2e-5  # largest error of these steps in standard deviations of the states, well below the noise
 TOO_FAR_OFF = 0.01  # if SUBSTEPS steps have a larger error, for example because f jumps, a flow is learned
 INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
-DEVIATIONS = (1e-4, 0.3)  # least and largest typical distance of increments from motions, in standard deviations
+DEVIATIONS = (1e-4, 0.3)  # increments start off motions: least and largest scale of offsets, in standard deviations
 
 
 class SimulatedSource:

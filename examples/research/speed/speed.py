@@ -22,7 +22,7 @@ from training.progress import ProgressBars, progress_bars
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
 OTHERS = ("large",)  # kinds of shipped maps besides the default ones
-# Ratio of the length of records to the steps of a turn; by default, records are an hour long at 100 Hz.
+# The timed records have together HOUR times Speed.steps samples: by default, an hour at 100 Hz.
 HOUR = 72
 
 Tasks = Mapping[str, Callable[[], float]]
@@ -134,7 +134,7 @@ def variants(
     wrapped: dict[str, dict[str, Any]] = {}
     if one.observed:
         artifact = Artifact.read(resolve(_default(one)))
-        default = {"observer": one.observer, "ignore_input": not artifact.nu}  # only times matter here
+        default = {"observer": one.observer, "ignore_input": not artifact.nu}  # x_hat may be wrong: only times matter
         if with_z:
             wrapped["z"] = {**default, "estimate": "z"}
         wrapped["x_hat"] = default
