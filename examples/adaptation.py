@@ -58,7 +58,7 @@ def main(
     inverse_steps: int | None = None,
     trajectories: int | None = None,
 ) -> Compared:
-    """Simulate records of a plant that differs from an observer's model, adapt the observer, and print its errors.
+    """Adapt an observer to a plant that differs from its model, train another on the plant, and print their errors.
 
     Args:
         system: reverse_duffing, van_der_pol, rossler or lorenz.

@@ -18,8 +18,8 @@ __version__ = "0.1.0"
 OWN_ID = "kkl_gym/Own-v0"
 ENV_IDS = {cls.name: f"KKL{cls.__name__}-v0" for cls in SYSTEMS.values()}
 
-# Each is about nine tenths of the return that the system's shipped agent reaches on the estimate x_hat. Under zero
-# action, episodes return 1,850 to 2,700.
+# Each threshold is about nine tenths of the return that the system's shipped agent reaches on the estimate x_hat.
+# Under zero action, episodes return 1,850 to 2,700.
 _REWARD_THRESHOLDS = {"reverse_duffing": 4100.0, "van_der_pol": 3900.0, "rossler": 4300.0, "lorenz": 4400.0}
 
 # Registered ids are left alone, so that importlib.reload may run this module again.

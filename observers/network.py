@@ -114,7 +114,7 @@ class MLP:
     def packed(self, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Return the layers from ``first`` on, in the form that :func:`observers.kernel_functions.evaluate` takes.
 
-        One array holds the bias and weights of each layer, the weights with rows of zeros up to a multiple of UNROLLED.
+        One array holds each layer's bias and weights (inputs, outputs), with zeros up to a multiple of UNROLLED inputs.
         The other array holds the activation's index, and the widths from the input of layer ``first`` on.
         """
         layers, (outputs, inputs) = self.layers[first:], np.shape(self.weights[max(first - 1, 0)])

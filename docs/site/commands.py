@@ -45,7 +45,7 @@ trajectories = 2000
 Some defaults depend on `--preset`, `--pipeline` or `--data`: "fast 20, paper 512" is 20 for `--preset fast` and 512 for
 `--preset paper`. Parentheses list the systems with their own value.
 """
-OF_OPTIONS = ("pipeline", "policy")  # settings that only options of their own can set
+OF_OPTIONS = ("pipeline", "policy")  # settings that have options, so that --set does not take them
 DEFAULT = re.compile(r"\s*\((?:default: (.*)|(required|optional|sets: .*))\)\s*$", re.DOTALL)
 SHOWN = 3  # longest tuple whose numbers the table lists
 
@@ -68,7 +68,7 @@ def parsers(prog: str, commands: Commands) -> Iterator[tuple[str, argparse.Argum
     """The full name (such as ``kkl-gym train``), parser and description of each command and subcommand."""
     for name, behind in commands.items():
         command = load(*behind)
-        with warnings.catch_warnings():  # only this function of tyro lists the options
+        with warnings.catch_warnings():  # tyro deprecates its only function that lists the options
             warnings.simplefilter("ignore", DeprecationWarning)
             parser = tyro.extras.get_parser(command, config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff))
         # numpydoc's sections are left out; they are for readers of the code
@@ -108,7 +108,7 @@ def text(written: str, between: str = " ") -> str:
 
 @dataclass(frozen=True)
 class Other(System):
-    """An oscillator unlike any that ships (1e5 rad/s, size 1e-5): a default that a shipped system shares is general."""
+    """An oscillator (1e5 rad/s, size 1e-5) unlike all shipped systems: a default in common with them is general."""
 
     name = "other"
     X = ((-1e-5, 1e-5), (-1e-5, 1e-5))

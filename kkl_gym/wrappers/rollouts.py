@@ -126,7 +126,7 @@ class Samples:
             return {}
         try:
             return {"x": self.hidden(observation, info, batch)}
-        # A wrapper inside replaces hidden signals by NaN, or ``info`` lacks them at this step.
+        # ValueError: a wrapper inside replaces hidden signals by NaN, or ``info`` lacks them at this step.
         except ValueError:
             return {}
 

@@ -19,7 +19,7 @@ from training.rollouts.playing import WANDERING, Recorder, policy_of, roll_out
 from training.sources.recorded import RECORDED_NOISE, RecordedSource, recorded_preset
 
 OBSERVER = "observer.safetensors"
-HEADROOM = 1.5  # T_inv's training covers noise levels up to this multiple of the task's, or more
+HEADROOM = 1.5  # T_inv's training covers noise levels up to at least this multiple of the task's
 HELD_OUT = 0.2  # held-out share of the episodes
 KEPT = 100_000  # number of latest steps from which an observer is learned
 SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}

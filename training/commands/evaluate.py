@@ -123,7 +123,7 @@ class Evaluate:
 
     2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out; noise levels
     beyond a map's range are left out. A policy under which an observer was trained acts in all runs. In driven runs it
-    sees the state with errors, and explores. In other runs it sees the exact state, and its inputs u reveal the state.
+    sees the state with errors, and explores. In other runs it sees the exact state, and its actions u reveal the state.
 
     --calibration: the shares of errors within the 50, 90 and 99 % regions of the covariances, for all states together
     and for each, and the mean normalised estimation error squared (NEES), at six noise levels.
@@ -300,7 +300,7 @@ class Evaluate:
             return []
         frame = pd.DataFrame(rows)
         limits = f"{frame.nees_low.min():.2f} to {frame.nees_high.max():.2f}"
-        caption = f"with true covariances, the mean NEES of a sample lies within {limits} with probability 95 %"
+        caption = f"with true covariances, the NEES at one time, averaged over runs, is {limits} with probability 95 %"
         title = f"{of.name}: errors in regions, %, {self._runs(of)}{of.on}"
         right = ["noise", *(f"{name} %" for name in REGIONS), "NEES"]
         progress.console.print(table(title, ["observer", "starts", "span"], shown, right, caption))

@@ -224,7 +224,7 @@ class Windows:
         return z
 
     def restarted(self, rows: np.ndarray, age: int) -> np.ndarray:
-        """Return, by linearity, the states at ``rows`` of filters that started ``age`` samples before each row."""
+        """Return z at the samples ``rows`` if the filter had started ``age`` samples before each, by linearity."""
         began = rows - age
         power = np.linalg.matrix_power(self.linear.transition, age)
         return np.asarray(self.z[rows] + (self.linear.start(self.y[began]) - self.z[began]) @ power.T)

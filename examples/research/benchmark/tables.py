@@ -92,7 +92,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
     costs = methods.set_index(["system", "method"])
     lines += ["## Cost", "", "CPU seconds of training; CPU time of a step of one trajectory and of 1,000 at once.", ""]
     lines += _by_method(methods, partial(_cost, costs))
-    lines += ["## Configuration", "", "Chosen on validation trajectories, or, without a search, the first one.", ""]
+    lines += ["## Configuration", "", "Chosen on validation runs; without a search, the first configuration.", ""]
     lines += _by_method(methods, partial(_configuration, costs))
     write(path, "\n".join(lines) + "\n")
 

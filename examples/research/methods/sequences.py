@@ -62,7 +62,7 @@ class LRUCell(Cell):
     """Blocks of diagonal complex linear recurrences, each followed by a gated layer and a residual connection."""
 
     blocks: ClassVar[int] = 2
-    decay: ClassVar[tuple[float, float]] = (0.003, 0.3)  # initial range per sample, logarithmically spaced
+    decay: ClassVar[tuple[float, float]] = (0.003, 0.3)  # range of the initial decay rates, per sample
     turn: ClassVar[float] = 0.3  # rad per sample, the largest initial angle
 
     def __init__(self, width: int) -> None:
