@@ -47,8 +47,8 @@ class Artifact:
     limits : Limits, optional
         Limits of the residual y - h(x_hat) in normal operation, if they were calibrated.
     free_inverse : InverseMap, optional
-        A map from z_y alone to x, which replaces T_inv until the first nonzero input. Motion without input visits far
-        fewer states than driven motion, so a map for these states alone is more accurate.
+        A map to x from z_y alone, the part of z that y drives; it replaces T_inv until the first nonzero input. Motion
+        without input visits far fewer states than driven motion, so a map for these states alone is more accurate.
     motion : Motion, optional
         Model of the system's motion: its equations or a learned flow. An observer with this model tracks: a Kalman
         filter predicts by the model and corrects by each sample, and T_inv initialises the filter.

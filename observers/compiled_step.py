@@ -73,7 +73,7 @@ class CompiledStep:
     ) -> None:
         """Advance rows of the state in place by samples and inputs, at the sampling interval of ``linear``.
 
-        ``record``, if given, receives by its shape each sample's rows (steps, n, width) or estimates (steps, n, nx).
+        A ``record`` of shape (steps, n, width) receives each sample's rows, one of (steps, n, nx) its estimates.
         Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu).
         """
         # Numba would compile again for arrays that are read-only or not contiguous.

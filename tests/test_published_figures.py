@@ -150,7 +150,7 @@ def test_coverage_and_nees():
         rows = rows[(rows.starts == "X") & (rows.measurement_noise > 0)]
         cells.append(f"{rows.nees.between(rows.nees_low, rows.nees_high).sum()} of {len(rows)}")
     assert row(
-        "noisy cases of the first four rows with NEES within 95 % limits of a mean over the runs", cells
+        "first four rows, noise above 0: cases with NEES within 95 % limits of a mean over the runs", cells
     ) in page(ACCURACY)
 
 

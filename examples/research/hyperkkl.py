@@ -38,7 +38,7 @@ PRINTED: dict[str, tuple[float, float, float, float]] = {
 
 
 class Driven:
-    """Base of all systems: one input within [-1, 1], and samples every 0.05 s.
+    """Base of all systems: one input, in training within [-1, 1], and samples every 0.05 s.
 
     ``trial`` is the duration of a trial in s, ``noise`` the noise of noisy trials, ``seen`` the measured state's index.
     """

@@ -16,7 +16,7 @@ from training.progress import ProgressBars
 from training.records import Record, check_signals, pieces
 
 HELD_OUT = 10  # of the pieces of records between gaps, the 6th, 16th, 26th, ... are held out of the fit
-KEPT_RATIOS = 100.0  # parameter i is given[i] * c * f_i: prior variance of log c, divided by that of log f_i
+KEPT_RATIOS = 100.0  # prior variance of the log of a common factor of all parameters, over that of each own factor
 BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(), tried in turn until one leaves the fit about as good
 UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change exceeds this share of the parameters' change
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
@@ -134,7 +134,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     """Return the parameters nearest to ``given`` among all that explain the outputs as well as ``values`` do.
 
     Parameters without influence on the outputs become ``given``; those of another sign than ``given`` keep ``values``.
-    The distance counts changed ratios of all others heavily, their common factor lightly: a faster plant may scale all.
+    For the rest, the distance weighs changed ratios heavily, a common factor lightly: a faster plant may scale all.
 
     Shapes: ``values`` (p,), ``given`` (p,), unidentifiable directions ``hidden`` (p, k); returns (p,).
     """

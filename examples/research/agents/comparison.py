@@ -43,7 +43,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 ON_SYSTEMS: tuple[Kind, ...] = ("state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state")
 IN_ENVIRONMENTS: tuple[Kind, ...] = ("state", "x_hat", "z", "stacked", "recurrent", "y")
 IDLE: Literal["random"] = "random"  # zero input on systems, random actions in environments; normalised score 0
-# The information sets of the kinds that are not named after their information set.
+# What agents of some kinds see; the other kinds have the name of their information set.
 SEEN: dict[str, Information] = {"ekf": "x_hat", "recurrent-state": "state"}
 # For some settings of a task: the kinds of agents that depend on the setting.
 CONCERNED = {
@@ -112,7 +112,7 @@ class ComparedAgent(Job):
 
     @property
     def _observer(self) -> str | None:
-        """Return the observer with which the agent begins, or None."""
+        """Return the observer's name or file on systems; None in environments, and for kinds without an observer."""
         if self.task.system is None or self.kind not in OBSERVED:
             return None
         return self.observer or observer_of(get_system(self.task.system))
