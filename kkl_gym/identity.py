@@ -33,7 +33,7 @@ def check_autoreset(env: Any) -> None:
 
 
 def identity(env: Env) -> dict[str, Any]:
-    """Return id and arguments of an environment; ValueError if the rows of a vector differ in them."""
+    """Return an environment's id and arguments; ValueError if a vector environment's members differ in them."""
     base: Any = env.unwrapped
     specs = base.get_attr("spec") if _of_rows(base) else [env.spec]
     found = [_identity(spec, env) for spec in specs]

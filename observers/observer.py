@@ -41,7 +41,7 @@ class KKLObserver(RecordEstimates):
     Parameters
     ----------
     artifact : Artifact
-        The learned filter, maps and motion.
+        The learned filter, maps and motion model.
     measurement_noise : float or sequence of float, length ny, optional
         Standard deviation of the noise on each sample: one for all outputs, or one for each if the map takes that.
         By default :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
@@ -73,7 +73,7 @@ class KKLObserver(RecordEstimates):
         If ``compiled`` is True and Numba is not installed.
     ValueError
         If an argument has the wrong type or is out of range, the levels of measurement noise differ between outputs
-        but the map takes one level for all, or the artifact lacks the motion or the limits that an argument needs.
+        but the map takes one level for all, or the artifact lacks the motion model or limits that an argument needs.
     """
 
     def __init__(
@@ -226,7 +226,7 @@ class KKLObserver(RecordEstimates):
         return self.decode()
 
     def _begin(self, y0: np.ndarray, x0: np.ndarray | None) -> np.ndarray:
-        """Return rows of the state at first samples (..., ny) and, if given, known states (..., nx)."""
+        """Return the internal state (n, width) at first samples (..., ny) and, if given, known states (..., nx)."""
         z0, age = first_state(self.artifact, self.tracking, y0, x0)
         n = math.prod(y0.shape[:-1])
         x0 = None if x0 is None else real_array("x0", x0).reshape(n, self.artifact.nx)
@@ -398,7 +398,7 @@ class KKLObserver(RecordEstimates):
     def covariance(self) -> np.ndarray:
         """Covariance of the error x - x_hat of the current estimate, shape (..., nx, nx).
 
-        It is calibrated on runs, by noise level and age, so that 90 % of errors have (x - x_hat)^T P^-1 (x - x_hat)
+        It is calibrated on runs by noise level and time since reset: 90 % of errors have (x - x_hat)^T P^-1 (x - x_hat)
         below the 90 % quantile of the chi-square distribution with nx degrees of freedom. For a tracker it is the
         calibrated covariance of its Kalman filter. On another plant, under a faulty sensor or far outside the training,
         P is too small. Raises RuntimeError before :meth:`reset`, and ArtifactError if the artifact holds no covariance.
@@ -422,7 +422,7 @@ class KKLObserver(RecordEstimates):
         return self._state
 
     def _some(self, rows: np.ndarray | None) -> tuple[np.ndarray, tuple[int, ...]]:
-        """Return some rows of the state, predicted to now if outputs are delayed, and the shape of their batch."""
+        """Return the internal state of some rows, predicted to now if outputs are delayed, and their batch's shape."""
         state, batch = self._begun(), self._batch
         chosen: Any = slice(None)
         if rows is not None:

@@ -16,7 +16,7 @@ from training.trajectories.motions import how_to_stay
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
 MIN_STEPS = 10  # least number of samples of a motion
-# Shares of a direction's initial standard deviation at a motion's end, above which the verdict is "problem" or "note".
+# The verdict is "problem" or "note" where more than this share of a direction's standard deviation is left at the end.
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in the direction
 VAGUE, NOTHING = 0.3, 1.0  # errors in standard deviations of the state, without and with noise, that get a "note"
@@ -34,7 +34,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
     late = weights[len(weights) // 2 :]
     late += max(0, round(subject.duration / subject.dt) + 1 - len(weights)) / len(late)
     least = np.average(errors, axis=1, weights=weights)
-    # Under a policy, motions from other starts have other inputs.
+    # Symmetries need motions under the same inputs; under a policy, other starts have other inputs.
     findings = _unseen(names, left) | ({} if subject.policy else _symmetries(subject, least[0]))
     yield from findings.values()
     for i, name in enumerate(names):
@@ -87,7 +87,7 @@ def _unseen(names: tuple[str, ...], left: np.ndarray) -> dict[tuple[int, ...], F
             involved = np.flatnonzero(np.abs(direction) > INVOLVED)
             states = [names[i] for i in involved]
             of = states[0] if len(states) == 1 else f"a combination of {' and '.join(states)}"
-            advice = f"let h measure {' or '.join(states)} too, or leave that state out"
+            advice = f"let h measure {' or '.join(states)} too, or leave {' or '.join(states)} out"
             verdict: Verdict = "problem" if share > UNSEEN else "note"
             text = f"y {'does not determine' if share > UNSEEN else 'hardly determines'} {of}"
             findings[tuple(involved.tolist())] = Finding("observability", verdict, text, advice)

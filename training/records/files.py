@@ -52,7 +52,7 @@ def read_records(
 
 
 def _read(path: Path, wanted: Signals) -> Record:
-    """Read the wanted signals of a file; a role, such as inputs, for which none is named takes the usual columns."""
+    """Read the wanted signals of a file; a role without named signals, such as inputs, takes the usual columns."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(

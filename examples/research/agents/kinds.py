@@ -53,7 +53,7 @@ EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluations after the firs
 OBSERVER_STEPS = 40_000  # steps from which an observer, or the weights of z under noise, are learned
 TRUTH = 0.15  # share of the time, at the start, in which agents on x_hat see the true state
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and agents on x_hat do not see y
-OF_STATE = ("masked", "parameters")  # kinds in which agents on the full state train; sensor faults do not affect them
+OF_STATE = ("masked", "parameters")  # kinds in which agents on the full state train; they see no sensor faults
 STEPS = 200_000  # number of steps after which returns are compared, too
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return")
 
@@ -152,7 +152,7 @@ class TimedAgent(Job):
         from training.agents.learning import Learner
 
         clock, observer, curve = _Clock(), None, list[tuple[Any, ...]]()
-        # Steps from which the observer or the weights of z are learned count too.
+        # The curve also counts the steps from which the observer or the weights of z are learned.
         steps = OBSERVER_STEPS if self.shown == "x_hat" or self.task.weights is not None else 0
         settings = PPO | {"learning_rate": lambda _: LEARNING_RATE * max(0.0, 1.0 - clock.seconds / self.seconds)}
         if self.env_id != "CartPole-v1":
