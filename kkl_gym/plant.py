@@ -59,7 +59,7 @@ class Plant:
         self.ny = self.system.ny  # stored, because the property evaluates h
         self._v_scale = np.broadcast_to(noise, (self.ny,))
         self._random = self.sensor is not None and self.sensor.is_random
-        if self._random:  # the sensor's own draws are not scaled
+        if self._random:  # v then ends with the sensor's own draws, which are not scaled
             self._v_scale = np.append(self._v_scale, np.ones(2 * self.ny))
         self.nv = len(self._v_scale)
         self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)

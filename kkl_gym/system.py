@@ -23,8 +23,8 @@ Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol fo
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 DT = 0.01  # s, the default where it suits a system's rate
-# DT suits a system if rate * DT lies between both limits. Beyond a limit, the default dt follows from rate * dt =
-# target. Each pair is (limit, target).
+# Each pair is (limit of rate * DT, target). Between the two limits the default dt is DT. Beyond a limit it is the
+# target divided by the rate, rounded down to 1, 2 or 5 times a power of ten.
 SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)
 PROCESS_NOISE = 0.05  # default bound, in multiples of a system's scale per time unit (``pace``)
 NOISE_SHARE = 0.05  # default measurement noise as a share of an output's range
@@ -329,7 +329,7 @@ def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> n
 
 
 def inner_state(system: System) -> tuple[float, ...]:
-    """Return a state in X for a first call of the equations. At the centre, some equations divide by zero."""
+    """Return a state in X for a first call of the equations: not the centre, where some equations divide by zero."""
     return tuple(low + (high - low) * ((0.5 + 0.618 * i) % 1.0) for i, (low, high) in enumerate(system.X, 1))
 
 

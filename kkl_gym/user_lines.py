@@ -17,7 +17,7 @@ def user_line(error: BaseException) -> str | None:
 
 
 def steps_within(error: BaseException, code: CodeType | None) -> list[TracebackType]:
-    """Return a traceback's last entry with this ``code`` and later entries outside libraries; [] if no entry has it."""
+    """Return the last traceback entry in ``code`` and the later ones outside libraries; [] if none is in ``code``."""
     steps = _steps(error)
     at = [i for i, step in enumerate(steps) if step.tb_frame.f_code is code]
     return [steps[at[-1]], *(step for step in steps[at[-1] + 1 :] if not _of_library(step))] if at else []

@@ -67,7 +67,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_part
     def smoothed(P: Any, L: Any, inverse: Any, across: Any, V: Any, turned: bool, G: Any) -> None:
-        """Compute G = across P^-1 V, or across^T P^-1 V if ``turned``."""
+        """Compute G = M P^-1 V, where M is ``across``, transposed if ``turned``."""
         b = stack(nx, W)
         factorise(P, L, inverse)
         for k in range(ny):
@@ -222,7 +222,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def whiten(y: Any, expected: Any, S: Any, r: Any, white: Any, V: Any) -> None:
-        """Whiten innovations: the corrected state is x + V white, with the covariance P - V V^T."""
+        """Whiten innovations: the corrected state is x + V ``white``, with the covariance P - V V^T."""
         for k in range(ny):
             white[k] = y[k] - expected[k]
         for k in range(ny):  # drops missing outputs, whose expected values may be undefined

@@ -112,7 +112,7 @@ class TorchTracker(Module):
         return x, P.reshape(self.nx, self.nx, -1), statistics[0], statistics[1], statistics[2], trend
 
     def _predicted(self, x: Tensor, P: Tensor, u: Tensor, Q: Tensor, G: Tensor, white: Tensor) -> Prediction:
-        """Predict x and P; the motion is linearised about the mean x + G white and the covariance P - G G^T."""
+        """Predict x and P; the motion is linearised about the mean x + G ``white`` and the covariance P - G G^T."""
         rows, sound = eliminated(P - product(G, G), G.transpose(0, 1).expand(-1, -1, x.shape[1]))
         L, H = rows[: self.nx], rows[self.nx :]
         mean, S, E = self._transformed(x + (G * white).sum(1), L, self._moved, u)
@@ -132,7 +132,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return V, white, expected outputs and V's validity; corrected moments are mean + V white and P - V V^T."""
+        """Return V, ``white``, expected outputs, V's validity; corrected moments: mean + V ``white`` and P - V V^T."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)

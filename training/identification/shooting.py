@@ -205,7 +205,7 @@ def _reduced(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the normal equations S (p, p), s (p,) of the parameters after the starts' elimination (Schur complement).
 
-    The third array (n, nx, p + 1) gives the starts' steps: its last column - its other columns @ the parameters' step.
+    The starts' steps are the last column of the third array (n, nx, p + 1), minus its others @ the parameters' step.
     """
     D, cross = damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
     along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))

@@ -68,7 +68,7 @@ def _joined(rows: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
 
 
 def _conditions(frame: pd.DataFrame, systems: set[str]) -> set[str]:
-    """Return the conditions that two results of one benchmark share: budgets and seeds, or test cases."""
+    """Return what must agree before results are joined: budgets and seeds of methods.csv, test cases of results.csv."""
     if "budget" in frame:
         return {f"budget {budget}, seed {seed}" for budget, seed in zip(frame.budget, frame.seed)}
     cases = frame[frame.system.isin(systems)][["system", "starts", "noise"]].drop_duplicates()

@@ -17,7 +17,7 @@ from training.spectrum import papers_spectrum
 
 Settings = Mapping[str, Any]
 
-NO_NOISE = 0.02  # largest noise in the training of noise-free inverses, as a share of the system's own
+NO_NOISE = 0.02  # stands for no noise: the largest noise in training, as a share of the system's own
 # A single inverse for free and driven motion, with the same distribution of noise levels for all systems.
 TOGETHER: Settings = {
     "free_inverse": False,
