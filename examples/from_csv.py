@@ -69,7 +69,7 @@ def main(
         inverse_steps: batches of the observer's training.
         trajectories: simulated trajectories of the identified plant, for the training.
         out: the run's folder.
-        seed: seed of all random numbers.
+        seed: seed of the records and the training; the episodes of the comparison have fixed seeds.
     """
     plant = kkl_gym.KKLEnv(
         "van_der_pol", parameters={"mu": MU}, process_noise=0.0, measurement_noise=NOISE, start_box=STARTS

@@ -54,7 +54,7 @@ class Outputs:
         if self.measured and keys:
             _check_keys("measured", self.measured, self._parts)
             self._parts = {key: part for key, part in self._parts.items() if key in self.measured}
-        # The keys of a Dict that an agent sees unchanged; None for other observations, or if indices choose entries.
+        # The keys that an agent still sees of a Dict; None for other observations, or if indices choose entries.
         self.keys = dict(self._parts) if isinstance(space, spaces.Dict) and (keys or not self.measured) else None
         if self.keys is not None:
             self._parts = {key: part for key, part in self._parts.items() if not _is_image(part)}
@@ -142,7 +142,7 @@ class Outputs:
         return y
 
     def kept(self, observation: Any, flat: np.ndarray) -> dict[str, Any]:
-        """Return the keys that an agent sees: boxes from the flat observation, and copies of all other values."""
+        """Return the part of a Dict that an agent still sees: boxes from ``flat``, and copies of all other values."""
         kept, at = {key: copy.deepcopy(observation[key]) for key in self.keys or ()}, 0
         for key, part in self._parts.items():
             end = at + spaces.flatdim(part)

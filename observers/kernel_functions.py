@@ -1,4 +1,4 @@
-"""Networks, equations of motion and outputs h(x) as machine code for the kernel. They need Numba."""
+"""Networks, equations of motion and outputs h(x) as machine code, called by :mod:`observers.kernel`. It needs Numba."""
 
 import functools
 import math

@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a run's folder, write its configuration; ValueError at another run's checkpoints, or any without resume."""
+    """Lock a run's folder, write its configuration; ValueError at any checkpoints, with ``resume`` at another run's."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)

@@ -30,7 +30,7 @@ PAPER_SPINN: dict[str, Any] = {
     "collocation": "box", "scaling": "range", "solved_output_layer": False, "transients": False,
 }  # fmt: skip
 NOISE_RANGE = 2.0  # largest measurement noise in training, in multiples of the system's default
-# Replaces FASTEST_MODE in discrete time, where one step may change the whole state and the last samples matter most.
+# Bound of |eigenvalue| * dt in discrete time: one step may change the whole state, and the last samples matter most.
 FASTEST_OF_STEPS = 3.0
 
 
@@ -82,7 +82,7 @@ PROFILES: dict[str, Profile] = {
         # Slower modes would have a rougher T; more modes average more of the noise.
         spinn_settings={"eigenvalues": _spaced(11, -4.0, -16.0), "noise_free_share": 0.2, "high_noise_emphasis": 4.5},
         # High noise levels are drawn more often, as they make the phase hard to estimate. Inputs within their bound
-        # cannot drive the oscillator out of X, so stronger inputs lead some starts out of it.
+        # cannot drive the oscillator out of X, so stronger inputs before some trajectories do.
         settings={"lead_in_input": 4.0, "noise_free_share": 0.05, "high_noise_emphasis": 4.0},
         # Without a tracker, slow complex modes at frequencies of y average the noise of y.
         large_settings={
@@ -128,7 +128,7 @@ def controller(system: System, dt: float) -> Controller:
 
 
 def named_policy(system: System, name: str, dt: float | None) -> Controller:
-    """Load and check a policy: the system's controller, held over dt or the default, or a script's function."""
+    """Load and check a policy: a script's function, or the system's controller, held over ``dt`` (None: its dt)."""
     if ":" not in name and name != "controller":
         similar = suggestion(name, ["controller"])
         raise ValueError(f"unknown policy {name!r}{similar}: give controller, or script.py:function")

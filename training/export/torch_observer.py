@@ -22,7 +22,7 @@ class TorchObserver(Module):
     ``state * ~done[:, None]`` restarts the rows of finished episodes. In later samples, NaN marks missing outputs.
 
     The whole step is differentiable, also with respect to the weights. The filter's state and the tracker's covariance
-    are float64 whatever ``dtype`` is. In float32, after ``observer.float()``, T_inv's estimates would be inaccurate.
+    are float64 whatever ``dtype`` is. ``observer.float()`` would make them float32, and T_inv's estimates inaccurate.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ class TorchObserver(Module):
         if self.tracker is not None:
             tracked, expected = self.tracker.advance(rest.T, y.T, u.T, begins[:, 0], levels[0].T, levels[1].T)
             y = filled(expected.T)
-        elif self.h is not None:  # the first prediction leads to a z, from which T_inv makes a better prediction
+        elif self.h is not None:  # fill gaps by h at the last estimate, then better, by h at T_inv(z)
             guess = filtered(filled(self.h(rest.T).T))
             y = filled(self.h(self._of_map(guess, TorchMap.__call__, age, *levels).T).T)
         else:

@@ -1,8 +1,8 @@
 """Identification of a plant from records of its outputs by multiple shooting, and training of its observer.
 
 :mod:`motions` simulates windows of the records, :mod:`shooting` fits parameters on windows of one length, and
-:mod:`windows` lengthens the windows. :mod:`identifiability` finds parameters and signs that the outputs do not
-determine. :mod:`identify` combines these steps, and :mod:`learning` trains the observer.
+:mod:`windows` lengthens the windows. :mod:`identifiability` finds parameters, and signs of states, that the outputs do
+not determine. :mod:`identify` combines these steps, and :mod:`learning` trains the observer.
 """
 
 from training.identification.identify import Identified, Product, estimate_parameters

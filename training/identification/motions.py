@@ -11,7 +11,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
-STEP = 1e-8  # step of numerical derivatives, in half-widths of states or units of parameters
+STEP = 1e-8  # step of numerical derivatives, for a start in half-widths of X, for a parameter in its unit
 SETTLING = 12  # largest number of Levenberg-Marquardt steps that fit a start
 CONVERGED = 1e-3  # a start has converged if a step lowers its mean squared residual by less than this share
 FIRST_DAMPING = 1e-3

@@ -15,10 +15,10 @@ FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows; all lengths are
 MORE_NOISE = 1.5  # largest standard deviation of the first windows' residuals, in multiples of the noise level
 SMALL = 0.01  # limit of these residuals in multiples of the output's standard deviation; the larger limit counts
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
-GAIN = 0.7  # a doubling of the length is the last if it leaves more than this share of every standard error
+GAIN = 0.7  # lengths grow no further once every standard error is more than this share of the one before
 MORE_COST = 2.0  # largest factor by which a doubling may increase the residuals' mean square
 LEFT = 0.4  # in standard errors: longest Gauss-Newton step that may remain after a fit
-APART = 0.5  # in standard errors: largest distance between the two fits of longer windows
+APART = 0.5  # in standard errors: largest distance between two fits of the same windows, see fit_windows
 MOST_SAMPLES = 6400  # largest number of samples in a window
 DIFFERENCES = 4  # order of the differences of y that estimate the noise
 

@@ -46,7 +46,7 @@ WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 class Cell:
     """Agents of one kind in one task: their returns ``values`` (n,) and normalised ``scores`` (n,).
 
-    ``interval``: mean score and its ends. ``scores`` and ``interval`` are NaN without idle or full-state agents.
+    ``interval``: (mean score, low, high). ``scores`` and ``interval`` are NaN if idle or full-state agents are missing.
     """
 
     values: np.ndarray
@@ -62,7 +62,7 @@ def on_systems(results: "pd.DataFrame") -> bool:
 
 
 def tasks_in(results: "pd.DataFrame") -> list[tuple[str, Any]]:
-    """Return environments and noise levels in order, without those that have only full-state or idle agents."""
+    """Return each task's environment and noise level in order, except tasks with only full-state or idle agents."""
     partly = results[~results.shown.isin(["state", IDLE])]
     return list(partly[["environment", "noise"]].drop_duplicates().itertuples(index=False, name=None))
 
@@ -90,7 +90,7 @@ def _task_name(environment: str, noise: float | str) -> str:
 
 
 def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
-    """Add columns task and idle (idle agent's return); environments' full-state agents recur at each noise level."""
+    """Add columns task and idle (idle agent's return). In environments each task gets the same full-state agents."""
     import pandas as pd
 
     tasks = []
@@ -214,7 +214,7 @@ def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
 
 
 def _draw_panel(ax: "Axes", row: Sequence[Cell | None]) -> None:
-    """Draw agents as dots, and their means with intervals; the first cell of ``row`` is at the bottom."""
+    """Draw one panel: agents as dots, means with intervals. ``row`` holds the panel's cells from bottom to top."""
     for place, cell in enumerate(row):
         if cell is not None and np.isfinite(cell.interval[0]):
             score, low, high = cell.interval
