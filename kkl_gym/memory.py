@@ -45,7 +45,7 @@ class Memory:
 
     If an angle is measured by its cosine and its sine, the memory filters the unwrapped angle itself. It assumes that
     the angle turns by less than half a turn from one sample to the next, and that it does not change where cosine and
-    sine are both 0. Memories of angles come after those of the other outputs.
+    sine are both 0. Within each filter, angles come after the other outputs.
 
     Shapes: ``angles``, indices of cosines and sines, (number of angles, 2); ``decay``, ``rise`` (m,), ``mixing``
     (m, m), ``input_decay`` (k,); outputs, inputs and the coordinates returned (..., ny), (..., nu), (..., size).
@@ -84,7 +84,7 @@ class Memory:
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
         """Two matrices that multiply rows from the right.
 
-        The first makes a step of [signals, w, v, next signals, u], and the second mixes [signals, w, v].
+        The first maps [signals, w, v, next signals, u] to the next [signals, w, v]; the second mixes [signals, w, v].
         """
         n, m, nu, of_inputs = len(self._signals), len(self.decay), self._nu, len(self.input_decay)
         each, rise = np.eye(n), np.kron(self.rise, np.eye(n))

@@ -95,7 +95,7 @@ class ErrorCovariance:
         return type(self)(np.zeros(1), self.ages, interpolated(level, self.levels, self.covariance)[None])
 
     def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
-        """Return the first level's covariances (..., nx, nx) at ages; ``shape``, if given, is the batch (...)."""
+        """Return covariances (..., nx, nx) at ages, for the level given to at_level; ``shape``: the batch, if given."""
         return interpolated(np.broadcast_to(age, shape or np.shape(age)), self.ages, self.covariance[0])
 
 

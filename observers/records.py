@@ -64,7 +64,7 @@ class RecordEstimates:
     def _along(
         self, y: np.ndarray, u: np.ndarray | None, x0: np.ndarray | None, *, of: Any, t: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the values of ``of`` at each sample; ``of`` is a function of the state, a row for each observer."""
+        """Return ``of`` at each sample; ``of`` maps the internal states (n, ...) of n observers to n rows of values."""
         if self._delay:
             raise ValueError("a record needs an observer without a delay: shift the recorded outputs by the delay")
         y = real_array("y", y)

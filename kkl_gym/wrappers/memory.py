@@ -79,7 +79,7 @@ class _Remembering:
         return np.where(np.isnan(flat), before, flat) if self._hold and before is not None else flat
 
     def show(self, obs: Any, flat: np.ndarray, shown: np.ndarray) -> Any:
-        """Return the observation: a row of the memory, or the keys of a Dict with the memory beside them."""
+        """Return the observation: the memory's output ``shown``, or a Dict of measured keys and the key "memory"."""
         return self.outputs.kept(obs, flat) | {"memory": shown[..., self._beside]} if self._beside else shown
 
 
