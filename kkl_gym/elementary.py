@@ -59,14 +59,14 @@ def _binary(name: str, on_numbers: Callable[[Any, Any], Any], meaning: str) -> C
 
 def _named(function: Any, call: str, meaning: str, on_numbers: Callable[..., Any]) -> Any:
     function.__name__ = function.__qualname__ = call.partition("(")[0]
-    # kkl_gym.compiled compiles this function, which takes numbers only.
+    # kkl_gym.compiled compiles ``on_numbers``, which takes numbers only.
     function.on_numbers = on_numbers
     function.__doc__ = f"{call}, {meaning}, for floats, NumPy arrays, torch tensors and sympy expressions."
     return function
 
 
 def _elsewhere(name: str, *args: Any) -> Any:
-    """Record a function of symbols, or evaluate it with sympy or torch."""
+    """Call a function: symbols record the call, sympy or torch evaluates it."""
     for arg in args:
         if isinstance(arg, Symbol):
             return arg.call(name, *args)

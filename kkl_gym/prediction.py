@@ -18,7 +18,7 @@ class PredictiveMemory(Memory):
     """A memory that returns the outputs expected in the next step, and predictions of later ones.
 
     It has the filters of :class:`Memory` for all outputs and angles. Cosine and sine of an angle are filtered too,
-    because a torque may depend on them. ``weights``, (features, width), multiply the signals, filters w and v, and 1.
+    because a torque may depend on them. ``weights``, (features, width), multiply signals, the filters' w and v, and 1.
     The first columns give each output's or angle's expected change in a step, the others the further predictions.
     """
 
@@ -43,7 +43,7 @@ class PredictiveMemory(Memory):
         return np.concatenate([self._signals, *self._w, *self._v, np.ones((*self._ages.shape, 1))], axis=-1)
 
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the expected outputs and the further predictions, (..., size), of all rows or some."""
+        """Return expected outputs and further predictions, (..., size), in all environments or where ``rows`` holds."""
         self._check_begun()
         predicted = self.features() @ self.weights
         n, plain = len(self._targets), len(self._plain)
@@ -66,8 +66,8 @@ class PredictiveMemory(Memory):
         n, features = x.shape
         if n < SAMPLES * features:
             raise ValueError(
-                f"the fit needs {SAMPLES * features} samples with {last} later ones in their episode, got {n}: take "
-                "more steps or shorter time constants"
+                f"the fit needs {SAMPLES * features} samples, each followed by {last} more of its episode, got {n}: "
+                "take more steps or shorter time constants"
             )
         signals = [episode[:, self._targets] for episode in episodes]
         following = [np.concatenate([s[h : len(s) - last + h] for s in signals if len(s) > last]) for h in horizons]

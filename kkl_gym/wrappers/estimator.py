@@ -28,15 +28,15 @@ class Estimates:
         self._running.reset(y0)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Begin episodes in rows (n,) with their first samples (number of True in rows, ny)."""
+        """Begin episodes where ``rows`` (n,) is True, with their first samples (number of True, ny)."""
         self._running.restart(y0, rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Return the entries to add to ``info``. Shapes: ``rows`` (n,); returns (number of rows, ...)."""
+        """Return the entries to add to ``info``, (m, ...), of all n environments or where ``rows`` (n,) is True."""
         return {"x_hat": self._running.decode(rows)}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the observations in a report, (number of rows, width)."""
+        """Return the observations in a report, (m, width)."""
         return report["x_hat"]
 
 
@@ -141,7 +141,7 @@ class KKLEstimator:
         self.observer.reset(y0, x0 if self._known_start else None)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
-        """Begin episodes in rows (n,) with their first samples (number of True in rows, ny)."""
+        """Begin episodes where ``rows`` (n,) is True, with their first samples (number of True, ny)."""
         self.observer.restart(y0, rows, x0 if self._known_start else None)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
@@ -149,7 +149,7 @@ class KKLEstimator:
         self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Return the entries to add to ``info``. Shapes: ``rows`` (...,)."""
+        """Return the entries to add to ``info``, of all environments or where ``rows`` (...,) is True."""
         found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
         if self.estimate == "x":
             found["x_hat"] = self.observer.decode(rows)
@@ -187,7 +187,7 @@ def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
 
 
 def check_untouched(obs: Any, emitted: bytes, env: Any, inside: Any) -> None:
-    """Raise ValueError if a wrapper between ``env`` and ``inside`` has changed the observations."""
+    """Raise ValueError if a wrapper between ``env`` and the environment ``inside`` it has changed the observations."""
     if isinstance(obs, np.ndarray) and obs.tobytes() == emitted:
         return
     between = []

@@ -90,7 +90,7 @@ def test_mere_noise_and_signals_at_rest_leave_nothing_to_show():
 
 
 def test_wrong_weights_and_too_few_steps():
-    with pytest.raises(ValueError, match=r"needs .* samples with 8 later ones in their episode, got "):
+    with pytest.raises(ValueError, match=r"needs .* samples, each followed by 8 more of its episode, got "):
         pendulum().learn_weights(50)
     with pytest.raises(ValueError, match=r"weights must be 18 rows of 1 numbers or more, got the shape \(2, 1\)"):
         pendulum(weights=[[1.0], [2.0]])

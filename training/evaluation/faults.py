@@ -34,10 +34,10 @@ def simulate_faults(
     """Simulate sensors that fail in the middle of a trajectory; return the scores and delays of the monitor."""
     check_duration(duration, dt := artifact.filter.dt)
     if trajectories < (least := 1 + bool(artifact.nu and not policy)):
-        raise ValueError(f"trajectories must be at least {least}, one without inputs, got {trajectories}")
+        raise ValueError(f"trajectories must be at least {least}, got {trajectories}")
     deadline = profile(system).fault_deadline or duration / 5
     if not deadline <= duration / 2:
-        raise ValueError(f"duration must be at least {2 * deadline:g} s, twice a fault's deadline, got {duration:g} s")
+        raise ValueError(f"duration must be at least {2 * deadline:g} s to simulate faults, got {duration:g} s")
     rng, noise = generator(Stream.FAULTS, seed), (system.process_noise,)
     motions = Motions(system, dt, round(duration / dt), **SOUND, levels=noise, policy=policy)
     x, u, *_ = motions.with_inputs(artifact.nu).drawn(trajectories, rng)

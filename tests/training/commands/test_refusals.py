@@ -65,7 +65,7 @@ def _records():
         ("export lorenz --format pdf", "'pdf' is not a format: write onnx or c"),
         ("train lorenz --policy controler", "unknown policy 'controler', did you mean 'controller'"),
         ("evaluate lorenz --faults --measurement-noise 0 1", "--faults takes one level of measurement noise, got 2"),
-        ("evaluate lorenz --faults --duration 0.1", "duration must be at least 4 s, twice a fault's deadline, got 0.1"),
+        ("evaluate lorenz --faults --duration 0.1", "duration must be at least 4 s to simulate faults, got 0.1"),
         ("export lorenz --format onnx --measurement-noise 0.1", "noise levels are inputs of an ONNX graph"),
         ("demo --duration nan", "duration must be finite"),
         ("demo --observer lorenz", "name the system of the observer lorenz as well"),
