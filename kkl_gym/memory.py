@@ -114,7 +114,7 @@ class Memory:
         return self.shown()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Begin again in rows (n,) of a batch; their first outputs are ``y0`` (number of True in rows, ny)."""
+        """Begin again where the mask ``rows`` (n,) is True; ``y0`` (number of True, ny) are the first outputs there."""
         if self._y is None:
             raise RuntimeError("reset all environments before some of them")
         self._y[rows], self._signals[rows] = y0, self._read(y0, 0.0)

@@ -395,7 +395,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
     ) -> None:  # fmt: skip
         """Advance rows of the state (n, width) by samples y (steps, n, ny) and inputs u (steps, n, nu).
 
-        ``record`` receives, by its shape, rows (steps, n, width), estimates (steps, n, nx) or nothing (1, 0, 0).
+        The shape of ``record`` decides what it receives: rows (steps, n, width), estimates (steps, n, nx), or nothing.
         """
         nz, widest, substeps = flags
         h, samples, dt, limit = numbers[:4]
