@@ -10,7 +10,7 @@ import numpy as np
 
 from observers.checks import is_finite
 
-MOST_LEVELS = 24  # levels of nested expressions
+MOST_LEVELS = 24  # levels of nested functions
 MOST_PARTS = 2000  # numbers, states, inputs and functions in all components together
 _POWERS = 8  # integer exponents up to this value compile to products
 _MOST_NESTED = 16  # number of a function's arguments beyond which the source combines them in halves
@@ -57,7 +57,7 @@ class Expression:
     Parameters
     ----------
     components : sequence
-        The components, nested lists or tuples, of at most 24 levels and 2,000 parts.
+        The components, nested lists or tuples, of at most 24 nested functions and 2,000 parts.
     """
 
     components: Sequence[Any]
@@ -121,7 +121,7 @@ def _checked(part: Any, condition: bool, levels: int, left: list[int]) -> Any:
     """Check a part of an expression and return it as numbers and tuples; ``left`` counts the parts still allowed."""
     left[0] -= 1
     if left[0] < 0 or levels < 0:
-        raise ValueError(f"an expression has at most {MOST_PARTS} parts, on at most {MOST_LEVELS} levels")
+        raise ValueError(f"an expression has at most {MOST_PARTS} parts, and {MOST_LEVELS} nested functions")
     if is_finite(part) and not condition:
         return float(part)
     if not isinstance(part, list | tuple) or not part or not isinstance(part[0], str):

@@ -121,5 +121,5 @@ def test_size_and_depth_are_limited():
     for _ in range(1000):
         deep = ["sin", deep]
     for wrong in ([["+", *[1] * 2000]], [1] * 2001, [deep]):
-        with pytest.raises(ValueError, match="at most 2000 parts, on at most 24 levels"):
+        with pytest.raises(ValueError, match="at most 2000 parts, and 24 nested functions"):
             Expression(wrong)

@@ -66,7 +66,7 @@ class Train:
     """input-aware: T_inv is fitted along noisy trajectories, with and without inputs. spinn: the paper's pipeline,
     without inputs and tracking; writes NAME-spinn."""
     preset: Preset = "fast"
-    """fast: about half a minute; it made the shipped maps. paper: the paper's sizes."""
+    """fast: about half a minute (spinn: five minutes); it made the shipped maps. paper: the paper's sizes."""
     size: Size = "default"
     """large: a T_inv that is accurate without tracking, for use without a model; takes about ten minutes, needs
     input-aware and writes NAME-large."""

@@ -44,7 +44,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
         first = int((exact <= max(DETERMINED, AS_GOOD * exact.min())).argmax())
         shares = [f"{error(least[0, i])} without noise ({error(exact[first])} after {first * subject.dt:.3g} s)"]
         shares += [f"{error(one[i])} at noise {show_level(level)}" for level, one in zip(subject.noise, least[1:])]
-        text = f"{name}: at best an error of {'; '.join(shares)}, in its standard deviations"
+        text = f"{name}: least error, relative to its standard deviation: {'; '.join(shares)}"
         blind = [show_level(level) for level, one in zip(subject.noise, least[1:, i]) if one >= NOTHING]
         if blind or least[0, i] > VAGUE:
             text += f"; at noise {blind[0]}, y shows nothing of it" if blind else ""
