@@ -27,7 +27,7 @@ KEYS = "space: pause   n: new start   left, right: input   up, down: noise   f: 
 
 
 class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
-    """Adds noise and faults to the outputs of a noise-free environment; ``level`` and ``fault`` may be changed."""
+    """Adds noise and faults to outputs that have no measurement noise; ``level`` and ``fault`` may be changed."""
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], level: Level, *, seed: int) -> None:
         super().__init__(env)

@@ -25,7 +25,7 @@ from kkl_gym.equation_errors import (
 from kkl_gym.tracing import Symbol
 from kkl_gym.user_lines import steps_within, user_line
 
-_POWERS = "take square roots by kkl_gym.elementary.sqrt, and other fractional powers of abs(x)"
+_POWERS = "use kkl_gym.elementary.sqrt for square roots; take other fractional powers of abs(x)"
 
 
 def components(equations: Equations, *args: Any) -> Any:

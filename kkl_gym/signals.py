@@ -249,13 +249,13 @@ def _check(space: Space, source: str) -> None:
     for leaf in _leaves(space):
         if _is_image(leaf):
             raise ValueError(
-                f"{source} is an image, {leaf}: turn it into a vector by an encoder in a wrapper "
-                "inside, such as gymnasium.wrappers.TransformObservation, or name only other entries in measured=[...]"
+                f"{source} is an image, {leaf}: first wrap the environment in an encoder to a vector, for instance "
+                "by gymnasium.wrappers.TransformObservation, or name only other keys of a Dict in measured=[...]"
             )
         if not isinstance(leaf, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
             raise ValueError(
                 f"{source} holds {shown(leaf)}, and only Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple "
-                "of these can be remembered: convert it by a wrapper inside, or leave its key out of measured=[...]"
+                "of these can be remembered: first wrap the environment to convert it, or leave out its key"
             )
 
 

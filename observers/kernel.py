@@ -268,7 +268,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
                 start[i] = now[i]
             for i in range(square):
                 spread[i] = now[nx + i]
-            if turn:  # correct the state before the step by the sample, too
+            if turn:  # the sample also corrects the previous state
                 smoothed(moved, L, inverse, across, V, False, G)
                 shift(start, 1.0, G, white)
                 add(spread, -1.0, G, G)

@@ -84,7 +84,7 @@ def test_an_equation_that_raises(tank, f, texts):
 @pytest.mark.parametrize(("changes", "match"), [
     ({"f": "x[1]"}, r"^f\(x\) of 'tank' \(.*, line \d+\) must return 2 components, .*; it returned -"),
     ({"f": "x[1], x[0], 0.0"}, "must return 2 components, .* 3 of them"),
-    ({"f": "x[0], (-x[0]) ** 0.5"}, "which is complex: take square roots"),
+    ({"f": "x[0], (-x[0]) ** 0.5"}, "which is complex: use kkl_gym.elementary.sqrt for square roots"),
     ({"f": "x[1], 1e400 * x[0]"}, "must return finite numbers at each start"),
     ({"f": "x[1], np.sum(x)"}, "sum, max and norm mix the states of a batch"),
     ({"f": "x[1], np.where(x[1] < 0, x[0], np.max(x[0]))"}, r"(\[\S+, \S+\]) in a batch and (?!\1)"),

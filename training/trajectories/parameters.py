@@ -12,7 +12,7 @@ from training.trajectories.motions import Controller
 
 # With k uncertain parameters, NOMINAL_SHARE ** k of the training motions have the system's own values of all of them,
 # and the other motions have other values. NOMINAL_SHARE was chosen on the four systems that ship: with 0.6 and layers
-# of 256 units, Lorenz's map no longer distinguished its own plant from the others.
+# of 256 units, Lorenz's map no longer distinguished its own parameters from other ones.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of an additional state: hardly any process noise acts on it, and 0 would be invalid
 EVERY = "all"  # stands for every parameter that is not named

@@ -82,7 +82,7 @@ class _Problem(nn.Module):
     """The trained parts: T_inv, and the logarithms of the rates -theta, which all outputs share.
 
     The components of z are nearly collinear. The principal directions of z under the initial spectrum are scaled to
-    unit variance, except the faintest (``SOFT_FLOOR``). Full whitening would have to follow the learned spectrum.
+    unit variance, except the faintest (``SOFT_FLOOR``), which change most with the learned spectrum.
     """
 
     def __init__(self, task: Task, noise: float, fastest: float, slowest: float) -> None:
