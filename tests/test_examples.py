@@ -77,11 +77,9 @@ SMALL = {
     "diagnose": "",
     "train": "--set trajectories=20 duration=5 samples=20 width=4 batch=64 inverse_steps=9 runs=100",
     "evaluate": "--trajectories 4 --duration 8",
-    "lipschitz": "",
     "agent train": "--timesteps 1",
     "agents": "--information state x_hat --seeds 1 --episodes 2 --timesteps 1 --jobs 1",
     "demo": "--duration 1",
-    "speed": "--steps 5 --turns 1 --num-envs 4 --vector-steps 3",
 }
 
 
