@@ -201,7 +201,7 @@ def settings_of(training: Mapping[str, Any], **changes: Any) -> Config:
     """Return the configuration in an artifact's training metadata, with some settings changed."""
     settings = {name: training[name] for name in setting_types() if training.get(name) is not None}
     if not {"pipeline", "eigenvalues"} <= set(settings):
-        raise ValueError("the observer holds no settings of its training, which this needs")
+        raise ValueError("the observer holds no settings of its training: use one that kkl-gym train made")
     return Config(**{**_validated(settings, "the observer's training"), **changes})
 
 

@@ -134,8 +134,8 @@ def _judged(artifact: Artifact, source: Source, run: Run) -> tuple[Artifact, dic
     total, of_T_inv = (sum(each["held_out_errors"].values()) for each in (errors, of_alone))
     if total <= WORSE * of_T_inv:
         return artifact, errors
-    text = f"its error on held-out records would be {total / of_T_inv:.2g} times that of T_inv alone"
-    run.progress.say(f"the observer does not track, as {text}: list the measured signals as hidden ones, too")
+    text = f"the observer does not track, as held-out errors would be {total / of_T_inv:.2g} times those of T_inv alone"
+    run.progress.say(f"{text}: list the measured signals as hidden ones, too")
     return alone, of_alone
 
 

@@ -214,7 +214,7 @@ class KKLTrainingCallback(BaseCallback):
         if (old.motion is not None and new.motion is None) or (
             old.inverse.error_covariance is not None and new.inverse.error_covariance is None
         ):
-            warnings.warn("the observer in use stays: too few steps are held out to calibrate a new one", stacklevel=2)
+            warnings.warn("the observer in use stays: too few steps are held out, or a tracker is worse", stacklevel=2)
             return
         before, after = (_rms(recorded_errors(each, held_out, measurement_noise=self._level)) for each in (old, new))
         taken = not after > before

@@ -315,13 +315,13 @@ def recorded_errors(
 ) -> dict[str, float]:
     """Return hidden signals' rms errors from ``after`` s on (None: settling time), divided by std; NaN if undefined."""
     first = math.ceil((settling_time(artifact.filter) if after is None else after) / artifact.filter.dt - 1e-6)
-    pairs, rng = [np.zeros((0, 2, artifact.nx))], np.random.default_rng(0)
+    pairs, rng, observer = list[np.ndarray](), np.random.default_rng(0), KKLObserver(artifact, measurement_noise)
     for record in pieces(records):
         if record.x is not None:
             y = record.y + np.asarray(measurement_noise) * rng.standard_normal(record.y.shape)
-            x_hat = KKLObserver(artifact, measurement_noise).estimate(y, record.u if artifact.nu else None)
+            x_hat = observer.estimate(y, record.u if artifact.nu else None)
             pairs.append(np.stack([x_hat - record.x, record.x], 1)[first:])
-    both = np.concatenate(pairs)
+    both = np.concatenate([np.zeros((0, 2, artifact.nx)), *pairs])
     error, x = np.moveaxis(both[~np.isnan(both).any((1, 2))], 1, 0)
     names = (artifact.signals or {})["hidden"]
     if not len(error):

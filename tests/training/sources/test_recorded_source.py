@@ -86,7 +86,7 @@ def test_confidence_regions_on_new_records(tracking, level):
 def test_a_tracker_that_is_worse_than_its_T_inv_is_dropped():
     records = [replace(run, x=run.y + 0.7 * run.x) for run in (swing(seed, n=600) for seed in range(6))]
     result, printed = trained(records)
-    assert "does not track, as its error on held-out records would be" in printed
+    assert "does not track, as held-out errors would be" in printed
     assert (result.artifact.motion, result.artifact.C) == (None, None)
     assert result.artifact.training["held_out_errors"]["speed"] < 0.2
 
