@@ -126,7 +126,7 @@ class KKLEstimator:
         return artifact
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
-        """Return the input ``u`` (..., nu), or None if the map has no inputs."""
+        """Return the input ``u`` (..., nu), or None for a map without inputs; ValueError if it must not be ignored."""
         if not self._blind:
             return u
         if not self._ignore_input and u.any():

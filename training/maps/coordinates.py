@@ -12,12 +12,12 @@ from training.config import Scaling
 SMALLEST_MODE = 1e-7  # least ratio of a singular value of z to the largest; directions below it are rounding errors
 STILL = 1e-12  # least ratio of a component's standard deviation to its largest value; less is rounding error
 SETTLED = np.log(1e3)  # number of time constants after which a thousandth of a filter's start is left
-LEAST = 0.1  # the loss divides square errors by the mean square of x / scale plus this, lest small states dominate
+LEAST = 0.1  # the loss divides square errors by the mean square of x / scale plus this, lest states near 0 dominate
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Coordinates of z in which the signal's covariance is the identity, and that of stationary noise is diagonal.
+    """Coordinates of z in which the signal's covariance is the identity, and that of the noise is diagonal.
 
     A network in float32 cannot read z itself: components of z are nearly collinear, and their variances spread over ten
     orders of magnitude.

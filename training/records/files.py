@@ -52,7 +52,7 @@ def read_records(
 
 
 def _read(path: Path, wanted: Signals) -> Record:
-    """Read the wanted signals of a file; a role without named signals, such as inputs, takes the usual columns."""
+    """Read the wanted signals of a file; a role for which none are named, such as inputs, has the usual columns."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(
@@ -198,7 +198,7 @@ def _csv(path: Path) -> Columns:
         if twice := sorted({name for name in names if name and names.count(name) > 1}):
             raise ValueError(f"more than one column {', '.join(twice)}")
         for row, cells in enumerate(csv.reader(file, **layout), 1):
-            if len(cells) not in (0, len(names)):  # pandas would fill or cut such a row
+            if len(cells) not in (0, len(names)):  # pandas would fill or shift such a row
                 raise ValueError(f"row {row} has {len(cells)} cells, the header {len(names)}: {shown(names)}")
     layout |= {"header": None, "skiprows": 1, "names": range(len(names)), "na_values": MISSING}
     frame = pd.read_csv(path, encoding="utf-8-sig", **layout)

@@ -20,17 +20,17 @@ from training.trajectories.motions import DRIVEN, KINDS, Motions, Report, record
 from training.trajectories.parameters import blind, nominal_share, relative_ranges, with_bias, with_parameters
 
 LEAD_IN_SHARE = 0.4  # in this share of the motions without inputs, earlier inputs have moved the start
-BEYOND = 2.0  # multiple of X in which a third of the calibration runs start, and some of a flow's training motions
-# Random inputs drive every second calibration run. A policy, if any, drives all; it explores in every second.
+BEYOND = 2.0  # size, relative to X, of the box in which a third of the calibration runs start
+# Random inputs drive half of the calibration runs. A policy drives all of them, and in half of them it also explores.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
-LEAST_PROCESS_NOISE = 0.005  # least level of process noise for a tracker, in ``scale`` per pace; a tenth of the default
-WINDOW, RUN = 0.5, 20.0  # lengths of a tracker's window and of a calibration run, in units of the pace
+LEAST_PROCESS_NOISE = 0.005  # least level for a tracker, in System.scale per System.pace; a tenth of the default
+WINDOW, RUN = 0.5, 20.0  # durations of a tracker's window and of a calibration run, in multiples of System.pace
 SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
 INTEGRATION_ERROR = 2e-5  # largest error of these steps in standard deviations of the states, well below the noise
 TOO_FAR_OFF = 0.01  # if SUBSTEPS steps have a larger error, for example because f jumps, a flow is learned
 INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
-DEVIATIONS = (1e-4, 0.3)  # increments start off motions: least and largest scale of offsets, in standard deviations
+DEVIATIONS = (1e-4, 0.3)  # increments start beside motions, at these least and largest distances in standard deviations
 
 
 class SimulatedSource:
@@ -47,8 +47,8 @@ class SimulatedSource:
     Raises
     ------
     ValueError
-        If the policy is unknown or invalid, an uncertain parameter is unknown or 0, or ``bias`` does not fit the
-        outputs.
+        If the policy is unknown or invalid, the system lacks an uncertain parameter or its value is 0, or ``bias`` does
+        not fit the outputs.
     """
 
     def __init__(self, system: System, config: Config) -> None:
@@ -204,7 +204,7 @@ class SimulatedSource:
         return along.mean(0), spread(along)
 
     def _states(self, paces: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return states (n, nx) along motions of so many paces from X and 2X, and inputs (n, nu)."""
+        """Return states (n, nx) and inputs (n, nu) along motions from X and 2X over ``paces`` times System.pace."""
         rng, steps = generator(Stream.CALIBRATION, self.config.seed, 6), max(1, round(paces * self.pace / self.dt))
         motions = Motions(self.model, self.dt, steps, KINDS, self.policy, box_factor=BEYOND).with_inputs(self.nu)
         x, u, *_ = motions.drawn(100, rng)
