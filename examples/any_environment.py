@@ -25,7 +25,7 @@ GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # gains of a linear-quad
 
 
 def swing_up(obs: np.ndarray) -> np.ndarray:
-    """Pumps energy into Pendulum-v1, and balances it at the top."""
+    """Pump energy into Pendulum-v1, and balance it at the top."""
     cos, sin, rate = obs
     if cos > 0.9 and abs(rate) < 3:
         torque = -10 * np.arctan2(sin, cos) - 2 * rate
@@ -35,17 +35,17 @@ def swing_up(obs: np.ndarray) -> np.ndarray:
 
 
 def balance(obs: np.ndarray) -> int:
-    """Balances CartPole-v1."""
+    """Balance CartPole-v1."""
     return int(obs @ [0.1, 0.25, 3.0, 0.6] > 0)
 
 
 def climb(obs: np.ndarray) -> np.ndarray:
-    """Pushes MountainCarContinuous-v0 in its direction of motion."""
+    """Push MountainCarContinuous-v0 in its direction of motion."""
     return np.float32([1.0 if obs[1] >= 0 else -1.0])
 
 
 def balance_both(obs: np.ndarray) -> np.ndarray:
-    """Balances InvertedDoublePendulum-v5."""
+    """Balance InvertedDoublePendulum-v5."""
     angles = np.arctan2(obs[1:3], obs[3:5])
     return np.float32([np.clip(-GAINS @ [obs[0], *angles, *obs[5:8]], -1, 1)])
 
@@ -142,7 +142,7 @@ def main(
         )
         env = KKLObservation(gym.make(env_id), Path(folder) / f"{env_id}.safetensors")
     obs, _ = env.reset(seed=seed)
-    print(f"{env_id}: the agent sees {obs.size} numbers, the measurements and {len(hidden)} estimates")
+    print(f"{env_id}: the agent sees {obs.size} numbers: the measurements and {len(hidden)} estimates")
     unseen = make(env_id)
     names = {"measured": list(map(str, measured)), "hidden": list(map(str, hidden))}
     found = {}

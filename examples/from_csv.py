@@ -22,7 +22,7 @@ from training.records import read_records
 
 MU = 3.3  # the plant's parameter; the model begins with GUESS
 GUESS, LIMITS = 2.0, (0.2, 20.0)
-NOISE = 0.1
+NOISE = 0.1  # standard deviation of the noise on each sample of y
 STARTS = ((-3.0, 3.0), (-6.0, 6.0))  # from these starts the controller's bounded input can stabilise the plant
 
 Policy = Callable[[np.ndarray, dict[str, np.ndarray]], np.ndarray]

@@ -67,7 +67,7 @@ def main(
     Args:
         system: the plant.
         noise: standard deviation of the measurement noise.
-        process_noise: level of process noise in the records; environments have 0.05.
+        process_noise: bound of the process noise in the records, in System.scale per s; environments have 0.05.
         records: number of records.
         seconds: length of each record.
         seed: seed of the records.

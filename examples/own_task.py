@@ -27,7 +27,7 @@ class FlexibleJoint(kkl_gym.System):
     """A motor turns a link through a spring, under gravity; only the motor's angle is measured. SI units."""
 
     stiffness: float = 10.0  # N m/rad
-    gravity: float = 2.0  # N m, torque on the level link
+    gravity: float = 2.0  # N m, torque of gravity on the link when it is level
     damping: float = 0.2  # N m s/rad, of motor and link
     goal: float = 0.6  # rad
 

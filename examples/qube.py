@@ -103,8 +103,8 @@ MOTIONS, LASTING, TURNED, MOVING = 24, 11.0, 0.9, (0.3, 0.5)
 ENCODER = 2 * np.pi / 2048  # rad, resolution of both angles
 # Settings of the Kalman filter that the observer starts, chosen on the training runs. LONGER: samples in a window for
 # the fit of its model. STARTED: time in s until which the observer restarts the filter at every sample. SURE: standard
-# deviations of the filter at a restart. APART: distance of the two estimates of alpha, as points on
-# the unit circle, above which the observer also restarts the filter.
+# deviations of the filter's states after a restart, in rad, rad/s and 0.1 mN m. APART: distance of the two estimates of
+# alpha, as points on the unit circle, above which the observer also restarts the filter.
 LONGER, STARTED, SURE, APART = 250, 0.3, (0.002, 0.3, 1.0, 4.0, 1.0), 0.5
 PUSHED = 1.0  # standard deviation of the unknown torque on the arm, in 0.1 mN m
 

@@ -92,7 +92,7 @@ class Sticking(BothAngles):
 
 @dataclass(frozen=True)
 class Pushed(Sticking):
-    """The same model with y = theta, and with an unknown torque on the arm, which stands for errors of its friction.
+    """The same model with y = theta, and with an unknown torque on the arm, which stands for errors of the friction.
 
     The torque is a fifth state, in 0.1 mN m: an Ornstein-Uhlenbeck process.
     """

@@ -48,7 +48,7 @@ def configuration(algorithm: Literal["ppo", "sac"]) -> AlgorithmConfig:
             alpha_lr=1e-3,
             gamma=0.98,
             train_batch_size_per_learner=256,
-            training_intensity=16.0,  # samples in training batches for each sample gathered
+            training_intensity=16.0,  # ratio of samples in training batches to gathered samples
             num_steps_sampled_before_learning_starts=1000,
         )
         .reporting(min_sample_timesteps_per_iteration=1000)

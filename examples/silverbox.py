@@ -34,7 +34,7 @@ FREE = 50
 TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)
 # Samples of the arrow (noise of growing amplitude), and of its part within the range of the training's outputs.
 ARROW, ARROW_INSIDE = (100, 40_575), (100, 32_100)
-# Number and length of the records that are taken from the training part; one is held out, to test predictions.
+# Number of records from the training part, and samples in each. One record is held out, to test predictions.
 RECORDS, LENGTH = 8, 2_048
 LIMITS = {
     "damping": (6.0, 600.0),
@@ -46,7 +46,7 @@ LIMITS = {
     "before": (-1.0, 1.0),
     "after": (-1.0, 1.0),
 }
-PUBLISHED = {"NARX (SysIdentPy)": (7.73, 4.15, 2.23), "SUBNET, nx = 4": (None, 6.79, 2.24)}
+PUBLISHED = {"NARX (SysIdentPy)": (7.73, 4.15, 2.23), "SUBNET, nx = 4": (None, 6.79, 2.24)}  # mV rms
 
 
 @dataclass(frozen=True)

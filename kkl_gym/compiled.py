@@ -304,7 +304,7 @@ def _assembled(motion: Motion, lines: list[str], jit: Callable[..., Any]) -> Any
 
 
 def _trial_states(system: System, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays of trial states: 400 random ones, and 600 at bounds or 0, at whole numbers or at starts."""
+    """Return two arrays: 400 random trial states, and 600 at bounds or 0, at whole numbers or at starts."""
     n, (low, high) = _TRIALS, np.array(system.bounds, dtype=float).T
     random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])
     ends = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 RESULTS = DOCS / "results"
 Draw = Callable[[Path], object]
-COLOURS = 256  # colours in a picture; so few reduce its size to a third
+COLOURS = 256  # number of colours that is left in a picture; this reduces its size to a third
 SEED = 7  # seed of the animations
 DT = 0.01  # s, sampling interval of the shipped systems
 EKF = "EKF with the exact equations"
@@ -171,7 +171,7 @@ def noise_levels() -> Draw:
 def errors_of_runs(
     level: float, *, trajectories: int = 100, duration: float | None = None
 ) -> dict[str, list[np.ndarray]]:
-    """Return errors in % by system, (steps, n) for the default map and for an EKF, in runs of ``kkl-gym evaluate``.
+    """Return, by system, errors in %, (steps, n), of the default map and of an EKF in runs of ``kkl-gym evaluate``.
 
     The runs start in X. The mean of a run's errors is its SMAPE; the tables of the pages show medians of SMAPEs.
     """

@@ -216,7 +216,7 @@ class HyperKKL:
 
 
 def inputs(kind: Input, beyond: bool, n: int, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return held inputs (steps, n, 1); trials have their own amplitude and frequency, sinusoids also their phase."""
+    """Return held inputs (steps, n, 1); each trial has its own amplitude and frequency, a sinusoid also its phase."""
     if kind == "zero":
         return np.zeros((len(t), n, 1))
     amplitude, frequency = (rng.uniform(*span, n) for span in RANGES[kind][beyond])

@@ -64,7 +64,7 @@ def _attempt(run: Callable[[Job], None], folder: Path, index: int, job: Job) -> 
 def engine(workers: int) -> Iterator[Engine]:
     """Yield an engine whose worker processes end with the context."""
     if workers < 1:
-        raise ValueError(f"jobs = {workers} at a time: give at least one worker process")
+        raise ValueError(f"jobs = {workers}: give at least one worker process")
     with parallel_config("loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)):
         try:
             yield Engine(workers)

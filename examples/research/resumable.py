@@ -26,9 +26,9 @@ class Job(ABC):
 
     folder: Path
     result: ClassVar[str]
-    """The file in the folder that is written last."""
+    """Name of the file that the job writes last."""
     other: ClassVar[str]
-    """Text for errors: the content of a folder with another identity."""
+    """Describes, in errors, the content of a folder with another identity."""
 
     @property
     @abstractmethod
@@ -46,7 +46,7 @@ class Job(ABC):
 
     @property
     def done(self) -> bool:
-        """Whether the result exists; ValueError if it has another identity."""
+        """Whether the result exists; ValueError if it is from a job with another identity."""
         if not (self.folder / self.result).exists():
             return False
         check_identity(self.folder / "job.json", self.identity, self.other)

@@ -62,7 +62,7 @@ def test_impossible_comparisons(tmp_path):
     for wrong, message in (
         ("--seeds 0", "must be positive"),
         ("lorenz CartPole-v1", "on systems or in environments"),
-        ("CartPole-v1 --information ekf", "cannot be compared by ekf"),
+        ("CartPole-v1 --information ekf", "cannot act on ekf"),
         ("lorenz --observers rossler", "the observer rossler is for rossler"),
         ("lorenz --observers lorenz-spinn", "has no inputs"),
     ):

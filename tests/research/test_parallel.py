@@ -95,5 +95,5 @@ def test_workers_end_when_the_context_is_left(tmp_path):
 
 
 def test_an_engine_needs_a_worker():
-    with pytest.raises(ValueError, match="jobs = 0 at a time: give at least one"), engine(0):
+    with pytest.raises(ValueError, match="jobs = 0: give at least one"), engine(0):
         raise AssertionError

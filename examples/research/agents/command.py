@@ -77,7 +77,7 @@ class Compare:
             raise ValueError("compare agents either on systems or in environments, in separate folders")
         (on_systems,) = systems
         if not on_systems and {"ekf", "x_hat_std"} & set(self.information or ()):
-            raise ValueError("agents in environments cannot be compared by ekf or x_hat_std; leave out both")
+            raise ValueError("agents in environments cannot act on ekf or x_hat_std; leave out both")
         out = self.out or Path("runs/agents") / ("comparison" if on_systems else "environments")
         kinds = self.information
         how: dict[str, Any] = {

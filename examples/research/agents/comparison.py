@@ -204,7 +204,7 @@ def planned(
 
 
 def seeds_in(out: Path) -> int:
-    """Return the number of seeds in the agents' folders, OUT/jobs/TASK/KIND/SEED."""
+    """Return 1 + the largest seed in the agents' folders, OUT/jobs/TASK/KIND/SEED."""
     return 1 + max((int(path.name) for path in out.glob("jobs/*/*/*") if path.name.isdigit()), default=-1)
 
 

@@ -53,7 +53,7 @@ EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluations after the firs
 OBSERVER_STEPS = 40_000  # steps from which an observer, or the weights of z under noise, are learned
 TRUTH = 0.15  # share of the time, at the start, in which agents on x_hat see the true state
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and agents on x_hat do not see y
-OF_STATE = ("masked", "parameters")  # kinds in which agents on the full state train; they see no sensor faults
+OF_STATE = ("masked", "parameters")  # agents on the full state train in these only: they see no sensor faults
 STEPS = 200_000  # number of steps after which returns are compared, too
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return")
 

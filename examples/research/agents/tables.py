@@ -90,7 +90,7 @@ def _task_name(environment: str, noise: float | str) -> str:
 
 
 def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
-    """Add columns task and idle (idle agent's return). In environments each task gets the same full-state agents."""
+    """Add columns task and idle (idle agent's return). Noise levels of an environment share full-state agents."""
     import pandas as pd
 
     tasks = []

@@ -21,7 +21,7 @@ from training import run
 from training.files import write
 from training.trajectories.equations import describe
 
-FAILED = 200.0  # largest SMAPE, given to a configuration whose training diverges
+FAILED = 200.0  # largest SMAPE in %, given to a configuration whose training diverges
 REVISION = 9  # increased with every change of the shipped methods, so that older results are not reused
 
 

@@ -82,7 +82,7 @@ def tuned_for(method: Method[Any], system: System) -> tuple[Level, ...] | None:
 
 
 def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
-    """Return the median SMAPE on validation trajectories from X, as a geometric mean over noise levels."""
+    """Return the geometric mean, over noise levels, of the median SMAPE in % on validation trajectories from X."""
     n = protocol.trajectories
     runs = unseen_trajectories(
         system,

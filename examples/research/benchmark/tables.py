@@ -18,7 +18,7 @@ PAPERS_MEASURE = "The paper's measure: median ± half the interquartile range [b
 # Columns of results.csv, and their titles.
 MEASURES = (("smape", "SMAPE in %, all steps"), ("smape_late", "SMAPE in % after the first 20 %"))
 NRMSE = re.compile(r"nrmse\d+")  # columns of results.csv, one for each state
-NEVER = 1e12  # replaces infinite times and errors, so that quantiles exist
+NEVER = 1e12  # replaces infinite errors, so that quantiles exist
 NARROWEST = 7.0  # least width in inches of a figure with its title
 DOMAINS = {"X": "starts in X", "1.5X": "starts in 1.5X \\ X", "2X": "starts in 2X \\ X"}
 

@@ -33,7 +33,7 @@ class KKLMethod(Method[Artifact]):
     """A method that trains an artifact."""
 
     def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
-        """Return the observer without process noise; its noise level is at most the highest of its training."""
+        """Return the observer; it assumes no process noise, and at most the highest noise level of its training."""
         return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0).estimator
 
     def save(self, trained: Artifact, path: Path) -> None:

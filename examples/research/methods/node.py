@@ -20,7 +20,7 @@ from training.trajectories.motions import filter_states
 
 TRAJECTORIES_PER_BATCH = 128
 AGES_PER_BATCH = 32
-SOFT_FLOOR = 1e-4  # directions of z with less than this share of the largest variation are not scaled up further
+SOFT_FLOOR = 1e-4  # directions of z with less than this share of the largest variation get one common scale
 # The loss is absolute, and quadratic only for errors below this share of a state's standard deviation. Peaks would
 # dominate a quadratic loss: Rössler's x3 stays near 0.02 between peaks of 20.
 ROUNDING = 0.01
@@ -29,7 +29,7 @@ LEARNING_RATE = 1e-2
 
 
 class NODE(KKLMethod):
-    """z' = diag(theta) z + B y, with theta < 0 and T_inv learned together from the error of x_hat along trajectories.
+    """z' = diag(theta) z + B y, theta < 0; theta and T_inv are learned together from errors of x_hat on trajectories.
 
     K. Miao and K. Gatsis, "Learning robust state observers using neural ODEs", L4DC 2023. The filter is
     linear and diagonal, so it is integrated exactly between samples instead of by an ODE solver.

@@ -17,7 +17,7 @@ from observers.estimator import Estimate, Estimator
 from training.evaluation.levels import Level
 from training.maps.networks import Network, tensor
 
-ROWS, CHUNK = 64, 100  # rows of a batch, and samples of truncated back-propagation
+ROWS, CHUNK = 64, 100  # rows of a batch, and samples in a chunk of truncated back-propagation
 WIDTH = 64  # width of features and hidden vectors
 LEARNING_RATE = 3e-3
 READOUT = 128  # neurons of the layer between the hidden vector and the estimate

@@ -18,8 +18,8 @@ from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
 
-BATCHES = 10  # number of steps of the Kalman filters, which are slow, on a batch of rows
-FEWER = 10  # single steps in Python are timed on fewer samples by this factor
+BATCHES = 10  # timed steps of Kalman filters on a batch of rows; there are few, because these filters are slow
+FEWER = 10  # divides the number of samples on which single steps in Python are timed
 
 
 Name = TypeVar("Name", bound=Hashable)

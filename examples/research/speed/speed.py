@@ -22,7 +22,7 @@ from training.progress import ProgressBars, progress_bars
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
 OTHERS = ("large",)  # kinds of shipped maps besides the default ones
-# The timed records have together HOUR times Speed.steps samples: by default, an hour at 100 Hz.
+# Together, the timed records have HOUR times Speed.steps samples: by default, an hour at 100 Hz.
 HOUR = 72
 
 Tasks = Mapping[str, Callable[[], float]]
