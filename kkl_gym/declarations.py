@@ -15,7 +15,7 @@ _SIZES = {"nx": "X", "nu": "u_max", "ny": "h(x)", "parameters": "the fields"}
 
 
 def complete(cls: Any, base: Any) -> None:
-    """Check a system's class variables, convert their sequences to tuples, and set the defaults of missing ones."""
+    """Check a system's class variables, convert sequences to tuples, and give missing variables their defaults."""
     _check_names(cls, base)
     _read_box(cls)
     nx = len(cls.X)
@@ -121,8 +121,8 @@ def _read(
     above: float = -math.inf,
     least: float = -math.inf,
 ) -> None:
-    """Check the shape and the limits of a class variable, and convert it to tuples."""
-    # Properties are not checked. X, bounds and u_max, which set numbers of states and inputs, must not be properties.
+    """Check the shape and the limits of a class variable, and convert a sequence to tuples."""
+    # Properties are not checked. X, bounds and u_max must not be properties, because other checks use their values.
     if isinstance(getattr(cls, name), property) and name not in ("X", "bounds", "u_max"):
         return
     try:

@@ -66,7 +66,7 @@ def _named(function: Any, call: str, meaning: str, on_numbers: Callable[..., Any
 
 
 def _elsewhere(name: str, *args: Any) -> Any:
-    """Call a function: symbols record the call, sympy or torch evaluates it."""
+    """Record the call of a function if an argument is a Symbol, otherwise call the function of sympy or torch."""
     for arg in args:
         if isinstance(arg, Symbol):
             return arg.call(name, *args)

@@ -71,7 +71,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         \|w_i\| <= process_noise * scale_i. None takes the system's own default.
     measurement_noise : float or sequence of float, length ny, optional
         Standard deviation of the Gaussian noise v on each sample: one for all outputs, or one for each. None takes the
-        system's own: 0.5 for the shipped ones, else by default 5 % of the range of each output over X.
+        system's own: 0.5 for the shipped ones; for others, if not set, 5 % of the range of each output over X.
     observe : {"state", "output"}
         Whether the agent sees the state x or the output y.
     parameters : mapping of str to float, optional
@@ -289,7 +289,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     def _exchanged(self) -> None:
         self._reward = reward_of(self.system)
         self._advance = partial(advance, self.system)
-        # The next reset adds _sample and thus begins with 0: samples of the old system do not count towards SOON.
+        # The next reset adds _sample, and _samples is then 0: samples of the old system do not count towards SOON.
         self._samples = -self._sample
 
     def _input(self, action: np.ndarray) -> list[float]:

@@ -97,7 +97,7 @@ def held(x: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """Return a value as text; for an array, only its shape."""
+    """Return a value as text; for an array, only its shape, or its value if the shape is ()."""
     if isinstance(value, np.ndarray) or is_of("torch", "Tensor", value):
         return f"an array of shape {tuple(value.shape)}" if value.ndim else repr(value.item())
     return reprlib.repr(value)
@@ -125,7 +125,7 @@ def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     on_floats = isinstance(x[0], Real)
     called = re.findall(r"(?:(?:math|cmath|np|numpy|torch|sympy)\.|(?<![\w.]))(\w+)\(", text_of(step))
     known = [_FUNCTIONS[name] for name in called if name in _FUNCTIONS]
-    # If x is a tuple of floats, the hint helps if math.sqrt(-1) failed, but not if the tuple was passed, as in abs(x).
+    # If x is a tuple of floats, the hint helps if math.sqrt(-1) failed, but not if abs(x) got the tuple itself.
     if known and not (on_floats and isinstance(error, TypeError)):
         return f": use kkl_gym.elementary.{known[0]}, which takes {_TYPES}"
     if "truth value" in str(error) or "Boolean value" in str(error):

@@ -210,7 +210,7 @@ def _check_components(equations: Any, values: Any, n: int | None, *, like: Any, 
 
 
 def _fits(value: Any, like: Any) -> bool:
-    """Whether a value is a number, or has the type of a component of the state."""
+    """Whether a value is a real number, or has the type of a component of the state and a shape that fits it."""
     if isinstance(value, Real | np.bool_):
         return True
     if is_of("torch", "Tensor", like):

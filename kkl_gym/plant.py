@@ -90,7 +90,7 @@ class Plant:
         return rng.uniform(low, high)
 
     def start(self, x0: Any) -> np.ndarray:
-        """Check a start ``x0`` (nx,) that the user gave, and return it as an array."""
+        """Check a start ``x0`` (nx,), given by the user or by ``draw_starts``, and return it as an array."""
         start = real_array("x0", x0)
         low, high = np.array(self.system.bounds).T
         if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():
@@ -122,7 +122,7 @@ class OfPlant:
             raise
 
     def _exchanged(self) -> None:
-        """Update everything that depends on the system after an exchange."""
+        """After an exchange of the system, update everything that depends on it."""
         raise NotImplementedError
 
     def _judged(self, x: Components, u: Components) -> tuple[Any, Any]:

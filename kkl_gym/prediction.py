@@ -10,7 +10,7 @@ from observers.checks import real_array
 
 # Predictions are kept if their variance exceeds this multiple of the variance that a fit to white noise would have.
 CHANCE = 3.0
-# The fit needs this number of samples for each feature.
+# The fit needs at least this number of samples for each feature.
 SAMPLES = 10
 
 

@@ -39,7 +39,7 @@ class Sensor:
     saturation : tuple of (low, high), optional
         Limits to which y is clipped, each a number or a sequence of length ny.
     delay : int or sequence of int, length ny
-        Steps by which samples arrive late. Before the first one has arrived, the sensor repeats its reading at reset.
+        Steps by which samples arrive late. The sample at reset is never late; it is repeated until the next arrives.
     drop_out : float or sequence of float, length ny
         Probability, below 1, with which a sample is lost, independently of others.
     every : int or sequence of int, length ny

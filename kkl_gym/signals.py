@@ -245,7 +245,7 @@ def _is_image(space: Space) -> bool:
 
 
 def _check(space: Space, source: str) -> None:
-    """Raise ValueError unless every elementary space within a space holds real signals."""
+    """Raise ValueError if an elementary space within a space is an image, or of a kind that cannot be remembered."""
     for leaf in _leaves(space):
         if _is_image(leaf):
             raise ValueError(

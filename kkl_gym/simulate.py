@@ -24,9 +24,9 @@ RATE_STEP = 0.4
 # different numbers of substeps where rate * dt / RATE_STEP is a power of two.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
 # Largest accepted estimates of a substep's error, in half-widths of X; the true errors are a thousand times smaller.
-# Equal substeps keep to TOLERANCE without a rate formula, and to ROUGH with one; other substeps keep to TOLERANCE. With
-# TOLERANCE, errors of stiff systems, and of shipped ones without their formulas, are below 1e-5. ROUGH detects where a
-# formula fails, as at an ignition; it is a hundred times the shipped systems' largest estimate.
+# Equal substeps keep to TOLERANCE without a rate formula, and to ROUGH with one; other substeps keep to TOLERANCE. It
+# keeps errors of stiff systems, and of shipped ones without formulas, below 1e-5 of the motion's size. ROUGH detects
+# where a formula fails, as at an ignition; it is a hundred times the shipped systems' largest estimate.
 TOLERANCE, ROUGH = 3e-6, 0.1
 # Number of attempts with equal substeps. After them, or beyond MOST_EQUAL substeps, the step length follows the error.
 ATTEMPTS = 3
@@ -159,7 +159,7 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
 
 def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: float) -> Components | None:
-    """Return the next state, computed on arrays, on which division by 0 raises no error; None if it is not finite."""
+    """Return the next state, computed on arrays, where 1 / 0 raises no error; None after an error, inf or NaN."""
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
         end: list[float] = advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
@@ -169,7 +169,7 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
-    """Return the next state by substeps whose length follows the error, or the given ``end`` if x escapes or is NaN."""
+    """Return the next state by substeps whose length follows the error, or ``end`` if x escapes or turns NaN."""
     # Motions that accelerate, as at an ignition, need such substeps. The substeps also verify an escape: equal substeps
     # that were too long at the end of the interval may have left the bounds only by their error.
     if system.discrete:

@@ -23,8 +23,8 @@ Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol fo
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 DT = 0.01  # s, the default where it suits a system's rate
-# Each pair is (limit of rate * DT, target). Between the two limits the default dt is DT. Beyond a limit it is the
-# target divided by the rate, rounded down to 1, 2 or 5 times a power of ten.
+# Each pair is (limit of rate * DT, target of rate * dt). Between the two limits the default dt is DT. Beyond a limit it
+# is the target divided by the rate, rounded down to 1, 2 or 5 times a power of ten.
 SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)
 PROCESS_NOISE = 0.05  # default bound, in multiples of a system's scale per time unit (``pace``)
 NOISE_SHARE = 0.05  # default measurement noise as a share of an output's range

@@ -126,7 +126,7 @@ class KKLEstimator:
         return artifact
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
-        """Return the input ``u`` (..., nu), or None for a map without inputs; ValueError if it must not be ignored."""
+        """Return ``u`` (..., nu), or None for a map without inputs; ValueError if such a map must not ignore ``u``."""
         if not self._blind:
             return u
         if not self._ignore_input and u.any():
@@ -170,7 +170,7 @@ class KKLEstimator:
         return report["x_hat" if self.estimate == "x" else "z"]
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
-        """Return the same as :meth:`shown` for a single sample; a list is faster than NumPy for so few numbers."""
+        """Return the same as :meth:`shown` for a single sample; a list is faster than NumPy for a few numbers."""
         values: list[float] = report["x_hat" if self.estimate == "x" else "z"].tolist()
         if self._uncertainty:
             variances = report["x_cov"].ravel().tolist()[:: len(values) + 1]
@@ -187,7 +187,7 @@ def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
 
 
 def check_untouched(obs: Any, emitted: bytes, env: Any, inside: Any) -> None:
-    """Raise ValueError if a wrapper between ``env`` and the environment ``inside`` it has changed the observations."""
+    """Raise ValueError if ``env``, or a wrapper between it and the environment ``inside``, changed observations."""
     if isinstance(obs, np.ndarray) and obs.tobytes() == emitted:
         return
     between = []

@@ -57,7 +57,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     Around a :class:`KKLEnv` the observer sees only the sensor's output ``info["y"]`` and the input ``info["u"]`` that
     the environment applied. ``info`` gains ``z``, the filter's state, and with ``estimate="x"`` also ``x_hat``, shape
     (nx,). Both are float64 and not clipped. With ``monitor``, ``info`` also has ``score``, of shape (). The score is
-    above 1 where the samples do not fit the estimates, as with a faulty sensor or far outside the map's training.
+    above 1 where the samples do not fit the estimates, as with a faulty sensor or far outside the training box.
     Once ``observer.gate`` is set, ``rejected`` counts rejected outputs. If the map estimates parameters, they are in
     ``parameters_hat``.
 
@@ -83,8 +83,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         The observation: "x" is the state estimate, clipped to the system's declared bounds, "z" the filter's state
         [z_y, z_u].
     measurement_noise : float or sequence of float, length ny, optional
-        The noise level that the observer assumes, one for all outputs or one for each. None takes the level of a
-        :class:`KKLEnv`, and 0 around other environments. Maps that need a level of process noise always take the level
+        The noise level that the observer assumes, one for all outputs or one for each. None takes the level of the
+        :class:`KKLEnv`, or 0 for an observer from rollouts. Maps that need a process-noise level always take that
         of the :class:`KKLEnv`.
     ignore_input : bool
         Whether to use a map without inputs, such as the paper's, although the agent acts.
@@ -224,7 +224,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         ValueError
             If the noise level is beyond the new maps' range, or the monitor in use needs limits that the maps lack.
         observers.ArtifactError
-            If the filters' A, B or dt or the signals differ, or the file is missing or damaged.
+            If the artifact differs in more than its maps, as in A, B, dt or signals, or the file is missing or damaged.
         """
         self._estimator.replace(observer)
 
