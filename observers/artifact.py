@@ -18,9 +18,9 @@ from observers.monitor import Limits
 from observers.motion import Motion
 from observers.network import MLP
 
-FORMAT = 1
+FORMAT = 1  # version of the file format
 FAR = 10.0  # observers warn of inputs beyond this multiple of the largest input in training
-USUAL_NOISE = 0.5  # default standard deviation of the measurement noise
+USUAL_NOISE = 0.5  # default standard deviation of the measurement noise, in units of y
 _KEY = "kkl-gym"
 
 
@@ -50,8 +50,8 @@ class Artifact:
         A map to x from z_y alone, the part of z that y drives; it replaces T_inv until the first nonzero input. Motion
         without input visits far fewer states than driven motion, so a map for these states alone is more accurate.
     motion : Motion, optional
-        Model of the system's motion: its equations or a learned flow. An observer with this model tracks: a Kalman
-        filter predicts by the model and corrects by each sample, and T_inv initialises the filter.
+        Model of the motion: the system's equations, or a network that predicts the next state. An observer with this
+        model tracks: a Kalman filter predicts by the model and corrects by each sample, and T_inv initialises it.
     measurement_noise : float or tuple of float, length ny, default 0.5
         Default standard deviation of the noise on each sample, one for all outputs or one for each. The artifact limits
         it to the largest value in the maps' training.
@@ -105,8 +105,8 @@ class Artifact:
         self._check_ranges()
         if self.inverse.whiten.shape[1] != self.filter.size or ("z_u" in self.inverse.features) != (self.filter.nu > 0):
             raise ArtifactError(
-                f"T_inv takes {self.inverse.features} and {self.inverse.whiten.shape[1]} values of z, but the filter "
-                f"has {self.filter.size} values of z and {self.filter.nu} inputs"
+                f"T_inv has features {self.inverse.features} and takes {self.inverse.whiten.shape[1]} values of z, "
+                f"but the filter has {self.filter.size} values of z and {self.filter.nu} inputs"
             )
         gain = self.inverse.noise_gain
         if gain.ndim == 2 and len(gain) != self.ny:
@@ -284,7 +284,7 @@ class Artifact:
         return self.inverse.process_noise_max if "process_noise" in self.inverse.features else None
 
     def check(self, system: str, parameters: Mapping[str, float], *, dt: float, ny: int, nu: int) -> None:
-        """Raise ArtifactError unless the observer was made for this system; the message names the values that differ.
+        """Raise ArtifactError unless the observer was made for this system; the message names the first difference.
 
         Parameters
         ----------

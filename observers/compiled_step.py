@@ -73,7 +73,7 @@ class CompiledStep:
     ) -> None:
         """Advance rows of the state in place by samples and inputs, at the sampling interval of ``linear``.
 
-        A ``record`` of shape (steps, n, width) receives each sample's rows, one of (steps, n, nx) its estimates.
+        The shape of ``record`` decides what it receives: rows (steps, n, width) or estimates (steps, n, nx).
         Shapes: ``rows`` (n, width), ``y`` (steps, n, ny), ``u`` (steps, n, nu).
         """
         # Numba would compile again for arrays that are read-only or not contiguous.
@@ -91,7 +91,7 @@ def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]
 
 
 def _of_filter(linear: LinearFilter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the transition's diagonal stacked on ``drive``, and places and values of its off-diagonal entries."""
+    """Return the transition matrix: its diagonal (stacked on ``drive``), and places and values of its other entries."""
     diagonal = linear.transition.diagonal()
     places = np.array(np.nonzero(linear.transition - np.diag(diagonal)))
     return np.vstack([diagonal, linear.drive]), places, linear.transition[*places]

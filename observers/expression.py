@@ -12,8 +12,8 @@ from observers.checks import is_finite
 
 MOST_LEVELS = 24  # levels of nested functions
 MOST_PARTS = 2000  # numbers, states, inputs and functions in all components together
-_POWERS = 8  # integer exponents up to this value compile to products
-_MOST_NESTED = 16  # number of a function's arguments beyond which the source combines them in halves
+_POWERS = 8  # integer exponents up to this absolute value compile to products
+_MOST_NESTED = 16  # arguments that the source nests one by one; longer lists of arguments are combined in halves
 
 
 class _Rule(NamedTuple):

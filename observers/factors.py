@@ -8,7 +8,7 @@ import numpy as np
 from observers.checks import ArtifactError, shown
 
 COVERAGE = 0.9  # share of errors inside the calibrated regions
-_MAX_FACTOR = 1e12
+_MAX_FACTOR = 1e12  # largest calibration factor
 
 
 def _check_grid(levels: np.ndarray, ages: np.ndarray) -> tuple[int, int]:
@@ -95,7 +95,7 @@ class ErrorCovariance:
         return type(self)(np.zeros(1), self.ages, interpolated(level, self.levels, self.covariance)[None])
 
     def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
-        """Return covariances (..., nx, nx) at ages, for the level given to at_level; ``shape``: the batch, if given."""
+        """Return covariances (..., nx, nx) at ages, broadcast to ``shape`` if given; call :meth:`at_level` before."""
         return interpolated(np.broadcast_to(age, shape or np.shape(age)), self.ages, self.covariance[0])
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from observers.checks import check_dt, integer, real_array
 
-MOST_INPUTS = 64  # each input adds nz values to the filter's state
+MOST_INPUTS = 64  # largest nu; each input adds nz values to the filter's state
 MOST_VALUES = 1024  # largest nz (1 + nu), and largest ny; more would need much memory and time
 
 
@@ -125,7 +125,7 @@ class LinearFilter:
     def advance(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
         """Return the state one sample later.
 
-        Shapes: ``z`` (..., size), ``y`` (..., ny) at the same time, ``u`` (..., nu) held until the next sample,
+        Shapes: ``z`` (..., size), ``y`` (..., ny) at the time of z, ``u`` (..., nu) held until the next sample,
         ``y_next`` (..., ny) at the next sample; returns (..., size). Raises ValueError if the shapes do not match.
         """
         return np.concatenate((z, y, u, y_next), axis=-1) @ self._update

@@ -160,7 +160,7 @@ class InverseMap:
         return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, error_covariance=None)
 
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        """Return noise levels, limited to the largest in training if the map takes levels; equal levels as a float.
+        """Return noise levels, at most the largest in training if the map takes levels; a float if all are equal.
 
         Raises ValueError for a tuple of levels if the map takes one level for all outputs.
         """

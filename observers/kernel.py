@@ -117,7 +117,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def together(L: Any, at: Any, n: int, across: Any) -> None:
-        """Compute the covariance (nx, n) of sigma points and images; ``at`` holds the images minus their mean."""
+        """Compute the covariance (nx, n) of sigma points and their images; ``at`` holds the images minus their mean."""
         for j in range(n):
             for i in range(nx):
                 total = 0.0
@@ -160,7 +160,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def predict(x: Any, P: Any, u: Any, model: Any, scratch: Any, L: Any, mean: Any, moved: Any, across: Any) -> None:
-        """Compute the state's mean and covariance at the next sample, and its covariance with the present state."""
+        """Compute the next state's mean, its covariance, and its covariance ``across`` with the present state."""
         states, flow, substeps, address, h, share = model
         inverse, at = stack(nx, W), stack(of_states, W)
         spread_out(x, P, L, inverse, at)
@@ -211,7 +211,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
-        """Set outputs beyond the gate to NaN, unless a start, a divergence or a window of rejections has opened it."""
+        """Set outputs beyond the gate to NaN, unless a start, a divergence or a window of rejections opens the gate."""
         for k in range(ny):
             innovation, count = y[k] - expected[k], now[rejections + k]
             far = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)

@@ -16,7 +16,7 @@ from observers.monitor import Monitor
 from observers.tracker import Tracker
 
 _MAX_SAMPLES = 1000  # longest step, in sampling intervals
-_CHUNK = 8192  # rows of a record that are decoded together; more would exceed the processor's cache
+_CHUNK = 8192  # rows of the state that are decoded together; more would exceed the processor's cache
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A test whether the measured outputs still fit the estimates."""
+"""A test of whether the measured outputs still fit the estimates."""
 
 from dataclasses import dataclass
 

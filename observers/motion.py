@@ -11,7 +11,7 @@ from observers.factors import Factors, check_positive_definite
 from observers.network import MLP
 
 _MAX_LEVEL = 1e30  # largest process noise or window, so that squares are finite
-_MAX_SUBSTEPS = 1024
+_MAX_SUBSTEPS = 1024  # Runge-Kutta steps in a sampling interval
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Equations:
             raise ArtifactError(f"substeps must be an integer from 0 to {_MAX_SUBSTEPS}, got {self.substeps!r}")
 
     def __call__(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
-        """Return the states samples * dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        """Return the states after ``samples * dt``. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         f, substeps = self.field, self.steps(samples)
         if not self.substeps:
             for _ in range(substeps):
@@ -179,7 +179,7 @@ class Motion:
         return self.equations.field.inputs <= nu
 
     def step(self, x: np.ndarray, u: np.ndarray, dt: float, samples: float = 1.0) -> np.ndarray:
-        """Return the states samples * dt later. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
+        """Return the states after ``samples * dt``. Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx)."""
         if self.equations is not None:
             return self.equations(x, u, dt, samples)
         assert self.flow is not None

@@ -35,7 +35,7 @@ class KKLObserver(RecordEstimates):
     T(x_hat).
 
     If the artifact holds a motion model, the observer tracks: a Kalman filter predicts the estimate by the system's
-    equations, or by a learned flow, and corrects it by each sample (:class:`observers.tracker.Tracker`). T_inv's
+    equations or a learned :class:`Flow`, and corrects it by each sample (:class:`observers.tracker.Tracker`). T_inv's
     estimate replaces the tracker's after a divergence, and soon after a reset if T_inv's covariance is smaller.
 
     Parameters
@@ -173,8 +173,8 @@ class KKLObserver(RecordEstimates):
         Raises
         ------
         ValueError
-            If the artifact differs in more than its maps, does not cover the noise level, or holds no limits for the
-            monitor. The observer is then unchanged.
+            If the artifact differs in more than its maps, does not cover the noise level, or lacks limits or a motion
+            model that the observer's arguments need. The observer is then unchanged.
         """
         check_replacement(self.artifact, artifact)
         how: dict[str, Any] = {**self._options, "gate": self._gate, "delay": self._delay}
@@ -257,7 +257,7 @@ class KKLObserver(RecordEstimates):
 
     @property
     def mismatch(self) -> np.ndarray:
-        """Distance of the filter's state from the image of T, shape (...,): 0 where z_y = T(x_hat).
+        """Distance of the filter's state z_y from T(x_hat), shape (...,).
 
         It is the root mean square of (T(x_hat) - z_y) / :attr:`ForwardMap.z_scale` over the entries of z_y. It is large
         in the transient, under inputs and sensor faults, on another plant, and outside the training; noise adds a
@@ -361,7 +361,7 @@ class KKLObserver(RecordEstimates):
             self._state[rows] = self._kkl.step(state[rows], y[rows], u[rows], dt)
 
     def _warn(self, text: str) -> None:
-        """Warn once for each kind of message, which its first characters identify."""
+        """Warn once for each kind of message; the first 12 characters identify the kind."""
         if text[:12] not in self._warned:
             self._warned = self._warned | {text[:12]}
             warnings.warn(text, stacklevel=5)

@@ -25,7 +25,7 @@ KNOWN = 1e-3  # assumed standard deviation of a known initial state, in scaled s
 
 @dataclass(frozen=True)
 class Supervision:
-    """Limits of the innovations' running statistics at any noise level, and a new sample's share in each statistic."""
+    """Limits of the innovations' running statistics, valid at any noise level, and a new sample's share in each."""
 
     window: int
     share: float
@@ -62,7 +62,7 @@ def _limit(freedom: float, quantile: float) -> float:
 
 
 class Tracker:
-    """An unscented Kalman filter on the system's equations, or on a learned flow, with one estimate in each row.
+    """An unscented Kalman filter on the system's equations or a learned :class:`Flow`, with one estimate in each row.
 
     It starts from the initial states' mean and covariance in training, corrected by the first sample. In the first
     :attr:`Motion.window` each step is repeated twice: the sample also corrects the state before the step, and the

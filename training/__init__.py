@@ -54,7 +54,7 @@ __all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use, as parts of the package do not need torch, which takes seconds to import."""
+    """Import a public name on first use: torch takes seconds to import, and parts of the package do not need it."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

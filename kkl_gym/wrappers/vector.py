@@ -42,7 +42,7 @@ class VectorEstimate(VectorWrapper):
         self.observation_space: gym.spaces.Box = batch_space(estimator.space, env.num_envs)  # type: ignore[assignment]
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._sample = np.zeros(env.num_envs, dtype=np.int64)
-        self.emitted = b""  # the last observations, as in KKLVectorEnv
+        self.emitted = b""  # bytes of the last observations, as in KKLVectorEnv
         # The KKLVectorEnv or VectorEstimate inside; None for Sync and Async vectors, and for observers from rollouts.
         self._inside: Any = None if isinstance(env, _SignalsInInfo) else env
         while self._inside is not None and not isinstance(self._inside, KKLVectorEnv | VectorEstimate):
@@ -59,7 +59,7 @@ class VectorEstimate(VectorWrapper):
         self._check_untouched(inner, at_reset=True)
         if not isinstance(info, dict) or not isinstance(info.get("y"), np.ndarray):
             raise ValueError(
-                f"the observer reads info['y'] as an array, and {shown(self.env)} changes info: put wrappers such as "
+                f"the observer reads info['y'] as an array, but {shown(self.env)} changes info: put wrappers such as "
                 "DictInfoToList and NumpyToTorch outside"
             )
         if mask.all():
@@ -85,7 +85,7 @@ class VectorEstimate(VectorWrapper):
         disabled = self.autoreset_mode is AutoresetMode.DISABLED
         expected = self._sample + 1
         over = bool(before.any())
-        if over:  # the step before ended these rows; this one reset them or, if DISABLED, left them
+        if over:  # the step before ended these rows; this one reset them or, in mode DISABLED, did not step them
             expected[before] = self._sample[before] if disabled else 0
         self._check(expected, info["sample"], before)
         if over and disabled:
@@ -154,7 +154,7 @@ class VectorEstimate(VectorWrapper):
             check_untouched(obs, b"".join(base.get_attr("emitted")), self.env, base)
 
     def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
-        """Add the observers' report to ``info``, with the mask ``rows`` of environments. Returns all observations."""
+        """Add the observers' report to ``info``, with ``rows`` as mask of its valid rows. Returns all observations."""
         report = self._estimator.report()
         for key, values in report.items():
             info |= {key: values, f"_{key}": rows.copy()}
@@ -253,8 +253,8 @@ class KKLVectorObservation(VectorEstimate):
     observer : str or path, optional
         As for :class:`kkl_gym.KKLObservation`.
     **options
-        All other arguments of :class:`kkl_gym.KKLObservation`. With ``known_start`` the observer is given the start of
-        every episode in each row. ``info["x_cov"]`` has the shape (num_envs, nx, nx).
+        All other arguments of :class:`kkl_gym.KKLObservation`. With ``known_start`` the observer starts at the true
+        initial state of every episode. ``info["x_cov"]`` has the shape (num_envs, nx, nx).
 
     Attributes
     ----------
@@ -269,7 +269,7 @@ class KKLVectorObservation(VectorEstimate):
     ------
     ValueError
         As for :class:`kkl_gym.KKLObservation`, and if the environments of a Sync or Async vector differ in a setting
-        that the observer needs; the level of process noise counts only if the map takes it.
+        that the observer needs; the level of process noise counts only if T_inv takes it or the map has a motion model.
 
     Examples
     --------
@@ -307,7 +307,7 @@ class KKLVectorObservation(VectorEstimate):
 
 
 def _check_process_noise(env: gym.vector.VectorEnv, artifact: Artifact) -> None:
-    """Raise ValueError if the rows differ in the level of process noise that the observer assumes for all."""
+    """Raise ValueError if the rows differ in the level of process noise, and T_inv or a motion model takes it."""
     if artifact.process_noise_max is not None or artifact.motion is not None:
         plant_of(env, "process_noise")
 
@@ -396,7 +396,7 @@ class VectorActionRepeat(VectorWrapper):
 
 
 def _merged(old: Infos, new: Infos) -> Infos:
-    """Return the entries of ``new``; in rows where ``new`` has no entry, return the entry of ``old``."""
+    """Return ``old`` with the masked entries of ``new``; rows that the masks leave out keep the values of ``old``."""
     out = dict(old)
     for key, mask in new.items():
         if key.startswith("_") and key[1:] in new:

@@ -20,7 +20,7 @@ from training.agents.information import INFORMATION, Information, make
 from training.agents.tasks import Task
 from training.trajectories.equations import describe
 
-FORMAT = 2
+FORMAT = 2  # version of the file format
 KEY = "kkl-gym-agent"
 MAX_SCALED = 10.0  # limit of normalised observations, as in stable-baselines3
 Head = Literal["tanh", "clip", "argmax"]
@@ -65,7 +65,7 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 class Agent:
     """A deterministic policy, the task on which it was trained, and the information that it sees.
 
-    Shapes: ``mean`` and ``scale``, which normalise observations, (inputs,).
+    ``mean`` and ``scale``, both of shape (inputs,), normalise observations.
     """
 
     network: MLP
@@ -90,7 +90,7 @@ class Agent:
             if not isinstance(getattr(self, name), str | None):
                 raise AgentError(f"{name} must be a string, got {getattr(self, name)!r}")
         if (self.mean is None) != (self.scale is None):
-            raise AgentError(f"mean and scale belong together, {'scale' if self.scale is None else 'mean'} is missing")
+            raise AgentError(f"mean and scale belong together; {'scale' if self.scale is None else 'mean'} is missing")
         for name in ("mean", "scale"):
             values = getattr(self, name)
             if values is not None and (values.shape != (self.inputs,) or not np.isfinite(values).all()):
@@ -117,7 +117,7 @@ class Agent:
         return self.network.inputs if self.lstm is None else self.lstm.inputs
 
     def policy(self, action_space: gym.Space[Any]) -> Callable[[np.ndarray], Any]:
-        """Return a function from observations (n, inputs) to n actions, for one episode if the agent is recurrent."""
+        """Return a function from observations (n, inputs) to n actions; a recurrent agent's serves one episode."""
         space: Any = action_space
         memory: tuple[np.ndarray, np.ndarray] | None = None
 

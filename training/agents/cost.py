@@ -7,15 +7,15 @@ import numpy as np
 from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 from training.agents.tasks import Task
 
-# States that are about three scales from the target have this cost. Larger costs would dominate the training.
+# States about three times System.scale from the target have this cost. Larger costs would dominate the training.
 MAX_COST = 10.0
 
 
 def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
-    """Return an action's reward: minus its cost c, which is at most ``MAX_COST``.
+    """Return an action's reward: minus its cost, which is at most ``MAX_COST``.
 
-    ``total`` is the sum of the environment's rewards 1/(1 + 4c) over the action's samples. An action that ends the
-    episode early, after ``age`` samples, also pays its cost for each action that would have followed.
+    ``total`` is the sum of the environment's rewards over the action's samples; the cost c makes their mean 1/(1 + 4c).
+    An action that ends the episode early, after ``age`` samples, also pays its cost for each action that would follow.
     """
     samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
     remaining = np.where(terminated, task.steps - np.ceil(age / task.repeat), 0.0)

@@ -28,7 +28,7 @@ def vector(
 ) -> VectorEnv:
     """Make a task's environments, with autoreset mode SAME_STEP.
 
-    ``wrap`` wraps them inside the action repeat. Without a system, each call of ``each`` makes one environment.
+    ``wrap`` wraps them inside the action repeat, if any. Without a system, each call of ``each`` makes one environment.
     """
     if task.system is None:
         side_by_side = SyncVectorEnv([each or partial(single, task)] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
