@@ -185,7 +185,7 @@ class _Calibration:
         return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
     def limits(self, extremes: np.ndarray) -> Limits:
-        """Return 3 ny limits a level; a sound motion crosses one or more with probability false_alarms / 2 at most."""
+        """Return 3 ny limits for each level; a fault-free run crosses any with probability <= false_alarms / 2."""
         share, sound = self.false_alarms / (6 * self.artifact.ny), self.noisy if self.noisy.any() else ~self.noisy
         largest, low, high = extremes[:, :, sound]
         mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))

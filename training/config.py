@@ -34,7 +34,7 @@ Biases = Annotated[
     frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 )
 class Config:
-    """The settings of a training. The input-aware preset "fast" changes only settings that depend on the system.
+    """The settings of a training. The input-aware preset "fast" keeps all defaults that do not depend on the system.
 
     Raises
     ------

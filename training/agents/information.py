@@ -1,4 +1,4 @@
-"""Information sets: vector environments that show agents states, outputs, memories or estimates as flat arrays."""
+"""Information sets: vector environments with states, outputs, memories or estimates as flat observations."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -26,7 +26,7 @@ Information = Literal["state", "y", "stacked", "traces", "z", "x_hat", "x_hat_st
 INFORMATION: tuple[Information, ...] = get_args(Information)
 ESTIMATED: tuple[Information, ...] = ("x_hat", "x_hat_std")
 OBSERVED: tuple[Information, ...] = (*ESTIMATED, "z")  # information that a learned observer can give
-MIN_DEVIATION = 1e-6  # lower bound of the standard deviations that agents see, in units of a state's scale
+MIN_DEVIATION = 1e-6  # lower bound of the standard deviations that agents see; for a system, in units of System.scale
 
 Values = Mapping[str, np.ndarray]
 Feature = Callable[[Values], np.ndarray]

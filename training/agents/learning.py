@@ -42,14 +42,14 @@ RECURRENT = "ppo_lstm"
 # all steps, and the agent learns from true hidden signals: its policy also suits the later, very accurate estimates.
 PRIVILEGED = 0.9
 WANDERED = 0.1  # share of all steps that the first phase takes under noise; its actions are random
-REHEARSAL = 0.05  # a training that refits its observer ends with this share of all steps, without learning
+REHEARSAL = 0.05  # share of all steps at the end of a training with refits; the agent does not learn or explore then
 FILE = "agent.safetensors"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings that no algorithm takes
 _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes a system's task
 
 
 def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:
-    """Return ppo_lstm for recurrent agents, else a system's ``PREFERRED``, sac for environments in sac.yml, or ppo."""
+    """Return the default: ppo_lstm if recurrent, ``PREFERRED`` of a system, sac for environments in sac.yml, or ppo."""
     if information == "recurrent":
         return RECURRENT
     if task.system is not None:
@@ -95,12 +95,12 @@ def learn(
     show: Callable[..., VectorEnv] = make,
     progress: ProgressBars | None = None,
 ) -> Agent:
-    """Train one agent, with checkpoints; write agent.safetensors, curve.csv and, if learned, observer.safetensors.
+    """Train one agent; write checkpoints, agent.safetensors, curve.csv and, if learned or refitted, the observer.
 
     If no observer is given to an agent that sees x_hat in an environment without a system, one is learned from the
     first ``observer_steps`` steps. Without noise the agent also learns in these steps: it sees the true hidden signals,
     and afterwards their estimates. Under noise the estimates are less accurate, and a policy for true signals does not
-    suit them. The first steps are then fewer, their actions are random, and only the observer learns.
+    suit them. By default the first steps are then fewer. Their actions are random, and only the observer learns.
 
     If ``observer_steps`` is given for z under noise, KKLMemory's weights are learned from that many random steps.
     All these first steps count as steps of the training. The observer is refitted ``aggregate`` times to the agent's

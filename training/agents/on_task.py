@@ -17,7 +17,7 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     """Gives an agent the observations and rewards of ``kkl-gym agent train SYSTEM``.
 
     The agent sees (x_hat - target) / scale and acts once in a period of the task, while the observer sees every sample.
-    The reward is minus the cost; systems with their own ``reward`` or ``terminated`` keep their environment's. With the
+    The reward is minus the cost, or the environment's if the system has its own ``reward`` or ``terminated``. With the
     seed of row i of the task's vector environment, this environment behaves like row i.
 
     The wrapped environment sets the noise, the starts and the length of episodes: make it with the ``env_kwargs`` of

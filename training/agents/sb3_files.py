@@ -1,4 +1,4 @@
-"""Conversion of agents to and from the files of stable-baselines3 (AGENT.zip), whose code is never run."""
+"""Conversion of agents to and from the files of stable-baselines3 (AGENT.zip); code in a file is never run."""
 
 import io
 import json
@@ -30,14 +30,14 @@ _LAYERS = {
     "dqn": re.compile(r"q_net\.q_net\.\d+"),
     "ppo": re.compile(r"mlp_extractor\.policy_net\.\d+|action_net"),
 }
-_MAX_BYTES = 1 << 28  # largest size of an unpacked file in the zip
+_MAX_BYTES = 1 << 28  # largest size in bytes of an unpacked file in the zip
 
 
 def to_sb3(agent: Agent, *, trusted: str | None = None) -> BaseAlgorithm:
     """Make a model of stable-baselines3 that acts like ``agent``; the model's ``save`` writes the zip.
 
     The model can play but not continue to learn: its critics, or DQN's target network, are untrained. Its first layer
-    includes the normalisation of observations, without the clip at ±10.
+    includes the normalisation of observations, without VecNormalize's clip at ±10.
     """
     network = agent.network
     hidden = [len(bias) for bias in network.biases[:-1]]
@@ -77,7 +77,7 @@ def to_sb3(agent: Agent, *, trusted: str | None = None) -> BaseAlgorithm:
 def from_sb3(
     path: str | os.PathLike[str], task: Task, information: Information = "x_hat", observer: str | None = None
 ) -> Agent:
-    """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task without VecNormalize.
+    """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task, without the wrapper VecNormalize.
 
     Only the tensors and the text of the file are read (by torch with ``weights_only``), so none of its code runs.
     """

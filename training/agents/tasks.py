@@ -26,7 +26,7 @@ TOLERANCE = 0.2  # largest distance from the target that counts as a success, in
 class Task:
     """An environment and the entries of its observations that agents may see.
 
-    A system's environment measures y, and ``measured``, ``hidden`` and ``angles`` are unused. ``hidden`` None stands
+    A system's environment measures y, so ``measured``, ``hidden`` and ``angles`` are unused. ``hidden`` None stands
     for all entries that are not measured. ``gym.make`` takes ``env_id`` and ``env_kwargs``. An action lasts ``repeat``
     samples; ``time_constants`` and ``frames`` are in actions. ``weights``: see :meth:`kkl_gym.KKLMemory.learn_weights`.
     """

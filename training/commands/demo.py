@@ -24,7 +24,7 @@ from training.files import require_writable
 from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports of progress
-SECONDS = 12.0  # length of an animation; it shows 1,200 times the system's dt, so that dt = 0.01 s gives real time
+SECONDS = 12.0  # length of an animation in s; it shows this multiple of System.pace, in real time if the pace is 1 s
 FRAMES = 144  # number of frames in an animation
 TRAIL = 0.35  # share of the samples that one frame draws; older points would hide the latest
 

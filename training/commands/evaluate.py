@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
-SKIPPED = 5.0  # transient of driven runs, in multiples of 100 dt (``System.pace``); at most half of a run
-FIRST, SETTLED = 2.0, 5.0  # error bars are evaluated before FIRST and after SETTLED, in multiples of 100 dt
+SKIPPED = 5.0  # transient of driven runs, in units of System.pace; at most half of a run
+FIRST, SETTLED = 2.0, 5.0  # error bars are evaluated before FIRST and after SETTLED, in units of System.pace
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, in multiples of the map's largest level
 FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %")
 
@@ -324,7 +324,7 @@ class Evaluate:
     def _cases(
         self, description: str, of: Subject, levels: Sequence[Level], progress: ProgressBars, left_out: list[str]
     ) -> Iterator[tuple[str, bool, UnseenTrajectories, Level]]:
-        """Yield, for each noise level, the name of the starts, whether runs are driven, the trajectories and the level.
+        """Yield, for each case and noise level, the starts' name, whether runs are driven, trajectories and level.
 
         A case gets a line in ``left_out`` instead if it has no starts, or if all its trajectories leave the bounds.
         """

@@ -19,7 +19,7 @@ class Finding:
 
 
 def percent(share: float) -> str:
-    """Format a share in percent: with two digits, or from 99.5 % on as a whole number."""
+    """Format a share in percent: with two significant digits, or from 99.5 % on as a whole number."""
     return (f"{100 * share:.0f}" if abs(share) >= 0.995 else f"{100 * share:.2g}") + " %"
 
 

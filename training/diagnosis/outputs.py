@@ -18,9 +18,9 @@ FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of sampl
 MIN_STEPS = 10  # least number of samples of a motion
 # The verdict is "problem" or "note" where more than this share of a direction's standard deviation is left at the end.
 UNSEEN, HARDLY = 0.9, 0.3
-INVOLVED = 0.3  # a finding names the states with larger components in the direction
+INVOLVED = 0.3  # a finding names the states with larger components in the direction, a unit vector
 VAGUE, NOTHING = 0.3, 1.0  # errors in standard deviations of the state, without and with noise, that get a "note"
-# Under a symmetry a state's least error is <= LOCALLY, but predicting it from motions of similar y errs by >= GLOBALLY.
+# Errors under a symmetry, in a state's standard deviations: the least is <= LOCALLY, that from similar y >= GLOBALLY.
 LOCALLY, GLOBALLY = 0.1, 0.3
 WINDOWS, MAX_SAMPLES = 7, 100  # number of windows, each half as long as the one before; upper bound of samples in each
 
@@ -34,7 +34,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
     late = weights[len(weights) // 2 :]
     late += max(0, round(subject.duration / subject.dt) + 1 - len(weights)) / len(late)
     least = np.average(errors, axis=1, weights=weights)
-    # Symmetries need motions under the same inputs; under a policy, other starts have other inputs.
+    # Symmetries show in motions under the same inputs, but under a policy the inputs depend on the start.
     findings = _unseen(names, left) | ({} if subject.policy else _symmetries(subject, least[0]))
     yield from findings.values()
     for i, name in enumerate(names):

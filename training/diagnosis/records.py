@@ -24,7 +24,7 @@ from training.spectrum import Spectrum
 
 STEPS = 10_000  # number of steps played in an environment by default
 MAX_QUERIES, MAX_OTHERS = 500, 40_000  # largest numbers of samples to predict, and of their possible neighbours
-QUERY_SHARE = 0.2  # share of the records to predict, or of each if there are fewer than FEW; neighbours are in the rest
+QUERY_SHARE = 0.2  # share of the records (of each record, if fewer than FEW) to predict; neighbours are in the rest
 MIN_QUERIES = 50  # least number of samples to predict
 MIN_OTHERS = 5  # for each coordinate of z there must be more possible neighbours than this
 NOISE_SHARES = 0.01, 0.1  # default noise levels, in standard deviations of the output
@@ -33,7 +33,7 @@ ROUNDING = 1e-9  # ridge of the linear regression on z, about the relative round
 # Largest error of a determined signal and least error of an undetermined one, in the signal's standard deviations.
 DETERMINED, UNDETERMINED = 0.05, 0.8
 AS_GOOD = 1.1  # a window whose error is at most this multiple of the least error is as good as the best
-# A signal is known up to a constant if its changes are determined, with at most this share of the signal's error.
+# A signal is known up to a constant if its changes have an error <= DETERMINED and <= this share of the signal's.
 SEEN = 0.1
 
 # Severity and advice by the first word of the verdict on a signal.

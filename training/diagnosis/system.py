@@ -43,8 +43,8 @@ def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
 class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
-    ``motions`` are states (steps + 1, MOTIONS, nx) and inputs. States are NaN after they leave the bounds. The
-    ``kinds``, such as free, have equal shares. ``stay`` (MOTIONS,) marks motions within bounds; ``y`` is their output.
+    ``motions`` are states (steps + 1, MOTIONS, nx) and inputs. States are NaN after they leave the bounds. Each of
+    the ``kinds``, such as free, has an equal share. ``stay`` (MOTIONS,) marks motions within bounds; ``y`` is theirs.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Subject:
 
     @property
     def followed(self) -> tuple[np.ndarray, np.ndarray]:
-        """States and inputs of the motions that stay within the bounds, driven ones if the system has inputs."""
+        """States and inputs of the motions that stay within the bounds, only driven ones if there are inputs."""
         rows = np.flatnonzero(self.stay & (np.arange(MOTIONS) >= MOTIONS - MOTIONS // len(self.kinds)))
         return self.motions[0][:, rows], self.motions[1][:, rows]
 

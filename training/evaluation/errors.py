@@ -17,7 +17,7 @@ from training.seeds import Stream, generator
 from training.sources.simulated import LEAST_PROCESS_NOISE, unknown_start
 from training.trajectories.motions import Controller, draw_process_noise, random_inputs, under_policy
 
-TRANSIENT = 0.2  # share of a trajectory, at its start, that errors after the transient leave out
+TRANSIENT = 0.2  # length of the transient at the start of a trajectory, as a share of the trajectory
 MAX_TRIES = 1000  # number of successive starts inside X after which the search for one outside X ends
 
 Domain = Literal["X", "1.5X", "2X"]

@@ -119,7 +119,7 @@ def _map(exported: Exported, label: str, inverse: InverseMap) -> str:
 
 
 def template(name: str, words: Mapping[str, object], parts: Collection[str]) -> str:
-    """Replace words in a file of the folder ``c``, and cut from "// if PART" to "// end PART" unless PART is given."""
+    """Replace words in a file of folder ``c``, and cut from "// if PART" to "// end PART" unless ``parts`` has PART."""
     text = files("training.export").joinpath("c", name).read_text(encoding="utf-8")
     ranges = re.compile(r"// if (\w+)\n(.*?)// end \1\n", re.DOTALL)
     while ranges.search(text):
