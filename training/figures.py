@@ -23,7 +23,7 @@ CYCLES: dict[Theme, tuple[str, ...]] = {
     "light": ("#0072b2", "#e69f00", "#009e73", "#c2187a", "#56b4e9", "#7a4a1e", "#1a1a1a", "#9a9a9a"),
     "dark": ("#4aa3df", "#f0a83c", "#2fbf93", "#ff6db8", "#a6dcff", "#b98a5a", "#eceae4", "#8a909c"),
 }
-GROUNDS: dict[Theme, str] = {"light": "#ffffff", "dark": "#1e2129"}  # backgrounds, those of the site
+GROUNDS: dict[Theme, str] = {"light": "#ffffff", "dark": "#1e2129"}  # backgrounds, the same as on the website
 RULES: dict[Theme, str] = {"light": "#e4e4e4", "dark": "#363b47"}  # grid lines and frames of legends
 ALIKE: dict[str, Any] = {  # settings of both themes
     "axes.axisbelow": True,
@@ -39,7 +39,7 @@ ALIKE: dict[str, Any] = {  # settings of both themes
     "lines.linewidth": 1.2,
     "lines.markersize": 4.0,
 }
-SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # shares in which an animation's palette mixes each colour with the background
+SHADES = (0.15, 0.3, 0.5, 0.75, 1.0)  # shares of each colour, mixed with the background, in an animation's palette
 
 
 def theme_around() -> Theme:

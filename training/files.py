@@ -41,7 +41,7 @@ def require_writable(folder: str | os.PathLike[str]) -> None:
 
 
 def clear_unfinished(folder: str | os.PathLike[str]) -> None:
-    """Remove temporary files and folders of killed processes, last written to at least an hour ago."""
+    """Remove temporary files and folders that killed processes left, if nothing was written to them for an hour."""
     for unfinished in Path(folder).glob(f"{UNFINISHED}*"):
         with suppress(OSError):  # another process may remove files too, and some belong to other users
             written = [unfinished, *unfinished.rglob("*")]  # writing to a file does not change its folder's time
@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a run's folder, write its configuration; ValueError at any checkpoints, with ``resume`` at another run's."""
+    """Lock a folder, write a run's configuration; ValueError if it holds checkpoints (if ``resume``: another run's)."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)
@@ -96,7 +96,7 @@ def refuse_checkpoints(folder: Path) -> None:
 
 
 def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
-    """Raise ValueError if a folder's identity file, where there is one, describes something else."""
+    """Raise ValueError if an identity file exists, but is damaged or differs from ``described``."""
     if not path.exists():
         return
     here = json.loads(json.dumps(described))

@@ -1,4 +1,4 @@
-"""The lessons of a training: functions that learn the map and the flow, and ``train``, which runs all lessons."""
+"""The lessons of a training: functions for the map and the flow, which predicts the next state; ``train`` runs all."""
 
 import dataclasses
 import platform
@@ -64,7 +64,7 @@ def train(
     device: torch.device | None = None,
     console: Console | ProgressBars | None = None,
 ) -> Result:
-    """Learn an observer: a filter, T_inv, a tracker's motion model, covariances and the limits of a monitor.
+    """Learn an observer: a filter, T_inv, a tracker's motion model, covariances and the limits of a fault monitor.
 
     The lessons, in order, are the map (:func:`training.learn_map`), the motion model, and the calibration
     (:func:`training.calibrate`). The motion model consists of the system's equations, or of a learned flow if the

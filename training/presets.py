@@ -95,7 +95,7 @@ PROFILES: dict[str, Profile] = {
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
         # Under noise, real modes hardly distinguish the parameters, but slow pairs at frequencies of y do: the first
-        # two cut the best T_inv's error from 2.3 to 1.9 % (parameters 10 % off). More training cut the error by 3 %.
+        # two cut the best T_inv's error from 2.3 to 1.9 % (parameters 10 % off). More training cut it by 3 % of that.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
@@ -128,7 +128,7 @@ def controller(system: System, dt: float) -> Controller:
 
 
 def named_policy(system: System, name: str, dt: float | None) -> Controller:
-    """Load and check a policy: a script's function, or the system's controller, held over ``dt`` (None: its dt)."""
+    """Load and check a policy: a script's function, or the system's controller, held for ``dt`` (None: system.dt)."""
     if ":" not in name and name != "controller":
         similar = suggestion(name, ["controller"])
         raise ValueError(f"unknown policy {name!r}{similar}: give controller, or script.py:function")

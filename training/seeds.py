@@ -10,7 +10,7 @@ class Stream(IntEnum):
 
     TRAINING = 1
     EVALUATION = 2
-    VALIDATION = 3  # splits of records, their diagnosis, and the benchmark's choice of settings
+    VALIDATION = 3  # splits and diagnosis of records, and the benchmark's choice of settings
     CALIBRATION = 5
     FAULTS = 6
     TUNING = 7

@@ -1,4 +1,4 @@
-"""The eigenvalues of A: the filter that they define, and a test, before any training, whether T is smooth for them."""
+"""The eigenvalues of A: the filter that they define, and a test before any training of whether T is smooth for them."""
 
 import functools
 from collections.abc import Iterable, Iterator

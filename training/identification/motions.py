@@ -14,8 +14,8 @@ from training.trajectories.parameters import with_parameters
 STEP = 1e-8  # step of numerical derivatives, for a start in half-widths of X, for a parameter in its unit
 SETTLING = 12  # largest number of Levenberg-Marquardt steps that fit a start
 CONVERGED = 1e-3  # a start has converged if a step lowers its mean squared residual by less than this share
-FIRST_DAMPING = 1e-3
-BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # shares of a window to which its start is fitted first
+FIRST_DAMPING = 1e-3  # damping of the first step, as a share of the diagonal of J'WJ
+BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # a start is fitted to these initial shares of its window in turn
 DRAWS, KEPT = 64, 4  # random starts for each window, and the number of best ones that are fitted
 SAMPLES_PER_STATE = 8  # least number of samples per state to which a start is fitted, because of noise
 MOST_ROWS = 60_000  # largest number of motions in one simulation
@@ -64,7 +64,7 @@ class Shooting:
     def derivatives(
         self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
     ) -> np.ndarray:
-        """Return derivatives (steps + 1, n, ny, d) of ``y`` by starts in half-widths and, if asked, theta in units."""
+        """Return derivatives (steps + 1, n, ny, d) of y by starts in half-widths (and theta in units, if asked)."""
         n, nx = x0.shape
         size = np.concatenate([self.half, self.unit]) * STEP
         moved = len(size) if parameters else nx
@@ -152,7 +152,7 @@ class Problem:
             moved, rows = rows[going], rows[going | ~better]
 
     def part(self, rows: np.ndarray, x0: np.ndarray, length: int | None = None) -> "Problem":
-        """Return the same problem for some windows with starts ``x0``, cut to their first ``length`` steps if given."""
+        """Return the same problem for some windows with starts ``x0``, cut to ``length`` steps unless it is None."""
         u = self.windows.u[:length, rows]
         return Problem(self.shooting, Windows(self.windows.y[: len(u) + 1, rows], u, x0), self.weight**-0.5)
 
@@ -164,7 +164,7 @@ class Problem:
     def searched(self, theta: np.ndarray, rng: np.random.Generator) -> Motions:
         """Return motions that fit the windows, found from random starts in X.
 
-        The squared residuals of a long chaotic window have many minima, those of its beginning have few. A start is
+        The squared residuals of a long chaotic window have many minima; those of its beginning have few. A start is
         therefore fitted first to the beginning, and then to longer and longer parts of the window.
         """
         x0, (length, *longer) = self.windows.x0.copy(), self.beginnings()

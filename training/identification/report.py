@@ -9,7 +9,7 @@ from training.figures import ESTIMATE, MEASURED, TRUTH, drawing
 from training.identification.identify import Identified
 
 LAGS = 40  # largest lag in samples
-SHOWN = 3  # number of held-out records in the figure
+SHOWN = 3  # largest number of held-out records in the figure
 
 
 def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:

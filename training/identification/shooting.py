@@ -11,14 +11,14 @@ from training.identification.motions import FIRST_DAMPING, Motions, Problem, Sho
 RESETTLING = 3  # largest number of steps that refit a start if its window fits worse after a step of the parameters
 NONLINEAR = 0.3  # largest rms error, in units of the noise, of outputs linearised over one standard error
 ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
-SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square per output by less is slow; three such in a row end the fit
+SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square per output by less is slow; PATIENCE of them in a row end a fit
 SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit
 EXACT = 1e-16  # a smaller mean square of residuals, relative to the outputs' variances, ends the fit
 ROUNDING = 1e-14  # lower bound of the noise, relative to an output's standard deviation
-MOST_DAMPING = 1e9
+MOST_DAMPING = 1e9  # the fit ends if no step with a smaller damping lowers the residuals
 CLUSTERS = 20  # least number of windows whose scatter gives standard errors
 COLOURED = 1.5  # residuals are coloured if scatter raises a standard error by a larger factor, which chance hardly does
-OUTLIER = 9.0  # a window is left out if its mean square is so many median absolute deviations above the median
+OUTLIER = 9.0  # a window is left out if its mean square exceeds the median by OUTLIER median absolute deviations
 
 
 class UnexplainedError(ValueError):
@@ -107,10 +107,10 @@ class Fit:
 
 
 def predictable(fit: Fit, windows: Windows) -> np.ndarray:
-    """Return a mask (n,) of the windows whose outputs respond linearly to parameter changes by a standard error.
+    """Return a mask (n,) of the windows whose outputs respond linearly to parameter changes of a standard error.
 
-    Long windows of a chaotic motion do not: their squared residuals have many minima, and the curvature at a minimum
-    gives no standard errors.
+    The outputs of long windows of a chaotic motion do not: their squared residuals have many minima, and the curvature
+    at a minimum gives no standard errors.
     """
     shooting, theta, problem = fit.shooting, fit.theta, Problem(fit.shooting, windows)
     at = problem.settled(theta)
@@ -205,7 +205,7 @@ def _reduced(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the normal equations S (p, p), s (p,) of the parameters after the starts' elimination (Schur complement).
 
-    The starts' steps are the last column of the third array (n, nx, p + 1), minus its others @ the parameters' step.
+    The starts' steps are the third array's (n, nx, p + 1) last column minus its other columns @ the parameters' step.
     """
     D, cross = damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
     along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))

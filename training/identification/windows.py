@@ -15,7 +15,7 @@ FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows; all lengths are
 MORE_NOISE = 1.5  # largest standard deviation of the first windows' residuals, in multiples of the noise level
 SMALL = 0.01  # limit of these residuals in multiples of the output's standard deviation; the larger limit counts
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
-GAIN = 0.7  # lengths grow no further once every standard error is more than this share of the one before
+GAIN = 0.7  # lengths grow no further once every standard error is more than this share of its previous value
 MORE_COST = 2.0  # largest factor by which a doubling may increase the residuals' mean square
 LEFT = 0.4  # in standard errors: longest Gauss-Newton step that may remain after a fit
 APART = 0.5  # in standard errors: largest distance between two fits of the same windows, see fit_windows
@@ -47,8 +47,8 @@ def fit_windows(
     """Fit parameters and initial states on windows of growing length; ``report`` receives the share done.
 
     Long windows give smaller standard errors, short ones converge from rougher guesses. Chaos and process noise limit
-    the length: the residuals of longer windows are not white, and their squares have many minima. Longer windows are
-    therefore fitted twice, from one standard error on either side of the last fit, and count only if both fits agree.
+    the length: the residuals of longer windows are not white, and their squares have many minima. Each doubled
+    length is therefore fitted twice, from one standard error on either side of the last fit; the fits must agree.
     """
     longest = min(max(len(record.y) for record in records) - 1, MOST_SAMPLES)
     first = [length for length in FIRST_LENGTHS if length <= longest] or [longest]

@@ -26,7 +26,7 @@ def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -
 
 
 def along(network: nn.Sequential, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return a network's values at x and derivatives along f, by hand, as torch.compile lacks forward-mode autodiff."""
+    """Return a network's values at x and derivatives along f, by formulas: torch.compile lacks forward autodiff."""
     for layer in network:
         if isinstance(layer, nn.Linear):
             x, f = layer(x), f @ layer.weight.T

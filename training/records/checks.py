@@ -10,9 +10,9 @@ from training.records.record import LONGEST_GAP, ROLES, Record, median_step
 
 Warn = Callable[[str], object]
 
-OTHER_CLOCK = 30.0  # if dt is longer than so many steps of a record, its times are probably in another unit
+OTHER_CLOCK = 30.0  # if dt is longer than this many steps of a record, the record's times are probably in another unit
 WHOLE_TURN = 0.9 * 2 * np.pi, 2 * np.pi + 0.1  # least and largest jump of a wrapped angle, in rad
-FAR_OFF = 10.0  # a value farther from all others than so many times their range may mark missing samples
+FAR_OFF = 10.0  # a value may mark missing samples if its distance from all others is over this multiple of their range
 
 
 def check_signals(records: Sequence[Record], system: System | None = None) -> None:

@@ -31,7 +31,7 @@ def read_records(
     system: System | None = None,
     warn: Warn | None = None,
 ) -> list[Record]:
-    """Read a record from each file, or from each episode of a data set, and check them."""
+    """Read a record from each file, or from each episode of a data set, and check the records."""
     paths = [Path(path) for path in files]
     if not paths:
         raise ValueError(f"name a file of recorded data, {', '.join(READERS)}, or a data set, minari:ID (--data)")
@@ -52,7 +52,7 @@ def read_records(
 
 
 def _read(path: Path, wanted: Signals) -> Record:
-    """Read the wanted signals of a file; a role for which none are named, such as inputs, has the usual columns."""
+    """Read the wanted signals of a file; a role without wanted signals has its usual columns, such as u for inputs."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(

@@ -23,8 +23,7 @@ MOST_STEPS = 1000  # largest number of grid steps for each sample; a record with
 class Signals:
     """The names of a record's columns by role; an empty role stands for the usual names, such as y1, y2.
 
-    A measured, input or hidden signal is the name of a column, or ``cos(column)`` or ``sin(column)`` of an angle in
-    rad.
+    A signal other than the time is the name of a column, or ``cos(column)`` or ``sin(column)`` of an angle in rad.
     """
 
     time: str = ""
@@ -196,7 +195,7 @@ class Windows:
     """The pieces of some records between gaps, concatenated, with a filter that runs along each piece.
 
     Shapes: ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx), NaN where unknown, ``z`` (n, size), and ``before`` and
-    ``after`` (n,): numbers of samples in the same piece before and after each.
+    ``after`` (n,): numbers of samples before and after each sample in its piece.
     """
 
     def __init__(self, records: Iterable[Record], linear: LinearFilter, nx: int) -> None:
@@ -224,7 +223,7 @@ class Windows:
         return z
 
     def restarted(self, rows: np.ndarray, age: int) -> np.ndarray:
-        """Return z at the samples ``rows`` if the filter had started ``age`` samples before each, by linearity."""
+        """Return, by linearity, z at the samples ``rows`` as if the filter had started ``age`` samples before each."""
         began = rows - age
         power = np.linalg.matrix_power(self.linear.transition, age)
         return np.asarray(self.z[rows] + (self.linear.start(self.y[began]) - self.z[began]) @ power.T)

@@ -27,12 +27,12 @@ from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a shorter training than the first, as there are many refits
-LONGEST = 250  # steps of a piece, or two settling times if that is more; episodes are cut so that parts can be held out
+LONGEST = 250  # most steps in a piece (two settling times if more): episodes are cut so that parts can be held out
 
 
 @dataclass(frozen=True)
 class Refit:
-    """A refit: the observer in use afterwards, whether this one is new, held-out errors before and after, the step."""
+    """A refit: the observer in use afterwards, whether it is new, held-out errors before and after, steps so far."""
 
     artifact: Artifact
     taken: bool
@@ -68,8 +68,7 @@ class KKLTrainingCallback(BaseCallback):
         Earlier episodes, the oldest first, such as those that the observer was learned from. Their steps count among
         the kept ones, but are never held out.
     rehearsal : int, default 0
-        Further steps at the end of each call of ``learn``, in which the agent acts without exploration; a last refit
-        follows.
+        Further steps at the end of each call of ``learn``, without exploration; a last refit follows.
     outputs : str, default "y"
         Key of ``info`` that holds the outputs to learn from. By default these are the outputs that the observer saw,
         noise included, and the map's noise level 0 stands for that noise.
@@ -214,7 +213,9 @@ class KKLTrainingCallback(BaseCallback):
         if (old.motion is not None and new.motion is None) or (
             old.inverse.error_covariance is not None and new.inverse.error_covariance is None
         ):
-            warnings.warn("the observer in use stays: too few steps are held out, or a tracker is worse", stacklevel=2)
+            warnings.warn(
+                "the observer in use stays: too few steps are held out, or the new one does not track", stacklevel=2
+            )
             return
         before, after = (_rms(recorded_errors(each, held_out, measurement_noise=self._level)) for each in (old, new))
         taken = not after > before
@@ -233,7 +234,7 @@ class KKLTrainingCallback(BaseCallback):
 
 
 def _in_use(env: VecEnv) -> tuple[list[KKLObserver], Callable[[Artifact], object]]:
-    """Return the observers in use and the function that replaces them; ValueError if there are no observers."""
+    """Return the observers in use and the function that replaces them; ValueError if an environment has none."""
     inside = getattr(env.unwrapped, "env", None)  # a vector environment of Gymnasium
     while isinstance(inside, gym.vector.VectorWrapper):
         if isinstance(inside, KKLVectorObservation):
@@ -276,7 +277,7 @@ class Gathering:
         self._outputs, self._dt, self._nx = outputs, artifact.filter.dt, artifact.nx
         self._longest = longest = max(LONGEST, 2 * math.ceil(settling_time(artifact.filter) / self._dt))
         self._keep, self._share = keep, held_out
-        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; each row's open piece
+        self._pieces, self._open = list[_Piece](), dict[int, _Piece]()  # all, oldest first; open ones by environment
         self._made = self.steps = 0
         check_dt(before, self._dt)
         for record in before:

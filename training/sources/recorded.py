@@ -30,8 +30,8 @@ WINDOW = 10  # least number of samples over which a tracker averages innovations
 UNEXPLAINED = 0.7  # a larger residual of y = C x, in standard deviations of the output, is no noise
 ROUNDING, OUTLIER = 1e-6, 6.0  # largest rounding, relative to an output; least outlier, in residual standard deviations
 LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
-MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # records: modes per output; slowest and fastest, relative to the signal rate
-RECORD_MEMORIES = 3.0  # settling times in a median record, at least; fewer if the slowest mode outpaced the signals
+MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # records: modes per output; slowest and fastest, in multiples of signal_rate
+RECORD_MEMORIES = 3.0  # least number of settling times in a median record; fewer if a mode would exceed signal_rate
 # For rollouts, whose hidden signals an agent needs within a few steps: number of modes of each output, and their rates
 # per step. A few modes that lie far apart forget the start soon, and distinguish single steps.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0

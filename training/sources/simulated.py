@@ -21,14 +21,14 @@ from training.trajectories.parameters import blind, nominal_share, relative_rang
 
 LEAD_IN_SHARE = 0.4  # in this share of the motions without inputs, earlier inputs have moved the start
 BEYOND = 2.0  # size, relative to X, of the box in which a third of the calibration runs start
-# Random inputs drive half of the calibration runs. A policy drives all of them, and in half of them it also explores.
+# Random inputs drive half of the calibration runs. A policy, if given, drives all of them, and explores in half.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
 LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
 LEAST_PROCESS_NOISE = 0.005  # least level for a tracker, in System.scale per System.pace; a tenth of the default
 WINDOW, RUN = 0.5, 20.0  # durations of a tracker's window and of a calibration run, in multiples of System.pace
 SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
 INTEGRATION_ERROR = 2e-5  # largest error of these steps in standard deviations of the states, well below the noise
-TOO_FAR_OFF = 0.01  # if SUBSTEPS steps have a larger error, for example because f jumps, a flow is learned
+TOO_FAR_OFF = 0.01  # in standard deviations: if SUBSTEPS steps err by more, as where f jumps, a flow is learned
 INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
 DEVIATIONS = (1e-4, 0.3)  # increments start beside motions, at these least and largest distances in standard deviations
 
@@ -47,7 +47,7 @@ class SimulatedSource:
     Raises
     ------
     ValueError
-        If the policy is unknown or invalid, the system lacks an uncertain parameter or its value is 0, or ``bias`` does
+        If the policy is unknown or invalid, an uncertain parameter is 0 or no parameter of the system, or ``bias`` does
         not fit the outputs.
     """
 

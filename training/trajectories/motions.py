@@ -21,7 +21,7 @@ Chunk = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 KINDS = ("zero", "steps", "zero", "sine")  # signals that the inputs of successive trajectories follow
 DRIVEN = ("steps", "sine", "pulses")  # the same if all trajectories shall have inputs
 CHUNK = 500  # number of trajectories simulated at once
-FIRST, FEWEST_INSIDE = 100, 0.05  # after so many trajectories, at least this share must have stayed within bounds
+FIRST, FEWEST_INSIDE = 100, 0.05  # after FIRST trajectories, at least this share must have stayed within bounds
 # Durations, in multiples of the system's pace, of lead-ins: inputs that lead starts out of X before a trajectory.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 FAR = 0.6  # share of the trajectories that start in the larger box, if there is one
@@ -29,9 +29,9 @@ INPUT_WEIGHT = 0.1  # a regulator's weight on inputs, relative to that on states
 POLICY_KINDS = ("steps", "sine")  # signals of a policy's errors and of its exploration
 POLICY_ERROR = (0.02, 0.5)  # range of errors in the states that a policy sees, in multiples of the system's scale
 EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in multiples of input bounds
-# One trajectory in so many follows the policy exactly. The exact policy's input reveals the state; an agent's input,
-# which depends on x_hat, does not. If a regulator acts on x_hat, at the default noise, the error of cart-pole's angle
-# is 3.4 % of X's half-width with one in 4, 3.2 % with one in 12, and 3.1 % with none; an EKF has 2.7 %.
+# One in this many trajectories follows the policy exactly. The exact policy's input reveals the state; an agent's
+# input, which depends on x_hat, does not. If a regulator acts on x_hat, at the default noise, the error of cart-pole's
+# angle is 3.4 % of X's half-width with one in 4, 3.2 % with one in 12, and 3.1 % with none; an EKF has 2.7 %.
 POLICYS_OWN = 12
 
 
