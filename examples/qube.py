@@ -89,7 +89,7 @@ GUESSES = {
 }
 ALONE, BOTH = "KKL, recorded states", "KKL, recorded states and the fitted model's motions"
 DIFFERENCES = "finite differences"
-GUIDED = "Kalman filter, fitted model with an arm that sticks, started by the second KKL"
+GUIDED = "Kalman filter, fitted model with an arm that sticks, initialised by the second KKL"
 # Line styles and colours of the estimators in the figure, in the order of the table.
 LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", ESTIMATE), ("-", RIVAL), ("-", TARGET)
 # The figure shows the first 4 s of each run, with root mean square errors over windows of 125 samples.
