@@ -100,7 +100,7 @@ class Program:
     exact: bool
 
     def lines(self, name: str, zeros: int = 0) -> list[str]:
-        """Return Python code of the function, which maps a tuple of arguments to the results and ``zeros`` zeros."""
+        """Return Python code of the function, from a tuple of arguments to the results, followed by ``zeros`` zeros."""
         return [
             f"def {name}(values):",
             f"    {in_tuple(self.arguments)} = values",

@@ -91,7 +91,7 @@ def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]
 
 
 def _of_filter(linear: LinearFilter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the transition matrix: its diagonal (stacked on ``drive``), and places and values of its other entries."""
+    """Return the transition matrix's diagonal above ``drive``, and places and values of the matrix's other entries."""
     diagonal = linear.transition.diagonal()
     places = np.array(np.nonzero(linear.transition - np.diag(diagonal)))
     return np.vstack([diagonal, linear.drive]), places, linear.transition[*places]

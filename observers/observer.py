@@ -50,7 +50,7 @@ class KKLObserver(RecordEstimates):
         The tracker takes any level; T_inv limits the level to the largest in its training. By default that largest
         level, which is also the default of the system's environments; 0 if T_inv takes no level.
     monitor : bool, default False
-        Whether to test if the samples fit the estimates, see :attr:`score`.
+        Whether to test if the samples fit the estimates (see :attr:`score`).
     tracking : bool, optional
         Whether to track. False uses T_inv alone, without any model at run time. None tracks if the artifact holds a
         motion model.
@@ -161,7 +161,7 @@ class KKLObserver(RecordEstimates):
         self._kkl, self._measurement_noise, self._process_noise = kkl, measurement_noise, process_noise
 
     def replace(self, artifact: Artifact) -> None:
-        """Use the maps of another artifact with the same filter from now on. The filter's state stays unchanged.
+        """From now on, use the maps of another artifact with the same filter. The filter's state stays unchanged.
 
         If the new map tracks and the old map did not, tracking starts at the current sample. A monitor restarts.
 
@@ -411,7 +411,7 @@ class KKLObserver(RecordEstimates):
         return standard_deviations(self.decode_covariance())
 
     def decode_covariance(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the :attr:`covariance` of some rows, (number of True in rows, nx, nx); see :meth:`decode`."""
+        """Return the :attr:`covariance` of all rows, or of some (number of True in rows, nx, nx), as :meth:`decode`."""
         state, batch = self._some(rows)
         self.artifact.require_covariance()
         return self._kkl.covariance(state).reshape(*batch, self.artifact.nx, self.artifact.nx)

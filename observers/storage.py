@@ -46,7 +46,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary file is in the same folder, which is created if missing. It has the permissions that the umask
     allows, and the same suffix, from which some writers choose a format. After an exception it is deleted, and ``path``
-    is unchanged. If the process is killed, the file stays until :func:`training.files.clear_unfinished` removes it.
+    is unchanged. If the process is killed, :func:`training.files.clear_unfinished` removes the temporary file later.
     """
     target = Path(path)
     temporary = target.with_name(f"{UNFINISHED}{secrets.token_hex(4)}-{target.stem}{target.suffix}")

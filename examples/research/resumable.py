@@ -88,7 +88,7 @@ def run_missing(
 ) -> list[str]:
     """Run the missing jobs; returns the failures."""
     todo, failures = [job for job in jobs if not job.done], list[str]()
-    names = [job.name for job in todo]  # the engine starts jobs in this order, so the first ones are running
+    names = [job.name for job in todo]  # engine() starts jobs in this order, so the first ones are running
     bar = progress.add_task(what, total=len(jobs), completed=len(jobs) - len(todo))
 
     def described() -> str:

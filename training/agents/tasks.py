@@ -18,7 +18,7 @@ from observers.names import matching
 from training.evaluation.levels import Level
 
 MAX_SAMPLES = 100_000  # largest number of samples in an episode, all of which are stored
-MAX_FRAMES = 1_000  # largest number of stacked observations; it also limits untrusted files
+MAX_FRAMES = 1_000  # largest number of stacked observations, also in files, which are untrusted
 TOLERANCE = 0.2  # largest distance from the target that counts as a success, in units of the scale
 
 

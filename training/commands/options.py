@@ -250,7 +250,7 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
 
 @dataclass(frozen=True)
 class Shown:
-    """An environment for a demo, and its observer; None stands for the system's shipped observer, if there is one."""
+    """An environment for a demo; ``observer`` None stands for the system's shipped observer, if there is one."""
 
     label: str
     env_id: str

@@ -16,7 +16,7 @@ from observers.inverse import InverseMap
 from observers.network import MLP
 from training.export.exported import Exported, output_expression, tracker_arrays, tracker_numbers
 
-_POWERS = 8  # integer exponents up to this value are written as products
+_POWERS = 8  # integer exponents up to this absolute value are written as products
 _CONDITIONS = {**{name: f"{{0}} {name} {{1}}" for name in ("<", "<=", ">", ">=")}, "not": "!{0}"}
 _CONDITIONS |= {"and": "{0} && {1}", "or": "{0} || {1}"}
 _OPERATIONS = _CONDITIONS | {  # C code with the results of NumPy's functions; each argument is a variable or a number

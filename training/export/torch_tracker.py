@@ -16,7 +16,7 @@ from training.export.torch_parts import Module, Network, TorchExpression, betwee
 Tracked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """Scaled states (nx, n), covariance (nx, nx, n), NIS, mean square of the trend, number of samples (n,), trend (ny, n).
 
-The trend is the running mean of the innovations.
+The trend is the running mean of the whitened innovations.
 """
 Prediction = tuple[Tensor, Tensor, Tensor, Tensor]
 """Means (nx, n), covariances (nx, nx, n), covariances with the last states (nx, nx, n), whether they are valid (n,)."""

@@ -9,7 +9,7 @@ from training.identification.identifiability import PART, identifiable_direction
 from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped
 
 RESETTLING = 3  # largest number of steps that refit a start if its window fits worse after a step of the parameters
-NONLINEAR = 0.3  # largest rms error, in units of the noise, of outputs linearised over one standard error
+NONLINEAR = 0.3  # largest rms error of outputs linearised over the parameters' standard errors, in units of the noise
 ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
 SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square per output by less is slow; PATIENCE of them in a row end a fit
 SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit
@@ -205,7 +205,7 @@ def _reduced(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the normal equations S (p, p), s (p,) of the parameters after the starts' elimination (Schur complement).
 
-    The starts' steps are the third array's (n, nx, p + 1) last column minus its other columns @ the parameters' step.
+    The third array, A (n, nx, p + 1), gives the starts' steps: A[..., -1] - A[..., :-1] @ the parameters' step.
     """
     D, cross = damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
     along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))
@@ -230,7 +230,7 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
     noise = np.sqrt(np.maximum(squares, ROUNDING**2 / problem.weight))
     curvature, beyond, by_parameters = _beyond_starts(J, problem.weight, nx)
     gradients = np.einsum("knyp,kny->np", beyond, at.r[:, used] * problem.weight)
-    # At the minimum the gradients add up to zero, which lowers the scatter of few windows.
+    # At the minimum the gradients add up to zero, so over few windows their scatter is too small.
     few = len(gradients) / max(len(gradients) - len(theta), 1)
     return Fit(
         shooting=shooting,

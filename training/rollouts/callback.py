@@ -27,7 +27,7 @@ from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a shorter training than the first, as there are many refits
-LONGEST = 250  # most steps in a piece (two settling times if more): episodes are cut so that parts can be held out
+LONGEST = 250  # episodes are cut into pieces of at most this many steps (two settling times if longer) to hold some out
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ class KKLTrainingCallback(BaseCallback):
     the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
     replaces the old one unless the new one's error on that share is larger. Filters keep their states. So that no
     on-policy batch mixes observers, a refit takes place only before a rollout is collected, or at the end of ``learn``.
-    A refit needs a kept and a held-out episode as long as the filter's settling time; otherwise the callback warns.
+    A refit needs a kept and a held-out episode of at least the filter's settling time; else the callback warns.
 
-    The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square, divided by
-    standard deviations), and ``kkl/error_before``, that of the observer before the refit.
+    The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square, in standard
+    deviations of the signals), and ``kkl/error_before``, that of the observer before the refit.
 
     Parameters
     ----------

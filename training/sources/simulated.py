@@ -27,10 +27,10 @@ LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multip
 LEAST_PROCESS_NOISE = 0.005  # least level for a tracker, in System.scale per System.pace; a tenth of the default
 WINDOW, RUN = 0.5, 20.0  # durations of a tracker's window and of a calibration run, in multiples of System.pace
 SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
-INTEGRATION_ERROR = 2e-5  # largest error of these steps in standard deviations of the states, well below the noise
+INTEGRATION_ERROR = 2e-5  # steps are halved until they err by at most this, in standard deviations: far below the noise
 TOO_FAR_OFF = 0.01  # in standard deviations: if SUBSTEPS steps err by more, as where f jumps, a flow is learned
 INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
-DEVIATIONS = (1e-4, 0.3)  # increments start beside motions, at these least and largest distances in standard deviations
+DEVIATIONS = (1e-4, 0.3)  # least and largest rms shift from a motion to an increment's start, in standard deviations
 
 
 class SimulatedSource:
