@@ -31,7 +31,7 @@ def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
         autoreset_mode="Disabled",
     )
     envs = kkl_gym.KKLVectorObservation(envs, config["observer"])  # the observer sees every sample, 0.01 s apart
-    return kkl_gym.VectorActionRepeat(envs, 5)  # a row resets in the next step, as RLlib expects
+    return kkl_gym.VectorActionRepeat(envs, 5)  # an ended row resets in the next step, as RLlib expects
 
 
 def configuration(algorithm: Literal["ppo", "sac"]) -> AlgorithmConfig:

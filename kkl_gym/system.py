@@ -233,7 +233,7 @@ class System:
         """Reward that environments return for a sampling interval; default: 1 at :attr:`target`, and less elsewhere.
 
         The default is 1 / (1 + 4 c) with c = mean(((x - target) / scale)^2). A system that overrides this method or
-        :meth:`terminated` defines its own task, and ``kkl-gym agent train`` trains for it.
+        :meth:`terminated` defines its own task, and ``kkl-gym agent train`` trains agents for it.
 
         Parameters
         ----------
@@ -270,8 +270,8 @@ class System:
         """How fast f changes along a motion, in 1/s: a norm of df/dx. The default ``dt`` follows from it.
 
         By default it is a numerical derivative, with each state in units of X's half-width, so that the rate does not
-        depend on the user's units. An estimate of the error then sets the number of substeps. If a subclass overrides
-        this method, its rate sets the number of substeps: each lasts at most 0.4 / rate. Override it if f jumps.
+        depend on the user's units. An estimate of the integration error then sets the number of substeps. If a subclass
+        overrides this method, its rate sets that number: a substep lasts at most 0.4 / rate. Override it if f jumps.
         """
         return slope(self.f, x, self.X)
 

@@ -22,7 +22,7 @@ from training.trajectories.motions import filter_states
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # measurement noise, in multiples of the largest level in training
 # Times since reset, in units of the source's ``pace``.
 AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)
-# Samples of each run around each age (four times as many at the last), because motions may be in phase at one age.
+# Number of samples of a run around each age (four times this at the last); at a single age motions may be in phase.
 PER_AGE = 6
 FEWEST = 50  # least number of errors for a covariance or a quantile
 LEAST_VARIANCE = 1e-6  # added to the variance of each state's error, as a fraction of the state's squared range
@@ -185,7 +185,7 @@ class _Calibration:
         return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
     def limits(self, extremes: np.ndarray) -> Limits:
-        """Return 3 ny limits for each level; a fault-free run crosses any with probability <= false_alarms / 2."""
+        """Return 3 ny limits by level; a fault-free run crosses any of them with probability <= false_alarms / 2."""
         share, sound = self.false_alarms / (6 * self.artifact.ny), self.noisy if self.noisy.any() else ~self.noisy
         largest, low, high = extremes[:, :, sound]
         mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))

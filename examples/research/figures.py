@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 RESULTS = DOCS / "results"
 Draw = Callable[[Path], object]
-COLOURS = 256  # number of colours that is left in a picture; this reduces its size to a third
+COLOURS = 256  # number of colours that remain in a picture; this reduces the file to a third
 SEED = 7  # seed of the animations
 DT = 0.01  # s, sampling interval of the shipped systems
 EKF = "EKF with the exact equations"

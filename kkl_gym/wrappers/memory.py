@@ -90,9 +90,9 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     linear, stable and fixed: filters of the outputs and inputs, the linear half of a KKL observer.
 
     The observation is [y, memory of y, memory of u], float32, where y are the measured entries. The memory of y has one
-    number for each entry and time constant: a first-order filter of its changes, 0 where y is constant. The memory of
-    u has a running mean for each input and time constant. The cosine and sine of an angle share one memory, that of
-    the unwrapped angle. Once the memory has filled, its numbers are about as large as y, see
+    number for each entry and time constant: a first-order filter of the entry's changes, 0 if y is constant. The
+    memory of u has a running mean for each input and time constant. The cosine and sine of an angle share one memory,
+    that of the unwrapped angle. Once the memory has filled, its numbers are about as large as y, see
     :class:`kkl_gym.memory.Memory`. At reset it assumes that y was constant and that no input acted. From the first step
     on, it assumes that y changed in the 64 steps before the reset at the mean rate that y has had since the reset.
     ``info`` is unchanged.
@@ -122,8 +122,8 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     time_constants : sequence of float
         Time constants of the outputs' filters in steps, from 0.5 to 10,000, each at least 1.5 times the one before.
     input_time_constants : sequence of float
-        The same for the filters of actions; an empty sequence leaves actions out. Boxes with bounds are scaled to
-        [-1, 1], discrete actions are one-hot.
+        The same for the filters of actions; an empty sequence leaves actions out. Actions in a bounded Box are scaled
+        to [-1, 1], discrete actions are one-hot.
 
     Raises
     ------

@@ -34,7 +34,7 @@ class Checkpoint(BaseCallback):
     def __init__(self, path: Path, fingerprint: str, *, resume: bool) -> None:
         super().__init__()
         self.path, self._fingerprint, self._curve_path = path, fingerprint, path.with_name(CURVE)
-        self.resumed = self.restarts = 0  # resumptions, and times that all environments were made again
+        self.resumed = self.restarts = 0  # number of resumptions, and how often all environments were made again
         self.spent = 0  # number of random steps before the algorithm's first step
         self.privileged = False  # whether the agent sees true hidden signals instead of estimates
         self.records: Callable[[], Sequence[Record]] = list  # returns the records to save

@@ -49,7 +49,7 @@ _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes
 
 
 def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:
-    """Return the default: ppo_lstm if recurrent, ``PREFERRED`` of a system, sac for environments in sac.yml, or ppo."""
+    """Return the default: ppo_lstm if recurrent, a system's in PREFERRED, sac for environments in sac.yml, else ppo."""
     if information == "recurrent":
         return RECURRENT
     if task.system is not None:

@@ -1,4 +1,4 @@
-"""Which states a system's outputs determine: locally, by the equations, and globally, by simulated motions."""
+"""Which states a system's outputs determine locally (from the equations) and globally (from simulated motions)."""
 
 from collections.abc import Iterator
 
@@ -14,13 +14,13 @@ from training.presets import eigenvalues
 from training.sources.simulated import unknown_start
 from training.trajectories.motions import how_to_stay
 
-FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of samples of each
+FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of steps of each
 MIN_STEPS = 10  # least number of samples of a motion
 # The verdict is "problem" or "note" where more than this share of a direction's standard deviation is left at the end.
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names the states with larger components in the direction, a unit vector
 VAGUE, NOTHING = 0.3, 1.0  # errors in standard deviations of the state, without and with noise, that get a "note"
-# Errors under a symmetry, in a state's standard deviations: the least is <= LOCALLY, that from similar y >= GLOBALLY.
+# Under a symmetry, in standard deviations: a state's least error is <= LOCALLY, its error from similar y >= GLOBALLY.
 LOCALLY, GLOBALLY = 0.1, 0.3
 WINDOWS, MAX_SAMPLES = 7, 100  # number of windows, each half as long as the one before; upper bound of samples in each
 
@@ -66,7 +66,7 @@ def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
     if 2 * n < FOLLOWED:
         raise ValueError(f"only {n} motions from X stayed within the bounds; {how_to_stay(system, subject.policy)}")
     if length < MIN_STEPS:
-        few = f"motions of {subject.duration:g} s have only {length - 1} samples of {subject.dt:g} s"
+        few = f"motions of {subject.duration:g} s have only {length - 1} steps of {subject.dt:g} s"
         raise ValueError(f"{few}; take a longer duration, or a smaller dt")
     floor = [RESOLUTION * (size or 1.0) for size in system.output_range]  # no network reads y more accurately
     R = np.repeat([np.diag(np.maximum(level, floor) ** 2) for level in levels], n, axis=0)

@@ -33,7 +33,7 @@ ROUNDING = 1e-9  # ridge of the linear regression on z, about the relative round
 # Largest error of a determined signal and least error of an undetermined one, in the signal's standard deviations.
 DETERMINED, UNDETERMINED = 0.05, 0.8
 AS_GOOD = 1.1  # a window whose error is at most this multiple of the least error is as good as the best
-# A signal is known up to a constant if its changes have an error <= DETERMINED and <= this share of the signal's.
+# A signal is known up to a constant if the error of its changes is <= DETERMINED and <= this share of its own error.
 SEEN = 0.1
 
 # Severity and advice by the first word of the verdict on a signal.

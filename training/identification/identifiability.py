@@ -64,7 +64,7 @@ def written(powers: dict[str, Fraction | float]) -> str:
 
 
 def sign_symmetries(system: System, parameters: Sequence[str], *, driven: bool = False) -> list[tuple[str, ...]]:
-    """Return the smallest sets of states and parameters whose common change of sign leaves the outputs unchanged."""
+    """Return the minimal sets of states and parameters whose common change of sign leaves the outputs unchanged."""
     values = system.parameters
     ranges = {name: _around(values[name]) for name in parameters}
     both = with_parameters(system, ranges)

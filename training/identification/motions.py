@@ -11,7 +11,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
-STEP = 1e-8  # step of numerical derivatives, for a start in half-widths of X, for a parameter in its unit
+STEP = 1e-8  # step of numerical derivatives: in half-widths of X for a start, in Shooting.unit for a parameter
 SETTLING = 12  # largest number of Levenberg-Marquardt steps that fit a start
 CONVERGED = 1e-3  # a start has converged if a step lowers its mean squared residual by less than this share
 FIRST_DAMPING = 1e-3  # damping of the first step, as a share of the diagonal of J'WJ
@@ -90,7 +90,7 @@ class Motions:
     each: np.ndarray
 
     def take(self, others: "Motions", rows: np.ndarray, of: np.ndarray) -> None:
-        """Replace the motions of indices ``rows`` by those of ``others`` at the indices ``of``."""
+        """Replace the motions at the indices ``rows`` by those of ``others`` at the indices ``of``."""
         self.x0[rows], self.each[rows] = others.x0[of], others.each[of]
         self.y[:, rows], self.r[:, rows] = others.y[:, of], others.r[:, of]
 

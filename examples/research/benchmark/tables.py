@@ -1,4 +1,4 @@
-"""Tables and the figure, only from the benchmark's two CSV files."""
+"""Make the benchmark's tables and figure from its two CSV files alone."""
 
 import json
 import re

@@ -76,5 +76,5 @@ def test_least_errors_do_not_depend_on_the_units_of_states(oscillator):
 def test_motions_that_leave_or_are_short():
     with pytest.raises(ValueError, match=r"only 0 motions from X stayed within the bounds; .* \(--policy\)"):
         of(made(f=lambda self, x: (x[1], 4.0 * x[0])))
-    with pytest.raises(ValueError, match=r"motions of 0.05 s have only 5 samples of 0.01 s"):
+    with pytest.raises(ValueError, match=r"motions of 0.05 s have only 5 steps of 0.01 s"):
         of(Oscillator(), duration=0.05)
