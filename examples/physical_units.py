@@ -16,7 +16,7 @@ from kkl_gym.elementary import exp, sqrt
 
 @dataclass(frozen=True)
 class StirredTank(System):
-    """A cooled tank with an exothermic reaction, A to B; the temperature is measured. Time is in minutes.
+    """A cooled tank with an exothermic reaction of A to B; the temperature is measured. Time is in minutes.
 
     c' = q (c_feed - c) - k(T) c, T' = q (T_feed - T) + heat k(T) c + cooling (T_jacket + u - T) with k = k0 exp(-E/T),
     after the example in D. E. Seborg, T. F. Edgar and D. A. Mellichamp, Process Dynamics and Control.

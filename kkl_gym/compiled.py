@@ -276,7 +276,7 @@ def _batch(system: System, kernel: Any) -> Advance[np.ndarray]:
     def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
         out = np.empty(x.shape)
         lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
-        # States that became NaN in this step need substeps whose length follows the error.
+        # States that became NaN in this step are stepped again, with substeps whose length follows the error.
         if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):
             out[:, rows] = advance_batch(system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out

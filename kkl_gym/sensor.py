@@ -11,7 +11,7 @@ import numpy as np
 from kkl_gym.equation_errors import is_sequence
 from observers.checks import integer, is_finite, noise_level, shown
 
-# Largest delay and largest gap between samples, in steps; each environment stores the samples of its delay.
+# Largest delay and largest gap between samples, in steps; environments store delay + 1 samples.
 MAX_SAMPLES = 10_000
 
 

@@ -126,7 +126,7 @@ class InverseMap:
                         f"{name}_max must be a positive, finite number for a map that takes {name}, got {end!r}"
                     )
                 if end != math.inf and (not is_finite(end) or end < 0):
-                    raise ArtifactError(f"{name}_max must be a number, not negative, got {end!r}")
+                    raise ArtifactError(f"{name}_max must be a nonnegative number, got {end!r}")
         conditions = sum(name in self.features for name in _CONDITIONS)
         if "measurement_noise" in self.features:
             conditions += outputs - 1
@@ -160,7 +160,7 @@ class InverseMap:
         return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, error_covariance=None)
 
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        """Return noise levels, at most the largest in training if the map takes levels; a float if all are equal.
+        """If the map takes noise levels, limit them to the largest in training, and return a float if all are equal.
 
         Raises ValueError for a tuple of levels if the map takes one level for all outputs.
         """
@@ -194,7 +194,7 @@ class InverseMap:
         return features
 
     def age_feature(self, age: Any) -> Any:
-        """Return the network's input for the time since reset in seconds, a number or an array."""
+        """Return the network's input for ``age``, a number or an array: the time since reset in seconds."""
         if isinstance(age, float):  # fast path for one sample
             return math.log1p(min(age, self.age_max) / self.age_unit)
         return np.log1p(np.minimum(age, self.age_max) / self.age_unit)

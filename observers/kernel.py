@@ -127,7 +127,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_part
     def flow_step(at: Any, flow: Any, scratch: Any) -> None:
-        """Move all sigma points in place by one step of a learned flow."""
+        """Move all sigma points in place by one step of a learned flow, a network that predicts the next state."""
         scaling, linear, packed, shape = flow
         q, given = stack(of_network, 1), offset(scratch, 0)
         for p in range(wide):

@@ -7,8 +7,8 @@ import numpy as np
 
 from observers.checks import choice, real_array, shown
 
-_PIECE = 2**15  # values of a layer that are computed together, so that they fit the second-level cache
-UNROLLED = 4  # inputs of a layer that the machine code processes together
+_PIECE = 2**15  # number of a layer's values that are computed together; they fit the second-level cache
+UNROLLED = 4  # number of a layer's inputs that the machine code processes together
 
 
 def _tanh(h: np.ndarray) -> np.ndarray:

@@ -182,7 +182,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self.observer = self._estimator.observer
         self.estimate = estimate
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # estimates
-        # The result is stored, because reading render_mode passes through every wrapper.
+        # Whether it renders is stored, because each access to render_mode passes through every wrapper.
         self._rendering = env.render_mode is not None
         # Observers around the environment are numbered from inside; the outermost, which has the last number, draws.
         self._draws = 0
@@ -209,7 +209,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         return self._show(info), float(reward), terminated, truncated, info
 
     def replace_observer(self, observer: str | os.PathLike[str] | Artifact) -> None:
-        """Use the maps of another observer with the same filter from now on. The filter's state stays.
+        """From now on, use the maps of another observer that has the same filter. The filter's state stays.
 
         The specification ``env.spec`` still names the observer with which the wrapper was made. In vectors of
         stable-baselines3, call ``env_method("replace_observer", artifact)``.

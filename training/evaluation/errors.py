@@ -124,8 +124,8 @@ def unseen_trajectories(
     Raises
     ------
     ValueError
-        If ``domain``, ``n``, ``duration``, ``seed`` or ``process_noise`` is invalid, or the plant's numbers of states,
-        inputs or outputs differ from the system's.
+        If ``domain``, ``n``, ``duration``, ``seed`` or ``process_noise`` is invalid, ``domain`` holds no starts, or the
+        plant's numbers of states, inputs or outputs differ from the system's.
     """
     moving = plant or system
     sizes, expected = ((each.nx, each.nu, each.ny) for each in (moving, system))

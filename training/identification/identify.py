@@ -16,7 +16,7 @@ from training.progress import ProgressBars
 from training.records import Record, check_signals, pieces
 
 HELD_OUT = 10  # of the pieces of records between gaps, the 6th, 16th, 26th, ... are held out of the fit
-KEPT_RATIOS = 100.0  # prior variance of the log of a factor common to all parameters, over that of a factor for each
+KEPT_RATIOS = 100.0  # prior variance of log(factor common to all parameters) / prior variance of log(factor of one)
 BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(...), tried in turn until the fit stays about as good
 UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change exceeds this share of the parameters' change
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
@@ -134,7 +134,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     """Return the parameters nearest to ``given`` among all that explain the outputs as well as ``values`` do.
 
     Parameters without influence on the outputs become ``given``; those of another sign than ``given`` keep ``values``.
-    For the rest, changed ratios weigh heavily in the distance; a factor common to all, as of a faster plant, lightly.
+    For the rest, the distance heavily weights changed ratios, and lightly weights a common factor (a faster plant).
 
     Shapes: ``values`` (p,), ``given`` (p,), unidentifiable directions ``hidden`` (p, k); returns (p,).
     """

@@ -11,7 +11,7 @@ from training.identification.motions import Problem, Shooting, Windows
 from training.identification.shooting import CLUSTERS, Fit, UnexplainedError, predictable, shoot
 from training.records import Record
 
-FIRST_LENGTHS = (100, 200, 400)  # samples of the first windows; all lengths are fitted in turn
+FIRST_LENGTHS = (100, 200, 400)  # lengths of the first windows in samples; each length is fitted in turn
 MORE_NOISE = 1.5  # largest standard deviation of the first windows' residuals, in multiples of the noise level
 SMALL = 0.01  # limit of these residuals in multiples of the output's standard deviation; the larger limit counts
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
@@ -47,8 +47,8 @@ def fit_windows(
     """Fit parameters and initial states on windows of growing length; ``report`` receives the share done.
 
     Long windows give smaller standard errors, short ones converge from rougher guesses. Chaos and process noise limit
-    the length: the residuals of longer windows are not white, and their squares have many minima. Each doubled
-    length is therefore fitted twice, from one standard error on either side of the last fit; the fits must agree.
+    the length: the residuals of longer windows are not white, and the sum of their squares has many minima. So each
+    doubled length is fitted twice, from one standard error on either side of the last fit; the fits must agree.
     """
     longest = min(max(len(record.y) for record in records) - 1, MOST_SAMPLES)
     first = [length for length in FIRST_LENGTHS if length <= longest] or [longest]

@@ -142,7 +142,7 @@ class ForwardProblem(nn.Module):
 
 
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:
-    """Return the first sample k* from which the filter's start changes z by at most ``epsilon`` along every trajectory.
+    """Return the first sample k* from which on the filter's start changes z by at most ``epsilon`` in every trajectory.
 
     t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, which prints the logarithm's argument inverted).
     """

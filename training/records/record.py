@@ -182,7 +182,7 @@ def _held(record: Record, t: np.ndarray, dt: float) -> np.ndarray | None:
 
 
 def pieces(records: Iterable[Record]) -> list[Record]:
-    """Split records at rows that lack an output, as no filter runs across a gap."""
+    """Split records at rows that lack an output, because no filter runs across a gap."""
     parts = []
     for record in records:
         whole = ~np.isnan(record.y).any(-1)
@@ -194,7 +194,7 @@ def pieces(records: Iterable[Record]) -> list[Record]:
 class Windows:
     """The pieces of some records between gaps, concatenated, with a filter that runs along each piece.
 
-    Shapes: ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx), NaN where unknown, ``z`` (n, size), and ``before`` and
+    Shapes: ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx; NaN where unknown), ``z`` (n, size), and ``before`` and
     ``after`` (n,): numbers of samples before and after each sample in its piece.
     """
 

@@ -19,7 +19,7 @@ Report = Callable[[float], object]  # called with the amount of work that is don
 Chunk = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 KINDS = ("zero", "steps", "zero", "sine")  # signals that the inputs of successive trajectories follow
-DRIVEN = ("steps", "sine", "pulses")  # the same if all trajectories shall have inputs
+DRIVEN = ("steps", "sine", "pulses")  # signals in place of KINDS if all trajectories shall have inputs
 CHUNK = 500  # number of trajectories simulated at once
 FIRST, FEWEST_INSIDE = 100, 0.05  # after FIRST trajectories, at least this share must have stayed within bounds
 # Durations, in multiples of the system's pace, of lead-ins: inputs that lead starts out of X before a trajectory.
@@ -37,7 +37,7 @@ POLICYS_OWN = 12
 
 @dataclass(frozen=True)
 class Pairs:
-    """States x (m, n, nx) of motions with process noise (n,), and z (m, n, size) of a filter that runs along them.
+    """States ``x`` (m, n, nx) of motions under ``process_noise`` (n,), and a filter's ``z`` (m, n, size) along them.
 
     ``ages`` (m,) are in samples since the filter's start; ``nominal`` (n,) marks motions with nominal parameters.
     """
@@ -244,7 +244,7 @@ def under_policy(
 
 
 def recording_ages(steps: int, n: int) -> np.ndarray:
-    """Return at most n ages, in samples, at which to record: half spaced evenly, half logarithmically (transients)."""
+    """Return at most n ages in samples at which to record: half evenly spaced, half logarithmically for transients."""
     late = max(2, n - n // 2)  # number of evenly spaced ages, among them the first and the last
     ages = np.concatenate([np.geomspace(1, steps, n - late), np.linspace(0, steps, late)])
     return np.unique(ages.round()).astype(int)
@@ -259,7 +259,7 @@ def how_to_stay(system: System, policy: Controller | None) -> str:
 
 
 def linear_quadratic(system: System, dt: float) -> Controller:
-    """Return a saturated LQ regulator at the target, of weights 1/scale^2 and INPUT_WEIGHT/u_max^2, held over dt."""
+    """Return a saturated LQ regulator to the target, sampled at dt, with weights 1/scale^2 and INPUT_WEIGHT/u_max^2."""
     target, u_max = np.array(system.target), np.array(system.u_max)
     A, B, _ = linearised(system, system.target)
     Q, R = np.diag(1.0 / np.square(system.scale)), np.diag(INPUT_WEIGHT / u_max**2)

@@ -18,7 +18,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 MEASURED = {"Pendulum-v1": [0, 1], "CartPole-v1": [0, 2], "InvertedDoublePendulum-v5": [0, 1, 2, 3, 4]}
 ANGLES = {"Pendulum-v1": ((0, 1),), "InvertedDoublePendulum-v5": ((3, 1), (4, 2))}  # indices in y of (cosine, sine)
-# Each episode multiplies a parameter by a log-uniform number between 1/factor and factor.
+# Each episode multiplies each of these parameters by a log-uniform number between 1/factor and factor.
 FACTORS: dict[str, dict[str, float]] = {
     "Pendulum-v1": {"m": 1.3, "l": 1.3},
     "CartPole-v1": {"masspole": 2.0, "length": 2.0, "force_mag": 2.0},

@@ -46,7 +46,7 @@ WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 class Cell:
     """Agents of one kind in one task: their returns ``values`` (n,) and normalised ``scores`` (n,).
 
-    ``interval``: (mean score, low, high). ``scores`` and ``interval`` are NaN if idle or full-state agents are missing.
+    ``interval`` is (interquartile mean score, low, high). Without idle or full-state agents it and ``scores`` are NaN.
     """
 
     values: np.ndarray
@@ -90,7 +90,7 @@ def _task_name(environment: str, noise: float | str) -> str:
 
 
 def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
-    """Add columns task and idle (idle agent's return). Noise levels of an environment share full-state agents."""
+    """Add columns task and idle (return of idling). In environments, noise levels share full-state and idle agents."""
     import pandas as pd
 
     tasks = []

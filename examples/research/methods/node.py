@@ -39,7 +39,7 @@ class NODE(KKLMethod):
     label: ClassVar[str] = "NODE"
     tuned_for: ClassVar[tuple[float, ...] | None] = (0.0,)
     noise: ClassVar[float] = 0.0
-    """Standard deviation of the noise added to y in training, in multiples of the system's own."""
+    """Standard deviation of the noise added to y in training, in multiples of the system's default level."""
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """Return three initial spectra."""

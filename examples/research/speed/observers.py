@@ -18,7 +18,7 @@ from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
 
-BATCHES = 10  # timed steps of Kalman filters on a batch of rows; there are few, because these filters are slow
+BATCHES = 10  # number of timed steps of Kalman filters on a batch of rows; few, because these filters are slow
 FEWER = 10  # divides the number of samples on which single steps in Python are timed
 
 
@@ -66,7 +66,7 @@ def environment_task(env: Any, actions: Sequence[np.ndarray]) -> Callable[[], fl
 def observer_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
     """Return tasks that time an observer and extended Kalman filters, on the same samples of motions from X.
 
-    The first half of an observer's steps is not timed, because a tracker may still evaluate T_inv at each sample.
+    The first half of an observer's steps is not timed, because a tracker may evaluate T_inv at each early sample.
     Single steps in Python, by far the slowest, are timed on fewer samples.
     """
     u = np.array(system.u_max) * np.random.default_rng(1).uniform(-1, 1, (steps + 1, rows, system.nu))
@@ -102,7 +102,7 @@ def observer_tasks(artifact: Artifact, system: System, *, rows: int, steps: int)
 
 
 def record_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
-    """Return tasks that time estimates along records: of the observer and, if installed, of dynamax's EKF.
+    """Return tasks that time estimates along records, by the observer and, if dynamax is installed, by its EKF.
 
     Both use the equations of the observer's tracker.
     """
