@@ -28,7 +28,7 @@ from training.records import Record
 DT = 2**14 / 1e7  # s
 FILE = "SNLS80mV.csv"
 SAMPLES = 131_072
-# The start of each test is fitted to this number of first samples; their errors do not count.
+# The initial state of each test is fitted to this number of first samples; their errors do not count.
 FREE = 50
 # Samples of the first three quarters of the multisine, and of its last quarter.
 TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)
@@ -54,8 +54,8 @@ class Silverbox(kkl_gym.System):
     """A forced Duffing oscillator, y'' = -damping y' - (stiffness + square y + cube y^2) y + offset + gain u(t).
 
     The generator's input is smooth between samples, but the simulation holds its input over an interval. A weighted sum
-    of three samples of V1, before, at and after the interval's first sample, has the smooth input's effect. For slow
-    signals the weights before = -1/6 and after = 1/3 are right to second order.
+    of V1 at the interval's first sample and at its two neighbours has the smooth input's effect. For slow signals
+    the weights before = -1/6 and after = 1/3 are right to second order.
     """
 
     damping: float = 60.0  # 1/s
@@ -109,7 +109,7 @@ def part(data: np.ndarray, begin: int, end: int) -> Record:
 
 
 def simulated(system: Silverbox, record: Record) -> np.ndarray:
-    """Return outputs (n,) of a simulation from inputs only; its start is fitted to the first samples."""
+    """Return outputs (n,) of a simulation from inputs only; its initial state is fitted to the first samples."""
     theta = np.array([system.parameters[name] for name in LIMITS])
     first = {(0, 0): np.array([record.y[0, 0], 0.0])}
     shooting = Shooting(system, DT, LIMITS, np.ones(len(theta)))

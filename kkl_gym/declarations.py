@@ -1,4 +1,4 @@
-"""Checks and completes the class variables of a user's system when its class is defined."""
+"""Check and complete the class variables of a user's system when its class is defined."""
 
 import dataclasses
 import inspect

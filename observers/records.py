@@ -47,7 +47,7 @@ class RecordEstimates:
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Return estimates (steps, ..., number) of uncertain parameters: :attr:`parameters_hat` along a whole record.
 
-        Arguments and errors are those of :meth:`estimate`. Also raises ValueError if there are no such parameters.
+        Arguments and errors are those of :meth:`estimate`. Also raises ValueError if the map estimates no parameters.
         """
         return self._along(y, u, None, of=self._kkl.parameters_hat)
 

@@ -118,9 +118,9 @@ class Config:
     """Share of the records that is held out to calibrate on and to measure errors: whole records if there are five or
     more, otherwise the end of each record."""
     tracking: bool = True
-    """Whether a Kalman filter that T_inv initialises tracks the state, by the equations or a flow (not with spinn)."""
+    """Whether a Kalman filter that T_inv initialises tracks the state by equations or a learned flow (not spinn)."""
     flow_steps: Count = 5000
-    """Batches for a flow, which replaces equations that are unknown or that an artifact cannot hold."""
+    """Batches for a learned flow, which replaces unknown equations and those that an artifact cannot hold."""
     runs: Annotated[int, Field(ge=100)] = 400
     """Number of simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01

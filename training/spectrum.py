@@ -1,4 +1,4 @@
-"""The eigenvalues of A: the filter that they define, and a test before any training of whether T is smooth for them."""
+"""The eigenvalues of A: the filter that they define, and a test, before any training, of whether they make T smooth."""
 
 import functools
 from collections.abc import Iterable, Iterator
@@ -19,7 +19,7 @@ SMOOTH = 0.85  # least exponent p of a smooth T: between close states, differenc
 MOTIONS = 300  # number of simulated motions
 ASKING = 40  # number of motions whose states are compared with neighbours on the other motions
 SAMPLES = 160  # number of states along a motion
-FAR = 64  # rank of the far neighbour, with which the nearest one is compared
+FAR = 64  # rank, by distance, of the far neighbour with which the nearest one is compared
 FEWEST_STATES = 1000  # least number of states for an exponent
 FOLLOWED = 300.0  # length of motions after the transient, in multiples of 1 / System.typical_rate
 FINEST = 0.05  # least sampling interval, in multiples of 1 / System.typical_rate; shorter intervals only cost time

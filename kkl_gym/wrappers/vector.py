@@ -85,7 +85,7 @@ class VectorEstimate(VectorWrapper):
         disabled = self.autoreset_mode is AutoresetMode.DISABLED
         expected = self._sample + 1
         over = bool(before.any())
-        if over:  # the step before ended these rows; this one reset them or, in mode DISABLED, did not step them
+        if over:  # the previous step ended these rows; this one reset them or, in mode DISABLED, left them as they were
             expected[before] = self._sample[before] if disabled else 0
         self._check(expected, info["sample"], before)
         if over and disabled:
@@ -425,7 +425,7 @@ def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
 
 
 def plant_of(env: VectorEnv, *also: str) -> Plant:
-    """Return the plant of row 0; ValueError if rows differ in system, dt, measurement noise or attributes ``also``."""
+    """Return the plant of row 0; ValueError if rows differ in system, dt, measurement noise or one of ``also``."""
     base: Any = env.unwrapped if isinstance(env, gym.vector.VectorEnv) else env
     if isinstance(base, KKLVectorEnv):
         return base.plant

@@ -48,7 +48,7 @@ class Demo:
     """Seed of the starts and the noise."""
     policy: OwnPolicy = None
     gif: bool = False
-    """Also write a .gif of phase portraits: the first 12 s (of your own systems, the first 1,200 samples)."""
+    """Also write a .gif of phase portraits: the first 12 s (of your own systems, 12 times System.pace)."""
 
     def run(self, console: Console) -> Path:
         """Play the episodes, and write the figure."""

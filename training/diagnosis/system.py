@@ -43,8 +43,8 @@ def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
 class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
-    ``motions`` are states (steps + 1, MOTIONS, nx) and inputs. States are NaN after they leave the bounds. Each of
-    the ``kinds``, such as free, has an equal share. ``stay`` (MOTIONS,) marks motions within bounds; ``y`` is theirs.
+    ``motions`` are states (steps + 1, MOTIONS, nx) and inputs, equally many of each of the ``kinds``, such as free.
+    States are NaN after they leave the bounds. ``stay`` (MOTIONS,) marks motions within bounds, ``y`` their outputs.
     """
 
     def __init__(

@@ -52,7 +52,7 @@ class TorchMemory(Module):
     ) -> None:
         pairs = np.asarray(angles) if np.size(angles) else np.empty((0, 2), dtype=int)
         if pairs.dtype.kind not in "iu" or pairs.shape[1:] != (2,) or len({*pairs.flat} & {*range(ny)}) < pairs.size:
-            raise ValueError(f"angles must be pairs of different outputs, of 0 to {ny - 1}, got {angles!r}")
+            raise ValueError(f"angles must be pairs of different outputs, from 0 to {ny - 1}, got {angles!r}")
         super().__init__()
         self.cosines, self.sines = pairs.T.tolist()
         self.others = [i for i in range(ny) if i not in pairs]

@@ -157,7 +157,7 @@ class TorchObserver(Module):
         if self.tracker is not None:
             tracked, expected = self.tracker.advance(rest.T, y.T, u.T, begins[:, 0], levels[0].T, levels[1].T)
             y = filled(expected.T)
-        elif self.h is not None:  # fill gaps by h at the last estimate, then better, by h at T_inv(z)
+        elif self.h is not None:  # fill gaps by h at the last estimate, then more exactly by h at T_inv(z)
             guess = filtered(filled(self.h(rest.T).T))
             y = filled(self.h(self._of_map(guess, TorchMap.__call__, age, *levels).T).T)
         else:

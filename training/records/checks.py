@@ -44,7 +44,7 @@ def check_alike(record: Record, names: Mapping[str, Sequence[str]], environment:
             "no known environment" if env is None else f"{env['id']} with arguments {env['kwargs']}"
             for env in (record.environment, environment)
         )
-        raise ValueError(f"{record.name} is of {here}, but {other} of {there}: an observer serves one environment")
+        raise ValueError(f"{record.name} has {here}, but {other} has {there}: an observer serves one environment")
 
 
 def check_motion(records: Sequence[Record], warn: Warn) -> None:

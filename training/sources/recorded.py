@@ -20,18 +20,18 @@ from training.sources import OF_MEDIAN, Increments, Pairs, Report, Runs, TooFewR
 from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
-FEW = 5  # with fewer records than this, none is held out whole
-STRETCHES, SAMPLES = 600, 2_000_000  # largest number of stretches of records for calibration, and of samples in them
-STRETCH_MEMORIES = 2.0  # greatest length of such a stretch, in settling times of the filter
+FEW = 5  # with this many records or more, whole records are held out; with fewer, the end of each
+STRETCHES, SAMPLES = 600, 2_000_000  # calibration: most stretches of records; most samples (unless in 100 stretches)
+STRETCH_MEMORIES = 2.0  # greatest length of a stretch, in settling times of the filter
 FEWEST = 50  # calibration needs at least this many samples at which a stretch may begin
-BEYOND = 0.5  # estimates may leave the range of the states by this fraction of it
-INCREMENTS = 400_000  # largest number of increments that a flow is learned from
+BEYOND = 0.5  # a tracker's estimates may leave the range of each recorded state by this fraction of it
+INCREMENTS = 400_000  # largest number of increments from which an observers.Flow is learned
 WINDOW = 10  # least number of samples over which a tracker averages innovations
-UNEXPLAINED = 0.7  # a larger residual of y = C x, in standard deviations of the output, is no noise
+UNEXPLAINED = 0.7  # a larger residual of y = C x, in standard deviations of the output, is not mere noise
 ROUNDING, OUTLIER = 1e-6, 6.0  # largest rounding, relative to an output; least outlier, in residual standard deviations
 LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
 MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # records: modes per output; slowest and fastest, in multiples of signal_rate
-RECORD_MEMORIES = 3.0  # least number of settling times in a median record; fewer if a mode would exceed signal_rate
+RECORD_MEMORIES = 3.0  # least number of settling times in a median record; fewer if all modes would exceed signal_rate
 # For rollouts, whose hidden signals an agent needs within a few steps: number of modes of each output, and their rates
 # per step. A few modes that lie far apart forget the start soon, and distinguish single steps.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
@@ -223,8 +223,8 @@ class RecordedSource:
 def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> Config:
     """Return a configuration for records, which determine dt, the eigenvalues of A, and the largest noise.
 
-    dt is the median time step. The eigenvalues follow from the rate of the signals and the length of the records; for
-    rollouts, from dt and the length of the episodes. The largest noise is a tenth of each output's standard deviation.
+    dt is the rounded median time step. The eigenvalues follow from the signals' rate and the records' length, those for
+    rollouts from dt and the episodes' length. The largest noise is a tenth of each output's standard deviation.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def recorded_preset(records: Sequence[Record], changes: Mapping[str, Any] | None
     Raises
     ------
     ValueError
-        If dt does not suit the records, an output never changes, or a setting is invalid.
+        If dt does not suit the records, an output never changes (unless its noise is set), or a setting is invalid.
     """
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     chosen: dict[str, Any] = {"dt": sampling_interval(*records), **RECORDED} | given

@@ -32,7 +32,7 @@ class Benchmark:
     budget: Literal["short", "cpu"] = "cpu"
     """cpu: 400,000 points and 300 CPU seconds for each training. short: half of the points, 40 s."""
     quick: bool = False
-    """Instead of the budget: train only each method's first configuration, on 300 batches, and test on few and short
+    """Ignore the budget: train only each method's first configuration, on 300 batches, and test on few and short
     trajectories. This takes minutes, and gives the same results each time."""
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Shipped systems, or your own as script.py:Class or module:Class."""

@@ -1,6 +1,6 @@
 """Ablation: two series of pipelines, trained for equal times. Each pipeline differs from the next in a few settings.
 
-The first series leads from the paper's SPINN to ours, the second from an inverse trained without noise to the default.
+One leads from the paper's SPINN to the package's, the other from an inverse trained without noise to the default.
 """
 
 from collections.abc import Callable, Mapping

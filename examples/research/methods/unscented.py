@@ -32,7 +32,7 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         if lost.any():
             x0, P0, _ = self.start(int(lost.sum()))
             restarted = self._updated(x0, P0, y[lost])
-            sound = self._inside(*restarted)  # filters that are not sound restart without the sample
+            sound = self._inside(*restarted)  # the others restart without the sample
             x[lost] = np.where(sound[:, None], restarted[0], x0)
             P[lost] = np.where(sound[:, None, None], restarted[1], P0)
         return x, P

@@ -52,5 +52,5 @@ def test_gradients_are_those_of_finite_differences():
 
 def test_angles_that_are_no_outputs_are_refused():
     for angles in ([(0, 3)], [(1, 1)], [(0, 1), (1, 2)], [(0, 0.5)], (0, 1), 3, 0.5):
-        with pytest.raises(ValueError, match="angles must be pairs of different outputs, of 0 to 2"):
+        with pytest.raises(ValueError, match="angles must be pairs of different outputs, from 0 to 2"):
             TorchMemory(3, 1, angles=angles)
