@@ -21,7 +21,7 @@ from training.figures import ALARM, ESTIMATE, MEASURED, TRUTH, style
 
 SECONDS = 12.0  # longest time axis, in multiples of System.pace
 FRAME = 0.04  # seconds between frames
-# Largest number of samples between two frames. If more are due, the motion falls behind real time.
+# Largest number of samples between two frames. If more are due, the motion in the window slows down.
 MOST = 100
 KEYS = "space: pause   n: new start   left, right: input   up, down: noise   f: next fault"
 

@@ -96,9 +96,9 @@ LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", ESTIMATE), ("-", RIVAL), ("-", 
 SHOWN, AVERAGED = 4.0, 125
 # The equations are fitted to windows of 125 samples, from the first 9 s of each run; afterwards the pendulum rests.
 WINDOW, FITTED = 125, 9.0
-# The simulated motions: their number, chosen by --cross-validate among 8, 24 and 72; their duration in s; and the
-# largest angle of the arm in rad and the largest rates in rad/s at their release. The pendulum's angle is arbitrary.
-# The eight runs begin with the arm up to 0.85 rad from the middle.
+# The simulated motions: their number, chosen by --cross-validate among 8, 24 and 72; their duration in s; and,
+# at their release, the arm's largest angle in rad and the largest rates of arm and pendulum in rad/s. The pendulum's
+# angle is arbitrary. The eight runs begin with the arm up to 0.85 rad from the middle.
 MOTIONS, LASTING, TURNED, MOVING = 24, 11.0, 0.9, (0.3, 0.5)
 ENCODER = 2 * np.pi / 2048  # rad, resolution of both angles
 # Settings of the Kalman filter that the observer starts, chosen on the training runs. LONGER: samples in a window for

@@ -67,7 +67,7 @@ class Qube(kkl_gym.System):
 
 @dataclass(frozen=True)
 class BothAngles(Qube):
-    """The same model with both angles measured, for the fit of its parameters to runs."""
+    """The model Qube with both angles measured, for the fit of its parameters to runs."""
 
     name: ClassVar[str] = "qube-both-angles"
 
@@ -78,7 +78,7 @@ class BothAngles(Qube):
 
 @dataclass(frozen=True)
 class Sticking(BothAngles):
-    """The same model, but the friction changes its sign so abruptly that the arm sticks until it is pushed."""
+    """The model BothAngles, but the friction changes its sign so abruptly that the arm sticks until it is pushed."""
 
     arm_slip: float = 0.004
     pendulum_slip: float = 0.2
@@ -92,7 +92,7 @@ class Sticking(BothAngles):
 
 @dataclass(frozen=True)
 class Pushed(Sticking):
-    """The same model with y = theta, and with an unknown torque on the arm, which stands for errors of the friction.
+    """The model Sticking with y = theta and with an unknown torque on the arm, which stands for errors of the friction.
 
     The torque is a fifth state, in 0.1 mN m: an Ornstein-Uhlenbeck process.
     """

@@ -138,7 +138,7 @@ class OfPlant:
         return reward, ended
 
     dt = property(lambda self: self.plant.dt, doc="Sampling interval in seconds.")
-    process_noise = property(lambda self: self.plant.process_noise, doc="Bound of w, in ``scale`` per second.")
+    process_noise = property(lambda self: self.plant.process_noise, doc="Bound of |w|, as a multiple of scale per s.")
     measurement_noise = property(lambda self: self.plant.measurement_noise, doc="Standard deviations of v.")
     sensor = property(lambda self: self.plant.sensor, doc="The sensor, None if it is ideal.")
 

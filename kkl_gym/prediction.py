@@ -17,8 +17,8 @@ SAMPLES = 10
 class PredictiveMemory(Memory):
     """A memory that returns the outputs expected in the next step, and predictions of later ones.
 
-    It has the filters of :class:`Memory` for all outputs and angles. Cosine and sine of an angle are filtered too,
-    because a torque may depend on them. ``weights``, (features, width), multiply signals, the filters' w and v, and 1.
+    It has the filters of :class:`Memory` for all outputs and angles, also for an angle's cosine and sine, because a
+    torque may depend on them. ``weights``, (features, width), multiply the signals, w and v of :class:`Memory`, and 1.
     The first columns give each output's or angle's expected change in a step, the others the further predictions.
     """
 
@@ -34,7 +34,7 @@ class PredictiveMemory(Memory):
         if self.weights.ndim != 2 or len(self.weights) != features or self.weights.shape[1] < len(self._targets):
             raise ValueError(
                 f"weights must be {features} rows of {len(self._targets)} numbers or more, got the shape "
-                f"{self.weights.shape}: pass the result of learn_weights() of a KKLMemory with the same other arguments"
+                f"{self.weights.shape}: pass weights from learn_weights() of a KKLMemory with otherwise equal arguments"
             )
         self.size = ny + self.weights.shape[1] - len(self._targets)
 
@@ -43,7 +43,7 @@ class PredictiveMemory(Memory):
         return np.concatenate([self._signals, *self._w, *self._v, np.ones((*self._ages.shape, 1))], axis=-1)
 
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return expected outputs and further predictions, (..., size), in all environments or where ``rows`` holds."""
+        """Return expected outputs and further predictions, (..., size), in all environments or in ``rows``, a mask."""
         self._check_begun()
         predicted = self.features() @ self.weights
         n, plain = len(self._targets), len(self._plain)

@@ -18,16 +18,16 @@ Entries = Sequence[int] | Sequence[str]
 Angles = Sequence[int | Sequence[int]] | Sequence[str | Sequence[str]]
 """Entries that are angles, and pairs of entries that are the cosine and the sine of an angle."""
 TURN = 2 * math.pi
-# If the bounds of an angle are this far apart, its unit is unclear: it may be turns, half turns or rad.
+# If the distance of an angle's bounds is one of these, its unit is unclear: it may be turns, half turns or rad.
 UNITS = 1.0, 2.0, 4.0
 
 
 class Outputs:
     """The measured outputs in an environment's observations.
 
-    The order is that of :func:`gymnasium.spaces.flatten`: boxes row by row, the parts of a Dict or Tuple one after the
-    other, and Discrete values one-hot. If ``measured`` holds keys, only those keys of a Dict are read. If it holds keys
-    or is None (all), images in a Dict are left out.
+    Their order is that of :func:`gymnasium.spaces.flatten`: boxes row by row, the parts of a Dict or Tuple one after
+    the other, and Discrete values one-hot. If ``measured`` holds keys, only those keys of a Dict are read. Images in a
+    Dict are left out, but raise an error if ``measured`` holds indices.
     """
 
     def __init__(

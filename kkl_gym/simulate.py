@@ -24,9 +24,9 @@ RATE_STEP = 0.4
 # different numbers of substeps where rate * dt / RATE_STEP is a power of two.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
 # Largest accepted estimates of a substep's error, in half-widths of X; the true errors are a thousand times smaller.
-# Equal substeps keep to TOLERANCE without a rate formula, and to ROUGH with one; other substeps keep to TOLERANCE. It
-# keeps errors of stiff systems, and of shipped ones without formulas, below 1e-5 of the motion's size. ROUGH detects
-# where a formula fails, as at an ignition; it is a hundred times the shipped systems' largest estimate.
+# Equal substeps keep to TOLERANCE without a rate formula, and to ROUGH with one; other substeps keep to TOLERANCE.
+# TOLERANCE keeps errors of stiff systems, and of shipped ones without formulas, below 1e-5 of the motion's size. ROUGH
+# detects where a formula fails, as at an ignition; it is a hundred times the shipped systems' largest estimate.
 TOLERANCE, ROUGH = 3e-6, 0.1
 # Number of attempts with equal substeps. After them, or beyond MOST_EQUAL substeps, the step length follows the error.
 ATTEMPTS = 3

@@ -33,7 +33,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     and states agree to rounding. ``info`` holds the same keys, as arrays with a row for each environment. For each key
     a mask ``_key`` marks the rows that reported it, as in Gymnasium's own vector environments.
 
-    **Autoreset modes.** ``"NextStep"``: the step after a row's episode ends ignores the row's action and resets the
+    **Autoreset modes.** ``"NextStep"``: the step after the end of a row's episode ignores its action and resets the
     row. ``"SameStep"``: the row is reset at once; ``info["final_obs"]`` and ``info["final_info"]`` hold the episode's
     last observation and info. ``"Disabled"``: a row stays at its episode's end, with reward 0 and its flags still set,
     until ``reset(options={"reset_mask": mask})``. While a row stays there, its ``u`` and ``escaped`` are not reported.
@@ -117,7 +117,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._sample = np.zeros(num_envs, dtype=np.int64)
         self._escaped, self._terminated, self._truncated = np.zeros((3, num_envs), dtype=bool)
         self._ready = False
-        # The last observations. An observer wrapper outside compares them with the observations that it receives.
+        # The last observations. A wrapper with an observer compares them with the observations that it receives.
         self.emitted = b""
         self._u = np.zeros((self.system.nu, num_envs))
         self._trails = None if render_mode is None else Trails(self.num_envs)
@@ -148,7 +148,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             If an option is unknown, a shape or a seed is invalid, or a start lies outside the declared bounds. The
             environments are then unchanged.
         gymnasium.error.ResetNeeded
-            If the mask selects some rows before the first reset of all.
+            If the mask selects only some rows before all rows have been reset once.
         """
         given, mask = with_mask(options, self.num_envs)
         x0 = (given or {}).get("x0")

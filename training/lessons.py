@@ -1,4 +1,4 @@
-"""The lessons of a training: functions for the map and the flow, which predicts the next state; ``train`` runs all."""
+"""The lessons of a training: the map, and the flow, which predicts the next state. ``train`` runs all lessons."""
 
 import dataclasses
 import platform
@@ -93,8 +93,8 @@ def train(
     Raises
     ------
     ValueError
-        If ``folder`` holds checkpoints and ``resume`` is False, holds those of another configuration, or is in use by
-        another process; if almost all motions leave the system's bounds, or ``config`` differs from the source's.
+        If ``folder`` is in use by another process, holds checkpoints of another configuration, or holds any and
+        ``resume`` is False; if almost all motions leave the system's bounds, or ``config`` differs from the source's.
     FloatingPointError
         If the loss becomes NaN.
     """

@@ -94,8 +94,8 @@ PROFILES: dict[str, Profile] = {
     ),
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
-        # Under noise, real modes hardly distinguish the parameters, but slow pairs at frequencies of y do: the first
-        # two cut the best T_inv's error from 2.3 to 1.9 % (parameters 10 % off). More training cut it by 3 % of that.
+        # Under noise, real modes hardly distinguish the parameters; slow pairs at frequencies of y do. The first two
+        # cut the best T_inv's error from 2.3 to 1.9 % (parameters 10 % off). More training cut this by a relative 3 %.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
@@ -128,7 +128,7 @@ def controller(system: System, dt: float) -> Controller:
 
 
 def named_policy(system: System, name: str, dt: float | None) -> Controller:
-    """Load and check a policy: a script's function, or the system's controller, held for ``dt`` (None: system.dt)."""
+    """Load and check a policy: a script's function, or the system's controller for ``dt`` (by default system.dt)."""
     if ":" not in name and name != "controller":
         similar = suggestion(name, ["controller"])
         raise ValueError(f"unknown policy {name!r}{similar}: give controller, or script.py:function")

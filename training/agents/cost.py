@@ -7,14 +7,14 @@ import numpy as np
 from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 from training.agents.tasks import Task
 
-# States about three times System.scale from the target have this cost. Larger costs would dominate the training.
+# The cost if all states are about three times System.scale from the target. Larger costs would dominate the training.
 MAX_COST = 10.0
 
 
 def paid(task: Task, total: Any, age: Any, terminated: Any) -> Any:
     """Return an action's reward: minus its cost, which is at most ``MAX_COST``.
 
-    ``total`` is the sum of the environment's rewards over the action's samples; the cost c makes their mean 1/(1 + 4c).
+    ``total`` is the sum of the environment's rewards over the action's samples; their mean is 1/(1 + 4c) at cost c.
     An action that ends the episode early, after ``age`` samples, also pays its cost for each action that would follow.
     """
     samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
