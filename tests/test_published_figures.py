@@ -149,9 +149,9 @@ def test_coverage_and_nees():
         rows = results(f"tracking/{system}")
         rows = rows[(rows.starts == "X") & (rows.measurement_noise > 0)]
         cells.append(f"{rows.nees.between(rows.nees_low, rows.nees_high).sum()} of {len(rows)}")
-    assert row(
-        "first four rows, noise above 0: cases with NEES within 95 % limits of a mean over the runs", cells
-    ) in page(ACCURACY)
+    assert row("first four rows, noise above 0: cases with NEES within the 95 % limits for 200 runs", cells) in page(
+        ACCURACY
+    )
 
 
 def test_the_benchmark_has_the_shipped_observers():
