@@ -76,8 +76,8 @@ def main(
     """Train the agents; returns for each way the larger error of the two hidden signals in the agent's episodes.
 
     Args:
-        observer_steps: steps from which the first observer is learned: random steps, or steps of a trained agent.
-        members: number of networks of the first observer, whose outputs are averaged.
+        observer_steps: random steps, in the third way a trained agent's, from which a way's first observer is learned.
+        members: number of networks of such an observer, whose outputs are averaged.
         timesteps: further steps, in which the agents learn.
         every: steps between refits; also the number of steps that the third agent learns on estimates.
         batches: training batches of each fit.

@@ -171,7 +171,7 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
     """Return the next state by substeps whose length follows the error, or ``end`` if x escapes or turns NaN."""
     # Motions that accelerate, as at an ignition, need such substeps. The substeps also verify an escape: equal substeps
-    # that were too long at the end of the interval may have left the bounds only by their error.
+    # that are too long for the interval's end may leave the bounds only by their error.
     if system.discrete:
         return end
     left, h, field, d = dt, dt, *forced(system, u, w)

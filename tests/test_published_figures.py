@@ -31,8 +31,8 @@ def text(value):
     return f"{value:.2f}" if value < 10 else f"{value:.1f}"
 
 
-def from_to(shares):
-    return f"{shares.min():.1f} to {shares.max():.1f}"
+def from_to(shares, digits=1):
+    return f"{shares.min():.{digits}f} to {shares.max():.{digits}f}"
 
 
 def of_evaluation(file, kind, column, starts, driven, noise):
@@ -167,7 +167,7 @@ def test_the_benchmark_has_the_shipped_observers():
 def test_ratios_to_tuned_kalman_filters():
     medians = of_benchmark().unstack("method")
     ratios = {
-        (rival, noise): from_to((medians["shipped"] / medians[rival]).xs(noise, level="noise"))
+        (rival, noise): from_to((medians["shipped"] / medians[rival]).xs(noise, level="noise"), 2)
         for rival in ("ekf", "ukf")
         for noise in (0.0, 0.5)
     }

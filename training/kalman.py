@@ -11,7 +11,7 @@ from observers.estimator import Estimate
 from training.sources.simulated import unknown_start
 
 Gaussian = tuple[np.ndarray, np.ndarray]
-"""Means (n, nx) and covariances (n, nx, nx)."""
+"""Means (..., nx) and covariances (..., nx, nx)."""
 
 ASIDE = 1e-4  # step of the central differences, in half-widths of X
 NOISE_FLOOR = 0.002  # least measurement noise that a filter assumes, in multiples of the system's default
@@ -78,8 +78,8 @@ class ExtendedKalmanFilter:
     def along(self, y: np.ndarray, u: np.ndarray, x: np.ndarray | None = None) -> Gaussian:
         """Return means (steps + 1, n, nx) and covariances for samples (steps + 1, n, ny) and inputs (steps, n, nu).
 
-        Given motions x (steps + 1, n, nx), the filter linearises about them. If it also assumes the plant's own noise,
-        the covariances are the posterior Cramér-Rao bound (Tichavsky, Muravchik and Nehorai, 1998).
+        Given motions x (steps + 1, n, nx), the filter linearises f about them, and h about predictions from them. With
+        the plant's own noise this gives the posterior Cramér-Rao bound of each motion (Tichavsky et al., 1998).
         """
         state, states = self.start(y.shape[1]), []
         for k in range(len(y)):

@@ -82,7 +82,7 @@ def output_matrix(system: System) -> np.ndarray | None:
 
 
 def output_facts(system: System) -> dict[str, Any]:
-    """Return the artifact's argument for the output: C if h(x) = C x, else h as an expression (or raise ValueError)."""
+    """Return Artifact's argument for the output: C if h(x) = C x, else h as an expression (or raise ValueError)."""
     C = output_matrix(system)
     return {"h": output_expression(system)} if C is None else {"C": C}
 

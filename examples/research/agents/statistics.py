@@ -8,7 +8,7 @@ import scipy
 
 
 def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
-    """Return scores scaled to 0 for ``idle`` and 1 for ``top``, the interquartile mean of agents on the full state."""
+    """Scale scores to 0 for ``idle`` (``IDLE`` actions) and 1 for ``top``, the mean of agents on the full state."""
     span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
     return np.asarray((scores - idle) / span)
 
