@@ -60,7 +60,7 @@ CASES: dict[str, tuple[list[int], list[int], Callable]] = {
 
 
 def exploring(policy: Callable, env: gym.Env, seed: int) -> Callable:
-    """Return a policy with a share of random actions: 0, 0.3 or 1, drawn for every hundred steps."""
+    """Mix a share of random actions into a policy; the share is drawn every hundred steps: 0, 0.3 or 1."""
     rng, calls = np.random.default_rng(seed), 0
     env.action_space.seed(seed)
     share = 0.0
@@ -76,7 +76,7 @@ def exploring(policy: Callable, env: gym.Env, seed: int) -> Callable:
 
 
 def under_noise(env_id: str, artifact: Artifact | None, noise: float, seed: int, episodes: int = 20) -> float:
-    """Let the policy act on an observer's estimates, or, without an observer, on the truth; return the mean return."""
+    """Run the policy on an observer's estimates, or without one on noise-free signals; return the mean return."""
     measured, _, policy = CASES[env_id]
     returns, apart = list[float](), list[np.ndarray]()
     env: gym.Env = MeasurementNoise(make(env_id), measured, noise)
@@ -112,12 +112,12 @@ def main(
     noise: float = 0.0,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Learn an observer for an environment; returns its largest held-out errors and, under noise, mean returns.
+    """Learn an environment's observer; returns its largest held-out errors and, with noise, the policy's mean returns.
 
     Args:
         env_id: one of Pendulum-v1, CartPole-v1, MountainCarContinuous-v0 and, with MuJoCo, InvertedDoublePendulum-v5.
         steps: steps to play for the training.
-        held_out: steps of the held-out rollouts, played once with and once without exploration.
+        held_out: steps of the held-out rollouts with exploration, and of those without it.
         batches: training batches of each network.
         members: number of networks, whose outputs are averaged.
         noise: standard deviation of the measurement noise. With noise the observer estimates all signals and

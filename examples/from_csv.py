@@ -89,7 +89,7 @@ def main(
             "inverse_steps": inverse_steps,
             "trajectories": trajectories,
             "duration": 20.0,
-            "free_inverse": False,  # no second map for motion without input, because the controller always acts
+            "free_inverse": False,  # no second T_inv for motion without input, because the controller always acts
         },
         seed=seed,
         resume=True,

@@ -1,4 +1,4 @@
-"""Identify a simulated plant from its outputs only, train an observer on the result, and print the errors of both.
+"""Identify a simulated plant from its outputs, train an observer, and print the errors of parameters and estimates.
 
 The records hold only t and y. First guesses of the parameters are 25 to 50 % off::
 
@@ -67,7 +67,7 @@ def main(
     Args:
         system: the plant.
         noise: standard deviation of the measurement noise.
-        process_noise: bound of the process noise in the records, in System.scale per s; environments have 0.05.
+        process_noise: bound of the records' process noise, in System.scale per s; environments have 0.05 by default.
         records: number of records.
         seconds: length of each record.
         seed: seed of the records.

@@ -7,18 +7,18 @@ finite differences, which a control engineer would try first::
     python examples/qube.py PATH
 
 PATH is a folder with run01.csv to run12.csv, whose columns are alpha (pendulum, rad), theta (arm, rad), alpha_dot,
-theta_dot (rad/s) and time (s): the twelve runs without motor input of Buisson-Fenet, Bahr, Morgenthaler, Di Meglio,
-"Towards gain tuning for numerical KKL observers" (2023), repository
+theta_dot (rad/s) and time (s). These are the twelve runs without motor input of Buisson-Fenet, Bahr, Morgenthaler,
+Di Meglio, "Towards gain tuning for numerical KKL observers" (2023), repository
 Centre-automatique-et-systemes/learn_observe_KKL, MIT licence. docs/results/qube.md has the results.
 
 Two facts about the device are used besides the records. Left and right are symmetric, so the observer learns from each
 run twice: as recorded, and mirrored, with the signs of both angles changed. No angle of the arm is special, so the map
 sees changes of the arm's angle, not the angle itself.
 
-Eight runs contain few of the possible swings of a pendulum. Therefore a second observer also learns from simulated
-motions of the device's equations, released from random states, with parameters that were fitted to the same eight runs.
+Eight runs contain few of the possible swings of a pendulum. Therefore a second observer also learns from motions
+that the device's equations simulate from random states, with parameters that were fitted to the same eight runs.
 
-While the arm sticks, its angle carries no information, and the pendulum swings on by its equation. Therefore a third
+While the arm sticks, its angle carries no information, and the pendulum swings on regardless. Therefore a third
 estimator is a Kalman filter with a model whose arm can stick. The second observer starts this filter, and restarts it
 when their estimates disagree.
 
@@ -189,7 +189,7 @@ def fitted(records: Sequence[Record], model: BothAngles | None = None) -> BothAn
 
 
 def released(model: BothAngles) -> list[Record]:
-    """Simulate motions by the equations; their signals are as the device would record them."""
+    """Simulate motions by the model's equations, with the signals that the device would record."""
     rng = np.random.default_rng(0)
     theta, alpha = rng.uniform(-TURNED, TURNED, MOTIONS), rng.uniform(0, 2 * np.pi, MOTIONS)
     x0 = np.stack([theta, alpha, *rng.uniform(-1, 1, (2, MOTIONS)) * np.array(MOVING)[:, None]], -1)

@@ -149,7 +149,7 @@ def _motion(system: System) -> Motion:
 
 
 def single_kernel(system: System, motion: Motion) -> Any:
-    """Compile the step of a single state; it returns NaN where equal substeps are not accurate enough."""
+    """Compile the step of a single state; it returns NaN where substeps of equal length are not accurate enough."""
     import numba
 
     if not (motion.field.exact and motion.push.exact):
@@ -206,7 +206,7 @@ def _single(system: System, kernel: Any) -> Advance[Components]:
 
 
 def batch_kernel(system: System, motion: Motion) -> Any:
-    """Compile the step of a batch: its states are sorted by the substeps that they need, and stepped in groups."""
+    """Compile the step of a batch: states are sorted by their numbers of substeps, and stepped in groups."""
     import numba
 
     # Each state of a group is a lane. All components of all lanes lie in one array, at offsets that the compiler knows.
@@ -276,7 +276,7 @@ def _batch(system: System, kernel: Any) -> Advance[np.ndarray]:
     def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
         out = np.empty(x.shape)
         lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
-        # States that became NaN in this step are stepped again, with substeps whose length follows the error.
+        # States that became NaN in this step are stepped again, with substeps whose length is adapted to the error.
         if lost and len(rows := np.flatnonzero(np.isnan(out[0]) & ~np.isnan(x).all(0))):
             out[:, rows] = advance_batch(system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out
@@ -304,7 +304,7 @@ def _assembled(motion: Motion, lines: list[str], jit: Callable[..., Any]) -> Any
 
 
 def _trial_states(system: System, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays: 400 random trial states, and 600 at bounds or 0, at whole numbers or at starts."""
+    """Return 400 random trial states, and 600 others: 200 each at bounds or 0, at whole numbers, and at starts."""
     n, (low, high) = _TRIALS, np.array(system.bounds, dtype=float).T
     random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])
     ends = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])

@@ -46,7 +46,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
 
     **Observation.** float32: the true state x (``observe="state"``) or the noisy output y (``observe="output"``). x is
     within the system's declared bounds. y is clipped to the range of noise-free outputs within these bounds, widened by
-    six standard deviations of the noise. Where the ``sensor`` delivers no sample, the observation repeats the last y.
+    six standard deviations of the noise. Where the ``sensor`` delivers no sample, an output keeps its last value.
 
     **Info.** The keys are the same at reset and at steps. ``y`` is the noisy output (NaN where the ``sensor`` delivers
     no sample), ``x`` the true state, and ``u`` the physical input that acted (zero at reset). These arrays are float64
@@ -152,7 +152,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         self._window: Window | None = None
         # The last observation. An outer observer wrapper raises an error if it receives another one.
         self.emitted = b""
-        # Number of observer wrappers outside. The outermost draws the window; 0: the environment draws it.
+        # Number of observer wrappers outside. The outermost draws the window; without a wrapper, the environment does.
         self.drawn_by = 0
 
     def reset(
@@ -165,7 +165,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         seed : int, optional
             Seed of starts and noise. None continues with the present generator.
         options : dict, optional
-            ``"x0"``, shape (nx,), is the start. Without it the start is drawn in ``start_box``.
+            ``"x0"``, shape (nx,), is the start. Without it the start is drawn (see ``start_box``).
 
         Raises
         ------

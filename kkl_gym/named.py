@@ -71,7 +71,7 @@ def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]
 
 
 class Reader:
-    """Reads n named signals from observations and ``info``; ``missing`` allows NaN. Shapes: ``low``, ``high`` (n,)."""
+    """Reads n named signals from observations and ``info``; ``missing`` allows NaN. Bounds: ``low``, ``high`` (n,)."""
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str, missing: bool = False) -> None:
         there, self._source = observed(space), source

@@ -22,7 +22,7 @@ from observers.checks import is_finite, mapping, shown
 Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
-DT = 0.01  # s, the default where it suits a system's rate
+DT = 0.01  # s, the default sampling interval where it suits a system's rate
 # Each pair is (limit of rate * DT, target of rate * dt). Between the two limits the default dt is DT. Beyond a limit it
 # is the target divided by the rate, rounded down to 1, 2 or 5 times a power of ten.
 SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)
@@ -190,7 +190,7 @@ class System:
 
     @functools.cached_property
     def typical_rate(self) -> float:
-        """Median rate of f(x) + g(x) u, in 1/s, over 1,000 starts at the largest input; ValueError if 0 or infinite."""
+        """Median rate of f(x) + g(x) u in 1/s at 1,000 starts, for the largest input; ValueError if 0 or not finite."""
         return typical_rate(self, _starts(self))
 
     def f(self, x: Components) -> Components:

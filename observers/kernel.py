@@ -53,7 +53,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def factorise(P: Any, L: Any, inverse: Any) -> None:
-        """Compute L with P = L L^T, and the reciprocals of its diagonal; L is not finite if P has no such factor."""
+        """Compute L with P = L L^T, and the reciprocals of L's diagonal; L is not finite if P has no such factor."""
         for i in range(nx):
             for j in range(i + 1):
                 total = P[i * nx + j]
@@ -211,7 +211,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
-        """Set outputs beyond the gate to NaN, unless a start, a divergence or a window of rejections opens the gate."""
+        """Set outputs beyond the gate to NaN; a start, a divergence or a window of rejections opens the gate."""
         for k in range(ny):
             innovation, count = y[k] - expected[k], now[rejections + k]
             far = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)
@@ -335,7 +335,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
         z, x_hat, covariance, surer, acted = stack(size, 1), stack(nx, 1), doubles(P), doubles(quotient), stack(W, 1)
         for w in range(count):
             row, at = offset(doubles(rows), w), 0
-            acted[w] = 1.0 if size == nz else 0.0  # until an input acts, the map for motion without input applies
+            acted[w] = 1.0 if size == nz else 0.0  # until an input acts, T_inv for free motion applies
             for i in range(nz, size):
                 acted[w] = acted[w] if row[i * W] == 0.0 else 1.0
             table = 0 if acted[w] else 1

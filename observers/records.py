@@ -11,7 +11,7 @@ from observers.samples import check_output, held_input, intervals, recorded_inpu
 
 
 class RecordEstimates:
-    """The methods of :class:`observers.KKLObserver` for whole records; they do not change its state."""
+    """The methods of :class:`observers.KKLObserver` for whole records; they do not change the observer's state."""
 
     artifact: Artifact
     _kkl: KKL

@@ -17,7 +17,7 @@ class Stream(IntEnum):
 
 
 def generator(stream: Stream, *seed: int) -> np.random.Generator:
-    """Make a generator for a purpose and a seed; a part of a purpose may append a nonzero entry to the seed."""
+    """Make a generator for a purpose and a seed; a nonzero entry after the seed distinguishes a part of the purpose."""
     for entry in seed:
         if not 0 <= entry < 2**32:
             raise ValueError(f"seed = {entry} must be a whole number from 0 to 2**32 - 1")

@@ -27,7 +27,7 @@ RANGES: dict[str, dict[bool, tuple[tuple[float, float], tuple[float, float]]]] =
     "sinusoid": {False: ((0.1, 1.0), (0.5, 3.0)), True: ((1.0, 2.0), (3.0, 6.0))},
     "square": {False: ((0.1, 1.0), (0.5, 2.0)), True: ((1.0, 2.0), (2.0, 4.0))},
 }
-SETTLING = 5.0  # s at the start, in which errors do not count
+SETTLING = 5.0  # s; errors before this time of each trial do not count
 # The best SMAPE in % that HyperKKL's paper prints for each system and each of INPUTS, within the distribution.
 PRINTED: dict[str, tuple[float, float, float, float]] = {
     "duffing": (5.6, 21.1, 22.7, 21.3),
@@ -40,7 +40,7 @@ PRINTED: dict[str, tuple[float, float, float, float]] = {
 class Driven:
     """Base of all systems: one input, in training within [-1, 1], and samples every 0.05 s.
 
-    ``trial`` is the duration of a trial in s, ``noise`` the noise of noisy trials, ``seen`` the measured state's index.
+    ``trial`` is a trial's duration in s, ``noise`` the noise's standard deviation, ``seen`` the measured state's index.
     """
 
     u_max: ClassVar[tuple[float, ...]] = (1.0,)
@@ -147,7 +147,7 @@ class HyperKKL:
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Names of systems."""
     trials: int = 100
-    """Number of starts for each input, by Latin hypercube sampling."""
+    """Number of starts for each input; they are drawn by Latin hypercube sampling."""
     seed: int = 0
     """Seed of starts, inputs and noise."""
     out: Path = Path("runs/hyperkkl")

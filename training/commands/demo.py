@@ -24,9 +24,9 @@ from training.files import require_writable
 from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports of progress
-SECONDS = 12.0  # length of an animation in s; it shows this multiple of System.pace, in real time if the pace is 1 s
+SECONDS = 12.0  # s, length of an animation; it shows SECONDS times System.pace, so in real time where the pace is 1 s
 FRAMES = 144  # number of frames in an animation
-TRAIL = 0.35  # share of the samples that one frame draws; older points would hide the latest
+TRAIL = 0.35  # share of the samples that a frame's phase portrait draws; older points would hide the latest
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def play(
         if k % EVERY == 0:
             report(k)
     x, x_hat, y = (np.array([info[key] for info in infos]) for key in ("x", "x_hat", "y"))
-    # SPINN's maps take no inputs, so that SPINN runs only where no policy acts.
+    # SPINN's maps take no inputs, so SPINN runs only where no policy acts.
     ships = acting is None and type(system) in kkl_gym.SYSTEMS.values()
     return Episode(
         environment,

@@ -94,7 +94,7 @@ class TorchMemory(Module):
         w = w + self.rise * torch.where(begins, 0.0, signals - before)[:, None]
         v = v.reshape(-1, len(self.input_decay), self.nu)
         v = (v + (1.0 - self.input_decay) * (u[:, None] - v)).flatten(1)
-        steps = age[..., None].clamp(min=1.0)  # any positive steps suit a start, where the memory w is 0
+        steps = age[..., None].clamp(min=1.0)  # at a start any positive number will do, because the memory w is 0
         with_past = torch.expm1(-(steps + IMAGINED) / self.time_constants) / torch.expm1(-steps / self.time_constants)
         shown = torch.cat([y, (self.mixing @ (w * with_past)).flatten(1), v], 1)
         shown = shown.to(torch.promote_types(y.dtype, torch.float32))

@@ -64,7 +64,7 @@ class Shooting:
     def derivatives(
         self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
     ) -> np.ndarray:
-        """Return derivatives (steps + 1, n, ny, d) of y by starts in half-widths (and theta in units, if asked)."""
+        """Return derivatives (steps + 1, n, ny, d) of y by starts in half-widths, and by theta in ``unit`` if asked."""
         n, nx = x0.shape
         size = np.concatenate([self.half, self.unit]) * STEP
         moved = len(size) if parameters else nx
@@ -157,7 +157,7 @@ class Problem:
         return Problem(self.shooting, Windows(self.windows.y[: len(u) + 1, rows], u, x0), self.weight**-0.5)
 
     def beginnings(self) -> list[int]:
-        """Return rising lengths of the windows' beginnings, up to the whole windows."""
+        """Return rising lengths (in steps) of the windows' beginnings, up to the whole windows."""
         steps, nx = len(self.windows.u), self.shooting.system.nx
         return sorted({min(max(round(part * steps), SAMPLES_PER_STATE * nx), steps) for part in (*BEGINNINGS, 1.0)})
 

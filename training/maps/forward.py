@@ -15,7 +15,7 @@ from training.config import Config
 from training.maps.coordinates import StateScale, spread
 from training.maps.networks import Network, compiled, tensor
 
-SOLVED = 20_000  # largest number of pairs, and of points, in the least squares for the output layer
+SOLVED = 20_000  # largest number of pairs, and of collocation points, in the least squares for the output layer
 RIDGE = 1e-5  # ridge of the least squares, as a fraction of the root mean square column norm of their matrix
 
 

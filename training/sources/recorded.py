@@ -21,22 +21,22 @@ from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
 FEW = 5  # with this many records or more, whole records are held out; with fewer, the end of each
-STRETCHES, SAMPLES = 600, 2_000_000  # calibration: most stretches of records; most samples (unless in 100 stretches)
+STRETCHES, SAMPLES = 600, 2_000_000  # calibration: limits of stretches, and of samples (if more than 100 stretches)
 STRETCH_MEMORIES = 2.0  # greatest length of a stretch, in settling times of the filter
 FEWEST = 50  # calibration needs at least this many samples at which a stretch may begin
-BEYOND = 0.5  # a tracker's estimates may leave the range of each recorded state by this fraction of it
-INCREMENTS = 400_000  # largest number of increments from which an observers.Flow is learned
+BEYOND = 0.5  # a tracker's estimates may leave the range of each recorded state by this fraction of the range
+INCREMENTS = 400_000  # largest number of state changes over dt from which an observers.Flow is learned
 WINDOW = 10  # least number of samples over which a tracker averages innovations
 UNEXPLAINED = 0.7  # a larger residual of y = C x, in standard deviations of the output, is not mere noise
-ROUNDING, OUTLIER = 1e-6, 6.0  # largest rounding, relative to an output; least outlier, in residual standard deviations
+ROUNDING, OUTLIER = 1e-6, 6.0  # rounding, as a share of an output; least outlier, in the residual's standard deviations
 LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
-MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # records: modes per output; slowest and fastest, in multiples of signal_rate
-RECORD_MEMORIES = 3.0  # least number of settling times in a median record; fewer if all modes would exceed signal_rate
+MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: modes of each output; their rates in multiples of signal_rate
+RECORD_MEMORIES = 3.0  # least median length of records in settling times, unless all modes would exceed signal_rate
 # For rollouts, whose hidden signals an agent needs within a few steps: number of modes of each output, and their rates
 # per step. A few modes that lie far apart forget the start soon, and distinguish single steps.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
 EPISODE_MEMORIES = 1.5  # least number of settling times in a median episode; fewer if it is shorter than about 10 steps
-RECORDED_NOISE = 0.1  # largest noise added to that of the records, in standard deviations of the output
+RECORDED_NOISE = 0.1  # largest noise that training adds to the records, in standard deviations of the output
 RECORDED: dict[str, Any] = {
     "samples": 60, "width": 96, "depth": 2, "learning_rate": 3e-3, "inverse_steps": 3000, "members": 3,
     "noise_free_share": 0.5, "scaling": "range",

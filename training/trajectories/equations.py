@@ -12,7 +12,7 @@ from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import Components, System
 from observers import Expression
 
-ASIDE = 1e-5  # step of the central differences, in widths of X
+ASIDE = 1e-5  # step of the central differences: in widths of X for a state, in u_max for an input
 LINEAR_ROUNDING = 1e-9  # largest residual of a linear output, as a share of its largest value
 EXPRESSION_ROUNDING = 1e-6  # largest difference of an expression from the equations, as a share of a component's size
 

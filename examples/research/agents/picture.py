@@ -15,7 +15,7 @@ from training.evaluation.levels import show_level
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, drawing, save_moving, style
 
 FRAMES = 150  # approximate number of frames in an animation
-SECONDS = 10.0  # length of an animation
+SECONDS = 10.0  # s, length of an animation
 WIDTH = 4.6  # width of a column in inches
 
 
@@ -55,7 +55,7 @@ def _system(task: Task) -> System:
 
 
 def _numbered(symbol: str, number: int) -> list[str]:
-    """Return names for a number of signals: the symbol alone for a single signal, else y1, y2, ..."""
+    """Return names for a number of signals: the symbol alone for one signal, else with numbers, as in y1, y2."""
     return [symbol] if number == 1 else [f"{symbol}{i + 1}" for i in range(number)]
 
 

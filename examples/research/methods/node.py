@@ -20,8 +20,8 @@ from training.trajectories.motions import filter_states
 
 TRAJECTORIES_PER_BATCH = 128
 AGES_PER_BATCH = 32
-SOFT_FLOOR = 1e-4  # directions of z with less than this share of the largest variation get one common scale
-# The loss is absolute, and quadratic only for errors below this share of a state's standard deviation. Peaks would
+SOFT_FLOOR = 1e-4  # directions in which z varies by less than this share of the largest spread get one common scale
+# The loss is the absolute error, quadratic only below this share of a state's standard deviation. Peaks would
 # dominate a quadratic loss: Rössler's x3 stays near 0.02 between peaks of 20.
 ROUNDING = 0.01
 SPECTRUM_PACE = 0.1  # ratio of the spectrum's learning rate to the network's; the network has to follow the spectrum
@@ -82,7 +82,7 @@ class _Problem(nn.Module):
     """The trained parts: T_inv, and the logarithms of the rates -theta, which all outputs share.
 
     The components of z are nearly collinear. The principal directions of z under the initial spectrum are scaled to
-    unit variance, except the faintest (``SOFT_FLOOR``), which change most with the learned spectrum.
+    unit variance, except those of least variance (``SOFT_FLOOR``), which change most as the spectrum is learned.
     """
 
     def __init__(self, task: Task, noise: float, fastest: float, slowest: float) -> None:
