@@ -5,8 +5,8 @@ Every parameter of the plant is 10 % larger than in the model. The plant's recor
     python examples/adaptation.py lorenz --noise 0.5
 
 The example compares three observers on the plant: the shipped one, the one that
-:func:`training.identification.adapt` makes from it, and one that is trained on the true parameters with equal settings.
-docs/results/identification.md has a table.
+:func:`training.identification.adapt` makes from it, and one trained on the true parameters with the same settings.
+docs/results/identification.md has a table of results.
 """
 
 import time
@@ -39,7 +39,7 @@ class Compared:
     shipped, adapted, trained : float
         Errors of the shipped observer, the adapted one, and the one trained on the true parameters.
     parameters : dict of str to float
-        Errors of the identified parameters, in % of the plant's.
+        Errors of the identified parameters, in % of the plant's parameters.
     """
 
     shipped: float

@@ -93,7 +93,7 @@ class Live:
         self._remember(info)
 
     def advance(self, samples: int) -> None:
-        """Advance by some samples; after a termination, a new motion begins."""
+        """Advance by a number of samples; after a termination, begin a new motion."""
         for _ in range(samples):
             _, _, terminated, _, info = self.env.step(self._action)
             self._remember(info)
@@ -231,7 +231,7 @@ def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> A
 
 
 def _pair(ax: Any, *styles: str) -> list[list[Any]]:
-    """Draw empty lines for the true state and for the estimate, one in each style."""
+    """Draw empty lines: for the true state one in each style, and likewise for the estimate."""
     looks = ({"color": TRUTH, "lw": 3.5, "ms": 9.0}, {"color": ESTIMATE, "lw": 1.3, "ms": 5.0})
     return [[ax.plot([], [], style, animated=True, **look)[0] for style in styles] for look in looks]
 
@@ -250,7 +250,7 @@ def main(
     Args:
         system: a shipped system, or your own as script.py:Class.
         observer: a shipped map or a .safetensors file; by default the one that ships for the system.
-        measurement_noise: standard deviation of the noise on each sample of y, by default the system's.
+        measurement_noise: standard deviation of the noise on each sample of y; by default that of the system.
         seed: seed of starts and noise.
     """
     (environment,) = shown(system, observer)

@@ -25,7 +25,7 @@ from training import errors, preset, train, unseen_trajectories
 class Pendulum(kkl_gym.System):
     """A lightly damped pendulum with a torque; the angle is measured, its rate is not."""
 
-    gravity: float = 5.0  # g / l in 1/s^2
+    gravity: float = 5.0  # gravitational acceleration / length, in 1/s^2
     damping: float = 0.1  # 1/s
 
     name: ClassVar[str] = "pendulum"

@@ -32,8 +32,8 @@ class Memory:
     filter v' = (u - v) / tau itself, with u held between samples.
 
     The past before the first output is unknown. The memory assumes that y was constant until 64 steps before the first
-    output. For these 64 steps, each filter assumes the weighted mean rate of change that it has seen since the first
-    output. After k steps this assumption multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also
+    output. For these 64 steps, each filter assumes the mean rate of change since the first output, with the filter's
+    weights. After k steps this assumption multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also
     assumes that no input acted before the first output.
 
     Every w of a slow signal is nearly tau times the signal's rate, so that all w would carry the same information. The
@@ -45,7 +45,7 @@ class Memory:
 
     If an angle is measured by its cosine and its sine, the memory filters the unwrapped angle itself. It assumes that
     the angle turns by less than half a turn from one sample to the next, and that it does not change where cosine and
-    sine are both 0. Within each filter, angles come after the other outputs.
+    sine are both 0. Among the coordinates of each filter, those of angles come last.
 
     Shapes: ``angles``, indices of cosines and sines, (number of angles, 2); ``decay``, ``rise`` (m,), ``mixing``
     (m, m), ``input_decay`` (k,); outputs, inputs and the coordinates returned (..., ny), (..., nu), (..., size).

@@ -1,4 +1,4 @@
-"""A Numba type that holds one number for each of several rows, so that code for one row steps several rows."""
+"""A Numba type that holds one number for each of several rows, so that code written for one row advances several."""
 
 import math
 import operator
@@ -76,7 +76,7 @@ def _common(*kinds: Any) -> Any:
 
 @_intrinsic
 def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    """Return ``yes`` where a > b, else ``no``, also where a or b is NaN."""
+    """Return ``yes`` where a > b, else ``no``; where a or b is NaN, return ``no``."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">", *arguments[:2]), *arguments[2:])

@@ -65,7 +65,7 @@ def shipped() -> tuple[str, ...]:
 
 
 def resolve(name_or_path: str | os.PathLike[str]) -> Path:
-    """Return the path of a shipped map from its name, or a given path to a file as it is."""
+    """Return the path of a shipped map from its name, or a given path unchanged."""
     text = os.fspath(name_or_path) if isinstance(name_or_path, str | os.PathLike) else None
     if not isinstance(text, str):
         raise ArtifactError(f"an observer is a shipped name or a path, got {shown(name_or_path)}")

@@ -73,7 +73,7 @@ class KKLObserver(RecordEstimates):
         If ``compiled`` is True and Numba is not installed.
     ValueError
         If an argument has the wrong type or is out of range, the levels of measurement noise differ between outputs
-        but the map takes one level for all, or the artifact lacks the motion model or limits that an argument needs.
+        but the map takes one level for all, or an argument needs a motion model or limits that the artifact lacks.
     """
 
     def __init__(
@@ -173,8 +173,8 @@ class KKLObserver(RecordEstimates):
         Raises
         ------
         ValueError
-            If the artifact differs in more than its maps, does not cover the noise level, or lacks limits or a motion
-            model that the observer's arguments need. The observer is then unchanged.
+            If the artifact differs in more than its maps, does not cover the noise level, or lacks the monitor
+            limits or motion model that the observer's arguments need. The observer is then unchanged.
         """
         check_replacement(self.artifact, artifact)
         how: dict[str, Any] = {**self._options, "gate": self._gate, "delay": self._delay}
@@ -411,7 +411,7 @@ class KKLObserver(RecordEstimates):
         return standard_deviations(self.decode_covariance())
 
     def decode_covariance(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the :attr:`covariance` of all rows, or of some (number of True in rows, nx, nx), as :meth:`decode`."""
+        """Return the :attr:`covariance` of all rows, or of those that ``rows`` marks as in :meth:`decode`."""
         state, batch = self._some(rows)
         self.artifact.require_covariance()
         return self._kkl.covariance(state).reshape(*batch, self.artifact.nx, self.artifact.nx)

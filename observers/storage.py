@@ -20,9 +20,9 @@ from safetensors.numpy import save as serialise
 
 from observers.network import MLP
 
-MOST_BYTES = 256 * 2**20  # largest file; the shipped maps have up to 350,000 bytes
-MOST_HEADER = 2**20  # bytes of the header, which holds the JSON
-DEEPEST = 32  # levels of nested objects and lists
+MOST_BYTES = 256 * 2**20  # size of the largest file in bytes; the shipped maps have up to 350,000 bytes
+MOST_HEADER = 2**20  # largest size in bytes of the header, which holds the JSON
+DEEPEST = 32  # largest number of levels of nested objects and lists
 UNFINISHED = ".part-"  # prefix of temporary files
 
 # The types of arrays, by their safetensors names.
@@ -45,8 +45,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary file to write, which replaces ``path`` once it is complete and on disk.
 
     The temporary file is in the same folder, which is created if missing. It has the permissions that the umask
-    allows, and the same suffix, from which some writers choose a format. After an exception it is deleted, and ``path``
-    is unchanged. If the process is killed, :func:`training.files.clear_unfinished` removes the temporary file later.
+    allows, and the suffix of ``path``, from which some writers choose a format. After an exception it is deleted, and
+    ``path`` is unchanged. If the process is killed, :func:`training.files.clear_unfinished` removes the temporary file.
     """
     target = Path(path)
     temporary = target.with_name(f"{UNFINISHED}{secrets.token_hex(4)}-{target.stem}{target.suffix}")

@@ -28,8 +28,8 @@ CHUNK = 4096  # points whose Jacobians are computed together
 class Lipschitz:
     """Bound the Lipschitz constant of T_inv: |x_hat(z + d) - x_hat(z)| <= constant |d| for all z and d.
 
-    T_inv is the one that an observer uses long after a reset if no input has acted. The lower bound is the largest norm
-    of its Jacobians along unseen motions.
+    The bounds hold for T_inv as an observer uses it long after a reset if no input has acted. The lower bound is the
+    largest norm of T_inv's Jacobians along unseen motions.
     """
 
     observers: Observers
@@ -98,8 +98,8 @@ def lipschitz_upper(mlp: MLP, steps: int = STEPS) -> float:
         return norm_product(mlp)
     low, high = SLOPES[mlp.activation]
     weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in mlp.weights]
-    # A change d of a layer changes the output by at most sqrt(d^T M d). Any diagonal D > M gives M of the layer before.
-    # D is diag(M) e^shape, scaled to the least D >= M, times 1 + e^margin. At first D = 2 M if M is diagonal.
+    # A change d of a layer changes the output by at most sqrt(d^T M d). M and any diagonal D > M give M of the layer
+    # before. D is diag(M) e^shape, scaled to the least D >= M, times 1 + e^margin. At first D = 2 M if M is diagonal.
     shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
     margins = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in weights[:-1]]
 

@@ -79,7 +79,7 @@ class _Remembering:
         return np.where(np.isnan(flat), before, flat) if self._hold and before is not None else flat
 
     def show(self, obs: Any, flat: np.ndarray, shown: np.ndarray) -> Any:
-        """Return the observation: the memory's output ``shown``, or a Dict of measured keys and the key "memory"."""
+        """Return the observation: the memory's output ``shown``, or a Dict of the measured keys and "memory"."""
         return self.outputs.kept(obs, flat) | {"memory": shown[..., self._beside]} if self._beside else shown
 
 
@@ -90,7 +90,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     linear, stable and fixed: filters of the outputs and inputs, the linear half of a KKL observer.
 
     The observation is [y, memory of y, memory of u], float32, where y are the measured entries. The memory of y has one
-    number for each entry and time constant: a first-order filter of the entry's changes, 0 if y is constant. The
+    number for each entry and time constant: a combination of filters of the entry's changes, 0 if y is constant. The
     memory of u has a running mean for each input and time constant. The cosine and sine of an angle share one memory,
     that of the unwrapped angle. Once the memory has filled, its numbers are about as large as y, see
     :class:`kkl_gym.memory.Memory`. At reset it assumes that y was constant and that no input acted. From the first step
@@ -130,7 +130,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ValueError
         If the environment is not a gymnasium.Env, has other spaces or is under ``Autoreset``, if an argument is not as
         described, or if the period of an angle is unknown. At a reset or step, if a measured entry is infinite, beyond
-        1e15, or NaN without "hold", because the memory would keep it. At a step, if the action holds such a value.
+        1e15, or NaN (with "hold", only at a reset). At a step, if the action is infinite, beyond 1e15, or NaN.
 
     Examples
     --------

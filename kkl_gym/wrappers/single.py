@@ -58,11 +58,11 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     the environment applied. ``info`` gains ``z``, the filter's state, and with ``estimate="x"`` also ``x_hat``, shape
     (nx,). Both are float64 and not clipped. With ``monitor``, ``info`` also has ``score``, of shape (). The score is
     above 1 where the samples do not fit the estimates, as with a faulty sensor or far outside the training box.
-    Once ``observer.gate`` is set, ``rejected`` counts rejected outputs. If the map estimates parameters, they are in
-    ``parameters_hat``.
+    Once ``observer.gate`` is set, ``rejected`` in ``info`` counts rejected outputs. If the map estimates parameters,
+    the estimates are in ``parameters_hat``.
 
-    With ``estimate="z"`` there are no ``x_hat`` and ``parameters_hat``, and :meth:`render` shows no estimate. Neither
-    the inverse map nor the tracker runs then, unless there is a monitor or the start is known.
+    With ``estimate="z"`` there is neither ``x_hat`` nor ``parameters_hat``, and :meth:`render` shows no estimate.
+    Neither the inverse map nor the tracker runs then, unless there is a monitor or the start is known.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
     ``training.learn``). Such an observer sees the actions, and the measured signals that its file names. The

@@ -1,4 +1,4 @@
-"""Tasks of agents: an environment, its measured entries and the time between actions; scores in systems' tasks."""
+"""Tasks of agents (an environment, its measured entries, the time between actions), and scores in systems' tasks."""
 
 import json
 import re
@@ -18,8 +18,8 @@ from observers.names import matching
 from training.evaluation.levels import Level
 
 MAX_SAMPLES = 100_000  # largest number of samples in an episode, all of which are stored
-MAX_FRAMES = 1_000  # largest number of stacked observations, also in files, which are untrusted
-TOLERANCE = 0.2  # largest distance from the target that counts as a success, in units of the scale
+MAX_FRAMES = 1_000  # largest number of stacked observations, also for tasks in files, which are untrusted
+TOLERANCE = 0.2  # largest norm of (x - target) / System.scale that counts as a success
 
 
 @dataclass(frozen=True)
@@ -196,6 +196,6 @@ def scores(system: System, x: np.ndarray) -> np.ndarray:
 
 
 def successes(system: System, x: np.ndarray) -> np.ndarray:
-    """Return whether ``x`` (steps, n, nx) stays within ``TOLERANCE`` of the target in its last fifth, as (n,)."""
+    """Return (n,) whether ``x`` (steps, n, nx) is within ``TOLERANCE`` of the target in the last fifth of the steps."""
     late = x[-max(1, round(0.2 * len(x))) :]
     return np.asarray((np.linalg.norm(deviation(system, late), axis=-1) <= TOLERANCE).all(0))

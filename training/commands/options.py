@@ -310,6 +310,6 @@ def system_of(artifact: Artifact, given: str | None) -> System:
 
 
 def model_of(artifact: Artifact, system: System) -> System:
-    """Return a system with the biases that an artifact estimates as additional states."""
+    """Return a system with additional states: the biases that an artifact estimates."""
     bias = artifact.training.get("bias", 0.0)
     return with_bias(system, bias) if np.any(bias) else system

@@ -125,7 +125,7 @@ class Train:
                 words = ["kkl-gym", "evaluate", str(path)]
                 words += [] if type(system) in SYSTEMS.values() else ["--system", self.system]
                 words += ["--policy", self.policy] if self.policy not in (None, "controller") else []
-                progress.say(f"{shlex.join(words)} measures its errors")
+                progress.say(f"{shlex.join(words)} measures the observer's errors")
         return path
 
     def _has_records(self, changes: Mapping[str, Any]) -> bool:

@@ -22,7 +22,7 @@ class Coordinates:
     A network in float32 cannot read z itself: components of z are nearly collinear, and their variances spread over ten
     orders of magnitude.
 
-    Shapes: ``offset`` (size,), ``whiten`` (modes, size), ``noise_gain`` (modes,).
+    Shapes, for ``modes`` coordinates: ``offset`` (size,), ``whiten`` (modes, size), ``noise_gain`` (modes,).
     """
 
     offset: np.ndarray
@@ -93,7 +93,7 @@ def root(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StateScale:
-    """Scales states by an offset and a scale, (n,) each; the first ``nx`` (None: all) determine errors' weights."""
+    """Scales states by an offset and a scale, (n,) each; the first ``nx`` states (None: all) set errors' weights."""
 
     offset: np.ndarray
     scale: np.ndarray

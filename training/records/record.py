@@ -117,7 +117,7 @@ def median_step(*records: Record) -> float:
 
 
 def sampling_interval(*records: Record) -> float:
-    """Return the median step in seconds, rounded to the digits on which all steps agree, at least two."""
+    """Return the median step in seconds, rounded to the digits on which all steps agree, and to at least two."""
     uneven = max(map(jitter, records))
     digits = 12 if uneven < 1e-12 else int(np.clip(-np.log10(uneven), 2, 12))
     return float(f"{median_step(*records):.{digits}g}")

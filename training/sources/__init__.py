@@ -90,7 +90,7 @@ class Source(Protocol):
         """Return motions for calibration; raise TooFewRunsError if too few are held out."""
 
     def equations(self) -> Equations:
-        """Return the equations of motion; raise ValueError with the reason if a flow must replace them."""
+        """Return the equations of motion; raise ValueError with the reason if a learned Flow must replace them."""
 
     def increments(self, *, report: Report) -> tuple[Increments, Increments]:
         """Return changes of the state over one sampling interval: for learning a flow, and for measuring its error."""

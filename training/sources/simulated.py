@@ -21,16 +21,16 @@ from training.trajectories.parameters import blind, nominal_share, relative_rang
 
 LEAD_IN_SHARE = 0.4  # in this share of the motions without inputs, earlier inputs have moved the start
 BEYOND = 2.0  # size, relative to X, of the box in which a third of the calibration runs start
-# Random inputs drive half of the calibration runs. A policy, if given, drives all of them, and explores in half.
+# Random inputs drive half of the calibration runs. A policy, if given, drives all, and explores in half of them.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
-LEAST_NOISE = 0.001  # least measurement noise that a tracker assumes, in multiples of the usual level
+LEAST_NOISE = 0.001  # a tracker's least measurement noise, relative to the system's (if this is 0: to 5 % of y's range)
 LEAST_PROCESS_NOISE = 0.005  # least level for a tracker, in System.scale per System.pace; a tenth of the default
 WINDOW, RUN = 0.5, 20.0  # durations of a tracker's window and of a calibration run, in multiples of System.pace
 SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
-INTEGRATION_ERROR = 2e-5  # steps are halved until they err by at most this, in standard deviations: far below the noise
-TOO_FAR_OFF = 0.01  # in standard deviations: if SUBSTEPS steps err by more, as where f jumps, a flow is learned
-INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a flow, and the share held out to measure its error
-DEVIATIONS = (1e-4, 0.3)  # least and largest rms shift from a motion to an increment's start, in standard deviations
+INTEGRATION_ERROR = 2e-5  # steps are halved until 99 % of the errors are below this, in standard deviations of x
+TOO_FAR_OFF = 0.01  # likewise: if SUBSTEPS steps err by more, as where f jumps, a Flow is learned in place of f
+INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a Flow, and the share held out to measure its error
+DEVIATIONS = (1e-4, 0.3)  # least and largest rms distance of an increment's start from a motion, in standard deviations
 
 
 class SimulatedSource:

@@ -26,7 +26,7 @@ from training.files import write
 if TYPE_CHECKING:
     import pandas as pd
 
-# A kind of agents: an information set, possibly with another source of estimates or another algorithm.
+# Kinds of agents differ in the information that they see, in the source of estimates, or in the algorithm.
 Kind = Literal[
     "state",
     "ekf",
@@ -43,7 +43,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 ON_SYSTEMS: tuple[Kind, ...] = ("state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state")
 IN_ENVIRONMENTS: tuple[Kind, ...] = ("state", "x_hat", "z", "stacked", "recurrent", "y")
 IDLE: Literal["random"] = "random"  # zero input on systems, random actions in environments; normalised score 0
-# What agents of some kinds see; the other kinds have the name of their information set.
+# The information that agents of these kinds see; all other kinds have the name of their information.
 SEEN: dict[str, Information] = {"ekf": "x_hat", "recurrent-state": "state"}
 # For some settings of a task: the kinds of agents that depend on the setting.
 CONCERNED = {
@@ -53,7 +53,7 @@ CONCERNED = {
     "angles": ("z",),
     "weights": ("z",),
 }
-SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # a second noise level for these tasks
+SECOND_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}  # second level (standard deviation) of the noise on y
 SEEDS = 5
 # Largest numbers of agents of each (slow) recurrent kind on a system: at the first and at the second noise level.
 RECURRENT_SEEDS, SECOND_NOISE_RECURRENT_SEEDS = 3, 1

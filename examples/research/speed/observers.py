@@ -102,7 +102,7 @@ def observer_tasks(artifact: Artifact, system: System, *, rows: int, steps: int)
 
 
 def record_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
-    """Return tasks that time estimates along records, by the observer and, if dynamax is installed, by its EKF.
+    """Return tasks that time estimates along records, by the observer and, if dynamax is installed, by dynamax's EKF.
 
     Both use the equations of the observer's tracker.
     """
@@ -182,7 +182,7 @@ def _stepping(observer: Any, y: np.ndarray, u: np.ndarray, *, error_bars: bool =
 
 
 class _Filterpy:
-    """EKF of filterpy with this package's step and Jacobian of the equations, as a user would write it."""
+    """EKF of filterpy with this package's step and Jacobian of the equations, as users would write one."""
 
     def __init__(self, kind: Any, system: System, dt: float, *, Q: np.ndarray, R: np.ndarray) -> None:
         self._system, self._dt = system, dt

@@ -48,7 +48,7 @@ def test_from_a_system_to_an_observer_that_tracks(capsys):
     assert re.fullmatch(r"CPU seconds: motions \S+, free \S+, inverse \S+, calibrating \S+", printed[3])
     assert printed[4] == "the observer tracks by the system's equations; T_inv initialises it"
     assert re.fullmatch(rf"wrote {path} \(0\.\d\d MB\), report\.png and log\.txt beside it, in \S+", printed[5])
-    evaluation = re.fullmatch(r"kkl-gym (evaluate .*) measures its errors", printed[6])[1].split()
+    evaluation = re.fullmatch(r"kkl-gym (evaluate .*) measures the observer's errors", printed[6])[1].split()
     assert printed[7:] == []
     logged = [line.split(" ", 2)[2] for line in path.with_name("log.txt").read_text().splitlines()]
     assert [line for line in logged if " passed" not in line] == printed
@@ -80,7 +80,7 @@ def test_other_kinds_have_names_of_their_own(options, name, capsys):
 
 def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(capsys):
     main(["train", FALLING, "--policy", f"{__file__}:hold", *SIZES])
-    assert lines(capsys)[-1].endswith(f"--system {FALLING} --policy {__file__}:hold measures its errors")
+    assert lines(capsys)[-1].endswith(f"--system {FALLING} --policy {__file__}:hold measures the observer's errors")
     path, short = "runs/falling/falling.safetensors", ["--trajectories", "4", "--duration", "6"]
     for command in (
         ["evaluate", path, "--system", FALLING, *short, "--measurement-noise", "0", "--csv", "errors.csv"],
