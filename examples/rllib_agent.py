@@ -20,8 +20,8 @@ import kkl_gym
 def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
     """Make batched environments with their observer inside: episodes of 20 s, an action every 0.05 s.
 
-    RLlib calls this function in each env runner and sends it only names. The runner itself imports kkl_gym and reads
-    the observer's file.
+    RLlib calls this function in each env runner, with names as its only arguments. The env runner itself imports
+    kkl_gym and reads the observer's file.
     """
     envs = gym.make_vec(
         config["env_id"],
@@ -31,7 +31,7 @@ def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
         autoreset_mode="Disabled",
     )
     envs = kkl_gym.KKLVectorObservation(envs, config["observer"])  # the observer sees every sample, 0.01 s apart
-    return kkl_gym.VectorActionRepeat(envs, 5)  # an ended row resets in the next step, as RLlib expects
+    return kkl_gym.VectorActionRepeat(envs, 5)  # ended episodes restart in the next step, as RLlib expects
 
 
 def configuration(algorithm: Literal["ppo", "sac"]) -> AlgorithmConfig:

@@ -26,7 +26,7 @@ _SYMPY_NAMES = {"abs": "Abs", "maximum": "Max", "minimum": "Min"}
 
 def _unary(name: str, on_numbers: Callable[[Any], Any], meaning: str) -> Callable[[Any], Any]:
     on_arrays = getattr(np, name)
-    # The other functions warn only of infinite arguments; they do without np.errstate, which takes time.
+    # Only these three functions warn of finite arguments. The others do without np.errstate, which takes time.
     if name in ("exp", "log", "sqrt"):
         on_arrays = np.errstate(all="ignore")(on_arrays)
 
@@ -66,7 +66,7 @@ def _named(function: Any, call: str, meaning: str, on_numbers: Callable[..., Any
 
 
 def _elsewhere(name: str, *args: Any) -> Any:
-    """Record the call of a function if an argument is a Symbol, otherwise call the function of sympy or torch."""
+    """Record the call if an argument is a Symbol of kkl_gym.tracing, otherwise call the function of sympy or torch."""
     for arg in args:
         if isinstance(arg, Symbol):
             return arg.call(name, *args)

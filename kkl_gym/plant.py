@@ -161,8 +161,8 @@ def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarra
     Without the margin, they are exact if h is monotone in each state.
     """
     # h is evaluated at random states, and on the grid of each state's low, middle and high values, where h must not be
-    # NaN. With more than six states, only a part of the grid is taken. This part includes, for each output, the two
-    # corners towards which the output rises and falls from the centre.
+    # NaN. With more than six states, only a part of the grid is taken. This part includes, for each output, the corner
+    # towards which the output rises from the centre, and the opposite corner.
     low, high = np.array(system.bounds, dtype=float).T
     rng, nx = np.random.default_rng(0), system.nx
     if 3**nx <= _MOST_POINTS:

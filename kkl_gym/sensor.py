@@ -113,7 +113,7 @@ class Sensor:
         return {name: np.broadcast_to(np.array(value), ny)[:, None] for name, value in given.items()}
 
     def bounds(self, low: np.ndarray, high: np.ndarray, noise: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds of y for bounds (ny,) of h(x), with a margin for six standard deviations and the rounding."""
+        """Return bounds of y for bounds (ny,) of h(x); they add six standard deviations of noise and half a quantum."""
         of = {name: column[:, 0] for name, column in self.columns(len(low)).items()}
         ends = of["gain"] * np.stack([low, high]) + of["bias"]
         margin = 6.0 * np.hypot(noise, of["coloured_noise"]) + of["quantum"] / 2

@@ -30,8 +30,8 @@ PER_RATE = (1.0 - 1e-6) / RATE_STEP
 TOLERANCE, ROUGH = 3e-6, 0.1
 # Number of attempts with equal substeps. After them, or beyond MOST_EQUAL substeps, the step length follows the error.
 ATTEMPTS = 3
-MOST_EQUAL = 1 << 10
-MAX_SUBSTEPS = 1 << 16
+MOST_EQUAL = 1 << 10  # equal substeps in a sampling interval
+MAX_SUBSTEPS = 1 << 16  # substeps of any length in a sampling interval
 REPORTED = 50  # sampling intervals between two calls of ``report`` by :func:`simulate`
 
 # Butcher's explicit sixth-order method with seven stages (J. C. Butcher, Numerical Methods for Ordinary Differential
@@ -170,8 +170,8 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
     """Return the next state by substeps whose length follows the error, or ``end`` if x escapes or turns NaN."""
-    # Motions that accelerate, as at an ignition, need such substeps. The substeps also verify an escape: equal substeps
-    # that are too long for the interval's end may leave the bounds only by their error.
+    # Motions that accelerate, as at an ignition, need such substeps. The substeps also verify an escape: where equal
+    # substeps are too long for the interval's end, their error alone may carry x out of the bounds.
     if system.discrete:
         return end
     left, h, field, d = dt, dt, *forced(system, u, w)
@@ -263,7 +263,7 @@ def _substeps(
 def followed_rows(
     system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, *, dt: float, end: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
-    """Return states ``end`` (nx, n); :func:`followed` replaces those of indices ``rows`` (m,) if x is within bounds."""
+    """Return the states ``end`` (nx, n), recomputed by :func:`followed` in those ``rows`` (m,) where x is in bounds."""
     if len(rows):
         low, high = np.array(system.bounds, dtype=float).T[..., None]
         # Equations may use NumPy even on the floats of a single state, and NumPy would warn.

@@ -107,7 +107,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         self._exchanged()
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
-        # A block of unscaled noise for each row, and the number of its samples that are used. At first all count as
+        # A block of unscaled noise for each row, and how many of its samples have been used. At first all count as
         # used, so that the first reset draws a block.
         self._w, self._v = (np.empty((NOISE_BLOCK, width, num_envs)) for width in (nx, self.plant.nv))
         self._used = np.full(num_envs, NOISE_BLOCK)
@@ -218,7 +218,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return self._observation(), reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Draw the phase portrait of each row so far, like :meth:`KKLEnv.render`; None without ``render_mode``."""
+        """Draw the phase portrait of each row's episode, like :meth:`KKLEnv.render`; None without ``render_mode``."""
         return self.draw()
 
     def draw(self, estimates: Trails | None = None) -> tuple[np.ndarray, ...] | None:

@@ -97,8 +97,8 @@ class Limits:
 class Monitor:
     """Running mean and mean square of the residual, compared with their limits.
 
-    A biased sensor shifts the mean, a frozen or dead sensor has too little noise, and filter states far outside the
-    training make the residual large.
+    A biased sensor shifts the mean, a frozen or dead sensor has too little noise, and filter states far from
+    those in training make the residual large.
 
     Parameters
     ----------

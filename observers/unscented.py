@@ -21,7 +21,7 @@ def weights(nx: int) -> tuple[float, float, float]:
 def transformed(
     x: np.ndarray, P: np.ndarray, function: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return means (n, k), covariances (n, k, k), and covariances with x (n, nx, k), of a function of Gaussian states.
+    """Return a function's means (n, k), covariances (n, k, k) and covariances with x (n, nx, k), for Gaussian states x.
 
     Shapes: means ``x`` (n, nx), covariances ``P`` (n, nx, nx). The results are NaN if P is not positive definite.
     """

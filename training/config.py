@@ -47,7 +47,7 @@ class Config:
     T_inv(z_y) along those without inputs, transients included. spinn: as in the paper, a physics-informed network
     learns T, and T_inv is fitted on z = T(x) (see ``transients``), without inputs."""
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
-    """Real eigenvalues of A, in 1/s; B is all ones for each output."""
+    """Real eigenvalues of A for each output, in 1/s; B feeds the output into each of its modes with weight 1."""
     pairs: tuple[tuple[Annotated[float, Field(lt=0)], Positive], ...] = ()
     """Eigenvalue pairs a +- iw of A, as (a, w) in 1/s and rad/s. Slow pairs at frequencies of y average its noise."""
     dt: Positive = 0.01
@@ -109,22 +109,22 @@ class Config:
     """1 draws the level of measurement noise evenly on a logarithmic scale over the two decades below
     measurement_noise_max; higher values draw high levels, which are harder to learn, more often."""
     windows: Count = 8000
-    """Number of recorded states for each time t since reset; the filter starts t before each of them (records)."""
+    """Number of recorded states for each time t since reset; the filter starts t before each state (records)."""
     members: Count = 1
     """Number of networks with different seeds, averaged into one wide network, as they extrapolate differently."""
     arbitrary_zero: tuple[str, ...] = ()
     """Measured signals with an arbitrary zero, like an encoder's; T_inv uses only their changes (recorded motions)."""
     held_out: Annotated[float, Field(ge=0, lt=1)] = 0.2
-    """Share of the records that is held out to calibrate on and to measure errors: whole records if there are five or
-    more, otherwise the end of each record."""
+    """Share of the records that is held out for calibration and for measuring errors: whole records if there are five
+    or more, otherwise the end of each record."""
     tracking: bool = True
-    """Whether a Kalman filter that T_inv initialises tracks the state by equations or a learned flow (not spinn)."""
+    """Whether a Kalman filter tracks the state (not spinn); it predicts by equations or a flow, a learned network."""
     flow_steps: Count = 5000
     """Batches for a learned flow, which replaces unknown equations and those that an artifact cannot hold."""
     runs: Annotated[int, Field(ge=100)] = 400
     """Number of simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Probability of an alarm in a fault-free motion as long as a calibration motion (systems: 20 times the pace)."""
+    """Probability of an alarm in a fault-free motion that is as long as a calibration motion (systems: 20 paces)."""
     truncation: Positive = 1e-6
     """epsilon: the forward map's data begins once the filter's start adds at most this to z (spinn, paper sec. 5.2)."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)

@@ -94,8 +94,8 @@ PROFILES: dict[str, Profile] = {
     ),
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
-        # Under noise, real modes hardly distinguish the parameters; slow pairs at frequencies of y do. The first two
-        # cut the best T_inv's error from 2.3 to 1.9 % (parameters 10 % off). More training cut this by a relative 3 %.
+        # Under noise, real modes hardly distinguish the parameters; slow pairs at frequencies of y do. Pairs 1 and 2
+        # cut the best T_inv's error from 2.3 to 1.9 % (parameters 10 % off); more training cut it by a relative 3 %.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,

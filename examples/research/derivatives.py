@@ -9,7 +9,7 @@ import numpy as np
 from kkl_gym.equations import components
 from kkl_gym.system import Components
 
-# NumPy's form of functions that some releases of sympy cannot print, or print for arrays of one shape only.
+# NumPy versions of functions that some sympy releases cannot print as code, or print for arrays of one shape only.
 _IN_NUMPY = {
     "largest": lambda *values: functools.reduce(np.maximum, values),
     "smallest": lambda *values: functools.reduce(np.minimum, values),
@@ -18,7 +18,7 @@ _IN_NUMPY = {
 
 
 def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
-    """Return derivatives of f or h: for each component, its nonzero derivatives by the index of the state.
+    """Return derivatives of f or h: for each component, a dict from a state's index to the derivative, without zeros.
 
     At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of the derivatives on both sides; at a jump it is
     the derivative beside the jump.

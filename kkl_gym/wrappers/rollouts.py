@@ -77,7 +77,7 @@ class NamedEstimator(KKLEstimator):
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the observations in a report: y, with its last value where it is missing, then x_hat or z."""
         y = report["y"]
-        # A report of restarted rows alone holds no NaN, because their first sample is complete.
+        # Where all rows of a report have just restarted, y holds no NaN, because first samples are complete.
         if np.isnan(y).any():
             y = np.where(np.isnan(y), self._held, y)
         return np.concatenate([y, super().shown(report)], axis=-1)
@@ -113,7 +113,7 @@ class Samples:
         return y, x.get("x", self._nothing)
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return outputs after a step and the inputs that led to them; sets ``u``, ``sample`` and, if shown, ``x``."""
+        """Return outputs and inputs of a step; sets ``u``, ``sample`` and, if shown, ``x`` in ``info``."""
         y, u = self.outputs(observation, info), self.inputs(action)
         x = self.states(observation, info)
         info.pop("x", None)

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
 SKIPPED = 5.0  # transient of driven runs, in units of System.pace; at most half of a run
 FIRST, SETTLED = 2.0, 5.0  # error bars are evaluated before FIRST and after SETTLED, in units of System.pace
-SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, in multiples of the map's largest level
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, in multiples of a map's largest in training
 FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %")
 
 
@@ -138,7 +138,7 @@ class Evaluate:
     system: OwnSystem = None
     policy: OwnPolicy = None
     measurement_noise: NoiseLevels = None
-    """Standard deviations of the noise on each sample of y; each gives a row. 0.1,0.3 is one value for each output."""
+    """Noise levels on y (standard deviations); each gives a table row. 0.1,0.3 has a value for each of two outputs."""
     ekf: bool = False
     """Also evaluate an extended Kalman filter that knows the inputs, the noise levels and the equations of the
     observer's model."""
@@ -268,7 +268,7 @@ class Evaluate:
                 found = parameter_errors(of.artifact, system, runs, measurement_noise=level, seed=self.motions.seed)
                 rows.append([*[("no", "yes")[driven]] * inputs, show_level(level), *map(percent, found)])
         on = f"plant {show_parameters(of.plant)}" if of.plant else "plants drawn from their ranges"
-        title = f"{of.name}: parameters, rms error in % of their values after transient, {on}"
+        title = f"{of.name}: parameters, rms error after transient in % of their values, {on}"
         return table(title, [], rows, [*["driven"] * inputs, "noise\non y", *names])
 
     def _coverage(self, of: Subject, progress: ProgressBars, left_out: list[str]) -> list["pd.DataFrame"]:
@@ -301,7 +301,7 @@ class Evaluate:
         frame = pd.DataFrame(rows)
         limits = f"{frame.nees_low.min():.2f} to {frame.nees_high.max():.2f}"
         caption = f"with true covariances, the NEES at one time, averaged over runs, is {limits} with probability 95 %"
-        title = f"{of.name}: errors in regions, %, {self._runs(of)}{of.on}"
+        title = f"{of.name}: share of errors in each region in %, {self._runs(of)}{of.on}"
         right = ["noise", *(f"{name} %" for name in REGIONS), "NEES"]
         progress.console.print(table(title, ["observer", "starts", "span"], shown, right, caption))
         return [frame]
@@ -324,7 +324,7 @@ class Evaluate:
     def _cases(
         self, description: str, of: Subject, levels: Sequence[Level], progress: ProgressBars, left_out: list[str]
     ) -> Iterator[tuple[str, bool, UnseenTrajectories, Level]]:
-        """Yield, for each case and noise level, the starts' name, whether runs are driven, trajectories and level.
+        """Yield, for each case and noise level: region of starts, whether inputs drive the runs, trajectories, level.
 
         A case gets a line in ``left_out`` instead if it has no starts, or if all its trajectories leave the bounds.
         """

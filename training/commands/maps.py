@@ -41,7 +41,7 @@ class Maps:
 
 
 def tracks_by(artifact: Artifact) -> str:
-    """Return the kind of model by which a tracker predicts, "equations" or (learned) "flow"; "" without a tracker."""
+    """Return by which model a tracker predicts: "equations", or "flow" for a learned network; "" without a tracker."""
     if artifact.motion is None:
         return ""
     return "flow" if artifact.motion.equations is None else "equations"

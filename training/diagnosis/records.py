@@ -33,7 +33,7 @@ ROUNDING = 1e-9  # ridge of the linear regression on z, about the relative round
 # Largest error of a determined signal and least error of an undetermined one, in the signal's standard deviations.
 DETERMINED, UNDETERMINED = 0.05, 0.8
 AS_GOOD = 1.1  # a window whose error is at most this multiple of the least error is as good as the best
-# A signal is known up to a constant if the error of its changes is <= DETERMINED and <= this share of its own error.
+# A signal is known up to a constant if the error of its changes is <= DETERMINED and <= SEEN times the signal's error.
 SEEN = 0.1
 
 # Severity and advice by the first word of the verdict on a signal.
@@ -240,7 +240,7 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
 
 
 def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return, at evenly spread samples, z (n, size) of filters begun ``steps`` samples before, and x and its change."""
+    """Return, at evenly spread samples, z (n, size) of filters begun ``steps`` before, and x with its change since."""
     rows = windows.rows(steps)
     rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
     rows = evenly(rows, min(most, len(rows)))

@@ -20,9 +20,9 @@ COMPARED = 100  # number of points of X, and of 2X, at which the equations are e
 POINTS = 1000  # number of points of X at which outputs are evaluated
 MOTIONS = 100  # number of motions; if the system has inputs and no policy is given, half are driven
 MANY = 0.5  # a larger share of motions that leave the bounds is a problem
-# Change of y in one sample, in standard deviations of y: a problem above COARSE, a note above JERKY, SMOOTH is advised.
+# Change of y per sample, in standard deviations of y: a problem above COARSE, a note above JERKY; SMOOTH is advised.
 COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1
-STILL = 1e-9  # an output whose range is a smaller share of its size does not move
+STILL = 1e-9  # an output does not move if its range is at most this share of its largest absolute value
 
 COST = {
     "floats": "single environments and observers do not run",

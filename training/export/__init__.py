@@ -1,1 +1,1 @@
-"""An observer's step in Torch, ONNX and C99, without known initial states, monitor, gate and delay."""
+"""An observer's step in Torch, ONNX and C99, without known initial states, monitor, outlier gate and sample delay."""

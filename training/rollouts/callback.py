@@ -27,7 +27,7 @@ from training.records.record import ROLES
 from training.sources.recorded import OF_THE_FILTER, RecordedSource, recorded_errors
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a shorter training than the first, as there are many refits
-LONGEST = 250  # episodes are cut into pieces of at most this many steps (two settling times if longer) to hold some out
+LONGEST = 250  # most steps in a piece of an episode (two settling times if longer); whole pieces are held out
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ class KKLTrainingCallback(BaseCallback):
     """Refits the observer in :class:`kkl_gym.KKLObservation` on the episodes of the agent that is being trained.
 
     An observer is accurate where its rollouts have been, but an agent in training goes elsewhere. A refit learns T_inv,
-    the covariances and the flow again from all kept episodes, except for a share that stays held out. The new observer
+    the covariances and the model of the motion again, from all kept episodes but a held-out share. The new observer
     replaces the old one unless the new one's error on that share is larger. Filters keep their states. So that no
-    on-policy batch mixes observers, a refit takes place only before a rollout is collected, or at the end of ``learn``.
+    on-policy batch mixes observers, refits take place only before a rollout or, with ``rehearsal``, as ``learn`` ends.
     A refit needs a kept and a held-out episode of at least the filter's settling time; else the callback warns.
 
     The logger receives ``kkl/error``, the held-out error of the observer in use (root mean square, in standard
