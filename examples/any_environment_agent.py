@@ -73,13 +73,13 @@ def main(
     batches: int = 1_000,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Train the agents; returns for each way the larger error of the two hidden signals in the agent's episodes.
+    """Train the agents; returns, for each way of training, the larger of the hidden signals' two relative errors.
 
     Args:
-        observer_steps: random steps, in the third way a trained agent's, from which a way's first observer is learned.
-        members: number of networks of such an observer, whose outputs are averaged.
+        observer_steps: steps from which an observer is first learned: random ones, in the third way a trained agent's.
+        members: number of networks of this first observer; their outputs are averaged.
         timesteps: further steps, in which the agents learn.
-        every: steps between refits; also the number of steps that the third agent learns on estimates.
+        every: steps between refits; also the number of last steps, in which the third agent learns on estimates.
         batches: training batches of each fit.
         seed: seed of all random numbers.
     """

@@ -62,16 +62,16 @@ class CartPole(kkl_gym.System):
 
 
 def balance(x: np.ndarray) -> np.ndarray:
-    """Map states (n, 4) to actions (n, 1) in [-1, 1], by another policy than in the training."""
+    """Map states (n, 4) to actions (n, 1) in [-1, 1], by a policy other than that of the training."""
     return np.clip(x @ [[0.3], [0.5], [4.0], [1.0]], -1.0, 1.0)
 
 
 def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/cart_pole")) -> np.ndarray:
-    """Train, wrap and act on the estimate; returns its rms errors after the first fifth, in half-widths of X.
+    """Train, then act on the estimate; returns its rms errors after a fifth of the run, in half-widths of X.
 
     Args:
-        inverse_steps: batches of training.
-        trajectories: simulated trajectories to train on.
+        inverse_steps: number of training batches.
+        trajectories: number of simulated trajectories to train on.
         out: the run's folder.
     """
     system = CartPole()

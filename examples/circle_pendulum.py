@@ -21,7 +21,7 @@ from training import preset, train
 
 @dataclass(frozen=True)
 class CirclePendulum(kkl_gym.System):
-    """Pendulum-v1's pendulum: cosine and sine of its angle are measured, its rate is hidden. The angle is 0 upright."""
+    """Pendulum-v1's pendulum: cosine and sine of the angle are measured, the rate is hidden. The angle is 0 upright."""
 
     gravity: float = 10.0  # m/s^2
     mass: float = 1.0  # kg
@@ -56,11 +56,11 @@ class CirclePendulum(kkl_gym.System):
 
 
 def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/circle_pendulum")) -> np.ndarray:
-    """Train an observer, swing up by its estimate; returns the estimate's rms errors in half-widths of X.
+    """Train, then swing up by the estimate; returns its rms errors after a fifth of the run, in half-widths of X.
 
     Args:
-        inverse_steps: batches of training.
-        trajectories: simulated trajectories to train on.
+        inverse_steps: number of training batches.
+        trajectories: number of simulated trajectories to train on.
         out: the run's folder.
     """
     system = CirclePendulum()

@@ -10,10 +10,10 @@ import numpy as np
 
 from observers.checks import is_finite
 
-MOST_LEVELS = 24  # levels of nested functions
-MOST_PARTS = 2000  # numbers, states, inputs and functions in all components together
+MOST_LEVELS = 24  # largest number of levels of nested functions
+MOST_PARTS = 2000  # bound on numbers, states, inputs and functions, counted together in all components
 _POWERS = 8  # integer exponents up to this absolute value compile to products
-_MOST_NESTED = 16  # arguments that the source nests one by one; longer lists of arguments are combined in halves
+_MOST_NESTED = 16  # largest number of arguments that the source nests one by one; longer lists are combined in halves
 
 
 class _Rule(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 
 from observers.checks import choice, real_array, shown
 
-_PIECE = 2**15  # number of a layer's values that are computed together; they fit the second-level cache
+_PIECE = 2**15  # largest number of a layer's values that are computed together; they fit the second-level cache
 UNROLLED = 4  # number of a layer's inputs that the machine code processes together
 
 

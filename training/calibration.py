@@ -185,7 +185,7 @@ class _Calibration:
         return np.array([entries[min(enough, key=lambda j: (abs(i - j), -j))] for i in range(len(cells))])
 
     def limits(self, extremes: np.ndarray) -> Limits:
-        """Return 3 ny limits by level; a fault-free run crosses any of them with probability <= false_alarms / 2."""
+        """Return 3 ny limits by level; a fault-free run crosses at least one with probability <= false_alarms / 2."""
         share, sound = self.false_alarms / (6 * self.artifact.ny), self.noisy if self.noisy.any() else ~self.noisy
         largest, low, high = extremes[:, :, sound]
         mean, above = (MARGIN * np.array([rare(each, share) for each in values]) for values in (largest, high))

@@ -54,7 +54,7 @@ def clear_unfinished(folder: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a folder against other processes, and remove the unfinished files of killed ones."""
+    """Lock a folder against other processes, and remove the unfinished files of killed processes."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
         lock = FileLock(folder / ".lock", timeout=0).acquire()
@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a folder, write a run's configuration; ValueError at checkpoints, with ``resume`` only at another run's."""
+    """Lock a folder, write a run's configuration; ValueError at checkpoints or, with ``resume``, at another run's."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)

@@ -33,7 +33,7 @@ from training.spectrum import Spectrum, check_continuous
 WIDTH, DEPTH, BATCH, LEARNING_RATE = 24, 2, 1024, 3e-3
 LEAST = 0.01  # the loss divides squared errors by the residual's mean square plus this, lest tiny residuals dominate
 WORSE = 2.0  # a tracker whose held-out error is more than this multiple of T_inv's is dropped
-LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, as a fraction of the increments' rms
+LEAST_ERROR = 0.01  # least error that a tracker assumes for a flow, as a fraction of a state's rms change in a step
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class Maps:
 def learn_map(source: Source, run: Run) -> Maps:
     """Learn T_inv along motions of a source, transients and all noise levels included.
 
-    By default, a simulated system with inputs has two maps: T_inv(z_y, z_u), and T_inv(z_y) until an input acts. The
+    By default, a simulated system with inputs has two T_inv: of filtered y until an input acts, then of y and u. The
     pipeline "spinn" follows the paper: it learns T from motions and T's equation, and then T_inv from z = T(x).
 
     Parameters

@@ -316,7 +316,7 @@ class VectorActionRepeat(VectorWrapper):
     """:class:`kkl_gym.ActionRepeat` for :class:`kkl_gym.KKLVectorEnv`, bare or under :class:`KKLVectorObservation`.
 
     It holds each action for ``repeat`` steps and sums the rewards. If a row's episode ends on the way, the row stays at
-    its end for the rest of the repeat, so that its next episode begins with a new action. Therefore the environment
+    that end for the rest of the repeat, so that its next episode begins with a new action. Therefore the environment
     inside must leave resets to this wrapper (``autoreset_mode="Disabled"``). The wrapper itself offers every mode.
 
     Parameters
@@ -326,7 +326,7 @@ class VectorActionRepeat(VectorWrapper):
     repeat : int
         Number of steps for which an action is held.
     autoreset_mode : str or gymnasium.vector.AutoresetMode
-        The mode that this wrapper offers.
+        The mode that this wrapper offers, by default NEXT_STEP.
 
     Raises
     ------

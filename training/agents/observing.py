@@ -85,7 +85,7 @@ def oldest_first(rows: Sequence[Sequence[Record]]) -> list[Record]:
     """Merge the records of environments that were stepped together, in the order of their ends."""
     dated = list[tuple[int, Record]]()
     for records in rows:
-        after = 0  # number of steps since the end of a record
+        after = 0  # number of steps from the end of a record to the last step
         for record in reversed(records):
             dated.append((after, record))
             after += len(record.t) - 1

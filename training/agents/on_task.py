@@ -16,7 +16,7 @@ from training.agents.tasks import deviation, task_of
 class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
     """Gives an agent the observations and rewards of ``kkl-gym agent train SYSTEM``.
 
-    The agent sees (x_hat - target) / scale and acts once in a period of the task, while the observer sees every sample.
+    The agent sees (x_hat - target) / scale and acts once per period of the task, while the observer sees every sample.
     The reward is minus the cost, or the environment's if the system has its own ``reward`` or ``terminated``. With the
     seed of row i of the task's vector environment, this environment behaves like row i.
 

@@ -104,11 +104,11 @@ def unseen_trajectories(
     domain : {"X", "1.5X", "2X"}
         Where the trajectories start: in X, or in the multiple of X but outside X.
     driven : bool
-        Whether random steps and sines act as inputs. With ``policy``: whether it explores and sees states with errors.
+        Whether random steps and sines are inputs. With ``policy``: whether the policy explores and sees inexact states.
     stream : Stream
         Stream of random numbers, for evaluation or for validation.
     process_noise : float
-        Level of the process noise, in multiples of the system's scale per second.
+        Level of the process noise, in multiples of ``System.scale`` per second.
     policy : callable, optional
         Function from states (n, nx) to actions (n, nu) in [-1, 1], which drive the trajectories.
     plant : System, optional
@@ -264,7 +264,7 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Return rms relative errors in % after the transient; without a plant, the last components of x are parameters."""
+    """Return parameters' rms relative errors in % after the transient; without a plant, x ends with the parameters."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
         raise ValueError(f"all {trajectories.escaped} runs left bounds = {system.bounds}")

@@ -131,10 +131,10 @@ class TorchObserver(Module):
         y : Tensor, shape (n, ny)
             The samples, NaN where missing.
         u : Tensor, shape (n, nu), optional
-            The inputs held since the last samples, by default zero.
+            The inputs held since the previous samples, by default zero.
         measurement_noise, process_noise : Tensor, shapes (n or 1, 1 or ny) and (n or 1, 1), optional
             Noise levels of each row, by default the observer's. Measurement noise has one level, or one for each output
-            if T_inv takes them.
+            if T_inv takes several.
 
         Returns
         -------

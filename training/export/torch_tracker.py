@@ -19,7 +19,7 @@ Tracked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 The trend is the running mean of the whitened innovations.
 """
 Prediction = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Means (nx, n), covariances (nx, nx, n), covariances with the last states (nx, nx, n), whether they are valid (n,)."""
+"""Means (nx, n), covariances (nx, nx, n) and covariances with the previous states (nx, nx, n); their validity (n,)."""
 
 
 class TorchTracker(Module):
@@ -63,7 +63,7 @@ class TorchTracker(Module):
     def advance(
         self, state: Tensor, y: Tensor, u: Tensor, begins: Tensor, measurement_noise: Tensor, process_noise: Tensor
     ) -> tuple[Tracked, Tensor]:
-        """Predict and correct by y (ny, n); return the state, with infinite NIS on failure, and expected outputs."""
+        """Predict and correct by y (ny, n); return the state (its NIS infinite on failure) and the expected outputs."""
         Q = self.eye * ((process_noise.clamp(min=self.least_process_noise) * self.process_noise) ** 2 + self.error**2)
         R = self.eye_y * torch.maximum(measurement_noise, self.least_measurement_noise) ** 2
         numbers, (x0, P0, nis, square, seen, trend) = self.numbers, self._unpacked(state)
@@ -95,7 +95,7 @@ class TorchTracker(Module):
         ), expected
 
     def supervise(self, tracked: Tracked, x_hat: Tensor, covariance: Callable[[Tensor], Tensor]) -> Tensor:
-        """Use T_inv's estimates (nx, n) after a divergence, and in the first window if their covariance is smaller."""
+        """Use T_inv's estimates (nx, n) after a divergence, and while seen < window if their covariance is smaller."""
         x, P, nis, square, seen, trend = tracked
         # The cause of a divergence may have disturbed z, too: take T_inv's covariance at an age of at most a window.
         learned = covariance(seen.clamp(max=self.window)[:, None] * self.dt)
@@ -122,7 +122,7 @@ class TorchTracker(Module):
     def _relinearised(
         self, x: Tensor, P: Tensor, prediction: Prediction, new: Tensor, y: Tensor, u: Tensor, Q: Tensor, R: Tensor
     ) -> Prediction:
-        """In the first window, predict again: linearise the motion about the last state as smoothed by the sample."""
+        """In the rows ``new``, predict again: linearise the motion about the last state, smoothed by the new sample."""
         nx, (mean, S, across, sound) = self.nx, prediction
         V, white, _, known = self._corrected(mean, S, y, R)
         rows, solvable = eliminated(S, across, V.transpose(0, 1))
@@ -132,7 +132,7 @@ class TorchTracker(Module):
         return mean, S, across, taken | sound
 
     def _corrected(self, mean: Tensor, P: Tensor, y: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return V, ``white``, expected outputs, V's validity; corrected moments: mean + V ``white`` and P - V V^T."""
+        """Return V, ``white``, expected outputs, V's validity. The corrected moments: mean + V ``white``, P - V V^T."""
         sound = torch.ones_like(mean[0], dtype=torch.bool)
         if self.h is None:
             V = product(P, self.C)

@@ -9,7 +9,7 @@ from training.identification.identifiability import PART, identifiable_direction
 from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped
 
 RESETTLING = 3  # largest number of steps that refit a start if its window fits worse after a step of the parameters
-NONLINEAR = 0.3  # largest rms error of outputs linearised over the parameters' standard errors, in units of the noise
+NONLINEAR = 0.3  # largest rms error / noise of outputs that are linearised for a parameter change of one standard error
 ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
 SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square per output by less is slow; PATIENCE of them in a row end a fit
 SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit

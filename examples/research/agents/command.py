@@ -44,7 +44,7 @@ class Compare:
     """Information that agents see (docs/guides/agents.md); ekf and x_hat_std exist only for systems."""
     seeds: int = comparison.SEEDS
     """Number of agents of each kind. On systems there are at most 3 agents of each recurrent kind, whose trainings take
-    longest, and only 1 at the second noise level."""
+    longest, and only 1 at the second default noise level."""
     episodes: int = 100
     """Number of evaluation episodes of each agent."""
     timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: from the hyperparameters)")] = None

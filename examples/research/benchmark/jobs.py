@@ -26,7 +26,7 @@ REVISION = 9  # increased with every change of the shipped methods, so that olde
 
 
 def seconds_spent(folder: Path) -> float:
-    """Return the CPU seconds of all stages with checkpoints in a folder, including those before interruptions."""
+    """Return the CPU seconds of all stages with checkpoints in a folder, including the time before interruptions."""
     spent = 0.0
     for path in sorted(folder.glob(f"[!.]*{run.CHECKPOINT}")):  # names of unfinished files begin with a dot
         checkpoint = run.load_checkpoint(path)

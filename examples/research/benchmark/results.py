@@ -76,7 +76,7 @@ def _conditions(frame: pd.DataFrame, systems: set[str]) -> set[str]:
 
 
 def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
-    """Sort rows: shipped systems and methods first, then the user's; the rows of an observer keep their order."""
+    """Sort rows by system and method (SYSTEMS, ABLATION and METHODS first); an observer's rows keep their order."""
     places = [
         {name: place for place, name in enumerate(dict.fromkeys([*shipped, *sorted(set(column))]))}
         for shipped, column in ((SYSTEMS, rows.system), (ABLATION | METHODS, rows.method))

@@ -63,7 +63,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         for case in cases:
             lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", PAPERS_MEASURE, ""]
             lines += _by_method(methods, partial(_spread, summary, case))
-    states = [column for column in results if NRMSE.fullmatch(column)]  # the published results.csv has no such columns
+    states = [column for column in results if NRMSE.fullmatch(column)]  # the benchmark's published CSV has none
     if states:
         medians = results[results.escaped == 0].groupby(["starts", "noise", "system", "method"])[states].median()
         for case in cases:

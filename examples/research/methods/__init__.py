@@ -22,7 +22,7 @@ default = Default()
 METHODS = _by_name(default, SPINN(), NODE(), NODENoise(), GRU(), LRU(), Transformer(), EKF(), UKF())
 # The ablation's two series, in the order of ``make ablation``; the second ends at the default.
 ABLATION = _by_name(*SPINN_METHODS, *INVERSE_METHODS, default)
-# These need a map that ships for the system; they run only if they are named.
+# These methods need a map that ships for the system, and run only if they are named.
 AS_SHIPPED = _by_name(Shipped(), ShippedSPINN(), ShippedLarge())
 SHIPPED = METHODS | ABLATION | AS_SHIPPED
 

@@ -1,6 +1,6 @@
 """Ablation: two series of pipelines, trained for equal times. Each pipeline differs from the next in a few settings.
 
-One leads from the paper's SPINN to the package's, the other from an inverse trained without noise to the default.
+One series leads from the paper's SPINN to the package's, the other from a T_inv trained without noise to the default.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,8 +17,8 @@ from training.spectrum import papers_spectrum
 
 Settings = Mapping[str, Any]
 
-NO_NOISE = 0.02  # stands for no noise: the largest noise in training, as a share of the system's own
-# A single inverse for free and driven motion, with the same distribution of noise levels for all systems.
+NO_NOISE = 0.02  # stands for no noise: the largest noise level in training, as a share of the system's default
+# A single T_inv for free and driven motion, with the same distribution of noise levels for all systems.
 TOGETHER: Settings = {
     "free_inverse": False,
     "process_noise_share": 0.0,

@@ -23,9 +23,9 @@ def diffusion_intensity(trained: Arrays, system: System) -> np.ndarray:
 
 
 class EKF(Method[Arrays]):
-    """Extended Kalman filter with the exact model and noise level; its diffusion is chosen on validation runs.
+    """Extended Kalman filter with the exact equations and measurement noise, its DIFFUSION chosen on validation runs.
 
-    It starts at the centre of X, with the covariance of a uniform distribution on X.
+    It starts with the mean and covariance of the system's starts in X.
     """
 
     name: ClassVar[str] = "ekf"
@@ -33,22 +33,22 @@ class EKF(Method[Arrays]):
     filter: ClassVar[type[ExtendedKalmanFilter]] = ExtendedKalmanFilter
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Return three levels of diffusion, in multiples of the scale per square root of the pace."""
+        """Return the three levels of DIFFUSION, the filter's process noise."""
         return tuple({"diffusion": level} for level in DIFFUSION)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
-        """Return the level; there is nothing to learn."""
+        """Return the level of diffusion; there is nothing to learn."""
         return {"diffusion": np.array([configuration["diffusion"]])}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> Estimator[Any]:
-        """Return the filter for a noise level."""
+        """Return the filter for a level of measurement noise."""
         Q = diffusion_intensity(trained, system)
         R = measurement_covariance(system, noise)
         return self.filter(system, dt, Q=Q, R=R)
 
 
 class UKF(EKF):
-    """Unscented Kalman filter with the exact model and noise level, tuned like the EKF."""
+    """Unscented Kalman filter with the exact equations and measurement noise, tuned like the EKF."""
 
     name: ClassVar[str] = "ukf"
     label: ClassVar[str] = "UKF"

@@ -33,7 +33,7 @@ class KKLMethod(Method[Artifact]):
     """A method that trains an artifact."""
 
     def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> Estimator[Any]:
-        """Return the observer; it assumes no process noise, and at most the highest noise level of its training."""
+        """Return the observer; it assumes no process noise, and no more measurement noise than in its training."""
         return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0).estimator
 
     def save(self, trained: Artifact, path: Path) -> None:
@@ -70,7 +70,7 @@ def trained(task: Task, config: Config) -> Artifact:
 
 
 class Default(KKLMethod):
-    """The package's method: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
+    """The package's method: T_inv of filtered y and u, noise and age, on noisy driven trajectories (``kkl-gym train``).
 
     For each of its two T_inv it simulates as many trajectories as every other method has: driven motions for one,
     free motions for the other. Some free motions start at states that inputs have reached from X. Each T_inv has half

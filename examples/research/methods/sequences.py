@@ -1,6 +1,6 @@
 """Neural networks on sequences of outputs. Each has a cell of its own; all share the code of training and observer.
 
-From its state and the features of new samples, a cell computes a hidden vector for each sample, and its next state.
+From its state and the features of new samples, a cell computes its next state, and a hidden vector for each sample.
 """
 
 import math
@@ -21,7 +21,7 @@ ROWS, CHUNK = 64, 100  # rows of a batch, and samples in a chunk of truncated ba
 WIDTH = 64  # width of features and hidden vectors
 LEARNING_RATE = 3e-3
 READOUT = 128  # neurons of the layer between the hidden vector and the estimate
-FAINT_NOISE = 0.01  # levels below this share of the system's own enter linearly, higher levels logarithmically
+FAINT_NOISE = 0.01  # noise below this share of the default enters the network linearly, noise above it logarithmically
 ROUNDING = 1e-3  # the loss is quadratic in errors below this length, in standard deviations of the states
 
 
@@ -102,7 +102,7 @@ def _parts(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class TransformerCell(Cell):
-    """Blocks of causal attention and a hidden layer; the state holds keys and values of the last samples."""
+    """Blocks, each of causal attention and a hidden layer; the state holds keys and values of the last samples."""
 
     blocks: ClassVar[int] = 2
     heads: ClassVar[int] = 4
@@ -144,7 +144,7 @@ class TransformerCell(Cell):
 
 
 class Model(nn.Module):
-    """A network around a cell: maps samples of y and their noise level to scaled estimates. Buffers hold the scales."""
+    """A network around a cell: maps samples of y and y's noise level to scaled estimates. Buffers hold the scales."""
 
     def __init__(self, kind: type[Cell], width: int, ny: int, nx: int) -> None:
         super().__init__()
@@ -159,7 +159,7 @@ class Model(nn.Module):
         self.x_scale: torch.Tensor
 
     def forward(self, y: torch.Tensor, noise: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return scaled estimates (samples, n, nx) and the state after y (samples, n, ny); NaN counts as mean y."""
+        """Return scaled estimates (samples, n, nx) and the state after y (samples, n, ny); NaN counts as y's mean."""
         scaled = torch.nan_to_num((y - self.y_offset) / self.y_scale)
         hidden, state = self.cell(self.inlet(torch.cat([scaled, noise.expand_as(scaled)], -1)), state)
         return self.readout(hidden), state

@@ -10,8 +10,8 @@ from training.kalman import ExtendedKalmanFilter, Gaussian
 class UnscentedKalmanFilter(ExtendedKalmanFilter):
     """A batch of unscented Kalman filters (Wan and van der Merwe, 2000).
 
-    Sigma points have alpha = 1, beta = 2 and kappa = 3 - nx, or 0 if that is negative. If h is undefined at a point, it
-    is evaluated at the mean instead. A filter restarts if its corrected mean leaves the system's declared bounds, or if
+    Sigma points have alpha = 1, beta = 2 and kappa = max(3 - nx, 0). If h is undefined at a point, h is evaluated at
+    the mean instead. A filter restarts if its corrected mean leaves the system's declared bounds, or if
     its covariance is no longer positive definite. The rest is as in the base class.
     """
 
