@@ -1,4 +1,4 @@
-"""A memory around a Gymnasium environment: SAC swings up a pendulum whose rate is not measured."""
+"""KKLMemory around a Gymnasium environment: SAC swings up a pendulum whose rate is not measured."""
 
 import gymnasium as gym
 import numpy as np
@@ -24,12 +24,12 @@ class Positions(gym.ObservationWrapper):
 
 
 def main(steps: int = 10_000, noise: float = 0.0, episodes: int = 20, seed: int = 0) -> dict[str, float]:
-    """Train SAC with and without a memory; returns the mean return of each agent's evaluation episodes.
+    """Train SAC with and without KKLMemory, and return the mean return of each agent's evaluation episodes.
 
     Args:
         steps: environment steps of each agent's training; the default takes half a minute.
         noise: standard deviation of the noise added to each measurement.
-        episodes: evaluation episodes, which training has not seen.
+        episodes: number of evaluation episodes, with other starts than in training.
         seed: seed of all random numbers.
     """
     wrappers = {

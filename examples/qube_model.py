@@ -94,7 +94,7 @@ class Sticking(BothAngles):
 class Pushed(Sticking):
     """The model Sticking with y = theta and with an unknown torque on the arm, which stands for errors of the friction.
 
-    The torque is a fifth state, in 0.1 mN m: an Ornstein-Uhlenbeck process.
+    The torque, an Ornstein-Uhlenbeck process, is a fifth state, in units of 0.1 mN m.
     """
 
     name: ClassVar[str] = "qube-pushed"

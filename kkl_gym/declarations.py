@@ -71,7 +71,7 @@ def _check_names(cls: Any, base: Any) -> None:
             f"{cls.__name__} defines __init__, and a copy would lack what __init__ sets: write the parameters as "
             "annotated fields under @dataclass(frozen=True), and values derived from them as properties"
         )
-    # These fields are all inherited, because the dataclass decorator adds the subclass's own fields only later.
+    # All fields in this loop are inherited, because the dataclass decorator adds the subclass's own fields only later.
     for name in (field.name for field in dataclasses.fields(cls)):
         first = next((each for each in cls.__mro__ if name in vars(each)), base)
         if first is not base and name not in inspect.get_annotations(first):

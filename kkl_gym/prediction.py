@@ -17,9 +17,9 @@ SAMPLES = 10
 class PredictiveMemory(Memory):
     """A memory that returns the outputs expected in the next step, and predictions of later ones.
 
-    It has the filters of :class:`Memory` for all outputs and angles, also for an angle's cosine and sine, because a
-    torque may depend on them. ``weights``, (features, width), multiply the signals, w and v of :class:`Memory`, and 1.
-    The first columns give each output's or angle's expected change in a step, the others the further predictions.
+    It filters all outputs and angles, also the angles' cosines and sines, on which a torque may depend. ``weights``
+    (features, width) multiply outputs, angles, their filters w, the inputs' filters v, and 1. The first columns give
+    expected changes in a step, of outputs except cosines and sines, and of angles; the others give further predictions.
     """
 
     def __init__(

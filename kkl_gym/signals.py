@@ -18,7 +18,7 @@ Entries = Sequence[int] | Sequence[str]
 Angles = Sequence[int | Sequence[int]] | Sequence[str | Sequence[str]]
 """Entries that are angles, and pairs of entries that are the cosine and the sine of an angle."""
 TURN = 2 * math.pi
-# If the distance of an angle's bounds is one of these, its unit is unclear: it may be turns, half turns or rad.
+# If an angle's bounds are one of these distances apart, the unit is unclear: it may be turns, half turns or rad.
 UNITS = 1.0, 2.0, 4.0
 
 
@@ -98,7 +98,7 @@ class Outputs:
         self.low, self.high = low[self._take], high[self._take]
         for side in (self._cosines, self._sines):
             self.low[side], self.high[side] = -1.0, 1.0
-        # Cosines and sines that replace an angle are outputs, but in no key of a Dict.
+        # Cosines and sines that replace an angle are outputs, but belong to no key of a Dict.
         self.unseen = np.sort([*self._cosines, *self._sines]).astype(int)
 
     def _period_of(self, low: float, high: float, name: str) -> float:

@@ -50,7 +50,7 @@ class ReverseDuffing(System):
         return (x[0],)
 
     def rate(self, x: Components) -> Any:
-        # The linearised motion's frequency is sqrt(3 a b) |x2|; this formula bounds it. Motions speed up as sqrt(a b).
+        # The linearised motion's frequency is sqrt(3 a b) |x2|; the result bounds it. Motions speed up as sqrt(a b).
         return math.sqrt(abs(self.a * self.b)) * (1.0 + 2.0 * abs(x[1]))
 
 
@@ -96,7 +96,7 @@ class Rossler(System):
 
     x1' = -x2 - x3 + u, x2' = x1 + a x2, x3' = b + x3 (x1 - c). Dimensionless; chaotic at the default parameters.
     Motions from some starts outside the training box escape to infinity. The target is the inner equilibrium. No static
-    gain from y to this input stabilises it.
+    gain from y to this input stabilises the target.
 
     Parameters
     ----------

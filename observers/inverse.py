@@ -54,8 +54,8 @@ class InverseMap:
       sigma_v the standard deviation of the measurement noise. Each mode has unit variance over noise-free training
       data, so the division shrinks a noisy mode to its conditional mean;
     - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), one input for each sigma_v (see below);
-    - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), with the level in multiples of the
-      system's scale per second, as in environments;
+    - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), with the level that bounds w
+      in environments, in multiples of ``System.scale`` per second;
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
     The output is x_offset + x_scale * mlp(inputs). Raises ArtifactError if the parts do not fit each other.

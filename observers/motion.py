@@ -10,8 +10,8 @@ from observers.expression import Expression
 from observers.factors import Factors, check_positive_definite
 from observers.network import MLP
 
-_MAX_LEVEL = 1e30  # largest process noise or window, so that squares are finite
-_MAX_SUBSTEPS = 1024  # Runge-Kutta steps in a sampling interval
+_MAX_LEVEL = 1e30  # largest least_process_noise, and largest window in s, so that squares are finite
+_MAX_SUBSTEPS = 1024  # largest number of Runge-Kutta steps in a sampling interval
 
 
 @dataclass(frozen=True)

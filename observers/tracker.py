@@ -19,7 +19,7 @@ _COLOURED = 4.265  # for the mean square of the trend, with tail probability 1e-
 _TREND = 0.25  # time constant of the trend, in multiples of Motion.window
 _LONG = 4.0  # time constant of the mean square of the trend, in multiples of Motion.window
 INFLATION = 10.0  # factor by which the covariance grows if innovations are not white
-RELINEARISATIONS = 2  # of each step in the first window; with 0, noise-free errors are 40 to 80 % larger
+RELINEARISATIONS = 2  # number for each step in the first window; with 0, noise-free errors are 40 to 80 % larger
 KNOWN = 1e-3  # assumed standard deviation of a known initial state, in multiples of Motion.x_scale
 
 

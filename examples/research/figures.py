@@ -1,6 +1,6 @@
 """Draw the figures of the pages, on a light and on a dark background: ``make figures``.
 
-The data are files in docs/results, or simulations that take seconds. The commands draw with the same functions. Each
+The data are files in docs/results, or simulations that take seconds. kkl-gym draws with the same functions. Each
 figure and animation is written twice, as NAME and NAME-dark; docs/site/hooks.py shows the file of the reader's theme.
 
 ``python -m examples.research.figures figures/portraits.gif`` draws a single figure.

@@ -126,7 +126,7 @@ class KKLEstimator:
         return artifact
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
-        """Return ``u`` (..., nu), or None for a map without inputs; ValueError if such a map must not ignore ``u``."""
+        """Return ``u`` (..., nu), or None for a map without inputs; ValueError if u is then nonzero and not ignored."""
         if not self._blind:
             return u
         if not self._ignore_input and u.any():
@@ -170,7 +170,7 @@ class KKLEstimator:
         return report["x_hat" if self.estimate == "x" else "z"]
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
-        """Return the same as :meth:`shown` for a single sample; a list is faster than NumPy for a few numbers."""
+        """Return :meth:`shown` for a single sample as a list, which is faster than NumPy for a few numbers."""
         values: list[float] = report["x_hat" if self.estimate == "x" else "z"].tolist()
         if self._uncertainty:
             variances = report["x_cov"].ravel().tolist()[:: len(values) + 1]

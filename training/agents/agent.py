@@ -117,7 +117,7 @@ class Agent:
         return self.network.inputs if self.lstm is None else self.lstm.inputs
 
     def policy(self, action_space: gym.Space[Any]) -> Callable[[np.ndarray], Any]:
-        """Return a function from observations (n, inputs) to n actions; a recurrent agent needs one per episode."""
+        """Return a function from observations (n, inputs) to n actions; recurrent agents need a new one per episode."""
         space: Any = action_space
         memory: tuple[np.ndarray, np.ndarray] | None = None
 

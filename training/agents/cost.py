@@ -7,7 +7,7 @@ import numpy as np
 from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 from training.agents.tasks import Task
 
-# The cost if all states are about three times System.scale from the target. Larger costs would dominate the training.
+# The cost if each state is about three times its System.scale from the target. Larger costs would dominate training.
 MAX_COST = 10.0
 
 

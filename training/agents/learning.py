@@ -42,14 +42,14 @@ RECURRENT = "ppo_lstm"
 # all steps, and the agent learns from true hidden signals: its policy also suits the later, very accurate estimates.
 PRIVILEGED = 0.9
 WANDERED = 0.1  # share of all steps that the first phase takes under noise; its actions are random
-REHEARSAL = 0.05  # share of all steps at the end of a training with refits; the agent does not learn or explore then
+REHEARSAL = 0.05  # share of steps at the end of a training that refits the observer; no learning or exploration then
 FILE = "agent.safetensors"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # settings that no algorithm takes
 _OF_RL_ZOO3 = ("env_kwargs", "env_wrapper")  # settings from which rl-zoo3 makes a system's task
 
 
 def algorithm_for(task: Task, information: Information, actions: gym.Space[Any]) -> str:
-    """Return the default: ppo_lstm if recurrent, a system's in PREFERRED, sac for environments in sac.yml, else ppo."""
+    """Return the default: ppo_lstm if recurrent, PREFERRED's for a system, sac for environments of sac.yml, or ppo."""
     if information == "recurrent":
         return RECURRENT
     if task.system is not None:
@@ -106,7 +106,7 @@ def learn(
     All these first steps count as steps of the training. The observer is refitted ``aggregate`` times to the agent's
     own steps and, if this number is not 0, once more at the end.
 
-    A resumed training starts new episodes, so that its agent differs from that of an uninterrupted training.
+    A resumed training starts new episodes, so its agent differs from that of an uninterrupted training.
     ``Agent.training`` then holds the number of resumptions.
     """
     with closing(vector(task.without_noise, 1)) as env:

@@ -16,11 +16,11 @@ from training.trajectories.motions import how_to_stay
 
 FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of steps of each
 MIN_STEPS = 10  # least number of samples of a motion
-# The verdict is "problem" or "note" where more than this share of a direction's standard deviation is left at the end.
+# "problem" or "note" if more than this share of the initial standard deviation along a direction of x remains.
 UNSEEN, HARDLY = 0.9, 0.3
-INVOLVED = 0.3  # a finding names the states with larger components in the direction, a unit vector
+INVOLVED = 0.3  # a finding names a state if its component of the direction, a unit vector, is larger
 VAGUE, NOTHING = 0.3, 1.0  # errors in standard deviations of the state, without and with noise, that get a "note"
-# Under a symmetry, in standard deviations: a state's least error is <= LOCALLY, its error from similar y >= GLOBALLY.
+# A symmetry: a state's least error is <= LOCALLY, but its error from similar y >= GLOBALLY, in standard deviations.
 LOCALLY, GLOBALLY = 0.1, 0.3
 WINDOWS, MAX_SAMPLES = 7, 100  # number of windows, each half as long as the one before; upper bound of samples in each
 

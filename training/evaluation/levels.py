@@ -38,7 +38,7 @@ def multiple(system: System, factor: float) -> Level:
 
 
 def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
-    """Return ``given``, or the system's level (its largest, if the map takes only one) limited to the map's range."""
+    """Return ``given``; else the system's level (its largest if the map takes only one), limited to the map's range."""
     if given is not None:
         return noise_levels("measurement_noise", given, system.ny)
     own = multiple(system, 1.0)

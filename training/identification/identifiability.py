@@ -69,7 +69,7 @@ def sign_symmetries(system: System, parameters: Sequence[str], *, driven: bool =
     ranges = {name: _around(values[name]) for name in parameters}
     both = with_parameters(system, ranges)
     if both.nx > MOST_SIGNS or both.discrete:
-        return []  # Symmetries of these systems are not searched for.
+        return []  # Larger systems, and those in discrete time, are not tested.
     x = both.draw_starts(np.random.default_rng(0), POINTS)
     f, h, g = both.drift(x), both.output(x), _inputs(both, x)
     found = []

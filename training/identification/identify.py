@@ -17,10 +17,10 @@ from training.records import Record, check_signals, pieces
 
 HELD_OUT = 10  # of the pieces of records between gaps, the 6th, 16th, 26th, ... are held out of the fit
 KEPT_RATIOS = 100.0  # prior variance of log(factor common to all parameters) / prior variance of log(factor of one)
-BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(...), tried in turn until the fit stays about as good
+BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(...), tried until one leaves the fit about as good
 UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change exceeds this share of the parameters' change
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
-HIDDEN = 0.05  # a parameter is unidentifiable if its component of an unidentifiable direction is as large as this
+HIDDEN = 0.05  # a parameter is unidentifiable if its component of an unidentifiable direction is at least this
 
 Limits = Mapping[str, tuple[float, float]]
 

@@ -88,7 +88,7 @@ def identify(
     check_signals(records, system)
     interval = sampling_interval(*records) if dt is None else check_dt(dt)
     given = {"dt": interval, "seed": seed, **(settings or {})}
-    # Invalid settings raise before the identification, which may take long.
+    # Invalid settings raise an error before the identification, which may take long.
     preset(system, "input-aware", "fast", changes={"eigenvalues": (-1.0,), **given})
     inputs = bool(system.nu) and records[0].u is not None
 

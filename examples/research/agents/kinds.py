@@ -48,10 +48,10 @@ PPO: dict[str, Any] = {
 }
 CONTINUOUS = {"use_sde": True, "sde_sample_freq": 4}  # smooth exploration where actions are continuous
 LEARNING_RATE = 0.001  # at the start; it falls linearly to zero
-FRAMES = 32  # length of the linear recurrent unit's history
-EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluations after the first; episodes in each, and in the last
-OBSERVER_STEPS = 40_000  # steps from which an observer is learned, or, under noise, the weights of z
-TRUTH = 0.15  # share of the time, at the start, in which agents on x_hat see the true state
+FRAMES = 32  # steps in the linear recurrent unit's history
+EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluations after the first one; episodes in each, and in the last
+OBSERVER_STEPS = 40_000  # steps from which an observer or, under noise, the weights of the memory z are learned
+TRUTH = 0.15  # initial share of the CPU time, in which agents on x_hat see the true state
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and agents on x_hat do not see y
 OF_STATE = ("masked", "parameters")  # agents on the full state train in these only: they see no sensor faults
 STEPS = 200_000  # number of steps after which returns are compared, too
@@ -89,7 +89,7 @@ class TimedAgent(Job):
         how = {"env_id": self.env_id, **KINDS[self.kind], "hold": self.shown != "x_hat"}
         y, angles = tuple(range(self._ny)), ANGLES.get(self.env_id, ())
         task = Task(f"examples.research.agents.partly:{ENV_ID}", y, env_kwargs=how, angles=angles)
-        weighs = self.shown == "z" and self._noise and angles  # without angles, learning weights does not help
+        weighs = self.shown == "z" and self._noise and angles  # without angles, learned weights do not help
         return weighted(task, OBSERVER_STEPS, seed=self.seed) if weighs else task
 
     @property
@@ -106,7 +106,7 @@ class TimedAgent(Job):
         return tuple(place for place in range(self._ny, size) if place - self._ny not in known)
 
     def make(self, rows: int, observer: Path | None = None) -> "VectorEnv":
-        """Make environments with the agent's information; without an observer, the truth replaces x_hat."""
+        """Make environments with the agent's information; without an observer, the true state replaces x_hat."""
         task = self.task
         if self.shown in ("state", "x_hat") and observer is None:
             env = vector(task, rows)
@@ -128,7 +128,7 @@ class TimedAgent(Job):
         return FeatureObservation(env, lambda at: at["obs"][:, first:], flatdim(env.single_observation_space) - first)
 
     def learn_observer(self, act: Callable[[np.ndarray], Any]) -> Path:
-        """Learn an observer in a simulator: from random steps, and as many steps of an agent that sees the truth."""
+        """Learn an observer in a simulator: half from random steps, half from an agent that sees the true state."""
         from training.agents.observing import learn_observer
         from training.rollouts.playing import WANDERING, policy_of, roll_out
 
@@ -201,7 +201,7 @@ class _Clock:
 
 
 def _budget(clock: _Clock, until: float, evaluate: Callable[[float], None] | None = None) -> Any:
-    """A callback that stops a training at a time of the clock; it evaluates at equal intervals, and at the end."""
+    """A callback that stops a training at ``until`` s on the clock; it evaluates at equal intervals, and at the end."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Budget(BaseCallback):
@@ -229,7 +229,7 @@ class Kinds:
     environments: tuple[str, ...] = ("Pendulum-v1", "CartPole-v1")
     """Environments whose velocities are hidden."""
     kinds: tuple[str, ...] = tuple(KINDS)
-    """masked (hidden velocities), noise (0.1), delay (5 steps), drop-out (30 %), parameters (new in each episode)."""
+    """masked (velocities only), noise (0.1 rms), delay (5 steps), drop-out (30 %), parameters (new per episode)."""
     information: tuple[Shown, ...] = get_args(Shown)
     """Information that agents see; lru is a linear recurrent unit over 32 frames."""
     seeds: int = 5
@@ -275,7 +275,7 @@ class Kinds:
 
 
 def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
-    """Interquartile means of returns at the end and at equal steps, with bootstrap intervals over seeds."""
+    """Interquartile means of returns, at the end and after ``STEPS`` steps, with bootstrap intervals over seeds."""
     agents = rows.groupby(["environment", "kind", "shown", "seed"], sort=False)
     partial = f" Partial: {missing} agents are missing." if missing else ""
     lines = [

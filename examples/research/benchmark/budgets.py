@@ -12,7 +12,7 @@ from kkl_gym.system import System
 
 BUDGETS = {
     "cpu": Budget("cpu", trajectories=2000, duration=50.0, samples=200, cpu_seconds=300.0),
-    # These trainings end after a number of batches, not of seconds, so that results do not depend on the machine.
+    # The quick trainings end after a number of batches, not of seconds, so that results do not depend on the machine.
     "quick": Budget(
         "quick", trajectories=200, duration=20.0, samples=50, cpu_seconds=math.inf, width=64, depth=2, steps=300
     ),

@@ -30,7 +30,7 @@ Tasks = Mapping[str, Callable[[], float]]
 
 @dataclass(frozen=True)
 class Speed:
-    """Time environments, bare and with an observer, against Gymnasium's Pendulum-v1 and batched CartPole-v1.
+    """Compare the speed of environments, bare and with an observer, to Gymnasium's Pendulum-v1 and batched CartPole-v1.
 
     Actions are drawn before the timing. The environments run in turns, because a shared machine's speed drifts: each
     ratio is the median over turns of the ratio to the reference in the same turn. An observer for your own system
@@ -81,7 +81,7 @@ class Speed:
         return ratios
 
     def _environments(self, envs: Mapping[str, Any], steps: int, progress: ProgressBars) -> dict[str, float]:
-        """Time environments; the first one is the reference."""
+        """Measure the environments' times of a step; the first environment is the reference."""
         tasks = {}
         for name, env in envs.items():
             env.action_space.seed(0)
@@ -102,7 +102,7 @@ class Speed:
         counts: Mapping[int, int],
         progress: ProgressBars,
     ) -> None:
-        """Time observers and Kalman filters without environments; ``counts`` maps numbers of rows to sample counts."""
+        """Measure times of observers and filters alone; ``counts`` maps a number of rows to a number of samples."""
         lines = []
         for name, system in systems.items():
             artifact = Artifact.read(resolve(name))
