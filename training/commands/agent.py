@@ -136,7 +136,7 @@ class Train:
     With noise the actions are random; --information z then fits z's weights to this many random steps."""
     aggregate: int = 0
     """Number of refits of the observer to the agent's own steps while the agent learns from estimates. If it is not 0,
-    the agent does not explore in the last twentieth of all steps, and a last refit follows."""
+    the agent neither learns nor explores in the last twentieth of all steps, and a last refit follows."""
     options: tyro.conf.OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
 
