@@ -66,7 +66,7 @@ class SamplingStep(Generic[Values]):
 class Motion:
     """Programs of x' = field(x) + push(u, w) if g is constant, else of x' = field(x, u) + push(u, w) with push = w.
 
-    ``rate`` is the program of the system's rate formula, None if it has no formula.
+    ``rate`` is the program of :meth:`System.rate`, which limits substeps; None if the system does not override it.
     """
 
     field: Program

@@ -13,8 +13,8 @@ _LARGEST = 1e30  # largest limit or level, so that squares are finite
 class Limits:
     """Limits of the residual y - h(x_hat) in normal operation, by noise level.
 
-    :func:`training.calibrate` simulates runs of ``duration`` seconds under white noise of each level, the environments'
-    process noise and random inputs. Such a run exceeds one of the limits with probability ``false_alarms``.
+    :func:`training.calibrate` simulates runs of ``duration`` seconds under white noise of each level, or takes them
+    from held-out records. Such a run exceeds one of the limits with a probability of at most ``false_alarms``.
     Raises ValueError if shapes or values are invalid.
 
     Parameters
@@ -31,7 +31,7 @@ class Limits:
     warm_up : float
         Seconds after reset in which the observer still converges and the score is 0.
     false_alarms : float
-        Probability of an alarm in a run without faults, within (0, 1).
+        Highest probability of an alarm in a run without faults, within (0, 1).
     duration : float
         Duration of a run in seconds.
     """
@@ -72,8 +72,8 @@ class Limits:
     def at(self, level: float | tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the limits at a noise level.
 
-        Some outputs may be noisier than others, relative to the largest levels. Their noise reaches the estimate, and
-        through it every residual: the upper limits of all outputs are those at the noisiest output's relative level.
+        An output's relative level is its noise over its largest level in ``levels``. Each output's noise reaches the
+        estimate and so every residual: all upper limits are those at the highest relative level of the outputs.
 
         Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each. Mean squares
         and squared means are interpolated in the squared level. Raises ValueError if a level is invalid or too large.

@@ -97,8 +97,8 @@ class Config:
     free_inverse: bool = True
     """Whether an input-aware map has a second inverse T_inv(z_y), used until an input acts; none with a policy."""
     lead_in_input: NotNegative = 0.0
-    """Before some trajectories without inputs, inputs lead the start out of X: constant inputs, up to this multiple of
-    their bounds, for 20 of the system's time units (pace); with 0, random inputs within bounds for 10 units."""
+    """Some trajectories without inputs start where a phase with inputs has led, mostly outside X: with constant inputs
+    up to this multiple of their bounds for 20 time units (pace), or if it is 0, with random inputs for 10 units."""
     process_noise_share: Share = 0.35
     """Share of trajectories with process noise (input-aware); with 0, its level is not an input of T_inv."""
     measurement_noise_max: Levels = 1.0

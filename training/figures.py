@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 Theme = Literal["light", "dark"]
 RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"  # indices into the theme's colour cycle
-# All eight colours can be distinguished with each kind of colour blindness. C0, C2 and C3, with which environments
-# render, resemble those of matplotlib's default cycle, which applies outside this style.
+# All eight colours can be distinguished with red-green and blue-yellow colour blindness. C0, C2 and C3, with which
+# environments render, are blue, green and magenta; outside this style they are blue, green and red.
 CYCLES: dict[Theme, tuple[str, ...]] = {
     "light": ("#0072b2", "#e69f00", "#009e73", "#c2187a", "#56b4e9", "#7a4a1e", "#1a1a1a", "#9a9a9a"),
     "dark": ("#4aa3df", "#f0a83c", "#2fbf93", "#ff6db8", "#a6dcff", "#b98a5a", "#eceae4", "#8a909c"),

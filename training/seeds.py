@@ -1,4 +1,4 @@
-"""Streams of random numbers: no two purposes share one, whatever their seeds."""
+"""Streams of random numbers: no two of these purposes share one, whatever their seeds."""
 
 from enum import IntEnum
 
@@ -17,7 +17,7 @@ class Stream(IntEnum):
 
 
 def generator(stream: Stream, *seed: int) -> np.random.Generator:
-    """Make a generator for a purpose and a seed; a nonzero entry after the seed distinguishes a part of the purpose."""
+    """Make a generator for a purpose and a seed. A number > 0 after the seed selects another stream of the purpose."""
     for entry in seed:
         if not 0 <= entry < 2**32:
             raise ValueError(f"seed = {entry} must be a whole number from 0 to 2**32 - 1")

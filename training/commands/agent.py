@@ -133,7 +133,7 @@ class Train:
     observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
     """For environments without --observer: number of first steps, from which an observer is learned. Without noise the
     agent also learns in these steps, from true hidden signals, and only the latest 100,000 steps serve the observer.
-    With noise the actions are random; --information z then fits z's weights to this many random steps."""
+    With noise the actions are random. For --information z: random steps, from which KKLMemory learns to predict."""
     aggregate: int = 0
     """Number of refits of the observer to the agent's own steps while the agent learns from estimates. If it is not 0,
     the agent neither learns nor explores in the last twentieth of all steps, and a last refit follows."""

@@ -49,10 +49,10 @@ class Diagnose:
     The subject is a system (only NAME), an environment (NAME with --measured and --hidden; the command then plays
     episodes), or recorded data (--data without NAME). The command takes about ten seconds.
 
-    For a system it checks the equations (on floats, arrays and symbols), motions, sampling, outputs and noise, and the
-    least error of each state. For data and environments it reports whether y and u determine each hidden signal, over
-    which window and under how much noise. The exit status is 1 if there is a problem. docs/guides/diagnose.md explains
-    the lines.
+    For a system it checks the equations (on floats, arrays and symbols), motions, sampling, outputs and noise, and
+    bounds each state's error. For data and environments it reports whether y and u determine each hidden
+    signal, over which window and under how much noise. The exit status is 1 if there is a problem.
+    docs/guides/diagnose.md explains the lines.
     """
 
     name: Annotated[
@@ -62,7 +62,7 @@ class Diagnose:
             help=f"{SYSTEM} With --measured and --hidden: an environment as gym.make takes it, such as Pendulum-v1.",
         ),
     ] = None
-    measurement_noise: Annotated[NoiseLevels, hint("the system's; else 1 % and 10 % of y's standard deviation")] = None
+    measurement_noise: Annotated[NoiseLevels, hint("a system's; else 1 % and 10 % of y's standard deviation")] = None
     """Noise levels to check besides 0: standard deviations on each sample of y. 0.1,0.3 has a level for each output."""
     dt: Annotated[float | None, hint("the system's")] = None
     """Sampling interval of a system in seconds."""
@@ -73,7 +73,7 @@ class Diagnose:
     script.py:function. For an environment, as in `kkl-gym record`."""
     parameters: Parameters = ()
     seed: int = 0
-    """Seed of the environment's episodes and of the choice of samples to compare."""
+    """Seed of the environment's episodes, and of the samples that are predicted from others."""
     json: Annotated[Path | None, NO_FILE] = None
     """File for the findings in JSON."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)

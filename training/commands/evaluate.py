@@ -122,8 +122,8 @@ class Evaluate:
     fifth of a run. In runs that random steps and sines drive, it is the first 5 s (500 samples for your own systems).
 
     2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out; noise levels
-    beyond a map's range are left out. A policy under which an observer was trained acts in all runs. In driven runs it
-    sees the state with errors, and explores. In other runs it sees the exact state, and its actions u reveal the state.
+    beyond a map's range are left out. A policy under which an observer was trained acts in all runs. In runs called
+    driven it sees the state with errors, and explores; in the others it sees the exact state, which u then reveals.
 
     --calibration: the shares of errors within the 50, 90 and 99 % regions of the covariances, for all states together
     and for each, and the mean normalised estimation error squared (NEES), at six noise levels.

@@ -161,12 +161,14 @@ OwnPolicy = Annotated[
 class RunOptions:
     """The folder of a training, and how it runs."""
 
-    out: Annotated[Path | None, hint("runs/NAME; agents: runs/agents/NAME-INFORMATION-SEED", metavar="FOLDER")] = None
+    out: Annotated[
+        Path | None, hint("runs/NAME; identify: as above; agents: runs/agents/NAME-INFORMATION-SEED", metavar="FOLDER")
+    ] = None
     """Folder for all files."""
     resume: bool = False
     """Resume from the checkpoints in the folder, if there are any."""
     threads: int = 1
-    """CPU threads. More threads hardly help with the fast preset's small networks."""
+    """CPU threads. More threads hardly help with small networks."""
 
 
 def set_threads(threads: int) -> None:
@@ -230,8 +232,8 @@ class PlayOptions:
 
     episodes: Annotated[int | None, hint("no limit")] = None
     """Episodes to play."""
-    steps: Annotated[int | None, hint("100,000 if no episodes are given")] = None
-    """Largest number of steps to play. diagnose plays 10,000 by default."""
+    steps: Annotated[int | None, hint("without --episodes 100,000, in diagnose 10,000")] = None
+    """Largest number of steps to play."""
     env_kwargs: EnvironmentArguments = ()
 
     @property

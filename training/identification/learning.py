@@ -69,7 +69,7 @@ def identify(
     settings : mapping of str to object, optional
         Settings of :class:`training.Config` for the observer.
     seed : int
-        Seed of the random starts and of the observer's training.
+        Seed of the initial states that the fit tries for each window, and of the observer's training.
     resume : bool
         Whether to resume from checkpoints in the folder.
     console : Console or ProgressBars, optional

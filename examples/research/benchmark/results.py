@@ -1,12 +1,14 @@
 """The combined results of a benchmark's jobs: CSV files, a table and a figure."""
 
 import json
+import math
 from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from examples.research.benchmark.budgets import BUDGETS
 from examples.research.benchmark.tables import draw, write_table
 from examples.research.methods import ABLATION, METHODS
 from kkl_gym.systems import SYSTEMS
@@ -109,5 +111,9 @@ def _read(out: Path) -> tuple[pd.DataFrame, pd.DataFrame, str]:
     """Read results and methods, and return them with a note on the conditions."""
     check_results(out)
     results, methods = (pd.read_csv(out / name) for name in FILES)
-    note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."
+    budget = BUDGETS[methods.budget[0]]
+    spent = f"{budget.cpu_seconds:g} CPU seconds" if math.isfinite(budget.cpu_seconds) else f"{budget.steps} batches"
+    note = (
+        f"{spent} for each training, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories for each cell."
+    )
     return results, methods, note

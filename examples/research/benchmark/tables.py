@@ -14,7 +14,7 @@ from training.evaluation.levels import read_level, show_level
 from training.figures import drawing
 from training.files import table, write
 
-PAPERS_MEASURE = "The paper's measure: median ± half the interquartile range [bootstrap 95 % interval of the median]."
+SPREAD = "Median ± half the interquartile range, as in the paper [bootstrap 95 % interval of the median]."
 # Columns of results.csv, and their titles.
 MEASURES = (("smape", "SMAPE in %, all steps"), ("smape_late", "SMAPE in % after the first 20 %"))
 NRMSE = re.compile(r"nrmse\d+")  # columns of results.csv, one for each state
@@ -61,7 +61,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
     for column, title in MEASURES:
         summary = summarise(results, column).set_index(["starts", "noise", "system", "method"])
         for case in cases:
-            lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", PAPERS_MEASURE, ""]
+            lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", SPREAD, ""]
             lines += _by_method(methods, partial(_spread, summary, case))
     states = [column for column in results if NRMSE.fullmatch(column)]  # the benchmark's published CSV has none
     if states:
@@ -92,7 +92,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
     costs = methods.set_index(["system", "method"])
     lines += ["## Cost", "", "CPU seconds of training; CPU time of a step of one trajectory and of 1,000 at once.", ""]
     lines += _by_method(methods, partial(_cost, costs))
-    lines += ["## Configuration", "", "Chosen on validation runs; without a search, the first configuration.", ""]
+    lines += ["## Configuration", "", "The best on validation runs; the first if nothing was searched.", ""]
     lines += _by_method(methods, partial(_configuration, costs))
     write(path, "\n".join(lines) + "\n")
 
