@@ -32,7 +32,7 @@ WRONG = 1.1  # ratio of the plant's parameters to those of the observer's model
 
 @dataclass(frozen=True)
 class Compared:
-    """Median SMAPE in %, over all steps of unseen trajectories of the plant.
+    """SMAPE in % over all steps of a trajectory; its median over unseen trajectories of the plant.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def main(
         noise: standard deviation of the measurement noise.
         records: number of records.
         seconds: length of each record.
-        seed: seed of the records.
+        seed: seed of the records and of the unseen trajectories.
         out: folder of the runs.
         inverse_steps: batches of both trainings; by default as many as for the shipped observer.
         trajectories: simulated trajectories of both trainings; by default as many as for the shipped observer.

@@ -23,7 +23,7 @@ from observers import Artifact, KKLObserver
 
 ENV_ID, MEASURED, HIDDEN = "CartPole-v1", [0, 2], [1, 3]
 ORDER = MEASURED + HIDDEN  # the order of the signals in KKLObservation's observations
-AFTER = 20  # number of steps at the start of each episode, in which errors do not count
+AFTER = 20  # number of steps at the start of each episode whose errors do not count
 
 
 def wrapped(path: Path) -> gym.Env:

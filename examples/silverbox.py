@@ -1,7 +1,7 @@
 """The Silverbox, a standard benchmark of nonlinear identification: measurements of an electronic Duffing oscillator.
 
 The data are not part of this project. nonlinearbenchmark.org offers SNLS80mV.csv, with columns V1 (input) and V2
-(output) and 131,072 samples at 610.35 Hz. docs/results/silverbox.md has assumptions and results::
+(output) and 131,072 samples at 610.35 Hz. docs/results/silverbox.md has assumptions and results. Usage::
 
     python examples/silverbox.py SNLS80mV.csv
 """
@@ -129,7 +129,7 @@ def main(path: Annotated[Path, tyro.conf.Positional], out: Path = Path("runs/sil
     Args:
         path: SNLS80mV.csv, or the folder that holds it.
         out: the run's folder.
-        seed: seed of the random starts.
+        seed: seed of the fit's random numbers.
     """
     data, console = read(path), Console()
     out.mkdir(parents=True, exist_ok=True)

@@ -73,7 +73,7 @@ class Limits:
         """Return the limits at a noise level.
 
         An output's relative level is its noise over its largest level in ``levels``. Each output's noise reaches the
-        estimate and so every residual: all upper limits are those at the highest relative level of the outputs.
+        estimate, and through it every residual. All upper limits are those at the outputs' highest relative level.
 
         Shapes: ``level`` is one number or (ny,); returns ``mean``, ``low`` and ``high``, (ny,) each. Mean squares
         and squared means are interpolated in the squared level. Raises ValueError if a level is invalid or too large.
@@ -135,7 +135,7 @@ class Monitor:
         return np.tile(np.concatenate([np.zeros(ny), self._sound, [0.0]]), (n, 1))
 
     def update(self, rows: np.ndarray, residual: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """Return the state ``rows`` after residuals y - h(x_hat) (n, ny) of the outputs that are ``seen`` (n, ny)."""
+        """Return the state after ``rows``, given residuals y - h(x_hat) (n, ny); only those ``seen`` (n, ny) count."""
         mean, square, samples = self._parts(rows)
         share = self._share * seen
         mean, square = mean + share * (residual - mean), square + share * (residual**2 - square)

@@ -168,7 +168,7 @@ class KKLObserver(RecordEstimates):
         Parameters
         ----------
         artifact : Artifact
-            An artifact with the same signals, A, B and dt.
+            An artifact for the same plant, with the same signals, A, B and dt.
 
         Raises
         ------
@@ -191,7 +191,7 @@ class KKLObserver(RecordEstimates):
 
     @property
     def z(self) -> np.ndarray:
-        """The filter's state [z_y, z_u], a copy of shape (..., nz * (1 + nu)); raises RuntimeError before reset."""
+        """State [z_y, z_u] of the filters of y and of u, a copy (..., nz * (1 + nu)); RuntimeError before reset."""
         state = self._begun()
         return state[:, self._kkl.z].reshape(*self._batch, self.artifact.filter.size).copy()
 
@@ -236,8 +236,8 @@ class KKLObserver(RecordEstimates):
     def score(self) -> np.ndarray:
         """How badly the samples since reset fit the estimates, shape (...,): above 1 a fault is likely.
 
-        For y - h(x_hat), the score is the largest of running mean / limit, mean square / upper limit, and lower limit /
-        mean square. It is 0 in the warm-up after a reset, and missing outputs do not change it.
+        With the running mean and mean square of y - h(x_hat), it is the largest of |mean| / limit, mean square / upper
+        limit and lower limit / mean square. It is 0 in the warm-up after a reset. Missing outputs do not change it.
         Biased, frozen and dead sensors raise it, and so do states outside the training. :class:`observers.Limits` gives
         the rate of false alarms. Raises RuntimeError before :meth:`reset`, or without ``monitor=True``.
         """

@@ -11,8 +11,8 @@ from torch import nn
 class LinearRecurrence(BaseFeaturesExtractor):
     """The latest frame of a stack, and the state of a linear recurrent unit after all frames of the stack.
 
-    h_k = lambda h_k-1 + B x_k, complex lambda inside the unit circle, all learned (Orvieto et al., arXiv:2303.06349).
-    Because the unit is linear, h is one matrix times the stacked frames.
+    h_k = lambda h_k-1 + (1 - |lambda|^2)^1/2 B x_k with complex lambda inside the unit circle; lambda and B are learned
+    (Orvieto et al., arXiv:2303.06349). Because the unit is linear, h is one matrix times the stacked frames.
     """
 
     ages: torch.Tensor

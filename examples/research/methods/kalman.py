@@ -23,7 +23,7 @@ def diffusion_intensity(trained: Arrays, system: System) -> np.ndarray:
 
 
 class EKF(Method[Arrays]):
-    """Extended Kalman filter with the exact equations and measurement noise, its DIFFUSION chosen on validation runs.
+    """Extended Kalman filter with the exact equations and noise level; validation runs choose its level of DIFFUSION.
 
     It starts with the mean and covariance of the system's starts in X.
     """
@@ -48,7 +48,7 @@ class EKF(Method[Arrays]):
 
 
 class UKF(EKF):
-    """Unscented Kalman filter with the exact equations and measurement noise, tuned like the EKF."""
+    """Unscented Kalman filter with the exact equations and noise level, tuned like the EKF."""
 
     name: ClassVar[str] = "ukf"
     label: ClassVar[str] = "UKF"

@@ -59,7 +59,7 @@ class GRUCell(Cell):
 
 
 class LRUCell(Cell):
-    """Blocks of diagonal complex linear recurrences, each followed by a gated layer and a residual connection."""
+    """Blocks, each of a diagonal complex linear recurrence, a gated layer and a residual connection."""
 
     blocks: ClassVar[int] = 2
     decay: ClassVar[tuple[float, float]] = (0.003, 0.3)  # range of the initial decay rates, per sample
