@@ -110,7 +110,7 @@ def check_equations(system: Any) -> None:
     try:
         target_of(system)
     except EquationError as error:
-        # A ValueError means that the system has no target. Only environments need a target, and they raise the error.
+        # If a user's target raises ValueError, there is no target. Only environments need one; they raise the error.
         if not isinstance(error.__cause__, ValueError):
             raise
 

@@ -1,4 +1,4 @@
-"""A Numba type that holds one number for each of several rows, so that code written for one row advances several."""
+"""A Numba type with one number for each of several rows of a batch, so that code for one row computes them all."""
 
 import math
 import operator
@@ -17,7 +17,7 @@ _IN_PLACE = {"add": operator.iadd, "sub": operator.isub, "mul": operator.imul}
 
 
 class _Lanes(types.Type):
-    """A vector with a double for each row; a number converts to a vector of equal doubles."""
+    """A vector with a double for each row; a float converts to a vector of equal doubles."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -87,7 +87,7 @@ def choose(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 @_intrinsic(prefer_literal=True)
 def stack(typing: Any, count: Any, rows: Any) -> Any:
-    """Return stack memory, or registers if ``count`` is a constant, for ``count`` vectors of ``rows`` doubles."""
+    """Return stack memory for ``count`` vectors of ``rows`` doubles; registers may hold it if ``count`` is constant."""
     kind = _Lanes(rows.literal_value) if rows.literal_value > 1 else types.float64
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

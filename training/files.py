@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 from observers.storage import UNFINISHED, replacing
 
 CHECKPOINTS = "[!.]*.checkpoint.*"  # checkpoints of a run or an agent; names of unfinished files begin with a dot
-ABANDONED = 3600.0  # seconds since the last write after which a temporary file counts as abandoned
+ABANDONED = 3600.0  # a temporary file counts as abandoned if its last write was more than this many seconds ago
 
 
 def write(path: str | os.PathLike[str], text: str) -> None:
@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a folder, write a run's configuration; ValueError at checkpoints or, with ``resume``, at another run's."""
+    """Lock a folder, write a run's configuration; ValueError if it holds checkpoints (``resume``: another run's)."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)

@@ -22,7 +22,7 @@ from training.trajectories.equations import describe
 
 FORMAT = 2  # version of the file format
 KEY = "kkl-gym-agent"
-MAX_SCALED = 10.0  # limit of normalised observations, as in stable-baselines3
+MAX_SCALED = 10.0  # largest size of a normalised observation's entries, in units of ``scale``, as in stable-baselines3
 Head = Literal["tanh", "clip", "argmax"]
 
 

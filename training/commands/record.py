@@ -69,7 +69,7 @@ class RecordCommand:
             ended = sum(episode.terminated for episode in rollouts.episodes)
             progress.say(
                 f"{len(lengths)} episodes of {min(lengths)} to {max(lengths)} steps of {rollouts.dt:g} s, "
-                f"{sum(lengths)} together; {ended} ended by the environment"
+                f"{sum(lengths)} together; {ended} terminated"
             )
             signals = rollouts.signals
             progress.say(f"measured {', '.join(signals.measured)}; hidden {', '.join(signals.hidden) or 'nothing'}")

@@ -46,7 +46,7 @@ WINDOW = 0.05  # a learning curve is averaged over this share of the steps
 class Cell:
     """Agents of one kind in one task: their returns ``values`` (n,) and normalised ``scores`` (n,).
 
-    ``interval`` is (interquartile mean score, low, high). Without idle or full-state agents it and ``scores`` are NaN.
+    ``interval``: interquartile mean score, low, high. If idle or full-state agents are missing, all scores are NaN.
     """
 
     values: np.ndarray
@@ -62,13 +62,13 @@ def on_systems(results: "pd.DataFrame") -> bool:
 
 
 def tasks_in(results: "pd.DataFrame") -> list[tuple[str, Any]]:
-    """Return each task's environment and noise level in order, except tasks with only full-state or idle agents."""
+    """Return environment and noise level of each task that has agents other than full-state and idle ones, in order."""
     partly = results[~results.shown.isin(["state", IDLE])]
     return list(partly[["environment", "noise"]].drop_duplicates().itertuples(index=False, name=None))
 
 
 def _kinds_in(results: "pd.DataFrame") -> list[str]:
-    """Return kinds of agents in the table's order; the default kinds for systems are listed even without results."""
+    """Return kinds of agents in the table's order; on systems, default kinds are included even without results."""
     systems = on_systems(results)
     there = {*results.shown} | ({*ON_SYSTEMS} if systems else set())
     order = KINDS if systems else dict.fromkeys((*IN_ENVIRONMENTS, *KINDS))
@@ -90,7 +90,7 @@ def _task_name(environment: str, noise: float | str) -> str:
 
 
 def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
-    """Add task and idle (an idle agent's return). In environments, noise levels share full-state and idle agents."""
+    """Add columns: task, idle (idle agent's return). In environments noise levels share full-state and idle agents."""
     import pandas as pd
 
     tasks = []
@@ -151,7 +151,7 @@ def _table_of_systems(
         "",
         "Normalised score: 0 is zero input, 1 the interquartile mean of the agents that know the full state. "
         "Interquartile mean over agents [bootstrap 95 % interval], success rate in %, number of agents. Observers see "
-        f"every sample of y; agents on y see it once for each action.{partial}",
+        f"every sample of y; agents on y see one sample for each action.{partial}",
         "",
         *files.table(["", *tasks], table),
         "",
@@ -184,8 +184,8 @@ def _table_of_environments(
     return [
         "# Agents in any environment",
         "",
-        "Return: interquartile mean over agents. In brackets the normalised return, where 0 is random actions and 1 "
-        "agents that see the full state without noise, with a bootstrap 95 % interval; then the number of agents. "
+        "Return: interquartile mean over agents. In brackets the normalised return (0: random actions; 1: agents that "
+        "see the full state without noise) with a bootstrap 95 % interval; then the number of agents. "
         f"Steps that trained an observer count as training steps.{partial}",
         "",
         *files.table([*heads, "random"], rows),
