@@ -11,7 +11,7 @@ from kkl_gym import KKLMemory
 
 
 class Positions(gym.ObservationWrapper):
-    """Shows the pendulum's cosine and sine with noise, and hides its rate."""
+    """Shows cosine and sine of the pendulum's angle, with noise, and hides its rate."""
 
     def __init__(self, env: gym.Env, noise: float) -> None:
         super().__init__(env)
@@ -27,7 +27,7 @@ def main(steps: int = 10_000, noise: float = 0.0, episodes: int = 20, seed: int 
     """Train SAC with and without KKLMemory, and return the mean return of each agent's evaluation episodes.
 
     Args:
-        steps: environment steps of each agent's training; the default takes half a minute.
+        steps: environment steps of each agent's training, which takes half a minute by default.
         noise: standard deviation of the noise added to each measurement.
         episodes: number of evaluation episodes, with other starts than in training.
         seed: seed of all random numbers.

@@ -50,8 +50,8 @@ class Artifact:
         A map to x from z_y alone, the part of z that y drives; it replaces T_inv until the first nonzero input. Motion
         without input visits far fewer states than driven motion, so a map for these states alone is more accurate.
     motion : Motion, optional
-        Model of the motion: the system's equations, or a network that predicts the next state. An observer with this
-        model tracks: a Kalman filter predicts by the model and corrects by each sample, and T_inv initialises it.
+        Model of the motion: the system's equations, or a network that predicts the next state. By default, an
+        observer with a model tracks: T_inv starts a Kalman filter, which predicts by the model and corrects by samples.
     measurement_noise : float or tuple of float, length ny, default 0.5
         Default standard deviation of the noise on each sample, one for all outputs or one for each. The artifact limits
         it to the largest value in the maps' training.
@@ -67,8 +67,8 @@ class Artifact:
     versions : mapping of str to str, optional
         Versions of the libraries that the training used.
     signals : mapping of str to sequence of str, optional
-        For an observer that was learned from recorded states, without equations: the names of the columns
-        under the keys "measured" (y), "inputs" (u) and "hidden" (x).
+        For an observer that was learned from recorded states, without equations: the keys "measured" (y),
+        "inputs" (u) and "hidden" (x), each with the names of its columns in the records.
     environment : mapping of str to object, optional
         For an observer that was learned from rollouts of an environment: the "id" of that environment and its arguments
         "kwargs". The observer fits only that environment. An observer from other records fits no environment.
@@ -227,7 +227,7 @@ class Artifact:
 
     @functools.cached_property
     def usual_input(self) -> float:
-        """Ten times the smallest entry of ``u_max``, at most LARGEST; inputs up to this value need no further check."""
+        """The least of LARGEST and ten times each entry of ``u_max``, if given; inputs up to it pass all checks."""
         return min([LARGEST, *(FAR * each for each in self.u_max or ())])
 
     @property
@@ -259,7 +259,7 @@ class Artifact:
         )
 
     def require_known_start(self, *, tracking: bool) -> None:
-        """Raise ArtifactError unless an observer, with or without ``tracking``, can start at a known state."""
+        """Raise ArtifactError if an observer cannot start at a known state: it does not track, and there is no T."""
         if not tracking and self.forward is None:
             self._lacks(
                 "cannot start at a known state: it has no T, and the observer does not track; kkl-gym train SYSTEM "
@@ -381,7 +381,7 @@ def _conditions(inverse: InverseMap) -> dict[str, Any]:
     """Return the properties in which the two inverse maps of an artifact must agree."""
     process_noise = inverse.process_noise_unit, inverse.process_noise_max
     return {
-        "number of outputs": inverse.mlp.outputs,
+        "number of estimated values": inverse.mlp.outputs,
         "measurement noise": inverse.measurement_noise_max,
         "process noise": process_noise if "process_noise" in inverse.features else None,
         "having a covariance": inverse.error_covariance is not None,

@@ -50,12 +50,12 @@ class InverseMap:
 
     The network's inputs follow ``features``, in which "z_y" comes first and the others are optional:
 
-    - ``z_y``, ``z_u``: together the modes ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2, with
-      sigma_v the standard deviation of the measurement noise. Each mode has unit variance over noise-free training
-      data, so the division shrinks a noisy mode to its conditional mean;
+    - ``z_y``, ``z_u``: together the modes, here the entries of ``whiten @ (z - z_offset)``, divided by
+      1 + (sigma_v * noise_gain)^2, with sigma_v the standard deviation of the measurement noise. Each mode has unit
+      variance over noise-free training data, so the division shrinks a noisy mode to its conditional mean;
     - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), one input for each sigma_v (see below);
-    - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), with the level that bounds w
-      in environments, in multiples of ``System.scale`` per second;
+    - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), with ``level`` the bound
+      of the noise w in environments, in multiples of ``System.scale`` per second;
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
     The output is x_offset + x_scale * mlp(inputs). Raises ArtifactError if the parts do not fit each other.
@@ -74,7 +74,7 @@ class InverseMap:
     whiten : ndarray, shape (modes, size)
         Matrix from the filter's state to the modes, which are the network's first inputs.
     noise_gain : ndarray, shape (modes,) or (ny, modes)
-        Standard deviation of each mode per unit of sigma_v, for all outputs together or for each output.
+        Standard deviation of the noise in each mode, per unit of sigma_v: for all outputs together, or for each output.
     x_offset, x_scale : ndarray, shape (nx,)
         Scaling of the estimate; nx counts the estimated parameters, too.
     measurement_noise_unit : float or tuple of float, length ny, default 1

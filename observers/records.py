@@ -47,7 +47,7 @@ class RecordEstimates:
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Return estimates (steps, ..., number) of uncertain parameters: :attr:`parameters_hat` along a whole record.
 
-        Arguments and errors are those of :meth:`estimate`. Also raises ValueError if the map estimates no parameters.
+        ``y``, ``u`` and errors are as in :meth:`estimate`. Also raises ValueError if the map estimates no parameters.
         """
         return self._along(y, u, None, of=self._kkl.parameters_hat)
 
@@ -56,7 +56,7 @@ class RecordEstimates:
     ) -> np.ndarray:
         """Return the error covariances (steps, ..., nx, nx) of :meth:`estimate`: :attr:`covariance` at each sample.
 
-        Arguments and errors are those of :meth:`estimate`. Also raises ArtifactError if the artifact has no covariance.
+        ``y``, ``u``, ``x0``, errors: as in :meth:`estimate`. Raises ArtifactError, too, if the map has no covariance.
         """
         self.artifact.require_covariance()
         return self._along(y, u, x0, of=self._kkl.covariance)

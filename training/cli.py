@@ -46,7 +46,7 @@ WIDE = 140  # columns of output to a file or pipe; 80 would cut tables
 PROG = "kkl-gym"
 MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
-# The modules that each extra of the package installs.
+# Modules that extras of the package install, for the hint on a missing module.
 EXTRAS = {
     "train": {
         *["filelock", "joblib", "pandas", "pydantic", "pytorch_optimizer", "rich", "scipy", "sympy", "torch", "tyro"]
@@ -205,7 +205,7 @@ def _described(module: str, name: str) -> Callable[..., Any]:
 
 
 def _message(error: Exception) -> str:
-    """Return an error's message; for a ValidationError, a line ``name = value: requirement`` for each setting."""
+    """Return an error's message; for a ValidationError, ``name = value: requirement`` for each invalid setting."""
     from pydantic import ValidationError
 
     if isinstance(error, OSError) and error.filename and error.strerror:

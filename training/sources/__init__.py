@@ -20,7 +20,7 @@ class Runs:
     ``sound`` is True if the plant certainly had no faults.
 
     Shapes: ``x`` (steps + 1, n, nx), NaN where unknown, ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu),
-    ``process_noise`` (n,), ``usual`` (n,): True for starts in the training box X.
+    ``process_noise`` (n,), ``usual`` (n,): True for starts in X, and for all recorded motions.
     """
 
     x: np.ndarray
@@ -96,7 +96,7 @@ class Source(Protocol):
         """Return changes of the state over one sampling interval: for learning a flow, and for measuring its error."""
 
     def tracking(self) -> dict[str, Any]:
-        """Return the arguments of observers.Motion that the source fixes; ValueError if tracking is impossible."""
+        """Return arguments of observers.Motion that the source fixes; raise ValueError if tracking is impossible."""
 
     def judged(self, artifact: Artifact) -> dict[str, Any]:
         """Return errors on held-out motions, for the training metadata of the artifact."""

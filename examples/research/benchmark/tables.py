@@ -22,7 +22,7 @@ NEVER = 1e12  # replaces infinite errors, so that quantiles exist
 NARROWEST = 7.0  # least width in inches of a figure with its title
 DOMAINS = {"X": "starts in X", "1.5X": "starts in 1.5X \\ X", "2X": "starts in 2X \\ X"}
 
-# SMAPE in % in the paper's released notebooks, by system and method.
+# Component-wise SMAPE in % that the notebooks released with the paper print for 1.5X \ X, by system and method.
 PRINTED = {
     "reverse_duffing": {"spinn": 1.96, "ae": 55.4, "dmf": 46.2, "node": 159.8},
     "van_der_pol": {"spinn": 0.35, "ae": 200.0, "dmf": 98.2, "node": 11.9},
@@ -32,7 +32,7 @@ PRINTED = {
 
 
 def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Return median, half the interquartile range and the median's bootstrap 95 % interval for each cell."""
+    """Return median, half the interquartile range and the median's bootstrap 95 % interval for each table cell."""
     from scipy.stats import bootstrap  # imported here, because it takes half a second
 
     rows = []

@@ -142,7 +142,7 @@ def rollout(
     y: torch.Tensor,
     ages: np.ndarray,
 ) -> torch.Tensor:
-    """Run z_k+1 = transition z_k + early y_k + late y_k+1, and return its states at the samples ``ages``.
+    """Run z_k+1 = transition z_k + early y_k + late y_k+1, and return z at the increasing sample numbers ``ages``.
 
     One power of the transition advances the filter to the next of these samples, however many samples lie between.
 

@@ -15,8 +15,8 @@ from observers import KKLObserver, load
 from training import TorchMemory, TorchObserver
 from training.files import table
 
-MOTIONS, SETTLED, STEPS = 1024, 60, 5  # number of motions, steps before the timing, and timed steps
-NY, NU, TAU, TAU_U = 8, 2, (1.0, 2.0, 4.0, 8.0), (1.0, 4.0)  # sizes and time constants of the memory
+MOTIONS, SETTLED, STEPS = 1024, 60, 5  # numbers of motions, of samples before the timed ones, and of timed steps
+NY, NU, TAU, TAU_U = 8, 2, (1.0, 2.0, 4.0, 8.0), (1.0, 4.0)  # the memory's sizes, and its time constants in steps
 WAYS = ("NumPy", "Numba", "Torch")
 
 Task = Callable[[], float]
@@ -24,7 +24,7 @@ Task = Callable[[], float]
 
 @dataclass(frozen=True)
 class TorchSpeed:
-    """Compare the times of a step in Torch, NumPy and Numba, for the default observers and for the memory.
+    """Compare a step's times in NumPy, Numba and Torch, for the default observers, and for the memory without Numba.
 
     Prints microseconds per row on one CPU thread: medians over turns, each of which times every variant.
     """
