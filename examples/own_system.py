@@ -1,6 +1,6 @@
 """Bring your own system: define it, train an observer for it, run this observer inside an environment, evaluate it.
 
-The same from the command line::
+Training and evaluation from the command line, with default settings::
 
     kkl-gym train examples/own_system.py:Pendulum
     kkl-gym evaluate runs/pendulum/pendulum.safetensors --system examples/own_system.py:Pendulum

@@ -26,7 +26,7 @@ _SYMPY_NAMES = {"abs": "Abs", "maximum": "Max", "minimum": "Min"}
 
 def _unary(name: str, on_numbers: Callable[[Any], Any], meaning: str) -> Callable[[Any], Any]:
     on_arrays = getattr(np, name)
-    # Only these three functions warn of finite arguments. The others do without np.errstate, which takes time.
+    # In NumPy only these three warn at finite arguments. The others need no np.errstate, which takes time.
     if name in ("exp", "log", "sqrt"):
         on_arrays = np.errstate(all="ignore")(on_arrays)
 

@@ -11,7 +11,7 @@ from observers.machine import available
 
 
 class Decoders:
-    """T_inv for some entries of the estimate. Rows without input since reset use the ``free_inverse``, if any."""
+    """T_inv for the n entries ``outputs`` of the estimate. Rows without input since reset use any ``free_inverse``."""
 
     def __init__(self, artifact: Artifact, outputs: slice, **options: Any) -> None:
         free = artifact.free_inverse
@@ -19,7 +19,7 @@ class Decoders:
         self.free = None if free is None else Decoder(free, outputs, **options)
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
-        """Return the estimates (..., nx) from filter states (..., size) and ages in seconds since reset."""
+        """Return the estimates (..., n) from filter states (..., size) and ages in seconds since reset."""
         return self._by_row(z, age, Decoder.__call__)
 
     def covariances(self, z: np.ndarray, age: Any) -> np.ndarray:
@@ -42,7 +42,7 @@ class Decoders:
 
 
 class Decoder:
-    """T_inv at given noise levels: a map from z, (..., size), and the age in seconds to x_hat, (..., nx)."""
+    """T_inv at given noise levels: from z (..., size) and the age in seconds to n entries of the estimate (..., n)."""
 
     def __init__(
         self,

@@ -154,7 +154,7 @@ class VectorEstimate(VectorWrapper):
             check_untouched(obs, b"".join(base.get_attr("emitted")), self.env, base)
 
     def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
-        """Add the observers' report to ``info``, with ``rows`` as mask of its valid rows. Returns all observations."""
+        """Add the observers' report to ``info``, with the mask ``rows`` of its valid rows. Returns all observations."""
         report = self._estimator.report()
         for key, values in report.items():
             info |= {key: values, f"_{key}": rows.copy()}

@@ -161,7 +161,7 @@ def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon
 def transients(T: np.ndarray, z0: np.ndarray, *, linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
     """Return z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)) along trajectories, which is exact for an exact T (paper, sec. 3).
 
-    Shapes: ``T`` (m, n, nz), ``z0`` (n, nz), ``ages`` (m,); returns (m, n, nz).
+    Shapes: ``T`` (m, n, nz), ``z0`` (n, nz), ``ages`` (m,) in samples; returns (m, n, nz).
     """
     poles, V = np.linalg.eig(linear.A)
     left = np.exp(ages[:, None] * linear.dt * poles)  # remaining share of each mode

@@ -48,7 +48,7 @@ class Compare:
     episodes: int = 100
     """Number of evaluation episodes of each agent."""
     timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: from the hyperparameters)")] = None
-    """Number of actions in a training, over all environments."""
+    """Number of actions in a training, summed over its parallel environments."""
     measurement_noise: Annotated[
         NoiseLevels, tyro.conf.arg(help_behavior_hint="(default: the task's own; also 0.2 on Van der Pol, 2 on Lorenz)")
     ] = None
@@ -56,7 +56,7 @@ class Compare:
     observers: tuple[str, ...] = ()
     """Observers for agents on systems: a .safetensors file for each of your own systems, or shipped maps."""
     aggregate: int = 0
-    """How many times an observer is refitted to the agent's own steps in environments (kkl-gym agent train --help)."""
+    """For x_hat in environments: number of the observer's refits to the agent's steps (kkl-gym agent train --help)."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     out: Annotated[
         Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/comparison, or runs/agents/environments)")

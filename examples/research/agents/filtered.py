@@ -10,7 +10,7 @@ from training.agents.information import FeatureObservation, Information
 from training.agents.tasks import Task, deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 
-# White process noise that the filters assume, in multiples of each state's scale per square root of System.pace.
+# Root of the spectral density of the process noise that the filters assume, as a multiple of scale / sqrt(pace).
 PROCESS_NOISE = 1e-2
 
 

@@ -49,7 +49,7 @@ PPO: dict[str, Any] = {
 CONTINUOUS = {"use_sde": True, "sde_sample_freq": 4}  # smooth exploration where actions are continuous
 LEARNING_RATE = 0.001  # at the start; it falls linearly to zero
 FRAMES = 32  # steps in the linear recurrent unit's history
-EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluations after the first one; episodes in each, and in the last
+EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # intervals in the CPU time; episodes of an evaluation, of the last
 OBSERVER_STEPS = 40_000  # steps from which an observer or, under noise, the weights of the memory z are learned
 TRUTH = 0.15  # initial share of the CPU time, in which agents on x_hat see the true state
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and agents on x_hat do not see y
@@ -227,9 +227,9 @@ class Kinds:
     """
 
     environments: tuple[str, ...] = ("Pendulum-v1", "CartPole-v1")
-    """Environments whose velocities are hidden."""
+    """Environments whose velocities are hidden, in every kind."""
     kinds: tuple[str, ...] = tuple(KINDS)
-    """masked (velocities only), noise (0.1 rms), delay (5 steps), drop-out (30 %), parameters (new per episode)."""
+    """masked (hidden velocities), noise (0.1 rms), delay (5 steps), drop-out (30 %), parameters (new per episode)."""
     information: tuple[Shown, ...] = get_args(Shown)
     """Information that agents see; lru is a linear recurrent unit over 32 frames."""
     seeds: int = 5
@@ -281,8 +281,8 @@ def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
     lines = [
         "# Kinds of partial observability",
         "",
-        "Returns: interquartile means over seeds, [95 % interval], number of seeds. Bold: the best mean without the "
-        f"full state, and means above the lower end of its interval.{partial}",
+        "Returns: interquartile means over seeds, [95 % interval], number of seeds. Bold (full state left "
+        f"out): the best mean, and means above the lower end of its interval.{partial}",
         "",
     ]
     equal = agents.apply(lambda curve: np.interp(STEPS, curve.steps, curve["return"]))
